@@ -1,0 +1,2 @@
+//! Python bindings of saccade.
+#![deny(unsafe_code)]

@@ -1,0 +1,2 @@
+//! The action head of GR00T-style robot policies on CPUs.
+#![forbid(unsafe_code)]
