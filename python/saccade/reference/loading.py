@@ -1,0 +1,87 @@
+"""Reads checkpoints for the reference: config, prefix, shards, and every disagreement in one message."""
+
+import json
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from saccade.reference._config import CheckpointError
+
+PREFIXES = ("action_head.", "_groot_model.action_head.", "")
+
+
+def tensor_files(source: str | PathLike[str]) -> list[Path]:
+    """The `.safetensors` files of a directory, or the one file itself."""
+    path = Path(source)
+    if path.is_file():
+        return [path]
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such checkpoint")
+    files = sorted(path.glob("*.safetensors"))
+    if not files:
+        raise CheckpointError(f"{path}: expected at least one .safetensors file")
+    return files
+
+
+def read_config(
+    source: str | PathLike[str], config: Mapping[str, Any] | str | PathLike[str] | None = None
+) -> Mapping[str, Any]:
+    """The config given, or the one that lies beside or inside the checkpoint."""
+    if isinstance(config, Mapping):
+        return config
+    if config is not None:
+        return json.loads(Path(config).read_text())
+    path = Path(source)
+    beside = (path if path.is_dir() else path.parent) / "config.json"
+    if beside.is_file():
+        return json.loads(beside.read_text())
+    for file in tensor_files(source):
+        with safe_open(file, framework="pt") as opened:
+            metadata = opened.metadata() or {}
+        if "config" in metadata:
+            return json.loads(metadata["config"])
+    raise CheckpointError(f"{path}: no config.json beside it; give config=")
+
+
+def read_tensors(
+    source: str | PathLike[str], expected: Mapping[str, torch.Size], dtype: torch.dtype
+) -> dict[str, Tensor]:
+    """The head's tensors without their prefix, in `dtype`.
+
+    Raises:
+        CheckpointError: listing all that is missing, unknown (inside the prefix) or of another shape than expected.
+    """
+    place = {}  # name in the file -> the file
+    for file in tensor_files(source):
+        with safe_open(file, framework="pt") as opened:
+            place.update(dict.fromkeys(opened.keys(), file))
+    prefix = next(prefix for prefix in PREFIXES if prefix == "" or any(name.startswith(prefix) for name in place))
+
+    tensors, problems = {}, []
+    for file in sorted(set(place.values())):
+        with safe_open(file, framework="pt") as opened:
+            for full_name in opened.keys():  # noqa: SIM118  (a safetensors handle is no dict)
+                name = full_name.removeprefix(prefix)
+                if not full_name.startswith(prefix):
+                    continue
+                if name not in expected:
+                    problems.append(f"{name}: unknown")
+                    continue
+                shape = tuple(opened.get_slice(full_name).get_shape())
+                if shape != tuple(expected[name]):
+                    problems.append(f"{name}: shape {shape}, expected {tuple(expected[name])}")
+                    continue
+                tensors[name] = opened.get_tensor(full_name).to(dtype)
+    for name, shape in expected.items():
+        if shape.numel() == 0:  # no future tokens: their empty table need not be stored
+            tensors.setdefault(name, torch.empty(shape, dtype=dtype))
+    absent = expected.keys() - tensors.keys() - {problem.split(":")[0] for problem in problems}
+    problems += [f"{name}: missing" for name in sorted(absent)]
+    if problems:
+        raise CheckpointError(f"{source}: {len(problems)} tensors do not fit the config: " + "; ".join(sorted(problems)))
+    return tensors

@@ -1,0 +1,529 @@
+"""The GR00T N1.5 action head as one torch module that reads from top to bottom.
+
+Module names follow the checkpoint, so that `state_dict()` has the released tensor names. Shapes in comments: B is the batch, R the rows
+of the query sequence (one state row, N future rows, T action rows), S the vision-language tokens.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from saccade.reference import loading, tables
+from saccade.reference._config import HeadConfig
+
+NORM_EPS = 1e-5  # every LayerNorm but the last
+OUTPUT_NORM_EPS = 1e-6  # the last one
+TABLE_STD = 0.02  # initial scale of learned tokens, positions and category-specific weights
+
+
+class Attention(nn.Module):
+    """Multi-head attention written out; heads are contiguous slices of the width."""
+
+    def __init__(self, width: int, context_dim: int, num_heads: int, head_dim: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.head_dim = head_dim
+        inner = num_heads * head_dim
+        self.to_q = nn.Linear(width, inner)
+        self.to_k = nn.Linear(context_dim, inner)
+        self.to_v = nn.Linear(context_dim, inner)
+        self.to_out = nn.ModuleList([nn.Linear(inner, width)])
+
+    def forward(
+        self, x: Tensor, context: Tensor, *, logit_bias: Tensor | None = None, return_weights: bool = False
+    ) -> tuple[Tensor, Tensor | None]:
+        """Lets the rows of `x` read those of `context`.
+
+        Args:
+            x: `(B, Q, width)`.
+            context: `(B, S, context_dim)`.
+            logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a key. A query with no
+                key left gets zeros from the attention.
+            return_weights: also return the probabilities.
+
+        Returns:
+            `(B, Q, width)`, and the probabilities `(B, heads, Q, S)` or None.
+        """
+        q = self.split_heads(self.to_q(x))  # (B, heads, Q, head_dim)
+        k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
+        v = self.split_heads(self.to_v(context))  # (B, heads, S, head_dim)
+        if logit_bias is None and not return_weights:
+            weights, values = None, F.scaled_dot_product_attention(q, k, v)  # the same sums, faster to train
+        else:
+            weights = attention_weights(q, k, logit_bias)  # (B, heads, Q, S)
+            values = weights @ v  # (B, heads, Q, head_dim)
+        return self.to_out[0](values.transpose(1, 2).flatten(2)), weights  # (B, Q, width)
+
+    def split_heads(self, x: Tensor) -> Tensor:
+        """`(B, S, heads * head_dim)` to `(B, heads, S, head_dim)`."""
+        return x.unflatten(-1, (self.num_heads, self.head_dim)).transpose(1, 2)
+
+
+def attention_weights(q: Tensor, k: Tensor, logit_bias: Tensor | None) -> Tensor:
+    """softmax(q k^T / sqrt(head_dim) + bias), and zeros where no key is left.
+
+    Args:
+        q: `(B, heads, Q, head_dim)`.
+        k: `(B, heads, S, head_dim)`.
+        logit_bias: broadcast to `(B, heads, Q, S)`, or None.
+
+    Returns:
+        `(B, heads, Q, S)`.
+    """
+    logits = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])  # (B, heads, Q, S)
+    if logit_bias is None:
+        return torch.softmax(logits, dim=-1)
+    logits = logits + logit_bias.to(logits.dtype)
+    nothing_left = torch.isneginf(logits).all(dim=-1, keepdim=True)  # (B, heads, Q, 1)
+    # Filled before the softmax too: a row of nan would poison the gradient even where its value is replaced.
+    return torch.softmax(logits.masked_fill(nothing_left, 0.0), dim=-1).masked_fill(nothing_left, 0.0)
+
+
+class GeluLinear(nn.Module):
+    """Linear, then GELU in its tanh form."""
+
+    def __init__(self, in_features: int, out_features: int) -> None:
+        super().__init__()
+        self.proj = nn.Linear(in_features, out_features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(..., in_features)` to `(..., out_features)`."""
+        return F.gelu(self.proj(x), approximate="tanh")
+
+
+class FeedForward(nn.Module):
+    """width -> 4 width -> width; place 1 of the list holds dropout in the released code."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.net = nn.ModuleList([GeluLinear(width, 4 * width), nn.Identity(), nn.Linear(4 * width, width)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(..., width)` to the same shape."""
+        for layer in self.net:
+            x = layer(x)
+        return x
+
+
+class VlBlock(nn.Module):
+    """Self-attention among the vision-language tokens, norm first, no mask, no positions."""
+
+    def __init__(self, config: HeadConfig) -> None:
+        super().__init__()
+        width = config.context_dim
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.attn1 = Attention(width, width, config.vl_num_heads, config.vl_head_dim)
+        self.norm3 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.ff = FeedForward(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(B, S, context_dim)` to the same shape."""
+        y = self.norm1(x)
+        attended, _ = self.attn1(y, y)
+        x = x + attended
+        return x + self.ff(self.norm3(x))
+
+
+class VlSelfAttention(nn.Module):
+    """The blocks that mix the vision-language tokens once per observation."""
+
+    def __init__(self, config: HeadConfig) -> None:
+        super().__init__()
+        self.transformer_blocks = nn.ModuleList(VlBlock(config) for _ in range(config.vl_num_layers))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(B, S, context_dim)` to the same shape."""
+        for block in self.transformer_blocks:
+            x = block(x)
+        return x
+
+
+class AdaptiveNorm(nn.Module):
+    """LayerNorm whose scale and shift come from the time embedding: scale in the first half of the projection, shift in the second."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(width, 2 * width)
+
+    def forward(self, x: Tensor, temb: Tensor) -> Tensor:
+        """`x (B, R, width)`, `temb (B, width)`; returns `(B, R, width)`."""
+        scale, shift = self.linear(F.silu(temb))[:, None].chunk(2, dim=-1)  # (B, 1, width) each
+        return plain_norm(x, NORM_EPS) * (1 + scale) + shift
+
+
+def plain_norm(x: Tensor, eps: float) -> Tensor:
+    """LayerNorm over the last axis without scale and shift."""
+    return F.layer_norm(x, x.shape[-1:], eps=eps)
+
+
+class DiTBlock(nn.Module):
+    """One attention (to the context, or among the rows) and one feed-forward, without gates."""
+
+    def __init__(self, config: HeadConfig, is_cross: bool) -> None:
+        super().__init__()
+        self.is_cross = is_cross
+        context_dim = config.context_dim if is_cross else config.width
+        self.norm1 = AdaptiveNorm(config.width)
+        self.attn1 = Attention(config.width, context_dim, config.num_heads, config.head_dim)
+        self.ff = FeedForward(config.width)
+
+    def forward(self, rows: Tensor, vl_embs: Tensor, temb: Tensor) -> Tensor:
+        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `temb (B, width)`; returns `(B, R, width)`."""
+        y = self.norm1(rows, temb)
+        attended, _ = self.attn1(y, vl_embs if self.is_cross else y)
+        rows = rows + attended
+        return rows + self.ff(plain_norm(rows, NORM_EPS))  # this norm does not see the time
+
+
+class TimestepEmbedder(nn.Module):
+    """256 sinusoids -> width -> width."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.linear_1 = nn.Linear(tables.TIMESTEP_CHANNELS, width)
+        self.linear_2 = nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(B, 256)` to `(B, width)`."""
+        return self.linear_2(F.silu(self.linear_1(x)))
+
+
+class TimestepEncoder(nn.Module):
+    """The time embedding that steers the adaptive norms."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.timestep_embedder = TimestepEmbedder(width)
+
+    def forward(self, timestep: Tensor) -> Tensor:
+        """Buckets `(B,)` to `(B, width)`."""
+        dtype = self.timestep_embedder.linear_1.weight.dtype
+        return self.timestep_embedder(tables.timestep_table(timestep).to(dtype))
+
+
+class DiffusionTransformer(nn.Module):
+    """Blocks 0, 2, 4, ... read the vision-language tokens, blocks 1, 3, 5, ... the rows themselves."""
+
+    def __init__(self, config: HeadConfig) -> None:
+        super().__init__()
+        self.timestep_encoder = TimestepEncoder(config.width)
+        self.transformer_blocks = nn.ModuleList(
+            DiTBlock(config, is_cross=index % 2 == 0 or not config.interleave_self_attention)
+            for index in range(config.num_layers)
+        )
+        self.proj_out_1 = nn.Linear(config.width, 2 * config.width)
+        self.proj_out_2 = nn.Linear(config.width, config.hidden_dim)
+
+    def forward(self, rows: Tensor, vl_embs: Tensor, timestep: Tensor) -> Tensor:
+        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; returns `(B, R, hidden_dim)`."""
+        temb = self.timestep_encoder(timestep)  # (B, width)
+        for block in self.transformer_blocks:
+            rows = block(rows, vl_embs, temb)
+        return self.output(rows, temb)
+
+    def output(self, rows: Tensor, temb: Tensor) -> Tensor:
+        """The last norm and projection; here, other than in the blocks, the first half of the modulation is the shift."""
+        shift, scale = self.proj_out_1(F.silu(temb))[:, None].chunk(2, dim=-1)  # (B, 1, width) each
+        return self.proj_out_2(plain_norm(rows, OUTPUT_NORM_EPS) * (1 + scale) + shift)  # (B, R, hidden_dim)
+
+
+class CategoryLinear(nn.Module):
+    """One linear layer per embodiment; weights are stored `(category, in, out)`, not transposed."""
+
+    def __init__(self, num_categories: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        self.W = nn.Parameter(TABLE_STD * torch.randn(num_categories, in_features, out_features))
+        self.b = nn.Parameter(torch.zeros(num_categories, out_features))
+
+    def forward(self, x: Tensor, embodiment_id: int | Tensor) -> Tensor:
+        """`x (B, rows, in_features)`, an int or `(B,)`; returns `(B, rows, out_features)`."""
+        if isinstance(embodiment_id, int):
+            return x @ self.W[embodiment_id] + self.b[embodiment_id]
+        return torch.bmm(x, self.W[embodiment_id]) + self.b[embodiment_id][:, None]
+
+
+class CategoryMlp(nn.Module):
+    """Two category-specific layers with ReLU between them."""
+
+    def __init__(self, num_categories: int, in_features: int, hidden_dim: int, out_features: int) -> None:
+        super().__init__()
+        self.layer1 = CategoryLinear(num_categories, in_features, hidden_dim)
+        self.layer2 = CategoryLinear(num_categories, hidden_dim, out_features)
+
+    def forward(self, x: Tensor, embodiment_id: int | Tensor) -> Tensor:
+        """`(B, rows, in_features)` to `(B, rows, out_features)`."""
+        return self.layer2(F.relu(self.layer1(x, embodiment_id)), embodiment_id)
+
+
+class ActionEncoder(nn.Module):
+    """Noisy actions and the time bucket to action rows."""
+
+    def __init__(self, num_categories: int, action_dim: int, width: int) -> None:
+        super().__init__()
+        self.width = width
+        self.W1 = CategoryLinear(num_categories, action_dim, width)
+        self.W2 = CategoryLinear(num_categories, 2 * width, width)
+        self.W3 = CategoryLinear(num_categories, width, width)
+
+    def forward(self, actions: Tensor, timestep: Tensor, embodiment_id: int | Tensor) -> Tensor:
+        """`actions (B, T, action_dim)`, `timestep (B,)`; returns `(B, T, width)`."""
+        a = self.W1(actions, embodiment_id)  # (B, T, width)
+        tau = tables.action_time_table(timestep, self.width).to(a.dtype)  # (B, width)
+        z = torch.cat((a, tau[:, None].expand_as(a)), dim=-1)  # (B, T, 2 width)
+        return self.W3(F.silu(self.W2(z, embodiment_id)), embodiment_id)
+
+
+@dataclass(frozen=True)
+class TimeDistribution:
+    """How training draws the flow time: `scale * (1 - b)` with `b ~ Beta(alpha, beta)`.
+
+    This form, that of the later releases, stays within [0, scale]; most times are near 0, where the actions are mostly noise.
+    """
+
+    alpha: float = 1.5
+    beta: float = 1.0
+    scale: float = 0.999
+
+    @classmethod
+    def from_dict(cls, config: Mapping[str, Any]) -> "TimeDistribution":
+        """Reads `noise_beta_alpha`, `noise_beta_beta` and `noise_s` of a checkpoint's config, released values where absent."""
+        head = config.get("action_head_cfg", config)
+        return cls(
+            alpha=float(head.get("noise_beta_alpha", cls.alpha)),
+            beta=float(head.get("noise_beta_beta", cls.beta)),
+            scale=float(head.get("noise_s", cls.scale)),
+        )
+
+
+class ActionHead(nn.Module):
+    """The N1.5 action head in torch.
+
+    Runs in the dtype of its parameters (`.double()` for float64) and is differentiable throughout; inputs are converted to that dtype,
+    and may be NumPy arrays. Wrap calls in `torch.no_grad()` where no gradient is wanted. A new head has the released code's initial
+    distribution. There is no dropout.
+
+    Args:
+        config: sizes and switches.
+        time_distribution: how `sample_time` draws.
+
+    Example:
+        >>> head = ActionHead.load("GR00T-N1.5-3B", dtype=torch.float64)
+        >>> vl_embs = head.encode(backbone_features)
+        >>> actions = head.sample(vl_embs, state, 31, noise=noise)
+    """
+
+    def __init__(self, config: HeadConfig, *, time_distribution: TimeDistribution | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.time_distribution = time_distribution or TimeDistribution()
+        categories, hidden, width = config.num_embodiments, config.hidden_dim, config.width
+        self.model = DiffusionTransformer(config)
+        self.state_encoder = CategoryMlp(categories, config.state_history * config.state_dim, hidden, width)
+        self.action_encoder = ActionEncoder(categories, config.encoder_action_dim, width)
+        self.action_decoder = CategoryMlp(categories, hidden, hidden, config.action_dim)
+        self.future_tokens = token_table(config.num_future_tokens, width)
+        if config.use_vlln:
+            self.vlln = nn.LayerNorm(config.context_dim, eps=NORM_EPS)
+            self.vl_self_attention = VlSelfAttention(config)
+        if config.add_pos_embed:
+            self.position_embedding = token_table(config.max_positions, width)
+
+    @classmethod
+    def load(
+        cls,
+        source: str | PathLike[str],
+        *,
+        config: Mapping[str, Any] | str | PathLike[str] | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> "ActionHead":
+        """Builds the head from a checkpoint.
+
+        Args:
+            source: a directory with one or more `.safetensors` files, or one such file. Tensors are found under `action_head.`,
+                `_groot_model.action_head.` or no prefix; what lies outside the prefix is ignored.
+            config: the checkpoint's config or the head's own, as a dict or a path. By default `config.json` beside the file, or
+                else the `config` entry of the file's metadata.
+            dtype: of the parameters; narrower ones are widened exactly.
+
+        Raises:
+            FileNotFoundError: a path that is not there.
+            CheckpointError: tensors missing, unknown or of the wrong shape (all of them are listed), or no config.
+        """
+        whole = loading.read_config(source, config)
+        with torch.device("meta"):  # no memory and no time spent on an initialisation that is replaced
+            head = cls(HeadConfig.from_dict(whole), time_distribution=TimeDistribution.from_dict(whole))
+        tensors = loading.read_tensors(source, {name: t.shape for name, t in head.state_dict().items()}, dtype)
+        head.load_state_dict(tensors, assign=True)
+        return head
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the parameters, in which everything is computed."""
+        return self.future_tokens.weight.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.future_tokens.weight.device
+
+    def encode(self, backbone_features: Tensor | np.ndarray) -> Tensor:
+        """Normalises and mixes the backbone's features, once per observation.
+
+        Args:
+            backbone_features: `(B, S, context_dim)`.
+
+        Returns:
+            `vl_embs (B, S, context_dim)`; the features themselves if the config has `use_vlln` false.
+        """
+        features = self.as_input(backbone_features)
+        if not self.config.use_vlln:
+            return features
+        return self.vl_self_attention(self.vlln(features))
+
+    def velocity(
+        self,
+        vl_embs: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        timestep: int | Tensor | np.ndarray,
+    ) -> Tensor:
+        """The flow's velocity at noisy actions.
+
+        Args:
+            vl_embs: `(B, S, context_dim)`, from `encode`.
+            state: `(B, state_dim)` or `(B, history, state_dim)`, normalised and padded.
+            embodiment_id: an int, or `(B,)`.
+            actions: `(B, T, encoder_action_dim)`.
+            timestep: time bucket, an int or `(B,)`.
+
+        Returns:
+            `(B, T, action_dim)`.
+        """
+        vl_embs, actions = self.as_input(vl_embs), self.as_input(actions)
+        batch, horizon = actions.shape[:2]
+        embodiment_id = self.as_embodiment(embodiment_id)
+        timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
+        state = self.as_input(state).reshape(batch, 1, -1)  # (B, 1, history * state_dim)
+
+        state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
+        future_rows = self.future_tokens.weight.expand(batch, -1, -1)  # (B, N, width)
+        action_rows = self.action_encoder(actions, timestep, embodiment_id)  # (B, T, width)
+        if self.config.add_pos_embed:
+            action_rows = action_rows + self.position_embedding.weight[:horizon]
+        rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
+
+        hidden = self.model(rows, vl_embs, timestep)  # (B, R, hidden_dim)
+        return self.action_decoder(hidden[:, -horizon:], embodiment_id)  # (B, T, action_dim)
+
+    def sample(
+        self,
+        vl_embs: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        num_steps: int | None = None,
+    ) -> Tensor:
+        """Follows the flow from noise (time 0) to actions (time 1) in equal Euler steps.
+
+        Args:
+            vl_embs, state, embodiment_id: as in `velocity`.
+            noise: `(B, T, encoder_action_dim)`, standard normal.
+            num_steps: default as the config says.
+
+        Returns:
+            Actions `(B, T, action_dim)`, normalised.
+        """
+        num_steps = self.config.num_steps if num_steps is None else num_steps
+        vl_embs, actions = self.as_input(vl_embs), self.as_input(noise)
+        for step in range(num_steps):
+            bucket = int(step / num_steps * self.config.num_timestep_buckets)
+            actions = actions + self.velocity(vl_embs, state, embodiment_id, actions, bucket) / num_steps
+        return actions
+
+    def forward(
+        self,
+        backbone_features: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        num_steps: int | None = None,
+    ) -> Tensor:
+        """`encode`, then `sample`."""
+        return self.sample(self.encode(backbone_features), state, embodiment_id, noise=noise, num_steps=num_steps)
+
+    def sample_time(self, batch: int, generator: torch.Generator | None = None) -> Tensor:
+        """Draws flow times for training.
+
+        Args:
+            batch: how many.
+            generator: default torch's own.
+
+        Returns:
+            `(batch,)`, in [0, scale].
+        """
+        # torch's Beta takes no generator, so the generator seeds NumPy's.
+        seed = int(torch.randint(2**63 - 1, (), generator=generator))
+        law = self.time_distribution
+        drawn = np.random.default_rng(seed).beta(law.alpha, law.beta, size=batch)
+        return torch.as_tensor(law.scale * (1.0 - drawn), dtype=self.dtype, device=self.device)
+
+    def loss(
+        self,
+        backbone_features: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        time: Tensor | np.ndarray,
+        action_mask: Tensor | np.ndarray | None = None,
+    ) -> Tensor:
+        """Flow-matching loss: the velocity on the straight line from noise to actions should be `actions - noise`.
+
+        Args:
+            backbone_features: `(B, S, context_dim)`.
+            state, embodiment_id: as in `velocity`.
+            actions: the demonstrated chunk, `(B, T, action_dim)`, normalised.
+            noise: the same shape, standard normal.
+            time: `(B,)`, from `sample_time`.
+            action_mask: broadcast to `actions`; the squared error is averaged with these weights. Default all.
+
+        Returns:
+            A scalar.
+        """
+        actions, noise, time = self.as_input(actions), self.as_input(noise), self.as_input(time)
+        t = time[:, None, None]  # (B, 1, 1)
+        noisy = (1 - t) * noise + t * actions  # (B, T, action_dim)
+        bucket = torch.floor(time * self.config.num_timestep_buckets).long()  # (B,)
+        predicted = self.velocity(self.encode(backbone_features), state, embodiment_id, noisy, bucket)
+        error = (predicted - (actions - noise)).square()  # (B, T, action_dim)
+        if action_mask is None:
+            return error.mean()
+        mask = self.as_input(action_mask).expand_as(error)
+        return (error * mask).sum() / mask.sum()
+
+    def as_input(self, array: Tensor | np.ndarray) -> Tensor:
+        """The array as a tensor in the head's dtype, on its device."""
+        return torch.as_tensor(array, dtype=self.dtype, device=self.device)
+
+    def as_embodiment(self, embodiment_id: int | Tensor | np.ndarray) -> int | Tensor:
+        """One id stays an int (one matrix product for the whole batch), several become a long tensor."""
+        ids = np.asarray(embodiment_id) if not isinstance(embodiment_id, Tensor) else embodiment_id
+        if ids.ndim == 0:
+            return int(ids)
+        return torch.as_tensor(ids, dtype=torch.long, device=self.device)
+
+
+def token_table(num_rows: int, width: int) -> nn.Embedding:
+    """Learned rows, `(num_rows, width)`; zero rows are allowed."""
+    return nn.Embedding(num_rows, width, _weight=TABLE_STD * torch.randn(num_rows, width))

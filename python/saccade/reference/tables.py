@@ -1,0 +1,57 @@
+"""The two sinusoidal tables of the head, correctly rounded to float32.
+
+Exponents are formed in float32 in the order that the released code uses; exp, sin and cos are evaluated in float64 and rounded once.
+Float32 vector libraries differ in the last bit of exp, and at a bucket of 900 that bit moves an angle by 6e-5, so the rounding is part
+of the definition here rather than left to the library.
+"""
+
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+LOG_10000 = np.float32(np.log(10000.0))
+TIMESTEP_CHANNELS = 256
+
+
+@cache
+def action_frequencies(width: int) -> Tensor:
+    """Frequencies of the table beside the action tokens, `(width // 2,)` float32."""
+    half = width // 2
+    exponents = -np.arange(half, dtype=np.float32) * (LOG_10000 / np.float32(half))
+    return torch.from_numpy(np.exp(exponents.astype(np.float64)).astype(np.float32))
+
+
+@cache
+def timestep_frequencies() -> Tensor:
+    """Frequencies of the table behind the time embedding, `(128,)` float32; the divisor is 127, so that the last one is 1/10000."""
+    half = TIMESTEP_CHANNELS // 2
+    exponents = (-LOG_10000 * np.arange(half, dtype=np.float32)) / np.float32(half - 1)
+    return torch.from_numpy(np.exp(exponents.astype(np.float64)).astype(np.float32))
+
+
+def sin_and_cos(timestep: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    """Sine and cosine of float32(timestep * frequency).
+
+    Args:
+        timestep: buckets, `(batch,)`, any number type.
+        frequencies: `(half,)` float32.
+
+    Returns:
+        Two float32 tensors `(batch, half)`.
+    """
+    angles = timestep.to(torch.float32)[:, None] * frequencies.to(timestep.device)  # (batch, half), rounded to float32
+    angles = angles.to(torch.float64)
+    return torch.sin(angles).to(torch.float32), torch.cos(angles).to(torch.float32)
+
+
+def action_time_table(timestep: Tensor, width: int) -> Tensor:
+    """The vector that is appended to every action token: sines first, `(batch, width)` float32."""
+    return torch.cat(sin_and_cos(timestep, action_frequencies(width)), dim=-1)
+
+
+def timestep_table(timestep: Tensor) -> Tensor:
+    """The input of the timestep encoder: cosines first, `(batch, 256)` float32."""
+    sin, cos = sin_and_cos(timestep, timestep_frequencies())
+    return torch.cat((cos, sin), dim=-1)
