@@ -1,0 +1,100 @@
+"""The released N1.5 head, as lerobot 0.4.4 ships it, without the rest of lerobot.
+
+lerobot's package files import datasets, cameras and robots; the head itself needs torch, diffusers and transformers only. So its three
+files are imported under their own names with empty packages around them, which are taken away again afterwards.
+
+Install with `pip install --no-deps lerobot==0.4.4` and `pip install "diffusers>=0.35,<0.36" "transformers>=4.57,<4.58"`.
+"""
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor, nn
+
+HEAD = "lerobot.policies.groot.action_head.flow_matching_action_head"
+
+
+def build(config: Mapping[str, Any]) -> nn.Module:
+    """A `FlowmatchingActionHead` in eval mode with the released code's own initialisation.
+
+    Args:
+        config: a head's config with the released key names, or a whole checkpoint's.
+
+    Raises:
+        ModuleNotFoundError: lerobot, diffusers or transformers is not installed.
+    """
+    module = import_head()
+    head_config = {"max_num_embodiments": 32, "max_seq_len": 1024} | dict(config.get("action_head_cfg", config))
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints what it tunes
+        head = module.FlowmatchingActionHead(module.FlowmatchingActionHeadConfig(**head_config))
+    return head.eval()
+
+
+def get_action(head: nn.Module, backbone_features: Tensor, state: Tensor, embodiment_id: Tensor, noise: Tensor) -> Tensor:
+    """The head's own `get_action`, started from the given noise.
+
+    Args:
+        head: from `build`.
+        backbone_features: `(batch, T_vl, context_dim)`.
+        state: `(batch, 1, state_dim)`.
+        embodiment_id: `(batch,)` long.
+        noise: `(batch, horizon, action_dim)`, used in place of what it would draw.
+
+    Returns:
+        `(batch, horizon, action_dim)`.
+    """
+    batch_feature = import_head().BatchFeature
+    backbone = batch_feature(data={"backbone_features": backbone_features})
+    inputs = batch_feature(data={"state": state, "embodiment_id": embodiment_id})
+
+    def given_noise(size: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+        if tuple(size) != tuple(noise.shape):
+            raise ValueError(f"noise: given {tuple(noise.shape)}, the head draws {tuple(size)}")
+        return noise.to(dtype=dtype, device=device)
+
+    with mock.patch.object(torch, "randn", given_noise):
+        return head.get_action(backbone, inputs).action_pred
+
+
+def import_head() -> ModuleType:
+    """The module that holds `FlowmatchingActionHead`."""
+    if HEAD in sys.modules:
+        return sys.modules[HEAD]
+    spec = importlib.util.find_spec("lerobot")
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError("lerobot is not installed: pip install --no-deps lerobot==0.4.4", name="lerobot")
+    with empty_packages(Path(spec.submodule_search_locations[0])):
+        return importlib.import_module(HEAD)
+
+
+@contextlib.contextmanager
+def empty_packages(root: Path) -> Iterator[None]:
+    """Packages of lerobot that have a path but run none of their own code; what was imported before is put back."""
+    stubs = {}
+    package = HEAD.rpartition(".")[0]
+    while package:
+        stubs[package] = ModuleType(package)
+        stubs[package].__path__ = [str(root.joinpath(*package.split(".")[1:]))]
+        package = package.rpartition(".")[0]
+    stubs["lerobot.utils"] = ModuleType("lerobot.utils")
+    stubs["lerobot.utils.import_utils"] = ModuleType("lerobot.utils.import_utils")
+    stubs["lerobot.utils.import_utils"]._transformers_available = True  # type: ignore[attr-defined]
+    before = {name: sys.modules.get(name) for name in stubs}
+    sys.modules.update(stubs)
+    try:
+        yield
+    finally:
+        for name, module in before.items():
+            if module is None:
+                del sys.modules[name]
+            else:
+                sys.modules[name] = module

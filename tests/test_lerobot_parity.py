@@ -1,0 +1,110 @@
+"""The reference against the released code itself, at the released widths.
+
+lerobot is installed by the test set-up without its dependencies; if it is missing, these tests fail.
+Tables differ: the released code calls torch's float32 sin and cos, so up to 2e-4 may come from them alone.
+"""
+
+from unittest import mock
+
+import pytest
+import torch
+from reference_cases import FIXTURES, load_fixture, relative_error, small_config
+from torch import Tensor, nn
+
+from saccade.reference import ActionHead, released
+from saccade.reference.random_weights import n15_config, random_head, random_inputs
+
+TOLERANCE = 3e-4
+
+
+@pytest.fixture(scope="module")
+def wide() -> tuple[ActionHead, nn.Module, dict[str, Tensor]]:
+    """Both heads at N1.5's widths with fewer blocks and embodiments, the same random weights, one view's tokens."""
+    config = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
+    head = random_head(config, seed=0)
+    theirs = released.build(config)
+    theirs.load_state_dict(head.state_dict(), strict=True, assign=True)
+    return head, theirs, random_inputs(head.config, seed=1, batch=2, num_vl_tokens=296)
+
+
+def their_actions(theirs: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
+    return released.get_action(
+        theirs, inputs["backbone_features"], inputs["state"], inputs["embodiment_id"], inputs["noise"]
+    )
+
+
+def test_reference_equals_lerobot_at_full_width(wide: tuple[ActionHead, nn.Module, dict[str, Tensor]]) -> None:
+    head, theirs, inputs = wide
+    with torch.no_grad():
+        ours = head(**inputs)
+    expected = their_actions(theirs, inputs)
+    assert expected.std() > 0.5
+    assert (ours - expected).abs().max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_lerobot_reproduces_the_fixtures(name: str) -> None:
+    """Guards the fixtures themselves: a changed file, or a wrong set-up of lerobot, shows here."""
+    fixture = load_fixture(name)
+    theirs = released.build(fixture.config)
+    theirs.load_state_dict(ActionHead.load(fixture.path).state_dict(), strict=True)
+    assert (their_actions(theirs, fixture.inputs) - fixture.actions_f64).abs().max() <= TOLERANCE
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"num_future_tokens": 0},
+        {"interleave": False},
+        {"use_vlln": False},
+        {"add_pos_embed": False},
+        {"num_layers": 3},
+        {"vl_num_layers": 2, "num_steps": 7},
+    ],
+    ids=str,
+)
+def test_reference_equals_lerobot_on_other_configs(change: dict[str, int | bool]) -> None:
+    config = small_config(**change)  # type: ignore[arg-type]
+    head = random_head(config, seed=2)
+    theirs = released.build(config)
+    theirs.load_state_dict(head.state_dict(), strict=True)
+    inputs = random_inputs(head.config, seed=3, batch=3, num_vl_tokens=7)
+    with torch.no_grad():
+        assert relative_error(head(**inputs), their_actions(theirs, inputs)) <= TOLERANCE
+
+
+def test_training_loss_and_gradients_equal_lerobot() -> None:
+    config = small_config()
+    head = random_head(config, seed=4, dtype=torch.float64)
+    theirs = released.build(config).double()
+    theirs.load_state_dict(head.state_dict(), strict=True)
+    inputs = {name: t.double() if t.is_floating_point() else t for name, t in training_inputs(head).items()}
+    loss = head.loss(**inputs)
+    loss.backward()
+
+    feature = released.import_head().BatchFeature
+    backbone = feature(data={"backbone_features": inputs["backbone_features"], "backbone_attention_mask": None})
+    batch = {"state": inputs["state"], "embodiment_id": inputs["embodiment_id"]}
+    batch |= {"action": inputs["actions"], "action_mask": inputs["action_mask"]}
+    with (
+        mock.patch.object(torch, "randn", lambda *args, **kwargs: inputs["noise"]),
+        mock.patch.object(type(theirs), "sample_time", lambda *args, **kwargs: inputs["time"]),
+    ):
+        their_loss = theirs(backbone, feature(data=batch)).loss
+    their_loss.backward()
+
+    assert relative_error(loss.detach(), their_loss.detach()) <= 1e-5
+    gradients = dict(head.named_parameters())
+    for name, parameter in theirs.named_parameters():
+        ours = gradients[name].grad
+        assert ours is not None
+        assert parameter.grad is not None
+        assert relative_error(ours, parameter.grad) <= 1e-4, name
+
+
+def training_inputs(head: ActionHead) -> dict[str, Tensor]:
+    inputs = random_inputs(head.config, seed=5, batch=4, num_vl_tokens=6)
+    generator = torch.Generator().manual_seed(6)
+    actions = torch.randn(inputs["noise"].shape, generator=generator)
+    mask = torch.randint(2, actions.shape, generator=generator).float()
+    return inputs | {"actions": actions, "action_mask": mask, "time": head.sample_time(4, generator)}

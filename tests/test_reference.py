@@ -1,0 +1,353 @@
+"""The torch reference against the released code's outputs, its tensor list, and the definitions of its parts."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from reference_cases import DATA, FIXTURES, load_fixture, relative_error, small_config
+from safetensors.torch import save_file
+from torch import nn
+
+import saccade
+from saccade.reference import ActionHead, TimeDistribution, tables
+from saccade.reference.model import Attention
+from saccade.reference.random_weights import N15_CONFIG, random_head, random_inputs
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_float64_equals_the_released_code(name: str) -> None:
+    fixture = load_fixture(name)
+    head = ActionHead.load(fixture.path, dtype=torch.float64)
+    with torch.no_grad():
+        actions = head(**fixture.inputs)
+    assert actions.dtype == torch.float64
+    assert relative_error(actions, fixture.actions_f64) <= 1e-6
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_float32_is_as_close_as_the_released_code(name: str) -> None:
+    fixture = load_fixture(name)
+    with torch.no_grad():
+        actions = ActionHead.load(fixture.path)(**fixture.inputs)
+    assert actions.dtype == torch.float32
+    allowed = 4 * fixture.float32_error + 1e-6 * fixture.actions_f64.abs().clamp(min=1.0)
+    assert ((actions - fixture.actions_f64).abs() <= allowed).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", FIXTURES)
+def test_vl_embs_equal_the_released_code(name: str, dtype: torch.dtype) -> None:
+    fixture = load_fixture(name)
+    with torch.no_grad():
+        vl_embs = ActionHead.load(fixture.path, dtype=dtype).encode(fixture.inputs["backbone_features"])
+    assert relative_error(vl_embs, fixture.vl_embs) <= 4e-6  # the fixture's vl_embs are float32
+
+
+def test_full_size_state_dict_has_the_released_names_and_shapes() -> None:
+    expected = {}
+    for line in (DATA / "groot_n15_tensors.tsv").read_text().splitlines()[2:]:
+        name, shape = line.split("\t")
+        expected[name.removeprefix("action_head.")] = tuple(int(size) for size in shape.split("x"))
+    with torch.device("meta"):
+        head = ActionHead(saccade.HeadConfig.from_dict(N15_CONFIG))
+    assert {name: tuple(t.shape) for name, t in head.state_dict().items()} == expected
+    assert sum(parameter.numel() for parameter in head.parameters()) == 1_068_806_144
+
+
+def test_new_head_starts_as_released() -> None:
+    head = ActionHead(saccade.HeadConfig.from_dict(small_config(num_heads=16, head_dim=8, num_future_tokens=64)))
+    for table in (head.future_tokens.weight, head.state_encoder.layer1.W, head.action_encoder.W2.W):
+        assert table.std().item() == pytest.approx(0.02, rel=0.2)
+    assert (head.action_encoder.W2.b == 0).all()
+    assert (head.vlln.weight == 1).all()
+    assert (head.vlln.bias == 0).all()
+    bound = 1 / math.sqrt(head.config.width)
+    assert head.model.proj_out_2.weight.abs().max().item() == pytest.approx(bound, rel=0.05)
+
+
+# The two tables
+
+
+def test_tables_are_correctly_rounded() -> None:
+    log_10000 = np.float32(math.log(10000.0))
+    buckets, width = [0, 1, 250, 907, 999], 12
+    sines_first = tables.action_time_table(torch.tensor(buckets), width).numpy()
+    cosines_first = tables.timestep_table(torch.tensor(buckets)).numpy()
+    for row, bucket in enumerate(buckets):
+        for i in range(width // 2):
+            exponent = np.float32(-i) * np.float32(log_10000 / np.float32(width // 2))
+            angle = float(np.float32(bucket) * np.float32(math.exp(exponent)))
+            assert sines_first[row, i] == np.float32(math.sin(angle))
+            assert sines_first[row, width // 2 + i] == np.float32(math.cos(angle))
+        for i in range(128):
+            exponent = np.float32(np.float32(-log_10000 * np.float32(i)) / np.float32(127))
+            angle = float(np.float32(bucket) * np.float32(math.exp(exponent)))
+            assert cosines_first[row, i] == np.float32(math.cos(angle))
+            assert cosines_first[row, 128 + i] == np.float32(math.sin(angle))
+
+
+# Attention
+
+
+def random_attention() -> tuple[Attention, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    attention = Attention(width=12, context_dim=10, num_heads=3, head_dim=4).double()
+    return attention, torch.randn(2, 5, 12).double(), torch.randn(2, 7, 10).double()
+
+
+def test_attention_equals_loops_over_heads() -> None:
+    attention, x, context = random_attention()
+    out, weights = attention(x, context, return_weights=True)
+    q, k, v = attention.to_q(x), attention.to_k(context), attention.to_v(context)
+    for row in range(2):
+        heads = []
+        for head in range(3):
+            columns = slice(4 * head, 4 * head + 4)
+            logits = q[row, :, columns] @ k[row, :, columns].T / 2.0
+            probabilities = logits.exp() / logits.exp().sum(dim=1, keepdim=True)
+            torch.testing.assert_close(weights[row, head], probabilities)
+            heads.append(probabilities @ v[row, :, columns])
+        torch.testing.assert_close(out[row], attention.to_out[0](torch.cat(heads, dim=1)))
+
+
+def test_attention_is_the_same_with_and_without_weights() -> None:
+    attention, x, context = random_attention()
+    plain, none = attention(x, context)
+    written_out, _ = attention(x, context, return_weights=True)
+    assert none is None
+    torch.testing.assert_close(plain, written_out)
+
+
+def test_minus_infinity_removes_a_key() -> None:
+    attention, x, context = random_attention()
+    bias = torch.zeros(7).double()
+    bias[[1, 4]] = -torch.inf
+    out, weights = attention(x, context, logit_bias=bias, return_weights=True)
+    without, _ = attention(x, context[:, [0, 2, 3, 5, 6]])
+    torch.testing.assert_close(out, without)
+    assert (weights[..., [1, 4]] == 0).all()
+
+
+def test_a_query_with_no_key_left_gets_the_bias_and_finite_gradients() -> None:
+    attention, x, context = random_attention()
+    x.requires_grad_()
+    bias = torch.zeros(5, 7).double()
+    bias[2] = -torch.inf
+    out, weights = attention(x, context, logit_bias=bias, return_weights=True)
+    assert (weights[:, :, 2] == 0).all()
+    torch.testing.assert_close(out[:, 2], attention.to_out[0].bias.expand(2, 12))
+    out.sum().backward()
+    assert x.grad is not None
+    assert x.grad.isfinite().all()
+    assert all(parameter.grad.isfinite().all() for parameter in attention.parameters())
+
+
+# Sampling
+
+
+@pytest.mark.parametrize(
+    ("num_steps", "buckets"), [(1, [0]), (4, [0, 250, 500, 750]), (7, [0, 142, 285, 428, 571, 714, 857])]
+)
+def test_sample_takes_equal_steps_through_these_buckets(num_steps: int, buckets: list[int]) -> None:
+    head = random_head(small_config(), seed=1, dtype=torch.float64)
+    inputs = random_inputs(head.config, seed=2, batch=2, num_vl_tokens=6)
+    vl_embs, noise = head.encode(inputs["backbone_features"]), inputs["noise"].double()
+    actions = noise
+    for bucket in buckets:
+        actions = actions + head.velocity(
+            vl_embs, inputs["state"], inputs["embodiment_id"], actions, torch.tensor([bucket, bucket])
+        ) / len(buckets)
+    sampled = head.sample(vl_embs, inputs["state"], inputs["embodiment_id"], noise=noise, num_steps=num_steps)
+    torch.testing.assert_close(sampled, actions)
+
+
+def test_numpy_inputs_and_flat_state_are_the_same() -> None:
+    head = random_head(small_config(), seed=1)
+    inputs = random_inputs(head.config, seed=2, batch=2, num_vl_tokens=6)
+    with torch.no_grad():
+        expected = head(**inputs)
+        arrays = {name: tensor.numpy() for name, tensor in inputs.items()}
+        arrays["state"] = arrays["state"][:, 0]
+        assert torch.equal(head(**arrays), expected)
+
+
+def test_one_embodiment_for_all_equals_one_per_row() -> None:
+    head = random_head(small_config(), seed=1, dtype=torch.float64)
+    inputs = random_inputs(head.config, seed=2, batch=3, num_vl_tokens=6)
+    inputs["embodiment_id"] = torch.tensor([2, 2, 2])
+    expected = head(**inputs)
+    torch.testing.assert_close(head(**(inputs | {"embodiment_id": 2})), expected)
+    torch.testing.assert_close(head(**(inputs | {"embodiment_id": np.int64(2)})), expected)
+
+
+# Training
+
+
+def numpy_loss(head: ActionHead, given: dict[str, np.ndarray], mask: np.ndarray) -> float:
+    total, weight = 0.0, 0.0
+    for row in range(len(given["time"])):
+        t = given["time"][row]
+        noisy = (1 - t) * given["noise"][row] + t * given["actions"][row]
+        velocity = head.velocity(
+            head.encode(given["backbone_features"][row : row + 1]),
+            given["state"][row : row + 1],
+            int(given["embodiment_id"][row]),
+            noisy[None],
+            math.floor(t * 1000),
+        )
+        error = velocity[0].detach().numpy() - (given["actions"][row] - given["noise"][row])
+        total += float((error**2 * mask[row]).sum())
+        weight += float(mask[row].sum())
+    return total / weight
+
+
+def training_batch(head: ActionHead, batch: int) -> dict[str, np.ndarray]:
+    inputs = random_inputs(head.config, seed=3, batch=batch, num_vl_tokens=6)
+    given = {name: tensor.numpy().astype(np.float64) for name, tensor in inputs.items()}
+    rng = np.random.default_rng(4)
+    return given | {
+        "embodiment_id": inputs["embodiment_id"].numpy(),
+        "actions": rng.standard_normal(given["noise"].shape),
+        "time": rng.uniform(0, 0.999, size=batch),
+    }
+
+
+def test_loss_is_the_masked_mean_of_squared_velocity_errors() -> None:
+    head = random_head(small_config(), seed=1, dtype=torch.float64)
+    given = training_batch(head, batch=4)
+    mask = np.random.default_rng(5).integers(0, 2, size=given["actions"].shape).astype(np.float64)
+    assert head.loss(**given).item() == pytest.approx(numpy_loss(head, given, np.ones_like(mask)), rel=1e-12)
+    assert head.loss(**given, action_mask=mask).item() == pytest.approx(numpy_loss(head, given, mask), rel=1e-12)
+    per_dimension = mask[:, :1]
+    expected = numpy_loss(head, given, np.broadcast_to(per_dimension, mask.shape))
+    assert head.loss(**given, action_mask=per_dimension).item() == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("interleave", [True, False])
+def test_every_used_parameter_gets_a_gradient(interleave: bool) -> None:
+    head = random_head(small_config(interleave=interleave), seed=1, dtype=torch.float64)
+    given = training_batch(head, batch=4) | {"embodiment_id": np.array([0, 2, 0, 2])}
+    head.loss(**given).backward()
+    # Among cross-attention blocks alone no action row reads the state or future rows. A key's bias shifts all logits of a query alike.
+    without = () if interleave else ("future_tokens", "state_encoder")
+    for name, parameter in head.named_parameters():
+        assert parameter.grad is not None, name
+        gradient = parameter.grad
+        if name.startswith(without):
+            assert (gradient == 0).all(), name
+        elif name.endswith("to_k.bias"):
+            assert gradient.abs().max() < 1e-12, name
+        elif name == "position_embedding.weight":
+            horizon = head.config.action_horizon
+            assert (gradient[:horizon] != 0).all()
+            assert (gradient[horizon:] == 0).all()
+        elif name.endswith((".W", ".b")):
+            assert gradient[0].any(), name
+            assert gradient[2].any(), name
+            assert not gradient[1].any(), name
+        else:
+            assert gradient.any(), name
+
+
+def test_gradients_equal_finite_differences() -> None:
+    head = random_head(small_config(num_layers=2), seed=1, dtype=torch.float64)
+    given = training_batch(head, batch=2)
+    features = torch.tensor(given.pop("backbone_features"), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: head.loss(x, **given), (features,), fast_mode=True)
+
+
+def test_sample_time_follows_the_distribution() -> None:
+    config = saccade.HeadConfig.from_dict(small_config())
+    head = ActionHead(config, time_distribution=TimeDistribution(alpha=3.0, beta=2.0, scale=0.9))
+    times = head.sample_time(20_000, torch.Generator().manual_seed(0))
+    assert times.dtype == torch.float32
+    assert times.min() >= 0
+    assert times.max() <= 0.9
+    assert times.mean().item() == pytest.approx(0.9 * (1 - 3 / 5), abs=0.005)
+    assert torch.equal(times, head.sample_time(20_000, torch.Generator().manual_seed(0)))
+
+
+def test_training_lowers_the_loss() -> None:
+    torch.manual_seed(0)
+    head = ActionHead(saccade.HeadConfig.from_dict(small_config(num_heads=4, head_dim=8)))
+    given = training_batch(head, batch=8)
+    optimizer = torch.optim.AdamW(head.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(100):
+        loss = head.loss(**given)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.4 * losses[0]
+
+
+# Loading
+
+
+def write_checkpoint(folder: Path, prefix: str, *, shards: int = 1, drop: str = "", extra: str = "") -> ActionHead:
+    config = small_config()
+    head = random_head(config, seed=1)
+    tensors = {f"{prefix}{name}": tensor for name, tensor in head.state_dict().items() if name != drop}
+    if extra:
+        tensors[extra] = torch.zeros(2)
+    tensors["backbone.weight"] = torch.zeros(3)
+    if prefix == "":
+        del tensors["backbone.weight"]
+    names = sorted(tensors)
+    for shard in range(shards):
+        kept = {name: tensors[name].contiguous() for name in names[shard::shards]}
+        save_file(kept, folder / f"model-{shard + 1:05}-of-{shards:05}.safetensors")
+    (folder / "config.json").write_text(json.dumps({"action_head_cfg": config}))
+    return head
+
+
+@pytest.mark.parametrize("shards", [1, 3])
+@pytest.mark.parametrize("prefix", ["action_head.", "_groot_model.action_head.", ""])
+def test_load_finds_prefixes_and_shards(tmp_path: Path, prefix: str, shards: int) -> None:
+    written = write_checkpoint(tmp_path, prefix, shards=shards)
+    loaded = ActionHead.load(tmp_path, dtype=torch.float64)
+    assert loaded.config == written.config
+    for name, tensor in written.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor.double())
+
+
+def test_load_takes_the_config_given(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path, "action_head.")
+    (tmp_path / "config.json").rename(tmp_path / "elsewhere.json")
+    file = tmp_path / "model-00001-of-00001.safetensors"
+    with pytest.raises(saccade.CheckpointError, match="config"):
+        ActionHead.load(file)
+    assert ActionHead.load(file, config=tmp_path / "elsewhere.json").config.num_layers == 4
+    assert ActionHead.load(file, config=small_config(num_steps=9)).config.num_steps == 9
+
+
+def test_load_reads_the_training_times_of_the_config(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path, "action_head.")
+    config = small_config() | {"noise_beta_alpha": 2.5, "noise_beta_beta": 4.0, "noise_s": 0.5}
+    head = ActionHead.load(tmp_path, config=config)
+    assert head.time_distribution == TimeDistribution(alpha=2.5, beta=4.0, scale=0.5)
+
+
+def test_load_lists_all_that_is_wrong(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path, "action_head.", drop="vlln.bias", extra="action_head.mystery")
+    config = small_config(num_future_tokens=9)
+    with pytest.raises(saccade.CheckpointError) as caught:
+        ActionHead.load(tmp_path, config=config)
+    message = str(caught.value)
+    for part in ("vlln.bias: missing", "mystery: unknown", "future_tokens.weight: shape (4, 12), expected (9, 12)"):
+        assert part in message
+    with pytest.raises(FileNotFoundError):
+        ActionHead.load(tmp_path / "nothing")
+
+
+def test_modules_are_only_those_of_the_config() -> None:
+    config = saccade.HeadConfig.from_dict(small_config(use_vlln=False, add_pos_embed=False))
+    names = ActionHead(config).state_dict().keys()
+    assert not any(name.startswith(("vlln", "vl_self_attention", "position_embedding")) for name in names)
+    features = torch.randn(1, 2, 10)
+    assert torch.equal(ActionHead(config).encode(features), features)
+    assert isinstance(ActionHead(saccade.HeadConfig.from_dict(small_config(vl_num_layers=0))).vlln, nn.LayerNorm)
