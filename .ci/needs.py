@@ -1,0 +1,87 @@
+"""Says what the machine lacks, and which packages bring it, before anything long is started.
+
+    python3 .ci/needs.py python rust opengl
+
+Written for any Python 3, so that an old one is told what is wrong and does not stop at a syntax error.
+"""
+
+import ctypes
+import os
+import re
+import subprocess
+import sys
+
+OLDEST_PYTHON = (3, 10)
+CARGO_TOML = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "Cargo.toml")
+
+
+def lacks_python():
+    """What is wrong with this interpreter, or None."""
+    if sys.version_info[:2] < OLDEST_PYTHON:
+        return (
+            "Python %d.%d or newer is needed; %s is %s." % (OLDEST_PYTHON + (sys.executable, sys.version.split()[0]))
+            + "\n    Another one is chosen by: make PYTHON=/path/to/python3.11 ..."
+        )
+    try:
+        import ensurepip  # noqa: F401
+        import venv  # noqa: F401
+    except ImportError:
+        return (
+            "%s cannot make virtual environments." % sys.executable
+            + "\n    Debian, Ubuntu: apt-get install python3-venv"
+        )
+    return None
+
+
+def lacks_rust():
+    """What is wrong with the Rust toolchain, or None."""
+    with open(CARGO_TOML) as file:
+        oldest = re.search(r'rust-version = "([\d.]+)"', file.read()).group(1)
+    how = "\n    Install or update it with rustup (rustup.rs), then: rustup update stable"
+    try:
+        said = subprocess.check_output(["cargo", "--version"]).decode()
+    except (OSError, subprocess.CalledProcessError):
+        return "Rust %s or newer is needed; no cargo was found on PATH." % oldest + how
+    found = re.search(r"(\d+)\.(\d+)", said).groups()
+    if tuple(map(int, found)) < tuple(map(int, oldest.split(".")[:2])):
+        return "Rust %s or newer is needed; found %s." % (oldest, said.strip()) + how
+    if not any(os.access(os.path.join(path, "cc"), os.X_OK) for path in os.environ["PATH"].split(os.pathsep)):
+        return (
+            "Rust needs a C compiler to link with; no cc was found on PATH."
+            "\n    Debian, Ubuntu: apt-get install build-essential"
+            "\n    Fedora: dnf install gcc"
+        )
+    return None
+
+
+def lacks_opengl():
+    """What is missing for drawing without a screen, or None."""
+    if not sys.platform.startswith("linux"):
+        return None  # macOS and Windows bring their own
+    for name in ("libEGL.so.1", "libOSMesa.so.8", "libOSMesa.so.6"):
+        try:
+            ctypes.CDLL(name)
+            return None
+        except OSError:
+            pass
+    return (
+        "The simulation draws with OpenGL; neither libEGL nor libOSMesa was found."
+        "\n    Debian, Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+        "\n    Fedora: dnf install mesa-libEGL mesa-dri-drivers"
+        "\n    Arch: pacman -S mesa"
+    )
+
+
+CHECKS = {"python": lacks_python, "rust": lacks_rust, "opengl": lacks_opengl}
+
+
+def main():
+    """Prints one paragraph for each thing that is missing; the exit status is 1 if there is any."""
+    problems = [problem for problem in (CHECKS[name]() for name in sys.argv[1:]) if problem]
+    for problem in problems:
+        sys.stderr.write("missing: %s\n" % problem)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

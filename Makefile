@@ -1,0 +1,89 @@
+# Two commands: `make rollout` (the shipped policy drives the simulated robot) and `make test` (every test).
+# They share one virtual environment. Each step of setting it up leaves a stamp in it and is redone when what it was made from changes.
+
+PYTHON ?= python3
+VENV ?= .venv
+ROLLOUT_OUT ?= out/rollout
+ROLLOUT_ARGS ?= --episodes 3 --video
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
+# The build tool is in the environment, so a build neither downloads anything nor uses another version of it.
+INSTALL := MATURIN_PEP517_ARGS=--locked $(PIP) --no-build-isolation --editable
+RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name Cargo.toml)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help rollout test test-rust test-python lint format setup-rollout setup-test clean
+
+help:
+	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
+	@echo "make test      every test, Rust and Python"
+	@echo "make lint      what .ci/run checks besides the tests"
+	@echo "make format    formats all Rust and Python files"
+	@echo "make clean     removes the virtual environment and what was built"
+
+rollout: setup-rollout
+	$(BIN)/saccade rollout $(ROLLOUT_ARGS) --out $(ROLLOUT_OUT)
+
+test: setup-test
+	$(MAKE) test-rust
+	$(MAKE) test-python
+
+test-rust:
+	cargo test --workspace --locked --quiet
+
+test-python:
+	$(BIN)/python -m pytest
+
+lint: setup-test
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --locked --quiet -- --deny warnings
+	RUSTDOCFLAGS="--deny warnings" cargo doc --workspace --no-deps --locked --quiet
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/stubtest saccade._saccade
+
+format: setup-test
+	cargo fmt --all
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# One after the other, in this order, also under `make -j`.
+setup-rollout:
+	@$(PYTHON) .ci/needs.py python rust opengl
+	@$(MAKE) --no-print-directory $(VENV)/.rollout
+	@$(MAKE) --no-print-directory $(VENV)/.extension
+
+setup-test:
+	@$(PYTHON) .ci/needs.py python rust opengl
+	@$(MAKE) --no-print-directory $(VENV)/.test
+	@$(MAKE) --no-print-directory $(VENV)/.extension
+
+# A copied or moved checkout has an environment that points elsewhere: it is made anew.
+$(VENV)/.tools: constraints.txt
+	@test "$$($(BIN)/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(VENV))" || $(PYTHON) -m venv --clear $(VENV)
+	@echo "setting up: build tool"
+	@$(PIP) maturin
+	@touch $@
+
+$(VENV)/.rollout: pyproject.toml constraints.txt $(VENV)/.tools
+	@echo "setting up: saccade and the simulation (builds the Rust head; minutes on the first run)"
+	@$(INSTALL) ".[sim]"
+	@touch $@ $(VENV)/.extension
+
+$(VENV)/.test: pyproject.toml constraints.txt $(VENV)/.tools
+	@echo "setting up: saccade and all that the tests need (torch is large; minutes on the first run)"
+	@$(INSTALL) ".[all]"
+	@$(PIP) --no-deps lerobot
+	@touch $@ $(VENV)/.rollout $(VENV)/.extension
+
+$(VENV)/.extension: pyproject.toml $(RUST_SOURCES)
+	@echo "setting up: the Rust head has changed, building it"
+	@$(INSTALL) . --no-deps
+	@touch $@
+
+clean:
+	rm -rf $(VENV) target out
+	find python -name '*.so' -delete
