@@ -33,7 +33,7 @@ def load_fixture(name: str) -> Fixture:
     path = DATA / f"{name}.safetensors"
     with safe_open(path, framework="pt") as file:
         config = json.loads(file.metadata()["config"])
-        tensors = {key: file.get_tensor(key) for key in file.keys() if key.startswith("_")}
+        tensors = {key: file.get_tensor(key) for key in file.keys() if key.startswith("_")}  # noqa: SIM118
     return Fixture(
         path=path,
         config=config,
@@ -63,7 +63,7 @@ def small_config(
     num_steps: int = 3,
     add_pos_embed: bool = True,
 ) -> dict[str, Any]:
-    """A head's config in the released key names; every size differs from the others, so that a mix-up shows."""
+    """A head's config in the released key names; every size differs, so that a mix-up shows."""
     return {
         "action_dim": action_dim,
         "action_horizon": action_horizon,

@@ -4,6 +4,9 @@ lerobot is installed by the test set-up without its dependencies; if it is missi
 Tables differ: the released code calls torch's float32 sin and cos, so up to 2e-4 may come from them alone.
 """
 
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
 from unittest import mock
 
 import pytest
@@ -19,7 +22,7 @@ TOLERANCE = 3e-4
 
 @pytest.fixture(scope="module")
 def wide() -> tuple[ActionHead, nn.Module, dict[str, Tensor]]:
-    """Both heads at N1.5's widths with fewer blocks and embodiments, the same random weights, one view's tokens."""
+    """Both heads at N1.5's widths with fewer blocks and embodiments, equal weights, one view's tokens."""
     config = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
     head = random_head(config, seed=0)
     theirs = released.build(config)
@@ -33,7 +36,9 @@ def their_actions(theirs: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
     )
 
 
-def test_reference_equals_lerobot_at_full_width(wide: tuple[ActionHead, nn.Module, dict[str, Tensor]]) -> None:
+def test_reference_equals_lerobot_at_full_width(
+    wide: tuple[ActionHead, nn.Module, dict[str, Tensor]],
+) -> None:
     head, theirs, inputs = wide
     with torch.no_grad():
         ours = head(**inputs)
@@ -83,7 +88,9 @@ def test_training_loss_and_gradients_equal_lerobot() -> None:
     loss.backward()
 
     feature = released.import_head().BatchFeature
-    backbone = feature(data={"backbone_features": inputs["backbone_features"], "backbone_attention_mask": None})
+    backbone = feature(
+        data={"backbone_features": inputs["backbone_features"], "backbone_attention_mask": None}
+    )
     batch = {"state": inputs["state"], "embodiment_id": inputs["embodiment_id"]}
     batch |= {"action": inputs["actions"], "action_mask": inputs["action_mask"]}
     with (

@@ -1,4 +1,7 @@
-"""The torch reference against the released code's outputs, its tensor list, and the definitions of its parts."""
+"""The torch reference against the released code: its outputs, its tensors, the definition of each part."""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call, operator, union-attr"
 
 import json
 import math
@@ -58,7 +61,9 @@ def test_full_size_state_dict_has_the_released_names_and_shapes() -> None:
 
 
 def test_new_head_starts_as_released() -> None:
-    head = ActionHead(saccade.HeadConfig.from_dict(small_config(num_heads=16, head_dim=8, num_future_tokens=64)))
+    head = ActionHead(
+        saccade.HeadConfig.from_dict(small_config(num_heads=16, head_dim=8, num_future_tokens=64))
+    )
     for table in (head.future_tokens.weight, head.state_encoder.layer1.W, head.action_encoder.W2.W):
         assert table.std().item() == pytest.approx(0.02, rel=0.2)
     assert (head.action_encoder.W2.b == 0).all()
@@ -220,7 +225,9 @@ def test_loss_is_the_masked_mean_of_squared_velocity_errors() -> None:
     given = training_batch(head, batch=4)
     mask = np.random.default_rng(5).integers(0, 2, size=given["actions"].shape).astype(np.float64)
     assert head.loss(**given).item() == pytest.approx(numpy_loss(head, given, np.ones_like(mask)), rel=1e-12)
-    assert head.loss(**given, action_mask=mask).item() == pytest.approx(numpy_loss(head, given, mask), rel=1e-12)
+    assert head.loss(**given, action_mask=mask).item() == pytest.approx(
+        numpy_loss(head, given, mask), rel=1e-12
+    )
     per_dimension = mask[:, :1]
     expected = numpy_loss(head, given, np.broadcast_to(per_dimension, mask.shape))
     assert head.loss(**given, action_mask=per_dimension).item() == pytest.approx(expected, rel=1e-12)
@@ -231,7 +238,8 @@ def test_every_used_parameter_gets_a_gradient(interleave: bool) -> None:
     head = random_head(small_config(interleave=interleave), seed=1, dtype=torch.float64)
     given = training_batch(head, batch=4) | {"embodiment_id": np.array([0, 2, 0, 2])}
     head.loss(**given).backward()
-    # Among cross-attention blocks alone no action row reads the state or future rows. A key's bias shifts all logits of a query alike.
+    # Among cross-attention blocks alone no action row reads the state or future rows.
+    # A key's bias shifts all logits of a query alike.
     without = () if interleave else ("future_tokens", "state_encoder")
     for name, parameter in head.named_parameters():
         assert parameter.grad is not None, name
@@ -288,7 +296,9 @@ def test_training_lowers_the_loss() -> None:
 # Loading
 
 
-def write_checkpoint(folder: Path, prefix: str, *, shards: int = 1, drop: str = "", extra: str = "") -> ActionHead:
+def write_checkpoint(
+    folder: Path, prefix: str, *, shards: int = 1, drop: str = "", extra: str = ""
+) -> ActionHead:
     config = small_config()
     head = random_head(config, seed=1)
     tensors = {f"{prefix}{name}": tensor for name, tensor in head.state_dict().items() if name != drop}
@@ -338,7 +348,11 @@ def test_load_lists_all_that_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(saccade.CheckpointError) as caught:
         ActionHead.load(tmp_path, config=config)
     message = str(caught.value)
-    for part in ("vlln.bias: missing", "mystery: unknown", "future_tokens.weight: shape (4, 12), expected (9, 12)"):
+    for part in (
+        "vlln.bias: missing",
+        "mystery: unknown",
+        "future_tokens.weight: shape (4, 12), expected (9, 12)",
+    ):
         assert part in message
     with pytest.raises(FileNotFoundError):
         ActionHead.load(tmp_path / "nothing")
@@ -350,4 +364,6 @@ def test_modules_are_only_those_of_the_config() -> None:
     assert not any(name.startswith(("vlln", "vl_self_attention", "position_embedding")) for name in names)
     features = torch.randn(1, 2, 10)
     assert torch.equal(ActionHead(config).encode(features), features)
-    assert isinstance(ActionHead(saccade.HeadConfig.from_dict(small_config(vl_num_layers=0))).vlln, nn.LayerNorm)
+    assert isinstance(
+        ActionHead(saccade.HeadConfig.from_dict(small_config(vl_num_layers=0))).vlln, nn.LayerNorm
+    )

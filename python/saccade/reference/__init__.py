@@ -1,7 +1,7 @@
-"""The same action head in plain torch: the oracle that the Rust head is tested against, and the module that is trained.
+"""The same action head in plain torch: the oracle of the Rust head, and the module that is trained.
 
-Slow and plain on purpose: no caching, no fused kernels, every row computed in every block. Read `model.py` from top to bottom.
-Needs torch and safetensors (`pip install saccade[torch]`).
+Slow and plain on purpose: nothing is cached, every row is computed in every block. `model.py` reads from top
+to bottom. Needs torch and safetensors (`pip install saccade[torch]`).
 """
 
 from saccade.reference.model import ActionHead, TimeDistribution

@@ -10,7 +10,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from saccade.reference._config import CheckpointError
+from saccade.config import read_json
+from saccade.errors import CheckpointError
 
 PREFIXES = ("action_head.", "_groot_model.action_head.", "")
 
@@ -35,17 +36,22 @@ def read_config(
     if isinstance(config, Mapping):
         return config
     if config is not None:
-        return json.loads(Path(config).read_text())
+        return parse(Path(config))
     path = Path(source)
     beside = (path if path.is_dir() else path.parent) / "config.json"
     if beside.is_file():
-        return json.loads(beside.read_text())
+        return parse(beside)
     for file in tensor_files(source):
         with safe_open(file, framework="pt") as opened:
             metadata = opened.metadata() or {}
         if "config" in metadata:
-            return json.loads(metadata["config"])
+            return dict(json.loads(metadata["config"]))
     raise CheckpointError(f"{path}: no config.json beside it; give config=")
+
+
+def parse(path: Path) -> Mapping[str, Any]:
+    """The JSON object of a config file."""
+    return dict(json.loads(read_json(path)))
 
 
 def read_tensors(
@@ -54,13 +60,13 @@ def read_tensors(
     """The head's tensors without their prefix, in `dtype`.
 
     Raises:
-        CheckpointError: listing all that is missing, unknown (inside the prefix) or of another shape than expected.
+        CheckpointError: listing all that is missing, unknown inside the prefix, or of another shape.
     """
     place = {}  # name in the file -> the file
     for file in tensor_files(source):
         with safe_open(file, framework="pt") as opened:
             place.update(dict.fromkeys(opened.keys(), file))
-    prefix = next(prefix for prefix in PREFIXES if prefix == "" or any(name.startswith(prefix) for name in place))
+    prefix = next(prefix for prefix in PREFIXES if any(name.startswith(prefix) for name in [*place, ""]))
 
     tensors, problems = {}, []
     for file in sorted(set(place.values())):
@@ -83,5 +89,6 @@ def read_tensors(
     absent = expected.keys() - tensors.keys() - {problem.split(":")[0] for problem in problems}
     problems += [f"{name}: missing" for name in sorted(absent)]
     if problems:
-        raise CheckpointError(f"{source}: {len(problems)} tensors do not fit the config: " + "; ".join(sorted(problems)))
+        listed = "; ".join(sorted(problems))
+        raise CheckpointError(f"{source}: {len(problems)} tensors do not fit the config: {listed}")
     return tensors

@@ -1,8 +1,12 @@
 """The GR00T N1.5 action head as one torch module that reads from top to bottom.
 
-Module names follow the checkpoint, so that `state_dict()` has the released tensor names. Shapes in comments: B is the batch, R the rows
-of the query sequence (one state row, N future rows, T action rows), S the vision-language tokens.
+Module names follow the checkpoint, so that `state_dict()` has the released tensor names. Shapes in comments:
+B is the batch, R the rows of the query sequence (one state row, N future rows, T action rows), S the
+vision-language tokens.
 """
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
 
 import math
 from collections.abc import Mapping
@@ -15,8 +19,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from saccade.config import HeadConfig
 from saccade.reference import loading, tables
-from saccade.reference._config import HeadConfig
 
 NORM_EPS = 1e-5  # every LayerNorm but the last
 OUTPUT_NORM_EPS = 1e-6  # the last one
@@ -44,8 +48,8 @@ class Attention(nn.Module):
         Args:
             x: `(B, Q, width)`.
             context: `(B, S, context_dim)`.
-            logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a key. A query with no
-                key left gets zeros from the attention.
+            logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a
+                key. A query with no key left gets zeros from the attention.
             return_weights: also return the probabilities.
 
         Returns:
@@ -146,7 +150,7 @@ class VlSelfAttention(nn.Module):
 
 
 class AdaptiveNorm(nn.Module):
-    """LayerNorm whose scale and shift come from the time embedding: scale in the first half of the projection, shift in the second."""
+    """LayerNorm whose scale and shift come from the time embedding: scale first, then shift."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -222,14 +226,14 @@ class DiffusionTransformer(nn.Module):
         self.proj_out_2 = nn.Linear(config.width, config.hidden_dim)
 
     def forward(self, rows: Tensor, vl_embs: Tensor, timestep: Tensor) -> Tensor:
-        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; returns `(B, R, hidden_dim)`."""
+        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; to `(B, R, hidden_dim)`."""
         temb = self.timestep_encoder(timestep)  # (B, width)
         for block in self.transformer_blocks:
             rows = block(rows, vl_embs, temb)
         return self.output(rows, temb)
 
     def output(self, rows: Tensor, temb: Tensor) -> Tensor:
-        """The last norm and projection; here, other than in the blocks, the first half of the modulation is the shift."""
+        """The last norm and projection; here the shift comes first, other than in the blocks."""
         shift, scale = self.proj_out_1(F.silu(temb))[:, None].chunk(2, dim=-1)  # (B, 1, width) each
         return self.proj_out_2(plain_norm(rows, OUTPUT_NORM_EPS) * (1 + scale) + shift)  # (B, R, hidden_dim)
 
@@ -284,7 +288,8 @@ class ActionEncoder(nn.Module):
 class TimeDistribution:
     """How training draws the flow time: `scale * (1 - b)` with `b ~ Beta(alpha, beta)`.
 
-    This form, that of the later releases, stays within [0, scale]; most times are near 0, where the actions are mostly noise.
+    This form, that of the later releases, stays within [0, scale]; most times are near 0, where the actions
+    are mostly noise.
     """
 
     alpha: float = 1.5
@@ -293,7 +298,7 @@ class TimeDistribution:
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> "TimeDistribution":
-        """Reads `noise_beta_alpha`, `noise_beta_beta` and `noise_s` of a checkpoint's config, released values where absent."""
+        """Reads `noise_beta_alpha`, `noise_beta_beta`, `noise_s`; the released values where absent."""
         head = config.get("action_head_cfg", config)
         return cls(
             alpha=float(head.get("noise_beta_alpha", cls.alpha)),
@@ -305,9 +310,9 @@ class TimeDistribution:
 class ActionHead(nn.Module):
     """The N1.5 action head in torch.
 
-    Runs in the dtype of its parameters (`.double()` for float64) and is differentiable throughout; inputs are converted to that dtype,
-    and may be NumPy arrays. Wrap calls in `torch.no_grad()` where no gradient is wanted. A new head has the released code's initial
-    distribution. There is no dropout.
+    Runs in the dtype of its parameters (`.double()` for float64) and is differentiable throughout; inputs are
+    converted to that dtype, and may be NumPy arrays. Wrap calls in `torch.no_grad()` where no gradient is
+    wanted. A new head has the released code's initial distribution. There is no dropout.
 
     Args:
         config: sizes and switches.
@@ -346,21 +351,22 @@ class ActionHead(nn.Module):
         """Builds the head from a checkpoint.
 
         Args:
-            source: a directory with one or more `.safetensors` files, or one such file. Tensors are found under `action_head.`,
-                `_groot_model.action_head.` or no prefix; what lies outside the prefix is ignored.
-            config: the checkpoint's config or the head's own, as a dict or a path. By default `config.json` beside the file, or
-                else the `config` entry of the file's metadata.
+            source: a directory with one or more `.safetensors` files, or one such file. Tensors are found
+                under `action_head.`, `_groot_model.action_head.` or no prefix; what lies outside the prefix
+                is ignored.
+            config: the checkpoint's config or the head's own, as a dict or a path. By default `config.json`
+                beside the file, or else the `config` entry of the file's metadata.
             dtype: of the parameters; narrower ones are widened exactly.
 
         Raises:
             FileNotFoundError: a path that is not there.
-            CheckpointError: tensors missing, unknown or of the wrong shape (all of them are listed), or no config.
+            CheckpointError: no config; or tensors missing, unknown or of the wrong shape (all are listed).
         """
         whole = loading.read_config(source, config)
         with torch.device("meta"):  # no memory and no time spent on an initialisation that is replaced
             head = cls(HeadConfig.from_dict(whole), time_distribution=TimeDistribution.from_dict(whole))
-        tensors = loading.read_tensors(source, {name: t.shape for name, t in head.state_dict().items()}, dtype)
-        head.load_state_dict(tensors, assign=True)
+        shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
+        head.load_state_dict(loading.read_tensors(source, shapes, dtype), assign=True)
         return head
 
     @property
@@ -459,7 +465,8 @@ class ActionHead(nn.Module):
         num_steps: int | None = None,
     ) -> Tensor:
         """`encode`, then `sample`."""
-        return self.sample(self.encode(backbone_features), state, embodiment_id, noise=noise, num_steps=num_steps)
+        vl_embs = self.encode(backbone_features)
+        return self.sample(vl_embs, state, embodiment_id, noise=noise, num_steps=num_steps)
 
     def sample_time(self, batch: int, generator: torch.Generator | None = None) -> Tensor:
         """Draws flow times for training.
@@ -488,7 +495,7 @@ class ActionHead(nn.Module):
         time: Tensor | np.ndarray,
         action_mask: Tensor | np.ndarray | None = None,
     ) -> Tensor:
-        """Flow-matching loss: the velocity on the straight line from noise to actions should be `actions - noise`.
+        """Flow-matching loss: on the way from noise to actions the velocity should be `actions - noise`.
 
         Args:
             backbone_features: `(B, S, context_dim)`.
@@ -496,7 +503,7 @@ class ActionHead(nn.Module):
             actions: the demonstrated chunk, `(B, T, action_dim)`, normalised.
             noise: the same shape, standard normal.
             time: `(B,)`, from `sample_time`.
-            action_mask: broadcast to `actions`; the squared error is averaged with these weights. Default all.
+            action_mask: broadcast to `actions`; weights of the mean of squared errors. Default: all the same.
 
         Returns:
             A scalar.

@@ -1,14 +1,17 @@
 """Seeded random heads and inputs, at the released sizes or any others, for tests and benchmarks."""
 
 import copy
+import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
-from saccade.reference._config import HeadConfig
+from saccade.config import HeadConfig
 from saccade.reference.model import ActionHead
 
 N15_CONFIG: Mapping[str, Any] = {
@@ -53,7 +56,7 @@ N15_CONFIG: Mapping[str, Any] = {
         "positional_embeddings": None,
     },
 }
-"""The head's config of nvidia/GR00T-N1.5-3B, with the two class defaults that it leaves out (embodiments, positions)."""
+"""The head's config of nvidia/GR00T-N1.5-3B, with the two class defaults that it leaves out."""
 
 
 def n15_config(*, num_layers: int = 16, vl_num_layers: int = 4, num_embodiments: int = 32) -> dict[str, Any]:
@@ -62,6 +65,15 @@ def n15_config(*, num_layers: int = 16, vl_num_layers: int = 4, num_embodiments:
     config["max_num_embodiments"] = num_embodiments
     config["diffusion_model_cfg"]["num_layers"] = num_layers
     config["vl_self_attention_cfg"]["num_layers"] = vl_num_layers
+    return config
+
+
+def small_config() -> dict[str, Any]:
+    """The released config with every size shrunk: milliseconds instead of seconds, the same structure."""
+    config = n15_config(num_layers=4, vl_num_layers=2, num_embodiments=3)
+    config |= {"backbone_embedding_dim": 128, "hidden_size": 64, "input_embedding_dim": 96, "max_seq_len": 16}
+    config["diffusion_model_cfg"] |= {"num_attention_heads": 2, "cross_attention_dim": 128, "output_dim": 64}
+    config["vl_self_attention_cfg"] |= {"num_attention_heads": 2}
     return config
 
 
@@ -76,8 +88,40 @@ def random_head(config: Mapping[str, Any], seed: int, *, dtype: torch.dtype = to
     return head
 
 
+def write_checkpoint(
+    folder: Path,
+    config: Mapping[str, Any],
+    seed: int,
+    *,
+    dtype: torch.dtype = torch.float32,
+    shard_bytes: int = 2**28,
+) -> None:
+    """Writes the tensors of `random_head(config, seed)` in the published layout, shard by shard.
+
+    Args:
+        folder: gets `config.json` and `model-*.safetensors`.
+        config: the head's config in the released key names.
+        seed: of the weights.
+        dtype: that the tensors are rounded to and stored in.
+        shard_bytes: a shard is closed when it reaches this size.
+    """
+    with torch.device("meta"):
+        shapes = {name: t.shape for name, t in ActionHead(HeadConfig.from_dict(config)).state_dict().items()}
+    generator = torch.Generator().manual_seed(seed)
+    shard: dict[str, Tensor] = {}
+    num_shards, held = 0, 0
+    for index, (name, shape) in enumerate(shapes.items(), start=1):
+        shard[f"action_head.{name}"] = random_tensor(name, shape, generator).to(dtype)
+        held += shard[f"action_head.{name}"].nbytes
+        if held >= shard_bytes or index == len(shapes):
+            num_shards += 1
+            save_file(shard, folder / f"model-{num_shards:05}.safetensors")
+            shard, held = {}, 0
+    (folder / "config.json").write_text(json.dumps({"action_head_cfg": dict(config)}, indent=1))
+
+
 def random_tensor(name: str, shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """One tensor of `random_head` in float32, scaled so that activations stay of order one through all blocks.
+    """One tensor of `random_head` in float32, scaled so that activations stay of order one.
 
     Args:
         name: its name in the checkpoint, which tells weights from biases, norms and tables.
@@ -106,7 +150,8 @@ def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: i
         num_vl_tokens: T_vl.
 
     Returns:
-        Keyword arguments of `ActionHead.forward`: `backbone_features`, `state`, `noise` in float32 and `embodiment_id` long.
+        Arguments of `ActionHead.forward`: `backbone_features`, `state`, `noise` in float32, `embodiment_id`
+        long.
     """
     generator = torch.Generator().manual_seed(seed)
     return {

@@ -1,10 +1,15 @@
 """The released N1.5 head, as lerobot 0.4.4 ships it, without the rest of lerobot.
 
-lerobot's package files import datasets, cameras and robots; the head itself needs torch, diffusers and transformers only. So its three
-files are imported under their own names with empty packages around them, which are taken away again afterwards.
+lerobot's package files import datasets, cameras and robots; the head itself needs torch, diffusers and
+transformers only. So its three files are imported under their own names with empty packages around them,
+which are taken away again.
 
-Install with `pip install --no-deps lerobot==0.4.4` and `pip install "diffusers>=0.35,<0.36" "transformers>=4.57,<4.58"`.
+Install with `pip install --no-deps lerobot==0.4.4` and `pip install "diffusers~=0.35.0"
+"transformers~=4.57.0"`.
 """
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, operator"
 
 import contextlib
 import importlib
@@ -33,13 +38,15 @@ def build(config: Mapping[str, Any]) -> nn.Module:
         ModuleNotFoundError: lerobot, diffusers or transformers is not installed.
     """
     module = import_head()
-    head_config = {"max_num_embodiments": 32, "max_seq_len": 1024} | dict(config.get("action_head_cfg", config))
+    head_config = dict(config.get("action_head_cfg", config))
     with contextlib.redirect_stdout(io.StringIO()):  # it prints what it tunes
         head = module.FlowmatchingActionHead(module.FlowmatchingActionHeadConfig(**head_config))
     return head.eval()
 
 
-def get_action(head: nn.Module, backbone_features: Tensor, state: Tensor, embodiment_id: Tensor, noise: Tensor) -> Tensor:
+def get_action(
+    head: nn.Module, backbone_features: Tensor, state: Tensor, embodiment_id: Tensor, noise: Tensor
+) -> Tensor:
     """The head's own `get_action`, started from the given noise.
 
     Args:
@@ -71,14 +78,16 @@ def import_head() -> ModuleType:
         return sys.modules[HEAD]
     spec = importlib.util.find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("lerobot is not installed: pip install --no-deps lerobot==0.4.4", name="lerobot")
+        raise ModuleNotFoundError(
+            "lerobot is not installed: pip install --no-deps lerobot==0.4.4", name="lerobot"
+        )
     with empty_packages(Path(spec.submodule_search_locations[0])):
         return importlib.import_module(HEAD)
 
 
 @contextlib.contextmanager
 def empty_packages(root: Path) -> Iterator[None]:
-    """Packages of lerobot that have a path but run none of their own code; what was imported before is put back."""
+    """Packages of lerobot with a path and none of their own code; puts back what was there before."""
     stubs = {}
     package = HEAD.rpartition(".")[0]
     while package:

@@ -1,8 +1,8 @@
 """The two sinusoidal tables of the head, correctly rounded to float32.
 
-Exponents are formed in float32 in the order that the released code uses; exp, sin and cos are evaluated in float64 and rounded once.
-Float32 vector libraries differ in the last bit of exp, and at a bucket of 900 that bit moves an angle by 6e-5, so the rounding is part
-of the definition here rather than left to the library.
+Exponents are formed in float32 in the order that the released code uses; exp, sin and cos are evaluated in
+float64 and rounded once. Float32 vector libraries differ in the last bit of exp, and at a bucket of 900 that
+bit moves an angle by 6e-5, so the rounding is part of the definition here rather than left to the library.
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ def action_frequencies(width: int) -> Tensor:
 
 @cache
 def timestep_frequencies() -> Tensor:
-    """Frequencies of the table behind the time embedding, `(128,)` float32; the divisor is 127, so that the last one is 1/10000."""
+    """Frequencies behind the time embedding, `(128,)` float32; the divisor 127 makes the last one 1/10000."""
     half = TIMESTEP_CHANNELS // 2
     exponents = (-LOG_10000 * np.arange(half, dtype=np.float32)) / np.float32(half - 1)
     return torch.from_numpy(np.exp(exponents.astype(np.float64)).astype(np.float32))
@@ -41,7 +41,8 @@ def sin_and_cos(timestep: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Two float32 tensors `(batch, half)`.
     """
-    angles = timestep.to(torch.float32)[:, None] * frequencies.to(timestep.device)  # (batch, half), rounded to float32
+    frequencies = frequencies.to(timestep.device)
+    angles = timestep.to(torch.float32)[:, None] * frequencies  # (batch, half), rounded to float32
     angles = angles.to(torch.float64)
     return torch.sin(angles).to(torch.float32), torch.cos(angles).to(torch.float32)
 
