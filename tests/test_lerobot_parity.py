@@ -9,15 +9,18 @@ Tables differ: the released code calls torch's float32 sin and cos, so up to 2e-
 
 from unittest import mock
 
+import numpy as np
 import pytest
 import torch
-from reference_cases import FIXTURES, load_fixture, relative_error, small_config
+from reference_cases import relative_error, small_config
+from released import Released
 from torch import Tensor, nn
 
-from saccade.reference import ActionHead, released
+from saccade.reference import ActionHead, lerobot_head
 from saccade.reference.random_weights import n15_config, random_head, random_inputs
 
 TOLERANCE = 3e-4
+INPUTS = ("backbone_features", "state", "embodiment_id", "noise")
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +28,13 @@ def wide() -> tuple[ActionHead, nn.Module, dict[str, Tensor]]:
     """Both heads at N1.5's widths with fewer blocks and embodiments, equal weights, one view's tokens."""
     config = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
     head = random_head(config, seed=0)
-    theirs = released.build(config)
+    theirs = lerobot_head.build(config)
     theirs.load_state_dict(head.state_dict(), strict=True, assign=True)
     return head, theirs, random_inputs(head.config, seed=1, batch=2, num_vl_tokens=296)
 
 
 def their_actions(theirs: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
-    return released.get_action(
+    return lerobot_head.get_action(
         theirs, inputs["backbone_features"], inputs["state"], inputs["embodiment_id"], inputs["noise"]
     )
 
@@ -47,13 +50,12 @@ def test_reference_equals_lerobot_at_full_width(
     assert (ours - expected).abs().max() <= TOLERANCE
 
 
-@pytest.mark.parametrize("name", FIXTURES)
-def test_lerobot_reproduces_the_fixtures(name: str) -> None:
-    """Guards the fixtures themselves: a changed file, or a wrong set-up of lerobot, shows here."""
-    fixture = load_fixture(name)
-    theirs = released.build(fixture.config)
-    theirs.load_state_dict(ActionHead.load(fixture.path).state_dict(), strict=True)
-    assert (their_actions(theirs, fixture.inputs) - fixture.actions_f64).abs().max() <= TOLERANCE
+def test_lerobot_reproduces_the_recorded_outputs(released: Released) -> None:
+    """Guards the recorded outputs: a changed file, or a wrong set-up of lerobot, shows here."""
+    theirs = lerobot_head.build(released.config)
+    theirs.load_state_dict(ActionHead.load(released.path).state_dict(), strict=True)
+    inputs = {name: torch.tensor(getattr(released, name)) for name in INPUTS}
+    assert np.abs(their_actions(theirs, inputs).numpy() - released.actions_f64).max() <= TOLERANCE
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def test_lerobot_reproduces_the_fixtures(name: str) -> None:
 def test_reference_equals_lerobot_on_other_configs(change: dict[str, int | bool]) -> None:
     config = small_config(**change)  # type: ignore[arg-type]
     head = random_head(config, seed=2)
-    theirs = released.build(config)
+    theirs = lerobot_head.build(config)
     theirs.load_state_dict(head.state_dict(), strict=True)
     inputs = random_inputs(head.config, seed=3, batch=3, num_vl_tokens=7)
     with torch.no_grad():
@@ -81,13 +83,13 @@ def test_reference_equals_lerobot_on_other_configs(change: dict[str, int | bool]
 def test_training_loss_and_gradients_equal_lerobot() -> None:
     config = small_config()
     head = random_head(config, seed=4, dtype=torch.float64)
-    theirs = released.build(config).double()
+    theirs = lerobot_head.build(config).double()
     theirs.load_state_dict(head.state_dict(), strict=True)
     inputs = {name: t.double() if t.is_floating_point() else t for name, t in training_inputs(head).items()}
     loss = head.loss(**inputs)
     loss.backward()
 
-    feature = released.import_head().BatchFeature
+    feature = lerobot_head.import_head().BatchFeature
     backbone = feature(
         data={"backbone_features": inputs["backbone_features"], "backbone_attention_mask": None}
     )

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from reference_cases import DATA, FIXTURES, load_fixture, relative_error, small_config
+from reference_cases import relative_error, small_config
+from released import DATA, Released
 from safetensors.torch import save_file
 from torch import nn
 
@@ -20,33 +21,31 @@ from saccade.reference.model import Attention
 from saccade.reference.random_weights import N15_CONFIG, random_head, random_inputs
 
 
-@pytest.mark.parametrize("name", FIXTURES)
-def test_float64_equals_the_released_code(name: str) -> None:
-    fixture = load_fixture(name)
-    head = ActionHead.load(fixture.path, dtype=torch.float64)
+def test_float64_equals_the_released_code(released: Released) -> None:
+    head = ActionHead.load(released.path, dtype=torch.float64)
     with torch.no_grad():
-        actions = head(**fixture.inputs)
+        actions = head(
+            released.backbone_features, released.state, released.embodiment_id, noise=released.noise
+        )
     assert actions.dtype == torch.float64
-    assert relative_error(actions, fixture.actions_f64) <= 1e-6
+    assert relative_error(actions, released.actions_f64) <= 1e-6
 
 
-@pytest.mark.parametrize("name", FIXTURES)
-def test_float32_is_as_close_as_the_released_code(name: str) -> None:
-    fixture = load_fixture(name)
+def test_float32_is_as_close_as_the_released_code(released: Released) -> None:
+    head = ActionHead.load(released.path)
     with torch.no_grad():
-        actions = ActionHead.load(fixture.path)(**fixture.inputs)
+        actions = head(
+            released.backbone_features, released.state, released.embodiment_id, noise=released.noise
+        )
     assert actions.dtype == torch.float32
-    allowed = 4 * fixture.float32_error + 1e-6 * fixture.actions_f64.abs().clamp(min=1.0)
-    assert ((actions - fixture.actions_f64).abs() <= allowed).all()
+    assert (np.abs(actions.numpy() - released.actions_f64) <= released.tolerance).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", FIXTURES)
-def test_vl_embs_equal_the_released_code(name: str, dtype: torch.dtype) -> None:
-    fixture = load_fixture(name)
+def test_vl_embs_equal_the_released_code(released: Released, dtype: torch.dtype) -> None:
     with torch.no_grad():
-        vl_embs = ActionHead.load(fixture.path, dtype=dtype).encode(fixture.inputs["backbone_features"])
-    assert relative_error(vl_embs, fixture.vl_embs) <= 4e-6  # the fixture's vl_embs are float32
+        vl_embs = ActionHead.load(released.path, dtype=dtype).encode(released.backbone_features)
+    assert relative_error(vl_embs, released.vl_embs) <= 4e-6  # the recorded ones are float32
 
 
 def test_full_size_state_dict_has_the_released_names_and_shapes() -> None:

@@ -521,14 +521,14 @@ class ActionHead(nn.Module):
 
     def as_input(self, array: Tensor | np.ndarray) -> Tensor:
         """The array as a tensor in the head's dtype, on its device."""
-        return torch.as_tensor(array, dtype=self.dtype, device=self.device)
+        if isinstance(array, Tensor):
+            return array.to(dtype=self.dtype, device=self.device)
+        return torch.tensor(array, dtype=self.dtype, device=self.device)  # a copy: the array may be read-only
 
     def as_embodiment(self, embodiment_id: int | Tensor | np.ndarray) -> int | Tensor:
         """One id stays an int (one matrix product for the whole batch), several become a long tensor."""
-        ids = np.asarray(embodiment_id) if not isinstance(embodiment_id, Tensor) else embodiment_id
-        if ids.ndim == 0:
-            return int(ids)
-        return torch.as_tensor(ids, dtype=torch.long, device=self.device)
+        ids = embodiment_id if isinstance(embodiment_id, Tensor) else torch.tensor(embodiment_id)
+        return int(ids) if ids.ndim == 0 else ids.to(dtype=torch.long, device=self.device)
 
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:
