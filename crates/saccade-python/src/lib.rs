@@ -1,2 +1,392 @@
-//! Python bindings of saccade.
+//! Python bindings of saccade: arrays become views, the interpreter is released, errors are mapped. No logic: what is checked is checked in
+//! the `saccade` crate, what is converted is converted in the Python package.
+
 #![deny(unsafe_code)]
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{
+    Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
+    PyUntypedArrayMethods,
+};
+use pyo3::exceptions::PyFileNotFoundError;
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyDict, PyType};
+use saccade::{Array, Checkpoint, Elements, Error, Features, Isa, LoadOptions};
+
+/// The exception class of `saccade.errors` with this name.
+fn exception<'py>(
+    py: Python<'py>,
+    cell: &'static PyOnceLock<Py<PyType>>,
+    name: &str,
+) -> PyResult<&'py Bound<'py, PyType>> {
+    cell.import(py, "saccade.errors", name)
+}
+
+fn raise(error: Error) -> PyErr {
+    static SHAPE: PyOnceLock<Py<PyType>> = PyOnceLock::new();
+    static INPUT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
+    static CHECKPOINT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
+    let message = error.to_string();
+    Python::attach(|py| {
+        let class = match error {
+            Error::NotFound { .. } => return PyFileNotFoundError::new_err(message),
+            Error::Shape(_) => exception(py, &SHAPE, "ShapeError"),
+            Error::Checkpoint(_) => exception(py, &CHECKPOINT, "CheckpointError"),
+            _ => exception(py, &INPUT, "InputError"),
+        };
+        class.map_or_else(|error| error, |class| PyErr::from_type(class.clone(), message))
+    })
+}
+
+/// A view of an array that the Python package made C-contiguous.
+fn view<'a, T: Element>(array: &'a PyReadonlyArrayDyn<'_, T>) -> PyResult<Array<'a, T>> {
+    Ok(Array::new(array.as_slice()?, array.shape()))
+}
+
+fn optional_view<'a, T: Element>(
+    array: &'a Option<PyReadonlyArrayDyn<'_, T>>,
+) -> PyResult<Option<Array<'a, T>>> {
+    array.as_ref().map(view).transpose()
+}
+
+fn to_numpy<'py, T: Element>(
+    py: Python<'py>,
+    data: Vec<T>,
+    shape: &[usize],
+) -> PyResult<Bound<'py, PyArrayDyn<T>>> {
+    data.into_pyarray(py).reshape(shape.to_vec())
+}
+
+fn config_dict<'py>(py: Python<'py>, config: &saccade::HeadConfig) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    dict.set_item("version", &config.version)?;
+    for (name, flag) in [
+        ("interleave_self_attention", config.interleave_self_attention),
+        ("use_vlln", config.use_vlln),
+        ("add_pos_embed", config.add_pos_embed),
+    ] {
+        dict.set_item(name, flag)?;
+    }
+    for (name, size) in [
+        ("width", config.width),
+        ("num_layers", config.num_layers),
+        ("num_heads", config.num_heads),
+        ("head_dim", config.head_dim),
+        ("context_dim", config.context_dim),
+        ("vl_num_layers", config.vl_num_layers),
+        ("vl_num_heads", config.vl_num_heads),
+        ("vl_head_dim", config.vl_head_dim),
+        ("num_future_tokens", config.num_future_tokens),
+        ("action_horizon", config.action_horizon),
+        ("action_dim", config.action_dim),
+        ("encoder_action_dim", config.encoder_action_dim),
+        ("state_dim", config.state_dim),
+        ("state_history", config.state_history),
+        ("hidden_dim", config.hidden_dim),
+        ("num_embodiments", config.num_embodiments),
+        ("num_timestep_buckets", config.num_timestep_buckets),
+        ("num_steps", config.num_steps),
+        ("max_positions", config.max_positions),
+    ] {
+        dict.set_item(name, size)?;
+    }
+    Ok(dict)
+}
+
+#[pyclass(frozen, module = "saccade._saccade")]
+struct Context(Arc<saccade::Context>);
+
+#[pymethods]
+impl Context {
+    #[getter]
+    fn batch(&self) -> usize {
+        self.0.batch()
+    }
+
+    #[getter]
+    fn num_vl_tokens(&self) -> usize {
+        self.0.num_vl_tokens()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+
+    fn vl_embs<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let rows = self.0.batch() * self.0.num_vl_tokens();
+        let data = self.0.vl_embs();
+        to_numpy(
+            py,
+            data.to_vec(),
+            &[self.0.batch(), self.0.num_vl_tokens(), data.len() / rows],
+        )
+    }
+
+    fn image_mask<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArrayDyn<bool>>>> {
+        let shape = [self.0.batch(), self.0.num_vl_tokens()];
+        self.0
+            .image_mask()
+            .map(|mask| to_numpy(py, mask.to_vec(), &shape))
+            .transpose()
+    }
+}
+
+#[pyclass(frozen, module = "saccade._saccade")]
+struct ActionHead(saccade::ActionHead);
+
+#[pymethods]
+impl ActionHead {
+    #[staticmethod]
+    fn load(
+        py: Python<'_>,
+        source: PathBuf,
+        config: Option<String>,
+        embodiment_ids: Option<Vec<i64>>,
+        num_threads: Option<usize>,
+    ) -> PyResult<Self> {
+        let options = LoadOptions {
+            config,
+            embodiment_ids,
+            num_threads,
+        };
+        py.detach(|| saccade::ActionHead::load(&source, &options))
+            .map(Self)
+            .map_err(raise)
+    }
+
+    fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        config_dict(py, self.0.config())
+    }
+
+    #[getter]
+    fn embodiment_ids(&self) -> Vec<usize> {
+        self.0.embodiment_ids().to_vec()
+    }
+
+    #[getter]
+    fn num_threads(&self) -> usize {
+        self.0.num_threads()
+    }
+
+    #[getter]
+    fn isa(&self) -> String {
+        self.0.isa().to_string()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+
+    fn warmup(
+        &self,
+        py: Python<'_>,
+        num_vl_tokens: usize,
+        batch: usize,
+        num_samples: Option<usize>,
+    ) -> PyResult<()> {
+        py.detach(|| self.0.warmup(num_vl_tokens, batch, num_samples))
+            .map_err(raise)
+    }
+
+    fn encode(
+        &self,
+        py: Python<'_>,
+        backbone_features: PyReadonlyArrayDyn<'_, f32>,
+        attention_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        image_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        drop_vl: Option<PyReadonlyArrayDyn<'_, bool>>,
+    ) -> PyResult<Context> {
+        let features = Features {
+            backbone_features: view(&backbone_features)?,
+            attention_mask: optional_view(&attention_mask)?,
+            image_mask: optional_view(&image_mask)?,
+            drop_vl: optional_view(&drop_vl)?,
+        };
+        let context = py.detach(|| self.0.encode(&features)).map_err(raise)?;
+        Ok(Context(Arc::new(context)))
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn sample(
+        &self,
+        py: Python<'_>,
+        context: &Context,
+        state: PyReadonlyArrayDyn<'_, f32>,
+        embodiment_id: PyReadonlyArrayDyn<'_, i64>,
+        noise: PyReadonlyArrayDyn<'_, f32>,
+        num_steps: Option<usize>,
+        num_samples: Option<usize>,
+        mut out: PyReadwriteArrayDyn<'_, f32>,
+    ) -> PyResult<()> {
+        let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
+        let (context, out) = (&context.0, out.as_slice_mut()?);
+        py.detach(|| {
+            self.0
+                .sample(context, state, embodiment_id, noise, num_steps, num_samples, out)
+        })
+        .map_err(raise)
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn velocity(
+        &self,
+        py: Python<'_>,
+        context: &Context,
+        state: PyReadonlyArrayDyn<'_, f32>,
+        embodiment_id: PyReadonlyArrayDyn<'_, i64>,
+        actions: PyReadonlyArrayDyn<'_, f32>,
+        timestep: PyReadonlyArrayDyn<'_, i64>,
+        mut out: PyReadwriteArrayDyn<'_, f32>,
+    ) -> PyResult<()> {
+        let (state, embodiment_id) = (view(&state)?, view(&embodiment_id)?);
+        let (actions, timestep) = (view(&actions)?, view(&timestep)?);
+        let (context, out) = (&context.0, out.as_slice_mut()?);
+        py.detach(|| {
+            self.0
+                .velocity(context, state, embodiment_id, actions, timestep, out)
+        })
+        .map_err(raise)
+    }
+}
+
+#[pyclass(frozen, module = "saccade._saccade")]
+struct KeyValues(saccade::KeyValues);
+
+#[pymethods]
+impl KeyValues {
+    #[getter]
+    fn batch(&self) -> usize {
+        self.0.batch()
+    }
+
+    #[getter]
+    fn num_vl_tokens(&self) -> usize {
+        self.0.num_vl_tokens()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+}
+
+#[pyclass(frozen, module = "saccade._saccade")]
+struct CrossAttention(saccade::CrossAttention);
+
+#[pymethods]
+impl CrossAttention {
+    #[new]
+    fn new(py: Python<'_>, tensors: &Bound<'_, PyDict>, num_heads: usize) -> PyResult<Self> {
+        let mut named = saccade::NamedTensors::new();
+        for (name, array) in tensors {
+            let array: PyReadonlyArrayDyn<'_, f32> = array.extract()?;
+            let elements = Elements::F32(array.as_slice()?.to_vec());
+            named.insert(name.extract()?, (array.shape().to_vec(), elements));
+        }
+        py.detach(|| saccade::CrossAttention::new(&named, num_heads, None))
+            .map(Self)
+            .map_err(raise)
+    }
+
+    #[getter]
+    fn width(&self) -> usize {
+        self.0.width()
+    }
+
+    #[getter]
+    fn context_dim(&self) -> usize {
+        self.0.context_dim()
+    }
+
+    #[getter]
+    fn num_heads(&self) -> usize {
+        self.0.num_heads()
+    }
+
+    fn project(
+        &self,
+        py: Python<'_>,
+        encoder_hidden_states: PyReadonlyArrayDyn<'_, f32>,
+    ) -> PyResult<KeyValues> {
+        let states = view(&encoder_hidden_states)?;
+        py.detach(|| self.0.project(states)).map(KeyValues).map_err(raise)
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn attend(
+        &self,
+        py: Python<'_>,
+        hidden_states: PyReadonlyArrayDyn<'_, f32>,
+        kv: &KeyValues,
+        key_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        key_bias: Option<PyReadonlyArrayDyn<'_, f32>>,
+        mut weights: Option<PyReadwriteArrayDyn<'_, f32>>,
+        mut out: PyReadwriteArrayDyn<'_, f32>,
+    ) -> PyResult<()> {
+        let hidden_states = view(&hidden_states)?;
+        let (key_mask, key_bias) = (optional_view(&key_mask)?, optional_view(&key_bias)?);
+        let weights = weights
+            .as_mut()
+            .map(|weights| weights.as_slice_mut())
+            .transpose()?;
+        let (kv, out) = (&kv.0, out.as_slice_mut()?);
+        py.detach(|| self.0.attend(hidden_states, kv, key_mask, key_bias, weights, out))
+            .map_err(raise)
+    }
+}
+
+#[pyfunction]
+fn parse_config<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
+    config_dict(py, &saccade::HeadConfig::from_json(text).map_err(raise)?)
+}
+
+#[pyfunction]
+fn read_tensors<'py>(py: Python<'py>, source: PathBuf, prefix: &str) -> PyResult<Bound<'py, PyDict>> {
+    let checkpoint = Checkpoint::open(&source).map_err(raise)?;
+    let dict = PyDict::new(py);
+    for name in checkpoint.names().filter(|name| name.starts_with(prefix)) {
+        let data = checkpoint.read(name).map_err(raise)?.into_f32();
+        let shape = checkpoint
+            .shape(name)
+            .expect("the name is one of the checkpoint's");
+        dict.set_item(&name[prefix.len()..], to_numpy(py, data, shape)?)?;
+    }
+    Ok(dict)
+}
+
+#[pyfunction]
+fn available_isas() -> Vec<String> {
+    Isa::available().iter().map(Isa::to_string).collect()
+}
+
+#[pyfunction]
+fn selected_isa() -> PyResult<String> {
+    Isa::from_env()
+        .map(|isa| isa.to_string())
+        .map_err(|error| raise(Error::Input(error.to_string())))
+}
+
+#[pyfunction]
+fn default_num_threads() -> PyResult<usize> {
+    let threads = saccade::default_num_threads();
+    threads
+        .map(usize::from)
+        .map_err(|error| raise(Error::Input(error.to_string())))
+}
+
+#[pymodule(gil_used = false)]
+mod _saccade {
+    #[pymodule_export]
+    use super::{ActionHead, Context, CrossAttention, KeyValues};
+    #[pymodule_export]
+    use super::{available_isas, default_num_threads, parse_config, read_tensors, selected_isa};
+
+    #[pymodule_export]
+    #[allow(non_upper_case_globals)]
+    const __version__: &str = env!("CARGO_PKG_VERSION");
+}

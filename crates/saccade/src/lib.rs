@@ -1,2 +1,32 @@
-//! The action head of GR00T-style robot policies on CPUs.
+//! The action head of GR00T-style robot policies on CPUs, exact and fast.
+//!
+//! An observation is encoded once ([`ActionHead::encode`]): the vision-language tokens pass their norm and self-attention, and every
+//! cross-attention block's keys and values are held in a [`Context`]. Chunks of actions are then sampled from it
+//! ([`ActionHead::sample`]) as often as wanted.
+//!
+//! Where an equation comes from is said by its number in the GR00T action head's specification, as in "spec 1.6".
+
 #![forbid(unsafe_code)]
+
+mod array;
+mod attention;
+mod cache;
+mod checkpoint;
+mod config;
+mod context;
+mod cross_attention;
+mod dit;
+mod error;
+mod head;
+mod layers;
+mod layout;
+mod tables;
+
+pub use array::Array;
+pub use checkpoint::{Checkpoint, Elements};
+pub use config::HeadConfig;
+pub use context::Context;
+pub use cross_attention::{CrossAttention, KeyValues, NamedTensors};
+pub use error::{Error, Result};
+pub use head::{ActionHead, Features, LoadOptions};
+pub use saccade_kernels::{Isa, default_num_threads};

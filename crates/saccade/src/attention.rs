@@ -1,0 +1,237 @@
+//! Multi-head attention with its projections, and the feed-forward: what VL blocks and DiT blocks share.
+
+use faer::MatRef;
+use saccade_kernels::{Epilogue, LogitBias, PackedKeyValues, PackedLinear, attention};
+
+use crate::error::Result;
+use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
+use crate::layout::{AttentionNames, FeedForwardNames};
+
+/// `to_q`, `to_k` over `to_v`, `to_out`: `out(softmax(q k^T / sqrt(head_dim)) v)`, heads being contiguous slices.
+pub(crate) struct Attention {
+    to_q: PackedLinear,
+    to_kv: PackedLinear,
+    to_out: PackedLinear,
+    num_heads: usize,
+}
+
+/// Memory of one attention call that is kept for the next.
+pub(crate) struct AttentionBuffers {
+    q: Vec<f32>,
+    kv: Vec<f32>,
+    mix: Vec<f32>,
+    packed: Option<PackedKeyValues>,
+}
+
+impl AttentionBuffers {
+    pub(crate) fn new() -> Self {
+        Self {
+            q: Vec::new(),
+            kv: Vec::new(),
+            mix: Vec::new(),
+            packed: None,
+        }
+    }
+}
+
+impl Attention {
+    pub(crate) fn load(
+        source: &dyn TensorSource,
+        engine: Engine,
+        names: &AttentionNames,
+        num_heads: usize,
+    ) -> Result<Self> {
+        Ok(Self {
+            to_q: load_linear(source, engine.isa, &[&names.to_q])?,
+            to_kv: load_linear(source, engine.isa, &[&names.to_k, &names.to_v])?,
+            to_out: load_linear(source, engine.isa, &[&names.to_out])?,
+            num_heads,
+        })
+    }
+
+    pub(crate) fn width(&self) -> usize {
+        self.to_q.out_features()
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        self.to_q.nbytes() + self.to_kv.nbytes() + self.to_out.nbytes()
+    }
+
+    fn head_dim(&self) -> usize {
+        self.width() / self.num_heads
+    }
+
+    /// Keys and values of `source`, whose rows are equally many for each of `groups`: one [`PackedKeyValues`] a group.
+    pub(crate) fn project(
+        &self,
+        engine: Engine,
+        source: &[f32],
+        groups: usize,
+        buffer: &mut Vec<f32>,
+    ) -> Vec<PackedKeyValues> {
+        let (keys, values) = self.keys_values(engine, source, buffer);
+        let len = keys.nrows() / groups;
+        (0..groups)
+            .map(|group| {
+                let mut packed = PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim());
+                packed.pack(
+                    engine.threads,
+                    keys.subrows(group * len, len),
+                    values.subrows(group * len, len),
+                );
+                packed
+            })
+            .collect()
+    }
+
+    fn keys_values<'a>(
+        &self,
+        engine: Engine,
+        source: &[f32],
+        buffer: &'a mut Vec<f32>,
+    ) -> (MatRef<'a, f32>, MatRef<'a, f32>) {
+        let source = rows(source, self.to_kv.in_features());
+        let both = self.to_kv.out_features();
+        let buffer = sized(buffer, source.nrows() * both); // (rows, keys | values)
+        self.to_kv
+            .apply(engine.threads, source, Epilogue::Store, rows_mut(buffer, both));
+        rows(buffer, both).split_at_col(both / 2)
+    }
+
+    /// `x += out(attention(y, held keys and values))`; `y` and `x` have equally many rows for each of `kv`.
+    /// `bias` gives the logit bias of a group, and `weights`, where asked for, is `(groups, heads, queries, keys)`.
+    #[allow(clippy::too_many_arguments)] // Buffers and views of one equation; a struct would only rename them.
+    pub(crate) fn add_cross<'b>(
+        &self,
+        engine: Engine,
+        y: &[f32],
+        kv: &[PackedKeyValues],
+        bias: impl Fn(usize) -> Option<LogitBias<'b>>,
+        weights: Option<&mut [f32]>,
+        epilogue: Epilogue,
+        buffers: &mut AttentionBuffers,
+        x: &mut [f32],
+    ) {
+        let width = self.width();
+        self.queries(engine, y, buffers);
+        let count = buffers.q.len() / width / kv.len(); // query rows of a group
+        let mix = sized(&mut buffers.mix, buffers.q.len());
+        let mut weights = weights;
+        for (group, kv) in kv.iter().enumerate() {
+            let range = group * count * width..(group + 1) * count * width;
+            let group_weights = weights.as_mut().map(|all| {
+                let size = self.num_heads * count * kv.len();
+                &mut all[group * size..(group + 1) * size]
+            });
+            attention(
+                engine.threads,
+                rows(&buffers.q[range.clone()], width),
+                kv,
+                self.scale(),
+                bias(group),
+                group_weights,
+                rows_mut(&mut mix[range], width),
+            );
+        }
+        self.to_out
+            .apply(engine.threads, rows(mix, width), epilogue, rows_mut(x, width));
+    }
+
+    /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences.
+    #[allow(clippy::too_many_arguments)] // As above.
+    pub(crate) fn add_self<'b>(
+        &self,
+        engine: Engine,
+        y: &[f32],
+        source: &[f32],
+        groups: usize,
+        bias: impl Fn(usize) -> Option<LogitBias<'b>>,
+        buffers: &mut AttentionBuffers,
+        x: &mut [f32],
+    ) {
+        let width = self.width();
+        self.queries(engine, y, buffers);
+        let count = buffers.q.len() / width / groups; // query rows of a sequence
+        let mix = sized(&mut buffers.mix, buffers.q.len());
+        let (keys, values) = self.keys_values(engine, source, &mut buffers.kv);
+        let len = keys.nrows() / groups; // rows of a sequence
+        let packed = buffers
+            .packed
+            .get_or_insert_with(|| PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim()));
+        for group in 0..groups {
+            packed.pack(
+                engine.threads,
+                keys.subrows(group * len, len),
+                values.subrows(group * len, len),
+            );
+            let range = group * count * width..(group + 1) * count * width;
+            attention(
+                engine.threads,
+                rows(&buffers.q[range.clone()], width),
+                packed,
+                self.scale(),
+                bias(group),
+                None,
+                rows_mut(&mut mix[range], width),
+            );
+        }
+        self.to_out.apply(
+            engine.threads,
+            rows(mix, width),
+            Epilogue::Add,
+            rows_mut(x, width),
+        );
+    }
+
+    fn queries(&self, engine: Engine, y: &[f32], buffers: &mut AttentionBuffers) {
+        let width = self.width();
+        let q = sized(&mut buffers.q, y.len());
+        self.to_q.apply(
+            engine.threads,
+            rows(y, width),
+            Epilogue::Store,
+            rows_mut(q, width),
+        );
+    }
+
+    fn scale(&self) -> f32 {
+        1.0 / (self.head_dim() as f32).sqrt()
+    }
+}
+
+/// `Linear(GELU_tanh(Linear(y)))`.
+pub(crate) struct FeedForward {
+    proj: PackedLinear,
+    out: PackedLinear,
+}
+
+impl FeedForward {
+    pub(crate) fn load(source: &dyn TensorSource, engine: Engine, names: &FeedForwardNames) -> Result<Self> {
+        Ok(Self {
+            proj: load_linear(source, engine.isa, &[&names.proj])?,
+            out: load_linear(source, engine.isa, &[&names.out])?,
+        })
+    }
+
+    /// `x += feed_forward(y)`.
+    pub(crate) fn add(&self, engine: Engine, y: &[f32], buffer: &mut Vec<f32>, x: &mut [f32]) {
+        let (width, inner) = (self.proj.in_features(), self.proj.out_features());
+        let hidden = sized(buffer, y.len() / width * inner);
+        self.proj.apply(
+            engine.threads,
+            rows(y, width),
+            Epilogue::GeluTanh,
+            rows_mut(hidden, inner),
+        );
+        self.out.apply(
+            engine.threads,
+            rows(hidden, inner),
+            Epilogue::Add,
+            rows_mut(x, width),
+        );
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        self.proj.nbytes() + self.out.nbytes()
+    }
+}

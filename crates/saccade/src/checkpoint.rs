@@ -1,0 +1,424 @@
+//! Reading safetensors: one file, or a directory of shards with or without an index.
+//!
+//! Headers are read and checked at [`Checkpoint::open`]; tensors are read one at a time when asked for, from files that stay open.
+//! Nothing is mapped: a file that changes later cannot reach a running head.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use half::{bf16, f16};
+use safetensors::Dtype;
+use safetensors::tensor::{Metadata, TensorInfo};
+use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+
+use crate::error::{Error, Result, show_shape};
+
+/// A longer header is hostile: the released head has 314 tensors in 40 kB.
+const MAX_HEADER_BYTES: u64 = 100_000_000;
+
+/// Where a head's tensors may stand in a checkpoint, longest first.
+const HEAD_PREFIXES: [&str; 2] = ["_groot_model.action_head.", "action_head."];
+
+/// The elements of one tensor, in the type they are stored in; float16 is widened to float32, which is exact.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Elements {
+    /// float32.
+    F32(Vec<f32>),
+    /// bfloat16, kept as it is.
+    Bf16(Vec<bf16>),
+}
+
+impl Elements {
+    /// The elements as float32, exactly.
+    #[must_use]
+    pub fn into_f32(self) -> Vec<f32> {
+        match self {
+            Self::F32(values) => values,
+            Self::Bf16(values) => values.into_iter().map(bf16::to_f32).collect(),
+        }
+    }
+}
+
+struct Entry {
+    file: usize,
+    info: TensorInfo,
+    /// Where the tensor's first byte lies in the file.
+    start: u64,
+}
+
+/// The tensors of one checkpoint, by name.
+pub struct Checkpoint {
+    files: Vec<(PathBuf, File)>,
+    entries: BTreeMap<String, Entry>,
+}
+
+impl Checkpoint {
+    /// Opens `path`: one `.safetensors` file, or a directory with one or more of them.
+    ///
+    /// A directory with an index (`*.safetensors.index.json`) is read as the index says; otherwise every `.safetensors` file in it counts.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] for a path that is not there; [`Error::Checkpoint`] for a file that is not safetensors, is truncated,
+    /// or names a tensor twice.
+    pub fn open(path: &Path) -> Result<Self> {
+        let metadata = std::fs::metadata(path).map_err(|error| Error::from_io("source", path, &error))?;
+        let mut checkpoint = Self {
+            files: Vec::new(),
+            entries: BTreeMap::new(),
+        };
+        if metadata.is_dir() {
+            let listing = Listing::of(path)?;
+            for file in &listing.files {
+                checkpoint.add_file(file)?;
+            }
+            checkpoint.check_index(&listing)?;
+        } else {
+            checkpoint.add_file(path)?;
+        }
+        Ok(checkpoint)
+    }
+
+    /// The names of all tensors, sorted.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.entries.keys().map(String::as_str)
+    }
+
+    /// The shape of tensor `name`.
+    #[must_use]
+    pub fn shape(&self, name: &str) -> Option<&[usize]> {
+        self.entries.get(name).map(|entry| entry.info.shape.as_slice())
+    }
+
+    /// The prefix under which a head's tensors stand, empty if none of the known ones is used.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if two heads are in one checkpoint.
+    pub fn head_prefix(&self) -> Result<&'static str> {
+        let mut used = HEAD_PREFIXES
+            .iter()
+            .filter(|prefix| self.names().any(|name| name.starts_with(**prefix)));
+        match (used.next(), used.next()) {
+            (None, _) => Ok(""),
+            (Some(prefix), None) => Ok(prefix),
+            (Some(first), Some(second)) => Err(Error::Checkpoint(format!(
+                "source: two heads in one checkpoint, under `{first}` and `{second}`"
+            ))),
+        }
+    }
+
+    /// That exactly the `expected` tensors stand under `prefix`, each of the right shape and a readable type.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
+    pub fn check(&self, prefix: &str, expected: &[(String, Vec<usize>)]) -> Result<()> {
+        let mut problems = Vec::new();
+        let mut known = BTreeSet::new();
+        for (name, shape) in expected {
+            let name = format!("{prefix}{name}");
+            match self.entries.get(&name) {
+                // A tensor without elements carries nothing, and some writers leave it out.
+                None if shape.contains(&0) => {}
+                None => problems.push(format!("{name} is missing, expected {}", show_shape(shape))),
+                Some(entry) if entry.info.shape != *shape => problems.push(format!(
+                    "{name} has shape {}, expected {}",
+                    show_shape(&entry.info.shape),
+                    show_shape(shape)
+                )),
+                Some(entry) if !is_readable(entry.info.dtype) => {
+                    problems.push(format!(
+                        "{name} is {:?}, expected F32, BF16 or F16",
+                        entry.info.dtype
+                    ));
+                }
+                Some(_) => {}
+            }
+            known.insert(name);
+        }
+        let unknown = self
+            .names()
+            .filter(|name| name.starts_with(prefix) && !known.contains(*name));
+        problems.extend(unknown.map(|name| format!("{name} is unknown")));
+        if problems.is_empty() {
+            return Ok(());
+        }
+        Err(Error::Checkpoint(format!(
+            "source: {} tensors do not fit the config:\n  {}",
+            problems.len(),
+            problems.join("\n  ")
+        )))
+    }
+
+    /// Reads tensor `name` whole.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if there is no such tensor, its type is not F32, BF16 or F16, or the file cannot be read.
+    pub fn read(&self, name: &str) -> Result<Elements> {
+        let entry = self.entry(name)?;
+        let elements = entry.info.shape.iter().product();
+        self.read_elements(name, entry, 0, elements)
+    }
+
+    /// Reads slice `index` of the first axis of tensor `name`.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::read`], and if there is no such slice.
+    pub fn read_slice(&self, name: &str, index: usize) -> Result<Elements> {
+        let entry = self.entry(name)?;
+        match entry.info.shape.split_first() {
+            Some((&size, rest)) if index < size => {
+                let elements = rest.iter().product();
+                self.read_elements(name, entry, index * elements, elements)
+            }
+            _ => Err(Error::Checkpoint(format!(
+                "source: {name} has shape {} and no slice {index}",
+                show_shape(&entry.info.shape)
+            ))),
+        }
+    }
+
+    fn entry(&self, name: &str) -> Result<&Entry> {
+        self.entries
+            .get(name)
+            .ok_or_else(|| Error::Checkpoint(format!("source: {name} is missing")))
+    }
+
+    fn read_elements(&self, name: &str, entry: &Entry, first: usize, count: usize) -> Result<Elements> {
+        let read = |size: usize| {
+            let (path, file) = &self.files[entry.file];
+            let mut file: &File = file;
+            let mut bytes = vec![0; count * size];
+            file.seek(SeekFrom::Start(entry.start + (first * size) as u64))
+                .and_then(|_| file.read_exact(&mut bytes))
+                .map_err(|error| {
+                    Error::Checkpoint(format!(
+                        "source: {name} cannot be read from {}: {error}",
+                        path.display()
+                    ))
+                })?;
+            Ok::<_, Error>(bytes)
+        };
+        let halves = |bytes: &[u8]| -> Vec<u16> {
+            bytes
+                .chunks_exact(2)
+                .map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
+                .collect()
+        };
+        match entry.info.dtype {
+            Dtype::F32 => {
+                let bytes = read(4)?;
+                let quads = bytes.chunks_exact(4);
+                Ok(Elements::F32(
+                    quads
+                        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+                        .collect(),
+                ))
+            }
+            Dtype::BF16 => Ok(Elements::Bf16(
+                halves(&read(2)?).into_iter().map(bf16::from_bits).collect(),
+            )),
+            Dtype::F16 => Ok(Elements::F32(
+                halves(&read(2)?)
+                    .into_iter()
+                    .map(|bits| f16::from_bits(bits).to_f32())
+                    .collect(),
+            )),
+            other => Err(Error::Checkpoint(format!(
+                "source: {name} is {other:?}, expected F32, BF16 or F16"
+            ))),
+        }
+    }
+
+    fn add_file(&mut self, path: &Path) -> Result<()> {
+        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
+        let mut file = File::open(path).map_err(|error| Error::from_io("source", path, &error))?;
+        let length = file
+            .metadata()
+            .and_then(|metadata| {
+                if metadata.is_file() {
+                    Ok(metadata.len())
+                } else {
+                    Err(std::io::ErrorKind::InvalidInput.into())
+                }
+            })
+            .map_err(|_| bad("not a regular file".to_owned()))?;
+        let (header, data_start) = read_header(&mut file, length).map_err(bad)?;
+        let index = self.files.len();
+        for (name, info) in header {
+            let start = data_start + info.data_offsets.0 as u64;
+            if let Some(other) = self.entries.get(&name) {
+                let other = self.files[other.file].0.display();
+                return Err(bad(format!("{name} is also in {other}")));
+            }
+            self.entries.insert(
+                name,
+                Entry {
+                    file: index,
+                    info,
+                    start,
+                },
+            );
+        }
+        self.files.push((path.to_owned(), file));
+        Ok(())
+    }
+
+    fn check_index(&self, listing: &Listing) -> Result<()> {
+        let mut problems = Vec::new();
+        for (name, shard) in &listing.weight_map {
+            match self.entries.get(name) {
+                Some(entry) if listing.files[entry.file] == *shard => {}
+                _ => problems.push(format!("{name} is not in {}", shard.display())),
+            }
+        }
+        if problems.is_empty() {
+            Ok(())
+        } else {
+            Err(Error::Checkpoint(format!(
+                "source: the index and its shards disagree:\n  {}",
+                problems.join("\n  ")
+            )))
+        }
+    }
+}
+
+fn is_readable(dtype: Dtype) -> bool {
+    matches!(dtype, Dtype::F32 | Dtype::BF16 | Dtype::F16)
+}
+
+/// The `.safetensors` files of a directory, and what its index promises of them.
+struct Listing {
+    files: Vec<PathBuf>,
+    weight_map: Vec<(String, PathBuf)>,
+}
+
+impl Listing {
+    fn of(directory: &Path) -> Result<Self> {
+        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", directory.display()));
+        let mut names: Vec<String> = std::fs::read_dir(directory)
+            .and_then(|entries| {
+                entries
+                    .map(|entry| Ok(entry?.file_name()))
+                    .collect::<std::io::Result<Vec<_>>>()
+            })
+            .map_err(|error| Error::from_io("source", directory, &error))?
+            .into_iter()
+            .filter_map(|name| name.into_string().ok())
+            .collect();
+        names.sort();
+        let mut indexes = names
+            .iter()
+            .filter(|name| name.ends_with(".safetensors.index.json"));
+        let files: Vec<PathBuf> = names
+            .iter()
+            .filter(|name| name.ends_with(".safetensors"))
+            .map(|name| directory.join(name))
+            .collect();
+        match (indexes.next(), indexes.next()) {
+            (None, _) if files.is_empty() => Err(bad("expected at least one .safetensors file".to_owned())),
+            (None, _) => Ok(Self {
+                files,
+                weight_map: Vec::new(),
+            }),
+            (Some(index), None) => Self::from_index(directory, &directory.join(index)),
+            (Some(first), Some(second)) => Err(bad(format!("expected one index, got {first} and {second}"))),
+        }
+    }
+
+    fn from_index(directory: &Path, path: &Path) -> Result<Self> {
+        #[derive(serde::Deserialize)]
+        struct Index {
+            weight_map: UniqueMap<String>,
+        }
+        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|error| Error::from_io("source", path, &error))?;
+        let index: Index = serde_json::from_str(&text).map_err(|error| bad(error.to_string()))?;
+        let mut files = BTreeSet::new();
+        let mut weight_map = Vec::new();
+        for (name, shard) in index.weight_map.0 {
+            // A name with a folder in it could point anywhere on the disk.
+            if Path::new(&shard).file_name() != Some(shard.as_ref()) {
+                return Err(bad(format!(
+                    "{name} is said to be in `{shard}`, expected a file name in the same directory"
+                )));
+            }
+            files.insert(directory.join(&shard));
+            weight_map.push((name, directory.join(shard)));
+        }
+        if files.is_empty() {
+            return Err(bad("weight_map names no tensor".to_owned()));
+        }
+        Ok(Self {
+            files: files.into_iter().collect(),
+            weight_map,
+        })
+    }
+}
+
+/// The tensors that a file's header names, checked against the file's length, and where the data begins.
+fn read_header(
+    file: &mut File,
+    length: u64,
+) -> std::result::Result<(Vec<(String, TensorInfo)>, u64), String> {
+    let mut size = [0; 8];
+    file.read_exact(&mut size)
+        .map_err(|_| format!("not safetensors: {length} bytes, expected at least 8"))?;
+    let size = u64::from_le_bytes(size);
+    if size > MAX_HEADER_BYTES || size > length - 8 {
+        return Err(format!(
+            "not safetensors or truncated: header of {size} bytes in a file of {length}"
+        ));
+    }
+    let mut header = vec![0; size as usize];
+    file.read_exact(&mut header)
+        .map_err(|error| format!("header cannot be read: {error}"))?;
+    let header: UniqueMap<serde_json::Value> =
+        serde_json::from_slice(&header).map_err(|error| format!("header: {error}"))?;
+    let mut tensors = Vec::new();
+    for (name, value) in header.0 {
+        if name != "__metadata__" {
+            let info = TensorInfo::deserialize(value).map_err(|error| format!("header: {name}: {error}"))?;
+            tensors.push((name, info));
+        }
+    }
+    // The library's own rules: offsets in order, without gaps or overlaps, each of the size that shape and type give.
+    tensors.sort_by_key(|(_, info)| info.data_offsets);
+    let metadata = Metadata::new(None, tensors.clone()).map_err(|error| format!("header: {error}"))?;
+    let expected = 8 + size + metadata.data_len() as u64;
+    if expected != length {
+        return Err(format!(
+            "truncated or with trailing bytes: {length} bytes, the header promises {expected}"
+        ));
+    }
+    Ok((tensors, 8 + size))
+}
+
+/// A JSON object whose keys are all different: the usual map types keep the last of two equal keys in silence.
+struct UniqueMap<T>(Vec<(String, T)>);
+
+impl<'de, T: Deserialize<'de>> Deserialize<'de> for UniqueMap<T> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        struct Entries<T>(std::marker::PhantomData<T>);
+        impl<'de, T: Deserialize<'de>> Visitor<'de> for Entries<T> {
+            type Value = UniqueMap<T>;
+
+            fn expecting(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                formatter.write_str("a JSON object")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Self::Value, A::Error> {
+                let mut seen = BTreeSet::new();
+                let mut entries = Vec::new();
+                while let Some((key, value)) = map.next_entry::<String, T>()? {
+                    if !seen.insert(key.clone()) {
+                        return Err(serde::de::Error::custom(format!("{key} stands there twice")));
+                    }
+                    entries.push((key, value));
+                }
+                Ok(UniqueMap(entries))
+            }
+        }
+        deserializer.deserialize_map(Entries(std::marker::PhantomData))
+    }
+}

@@ -1,0 +1,226 @@
+//! What is computed once per observation and held: the vision-language tokens, and the keys and values of every cross-attention block.
+
+use saccade_kernels::{LogitBias, PackedKeyValues};
+
+use crate::attention::{Attention, AttentionBuffers, FeedForward};
+use crate::config::HeadConfig;
+use crate::error::Result;
+use crate::layers::{Engine, HeadTensors, Norm, sized};
+use crate::layout::{HeadNames, VlBlockNames};
+
+/// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate
+/// activations small. At 1024 rows the weights are read once per 3 to 4 camera views and the largest buffer is 32 MB at N1.5's size.
+const ENCODE_ROWS: usize = 1024;
+
+/// An encoded observation. Immutable; serves any number of calls and threads.
+pub struct Context {
+    pub(crate) head: u64,
+    pub(crate) batch: usize,
+    pub(crate) num_vl_tokens: usize,
+    pub(crate) vl_embs: Vec<f32>,
+    /// By block, empty for self-attention; within it by batch element.
+    pub(crate) keys_values: Vec<Vec<PackedKeyValues>>,
+    pub(crate) removed: Option<RemovedKeys>,
+    pub(crate) image_mask: Option<Vec<bool>>,
+}
+
+impl Context {
+    /// Observations in this context.
+    #[must_use]
+    pub fn batch(&self) -> usize {
+        self.batch
+    }
+
+    /// Vision-language tokens of each, removed ones counted.
+    #[must_use]
+    pub fn num_vl_tokens(&self) -> usize {
+        self.num_vl_tokens
+    }
+
+    /// The tokens after `vlln` and the VL self-attention, `(batch, num_vl_tokens, context_dim)`; rows of removed positions are zero.
+    #[must_use]
+    pub fn vl_embs(&self) -> &[f32] {
+        &self.vl_embs
+    }
+
+    /// Which positions are image tokens, `(batch, num_vl_tokens)`, as it was given to `encode`.
+    #[must_use]
+    pub fn image_mask(&self) -> Option<&[bool]> {
+        self.image_mask.as_deref()
+    }
+
+    /// Bytes held.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        let keys_values: usize = self
+            .keys_values
+            .iter()
+            .flatten()
+            .map(PackedKeyValues::nbytes)
+            .sum();
+        4 * self.vl_embs.len() + keys_values
+    }
+
+    /// The logit bias that takes the removed positions of batch element `element` away.
+    pub(crate) fn bias(&self, element: usize) -> Option<LogitBias<'_>> {
+        self.removed.as_ref().map(|removed| removed.bias(element))
+    }
+}
+
+/// Positions that are not there, as logit biases: 0 or minus infinity.
+pub(crate) struct RemovedKeys {
+    values: Vec<f32>,
+    num_vl_tokens: usize,
+}
+
+impl RemovedKeys {
+    pub(crate) fn new(removed: &[bool], num_vl_tokens: usize) -> Self {
+        let values = removed
+            .iter()
+            .map(|&removed| if removed { f32::NEG_INFINITY } else { 0.0 })
+            .collect();
+        Self {
+            values,
+            num_vl_tokens,
+        }
+    }
+
+    fn bias(&self, element: usize) -> LogitBias<'_> {
+        let range = element * self.num_vl_tokens..(element + 1) * self.num_vl_tokens;
+        LogitBias {
+            values: &self.values[range],
+            head_stride: 0,
+            query_stride: 0,
+        }
+    }
+}
+
+/// `vlln` and the VL self-attention (spec 1.5).
+pub(crate) struct VlEncoder {
+    vlln: Option<Norm>,
+    blocks: Vec<VlBlock>,
+    context_dim: usize,
+}
+
+struct VlBlock {
+    norm1: Norm,
+    attention: Attention,
+    norm3: Norm,
+    feed_forward: FeedForward,
+}
+
+/// Memory of one `encode` that is kept for the next.
+pub(crate) struct EncodeBuffers {
+    y: Vec<f32>,
+    hidden: Vec<f32>,
+    attention: AttentionBuffers,
+}
+
+impl EncodeBuffers {
+    pub(crate) fn new() -> Self {
+        Self {
+            y: Vec::new(),
+            hidden: Vec::new(),
+            attention: AttentionBuffers::new(),
+        }
+    }
+}
+
+const EPS: f32 = 1e-5;
+
+impl VlEncoder {
+    pub(crate) fn load(
+        tensors: &HeadTensors<'_>,
+        engine: Engine,
+        config: &HeadConfig,
+        names: &HeadNames,
+    ) -> Result<Self> {
+        let block = |names: &VlBlockNames| {
+            Ok(VlBlock {
+                norm1: Norm::load(tensors, &names.norm1, EPS)?,
+                attention: Attention::load(tensors, engine, &names.attention, config.vl_num_heads)?,
+                norm3: Norm::load(tensors, &names.norm3, EPS)?,
+                feed_forward: FeedForward::load(tensors, engine, &names.feed_forward)?,
+            })
+        };
+        Ok(Self {
+            vlln: names
+                .vlln
+                .as_ref()
+                .map(|names| Norm::load(tensors, names, EPS))
+                .transpose()?,
+            blocks: names.vl_blocks.iter().map(block).collect::<Result<_>>()?,
+            context_dim: config.context_dim,
+        })
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        let block = |block: &VlBlock| {
+            block.norm1.nbytes()
+                + block.attention.nbytes()
+                + block.norm3.nbytes()
+                + block.feed_forward.nbytes()
+        };
+        self.vlln.as_ref().map_or(0, Norm::nbytes) + self.blocks.iter().map(block).sum::<usize>()
+    }
+
+    /// The tokens that the cross-attention blocks see, and their keys and values in each of `cross` blocks.
+    ///
+    /// `features` is `(batch, num_vl_tokens, context_dim)`.
+    pub(crate) fn encode(
+        &self,
+        engine: Engine,
+        cross: &[Option<&Attention>],
+        features: &[f32],
+        num_vl_tokens: usize,
+        removed: Option<&RemovedKeys>,
+        buffers: &mut EncodeBuffers,
+    ) -> (Vec<f32>, Vec<Vec<PackedKeyValues>>) {
+        let mut vl_embs = vec![0.0; features.len()];
+        let mut keys_values: Vec<Vec<_>> = cross.iter().map(|_| Vec::new()).collect();
+        let together = (ENCODE_ROWS / num_vl_tokens).max(1); // batch elements
+        let chunk = together * num_vl_tokens * self.context_dim;
+        for (index, (features, vl)) in features.chunks(chunk).zip(vl_embs.chunks_mut(chunk)).enumerate() {
+            let groups = features.len() / (num_vl_tokens * self.context_dim);
+            let bias = |group: usize| removed.map(|removed| removed.bias(index * together + group));
+            self.tokens(engine, features, groups, bias, buffers, vl);
+            for (attention, keys_values) in cross.iter().zip(&mut keys_values) {
+                if let Some(attention) = attention {
+                    keys_values.extend(attention.project(engine, vl, groups, &mut buffers.hidden));
+                }
+            }
+        }
+        if let Some(removed) = removed {
+            for (row, &bias) in vl_embs.chunks_exact_mut(self.context_dim).zip(&removed.values) {
+                if bias != 0.0 {
+                    row.fill(0.0);
+                }
+            }
+        }
+        (vl_embs, keys_values)
+    }
+
+    fn tokens<'b>(
+        &self,
+        engine: Engine,
+        features: &[f32],
+        groups: usize,
+        bias: impl Fn(usize) -> Option<LogitBias<'b>>,
+        buffers: &mut EncodeBuffers,
+        vl: &mut [f32],
+    ) {
+        match &self.vlln {
+            Some(vlln) => vlln.apply(engine, features, vl),
+            None => vl.copy_from_slice(features),
+        }
+        for block in &self.blocks {
+            let y = sized(&mut buffers.y, vl.len());
+            block.norm1.apply(engine, vl, y);
+            block
+                .attention
+                .add_self(engine, y, y, groups, &bias, &mut buffers.attention, vl);
+            block.norm3.apply(engine, vl, y);
+            block.feed_forward.add(engine, y, &mut buffers.hidden, vl);
+        }
+    }
+}

@@ -1,0 +1,274 @@
+//! Cross-attention alone: the layer in which state, future and action rows look at the vision-language tokens.
+
+use std::collections::BTreeMap;
+use std::sync::Mutex;
+
+use saccade_kernels::{Epilogue, LogitBias, PackedKeyValues};
+
+use crate::array::Array;
+use crate::attention::{Attention, AttentionBuffers};
+use crate::checkpoint::Elements;
+use crate::error::{Error, Result, show_shape};
+use crate::head::engine;
+use crate::layers::{Engine, TensorSource};
+use crate::layout::AttentionNames;
+
+/// A tensor given in memory: its shape and elements.
+pub type NamedTensors = BTreeMap<String, (Vec<usize>, Elements)>;
+
+impl TensorSource for NamedTensors {
+    fn tensor(&self, name: &str) -> Result<Elements> {
+        self.get(name)
+            .map(|(_, elements)| elements.clone())
+            .ok_or_else(|| Error::Checkpoint(format!("tensors: {name} is missing")))
+    }
+}
+
+/// Projected keys and values of a batch: immutable, for any number of calls.
+pub struct KeyValues {
+    batch: usize,
+    num_vl_tokens: usize,
+    num_heads: usize,
+    width: usize,
+    packed: Vec<PackedKeyValues>,
+}
+
+impl KeyValues {
+    /// Sequences.
+    #[must_use]
+    pub fn batch(&self) -> usize {
+        self.batch
+    }
+
+    /// Keys of each.
+    #[must_use]
+    pub fn num_vl_tokens(&self) -> usize {
+        self.num_vl_tokens
+    }
+
+    /// Bytes held.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        self.packed.iter().map(PackedKeyValues::nbytes).sum()
+    }
+}
+
+/// `to_out(softmax(to_q(x) to_k(c)^T / sqrt(head_dim)) to_v(c))`.
+pub struct CrossAttention {
+    attention: Attention,
+    engine: Engine,
+    num_heads: usize,
+    context_dim: usize,
+    buffers: Mutex<Vec<AttentionBuffers>>,
+}
+
+impl CrossAttention {
+    /// From `to_q.weight (width, width)`, `to_k.weight` and `to_v.weight (width, context_dim)`, `to_out.0.weight (width, width)` and their
+    /// biases.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown or misshaped; [`Error::Input`] if `num_heads` does not divide
+    /// the width.
+    pub fn new(tensors: &NamedTensors, num_heads: usize, num_threads: Option<usize>) -> Result<Self> {
+        let engine = engine(num_threads)?;
+        let axes = |name: &str| tensors.get(name).map(|(shape, _)| shape.as_slice());
+        // The sizes come from two of the tensors; the others must agree with them.
+        let width = axes("to_q.weight")
+            .and_then(|shape| shape.first().copied())
+            .unwrap_or(0);
+        let context_dim = axes("to_k.weight")
+            .and_then(|shape| shape.get(1).copied())
+            .unwrap_or(0);
+        let names = AttentionNames::new("", width, context_dim);
+        check_tensors(tensors, &names.tensors())?;
+        if width == 0 || context_dim == 0 {
+            return Err(Error::Checkpoint(format!(
+                "tensors: expected at least one input and output feature, got width {width} and context_dim {context_dim}"
+            )));
+        }
+        if num_heads == 0 || !width.is_multiple_of(num_heads) {
+            return Err(Error::Input(format!(
+                "num_heads: expected a divisor of the width {width}, got {num_heads}"
+            )));
+        }
+        let attention = Attention::load(tensors, engine, &names, num_heads)?;
+        Ok(Self {
+            attention,
+            engine,
+            num_heads,
+            context_dim,
+            buffers: Mutex::new(Vec::new()),
+        })
+    }
+
+    /// Width of queries and output.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.attention.width()
+    }
+
+    /// Width of the tokens attended to.
+    #[must_use]
+    pub fn context_dim(&self) -> usize {
+        self.context_dim
+    }
+
+    /// Attention heads.
+    #[must_use]
+    pub fn num_heads(&self) -> usize {
+        self.num_heads
+    }
+
+    /// Keys and values of `encoder_hidden_states (batch, num_vl_tokens, context_dim)`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for states that do not fit.
+    pub fn project(&self, encoder_hidden_states: Array<'_>) -> Result<KeyValues> {
+        let (batch, num_vl_tokens) =
+            self.check_rows("encoder_hidden_states", encoder_hidden_states, self.context_dim)?;
+        let mut buffer = Vec::new();
+        let packed = self
+            .attention
+            .project(self.engine, encoder_hidden_states.data, batch, &mut buffer);
+        Ok(KeyValues {
+            batch,
+            num_vl_tokens,
+            num_heads: self.num_heads,
+            width: self.width(),
+            packed,
+        })
+    }
+
+    /// Attends from `hidden_states (batch, queries, width)` to `kv`.
+    ///
+    /// `key_mask (batch, num_vl_tokens)`: true = attended; `key_bias (batch, num_vl_tokens)` is added to the logits. A query with no key left
+    /// gets zeros before the output projection. `out` is `(batch, queries, width)`; `weights`, if wanted, `(batch, heads, queries, keys)`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit; `out` is then untouched.
+    pub fn attend(
+        &self,
+        hidden_states: Array<'_>,
+        kv: &KeyValues,
+        key_mask: Option<Array<'_, bool>>,
+        key_bias: Option<Array<'_>>,
+        weights: Option<&mut [f32]>,
+        out: &mut [f32],
+    ) -> Result<()> {
+        let (batch, _) = self.check_rows("hidden_states", hidden_states, self.width())?;
+        if (kv.num_heads, kv.width) != (self.num_heads, self.width()) {
+            return Err(Error::Input(format!(
+                "kv: expected keys and values of {} heads and width {}, got {} and {}",
+                self.num_heads,
+                self.width(),
+                kv.num_heads,
+                kv.width
+            )));
+        }
+        if batch != kv.batch {
+            return Err(Error::Shape(format!(
+                "hidden_states: expected the batch of kv, {}, got {batch}",
+                kv.batch
+            )));
+        }
+        let keys = [kv.batch, kv.num_vl_tokens];
+        let logit_bias = logit_bias(keys, key_mask, key_bias)?;
+        let bias = |element: usize| {
+            logit_bias.as_ref().map(|values| LogitBias {
+                values: &values[element * keys[1]..(element + 1) * keys[1]],
+                head_stride: 0,
+                query_stride: 0,
+            })
+        };
+        let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
+        let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);
+        let (y, engine) = (hidden_states.data, self.engine);
+        self.attention.add_cross(
+            engine,
+            y,
+            &kv.packed,
+            bias,
+            weights,
+            Epilogue::Store,
+            &mut buffers,
+            out,
+        );
+        if let Ok(mut kept) = self.buffers.try_lock() {
+            kept.push(buffers);
+        }
+        Ok(())
+    }
+
+    fn check_rows(&self, name: &str, array: Array<'_>, width: usize) -> Result<(usize, usize)> {
+        match *array.shape {
+            [batch, rows, last] if last == width && batch > 0 && rows > 0 => {
+                array.check_finite(name)?;
+                Ok((batch, rows))
+            }
+            _ => Err(Error::Shape(format!(
+                "{name}: expected (batch, rows, {width}) with at least one row, got {}",
+                show_shape(array.shape)
+            ))),
+        }
+    }
+}
+
+/// Mask and bias in one: minus infinity takes a key away.
+fn logit_bias(
+    shape: [usize; 2],
+    key_mask: Option<Array<'_, bool>>,
+    key_bias: Option<Array<'_>>,
+) -> Result<Option<Vec<f32>>> {
+    let axes = "(batch, num_vl_tokens)";
+    let mut values = match key_bias {
+        None if key_mask.is_none() => return Ok(None),
+        None => vec![0.0; shape[0] * shape[1]],
+        Some(bias) => {
+            bias.check_shape("key_bias", axes, &shape)?;
+            if let Some(bad) = bias
+                .data
+                .iter()
+                .find(|value| value.is_nan() || **value == f32::INFINITY)
+            {
+                return Err(Error::Input(format!(
+                    "key_bias: expected finite values or minus infinity, got {bad}"
+                )));
+            }
+            bias.data.to_vec()
+        }
+    };
+    if let Some(mask) = key_mask {
+        mask.check_shape("key_mask", axes, &shape)?;
+        for (value, &attended) in values.iter_mut().zip(mask.data) {
+            if !attended {
+                *value = f32::NEG_INFINITY;
+            }
+        }
+    }
+    Ok(Some(values))
+}
+
+fn check_tensors(tensors: &NamedTensors, expected: &[(String, Vec<usize>)]) -> Result<()> {
+    let mut problems = Vec::new();
+    for (name, shape) in expected {
+        match tensors.get(name) {
+            None => problems.push(format!("{name} is missing")),
+            Some((given, _)) if given != shape => {
+                problems.push(format!(
+                    "{name} has shape {}, expected {}",
+                    show_shape(given),
+                    show_shape(shape)
+                ));
+            }
+            Some(_) => {}
+        }
+    }
+    let unknown = tensors
+        .keys()
+        .filter(|name| !expected.iter().any(|(known, _)| known == *name));
+    problems.extend(unknown.map(|name| format!("{name} is unknown")));
+    if problems.is_empty() {
+        return Ok(());
+    }
+    Err(Error::Checkpoint(format!("tensors: {}", problems.join("; "))))
+}

@@ -1,0 +1,360 @@
+//! The diffusion transformer (spec 1.4, 1.6, 1.7), one forward pass over the rows `[state, future, action]`.
+
+use std::sync::Arc;
+
+use saccade_kernels::{Epilogue, PackedLinear, layer_norm};
+
+use crate::attention::{Attention, AttentionBuffers, FeedForward};
+use crate::cache::Cache;
+use crate::config::HeadConfig;
+use crate::context::Context;
+use crate::error::Result;
+use crate::layers::{Engine, HeadTensors, load_linear, rows, rows_mut, sized};
+use crate::layout::{DitBlockNames, HeadNames, LinearNames};
+use crate::tables::{TIME_CHANNELS, embedding_time};
+
+const BLOCK_EPS: f32 = 1e-5;
+const OUTPUT_EPS: f32 = 1e-6;
+
+/// Buckets whose modulations are kept: the 4 of the released sampler several times over; 13 MB at N1.5's size.
+const CACHED_BUCKETS: usize = 64;
+
+pub(crate) struct Dit {
+    timestep_embedder: [PackedLinear; 2],
+    blocks: Vec<Block>,
+    /// `proj_out_1`: the output norm's modulation.
+    output_modulation: PackedLinear,
+    /// `proj_out_2`.
+    output: PackedLinear,
+    width: usize,
+    times: Cache<usize, TimeModulations>,
+}
+
+struct Block {
+    /// `norm1.linear`.
+    modulation: PackedLinear,
+    attention: Attention,
+    is_cross: bool,
+    feed_forward: FeedForward,
+}
+
+/// `norm(h) * scale + shift`; the 1 of the released `1 + scale` is in `scale`.
+struct Modulation {
+    scale: Vec<f32>,
+    shift: Vec<f32>,
+}
+
+/// All that depends on the bucket alone (spec I11).
+pub(crate) struct TimeModulations {
+    blocks: Vec<Modulation>,
+    output: Modulation,
+}
+
+/// What one forward pass is over: equally many rows for each sequence, `samples` sequences for each batch element.
+pub(crate) struct Sequences<'a> {
+    pub context: &'a Context,
+    pub samples: usize,
+    /// Rows of one sequence, and how many of them, the last ones, are actions.
+    pub rows: usize,
+    pub action_rows: usize,
+    /// One for each batch element.
+    pub times: &'a [Arc<TimeModulations>],
+}
+
+/// In the last block only the action rows are needed (spec I4).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum LastBlock {
+    ActionRows,
+    /// The plain computation, which the saving is tested against.
+    #[cfg(test)]
+    AllRows,
+}
+
+/// Memory of one pass that is kept for the next.
+pub(crate) struct DitBuffers {
+    /// The residual stream, `(sequences, rows, width)`: filled by the caller.
+    pub h: Vec<f32>,
+    action: Vec<f32>,
+    y: Vec<f32>,
+    y_all: Vec<f32>,
+    hidden: Vec<f32>,
+    attention: AttentionBuffers,
+}
+
+impl DitBuffers {
+    pub(crate) fn new() -> Self {
+        Self {
+            h: Vec::new(),
+            action: Vec::new(),
+            y: Vec::new(),
+            y_all: Vec::new(),
+            hidden: Vec::new(),
+            attention: AttentionBuffers::new(),
+        }
+    }
+}
+
+impl Dit {
+    pub(crate) fn load(
+        tensors: &HeadTensors<'_>,
+        engine: Engine,
+        config: &HeadConfig,
+        names: &HeadNames,
+    ) -> Result<Self> {
+        let linear = |names: &LinearNames| load_linear(tensors, engine.isa, &[names]);
+        let block = |(index, names): (usize, &DitBlockNames)| {
+            Ok(Block {
+                modulation: linear(&names.modulation)?,
+                attention: Attention::load(tensors, engine, &names.attention, config.num_heads)?,
+                is_cross: config.is_cross(index),
+                feed_forward: FeedForward::load(tensors, engine, &names.feed_forward)?,
+            })
+        };
+        let [linear_1, linear_2] = &names.timestep_embedder;
+        let [proj_out_1, proj_out_2] = &names.proj_out;
+        Ok(Self {
+            timestep_embedder: [linear(linear_1)?, linear(linear_2)?],
+            blocks: names
+                .blocks
+                .iter()
+                .enumerate()
+                .map(block)
+                .collect::<Result<_>>()?,
+            output_modulation: linear(proj_out_1)?,
+            output: linear(proj_out_2)?,
+            width: config.width,
+            times: Cache::new(CACHED_BUCKETS),
+        })
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        let block = |block: &Block| {
+            block.modulation.nbytes() + block.attention.nbytes() + block.feed_forward.nbytes()
+        };
+        self.timestep_embedder
+            .iter()
+            .map(PackedLinear::nbytes)
+            .sum::<usize>()
+            + self.blocks.iter().map(block).sum::<usize>()
+            + self.output_modulation.nbytes()
+            + self.output.nbytes()
+    }
+
+    /// By block: the attention over the vision-language tokens, if it is one.
+    pub(crate) fn cross_attentions(&self) -> Vec<Option<&Attention>> {
+        self.blocks
+            .iter()
+            .map(|block| block.is_cross.then_some(&block.attention))
+            .collect()
+    }
+
+    /// The modulations of bucket `timestep`, computed at its first use.
+    pub(crate) fn time(&self, engine: Engine, timestep: usize) -> Arc<TimeModulations> {
+        self.times
+            .get_or_insert(timestep, || self.modulations(engine, timestep))
+    }
+
+    fn modulations(&self, engine: Engine, timestep: usize) -> TimeModulations {
+        let row = |layer: &PackedLinear, x: &[f32], epilogue| {
+            let mut out = vec![0.0; layer.out_features()];
+            layer.apply(
+                engine.threads,
+                rows(x, x.len()),
+                epilogue,
+                rows_mut(&mut out, layer.out_features()),
+            );
+            out
+        };
+        let mut table = [0.0; TIME_CHANNELS];
+        embedding_time(timestep, &mut table);
+        let [linear_1, linear_2] = &self.timestep_embedder;
+        // Every use of the embedding goes through SiLU first, so it is applied here once.
+        let silu_temb = row(linear_2, &row(linear_1, &table, Epilogue::Silu), Epilogue::Silu);
+        let modulation = |layer: &PackedLinear, scale_first: bool| {
+            let both = row(layer, &silu_temb, Epilogue::Store);
+            let (first, second) = both.split_at(self.width);
+            let (scale, shift) = if scale_first {
+                (first, second)
+            } else {
+                (second, first)
+            };
+            Modulation {
+                scale: scale.iter().map(|scale| 1.0 + scale).collect(),
+                shift: shift.to_vec(),
+            }
+        };
+        TimeModulations {
+            blocks: self
+                .blocks
+                .iter()
+                .map(|block| modulation(&block.modulation, true))
+                .collect(),
+            output: modulation(&self.output_modulation, false),
+        }
+    }
+
+    /// Runs all blocks over `buffers.h` and writes the output rows of the actions, `(sequences, action_rows, hidden_dim)`.
+    pub(crate) fn forward(
+        &self,
+        engine: Engine,
+        sequences: &Sequences<'_>,
+        last: LastBlock,
+        buffers: &mut DitBuffers,
+        out: &mut Vec<f32>,
+    ) {
+        let (final_block, blocks) = self.blocks.split_last().expect("a config has at least one block");
+        let mut h = std::mem::take(&mut buffers.h); // (sequences, rows, width)
+        for (index, block) in blocks.iter().enumerate() {
+            self.block(engine, sequences, index, block, &mut h, None, buffers);
+        }
+        let mut action = std::mem::take(&mut buffers.action); // (sequences, action_rows, width)
+        match last {
+            LastBlock::ActionRows => {
+                gather_action_rows(sequences, self.width, &h, &mut action);
+                self.block(
+                    engine,
+                    sequences,
+                    blocks.len(),
+                    final_block,
+                    &mut action,
+                    Some(&h),
+                    buffers,
+                );
+            }
+            #[cfg(test)]
+            LastBlock::AllRows => {
+                self.block(
+                    engine,
+                    sequences,
+                    blocks.len(),
+                    final_block,
+                    &mut h,
+                    None,
+                    buffers,
+                );
+                gather_action_rows(sequences, self.width, &h, &mut action);
+            }
+        }
+        let y = sized(&mut buffers.y, action.len());
+        modulated_norm(
+            engine,
+            sequences.times,
+            |time| &time.output,
+            self.width,
+            OUTPUT_EPS,
+            &action,
+            y,
+        );
+        let hidden_dim = self.output.out_features();
+        let out = sized(out, action.len() / self.width * hidden_dim);
+        self.output.apply(
+            engine.threads,
+            rows(y, self.width),
+            Epilogue::Store,
+            rows_mut(out, hidden_dim),
+        );
+        (buffers.h, buffers.action) = (h, action);
+    }
+
+    /// One block over the rows `x`. `all` are the rows that keys and values come from where `x` is only some of them.
+    #[allow(clippy::too_many_arguments)] // One equation: its rows, its conditions and its memory.
+    fn block(
+        &self,
+        engine: Engine,
+        sequences: &Sequences<'_>,
+        index: usize,
+        block: &Block,
+        x: &mut [f32],
+        all: Option<&[f32]>,
+        buffers: &mut DitBuffers,
+    ) {
+        let DitBuffers {
+            y,
+            y_all,
+            hidden,
+            attention,
+            ..
+        } = buffers;
+        let norm = |h: &[f32], y: &mut [f32]| {
+            modulated_norm(
+                engine,
+                sequences.times,
+                |time| &time.blocks[index],
+                self.width,
+                BLOCK_EPS,
+                h,
+                y,
+            );
+        };
+        let y = sized(y, x.len());
+        norm(x, y);
+        if block.is_cross {
+            let context = sequences.context;
+            let (kv, bias) = (&context.keys_values[index], |element| context.bias(element));
+            block
+                .attention
+                .add_cross(engine, y, kv, bias, None, Epilogue::Add, attention, x);
+        } else {
+            let groups = sequences.context.batch * sequences.samples;
+            let source: &[f32] = match all {
+                None => y,
+                Some(h) => {
+                    let y_all = sized(y_all, h.len());
+                    norm(h, y_all);
+                    y_all
+                }
+            };
+            block
+                .attention
+                .add_self(engine, y, source, groups, |_| None, attention, x);
+        }
+        layer_norm(
+            engine.isa,
+            engine.threads,
+            rows(x, self.width),
+            BLOCK_EPS,
+            None,
+            rows_mut(y, self.width),
+        );
+        block.feed_forward.add(engine, y, hidden, x);
+    }
+}
+
+/// Copies the action rows, the last of each sequence, from `h` to `action`.
+fn gather_action_rows(sequences: &Sequences<'_>, width: usize, h: &[f32], action: &mut Vec<f32>) {
+    let (sequence, actions) = (sequences.rows * width, sequences.action_rows * width);
+    let action = sized(action, h.len() / sequence * actions);
+    for (from, to) in h.chunks_exact(sequence).zip(action.chunks_exact_mut(actions)) {
+        to.copy_from_slice(&from[sequence - actions..]);
+    }
+}
+
+/// `norm(h) * (1 + scale) + shift` with each batch element's own scale and shift.
+fn modulated_norm(
+    engine: Engine,
+    times: &[Arc<TimeModulations>],
+    modulation: impl Fn(&TimeModulations) -> &Modulation,
+    width: usize,
+    eps: f32,
+    h: &[f32],
+    y: &mut [f32],
+) {
+    let element = h.len() / times.len();
+    let (mut h, mut y) = (h, y);
+    // Usually all elements are at one time, and one call does all rows.
+    for run in times.chunk_by(Arc::ptr_eq) {
+        let (h_run, h_rest) = h.split_at(run.len() * element);
+        let (y_run, y_rest) = std::mem::take(&mut y).split_at_mut(run.len() * element);
+        let Modulation { scale, shift } = modulation(&run[0]);
+        let (h_run, y_run) = (rows(h_run, width), rows_mut(y_run, width));
+        layer_norm(
+            engine.isa,
+            engine.threads,
+            h_run,
+            eps,
+            Some((scale, shift)),
+            y_run,
+        );
+        (h, y) = (h_rest, y_rest);
+    }
+}

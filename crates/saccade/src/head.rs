@@ -1,0 +1,718 @@
+//! The action head: encode an observation once, sample chunks of actions from it as often as wanted.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+
+use saccade_kernels::{Epilogue, Isa, silu};
+
+use crate::array::Array;
+use crate::cache::Cache;
+use crate::checkpoint::Checkpoint;
+use crate::config::HeadConfig;
+use crate::context::{Context, EncodeBuffers, RemovedKeys, VlEncoder};
+use crate::dit::{Dit, DitBuffers, LastBlock, Sequences, TimeModulations};
+use crate::error::{Error, Result, show_shape};
+use crate::layers::{ActionEncoder, CategoryLinear, Engine, HeadTensors, TensorSource, sized};
+use crate::layout::HeadNames;
+use crate::tables::action_time;
+
+/// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
+const CACHED_BRACKETS: usize = 256;
+
+/// How a head is loaded.
+#[derive(Clone, Debug, Default)]
+pub struct LoadOptions {
+    /// The config as JSON; default the `config.json` beside the weights.
+    pub config: Option<String>,
+    /// Keep only these embodiments; default all.
+    pub embodiment_ids: Option<Vec<i64>>,
+    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
+    pub num_threads: Option<usize>,
+}
+
+/// The observation given to [`ActionHead::encode`].
+#[derive(Clone, Copy, Debug)]
+pub struct Features<'a> {
+    /// `(batch, num_vl_tokens, context_dim)`.
+    pub backbone_features: Array<'a>,
+    /// `(batch, num_vl_tokens)`, true = attended. N1.5 ignores padding: only an all-true mask is taken.
+    pub attention_mask: Option<Array<'a, bool>>,
+    /// `(batch, num_vl_tokens)`, true = image token; kept for maps.
+    pub image_mask: Option<Array<'a, bool>>,
+    /// `(batch, num_vl_tokens)`, true = as if the position were not there.
+    pub drop_vl: Option<Array<'a, bool>>,
+}
+
+impl<'a> Features<'a> {
+    /// Features without masks.
+    #[must_use]
+    pub fn new(backbone_features: Array<'a>) -> Self {
+        Self {
+            backbone_features,
+            attention_mask: None,
+            image_mask: None,
+            drop_vl: None,
+        }
+    }
+}
+
+/// A loaded action head. Immutable; serves any number of threads at once.
+pub struct ActionHead {
+    config: HeadConfig,
+    engine: Engine,
+    /// Tells contexts of this head from those of others.
+    id: u64,
+    embodiment_ids: Vec<usize>,
+    vl: VlEncoder,
+    state_encoder: [CategoryLinear; 2],
+    action_encoder: ActionEncoder,
+    future_tokens: Vec<f32>,
+    /// Its first `action_horizon` rows; none without `add_pos_embed`.
+    position_embedding: Option<Vec<f32>>,
+    dit: Dit,
+    action_decoder: [CategoryLinear; 2],
+    brackets: Cache<(usize, usize), Vec<f32>>,
+    workspaces: Mutex<Vec<Workspace>>,
+}
+
+/// Memory of one call, kept for the next call.
+struct Workspace {
+    encode: EncodeBuffers,
+    dit: DitBuffers,
+    embodiment_ids: Vec<usize>,
+    times: Vec<Arc<TimeModulations>>,
+    state_hidden: Vec<f32>,
+    state: Vec<f32>,
+    x: Vec<f32>,
+    tokens: Vec<f32>,
+    encoded: Vec<f32>,
+    output: Vec<f32>,
+    decoder_hidden: Vec<f32>,
+    velocity: Vec<f32>,
+}
+
+impl Workspace {
+    fn new() -> Self {
+        Self {
+            encode: EncodeBuffers::new(),
+            dit: DitBuffers::new(),
+            embodiment_ids: Vec::new(),
+            times: Vec::new(),
+            state_hidden: Vec::new(),
+            state: Vec::new(),
+            x: Vec::new(),
+            tokens: Vec::new(),
+            encoded: Vec::new(),
+            output: Vec::new(),
+            decoder_hidden: Vec::new(),
+            velocity: Vec::new(),
+        }
+    }
+}
+
+impl ActionHead {
+    /// Loads a head from `source`: one `.safetensors` file, or a directory with `config.json` beside one or more of them.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] for a path that is not there, [`Error::Checkpoint`] for a config or weights that are broken or do not fit each
+    /// other (all that is wrong is listed), [`Error::Input`] for options out of range.
+    pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
+        let engine = engine(options.num_threads)?;
+        let checkpoint = Checkpoint::open(source)?;
+        let config = match &options.config {
+            Some(text) => HeadConfig::from_json(text)?,
+            None => HeadConfig::from_json(&read_config_beside(source)?)?,
+        };
+        let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
+        let names = HeadNames::new(&config);
+        let tensors = HeadTensors {
+            prefix: checkpoint.head_prefix()?,
+            checkpoint: &checkpoint,
+        };
+        checkpoint.check(tensors.prefix, &names.tensors())?;
+
+        let ids = &embodiment_ids;
+        let category = |names| CategoryLinear::load(&tensors, engine.isa, names, ids);
+        let [state_1, state_2] = &names.state_encoder;
+        let [decoder_1, decoder_2] = &names.action_decoder;
+        Ok(Self {
+            engine,
+            id: next_id(),
+            vl: VlEncoder::load(&tensors, engine, &config, &names)?,
+            state_encoder: [category(state_1)?, category(state_2)?],
+            action_encoder: ActionEncoder::load(&tensors, engine.isa, &names.action_encoder, ids)?,
+            future_tokens: match config.num_future_tokens {
+                0 => Vec::new(),
+                _ => tensors.tensor(&names.future_tokens.0)?.into_f32(),
+            },
+            position_embedding: match &names.position_embedding {
+                None => None,
+                Some((name, _)) => {
+                    let mut table = tensors.tensor(name)?.into_f32();
+                    table.truncate(config.action_horizon * config.width);
+                    table.shrink_to_fit();
+                    Some(table)
+                }
+            },
+            dit: Dit::load(&tensors, engine, &config, &names)?,
+            action_decoder: [category(decoder_1)?, category(decoder_2)?],
+            brackets: Cache::new(CACHED_BRACKETS),
+            workspaces: Mutex::new(Vec::new()),
+            embodiment_ids,
+            config,
+        })
+    }
+
+    /// Sizes and switches.
+    #[must_use]
+    pub fn config(&self) -> &HeadConfig {
+        &self.config
+    }
+
+    /// The loaded embodiments, ascending.
+    #[must_use]
+    pub fn embodiment_ids(&self) -> &[usize] {
+        &self.embodiment_ids
+    }
+
+    /// Threads that a call uses.
+    #[must_use]
+    pub fn num_threads(&self) -> usize {
+        self.engine.threads
+    }
+
+    /// The instruction set that the kernels use.
+    #[must_use]
+    pub fn isa(&self) -> Isa {
+        self.engine.isa
+    }
+
+    /// Bytes of weights in memory.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        let category = |layers: &[CategoryLinear]| layers.iter().map(CategoryLinear::nbytes).sum::<usize>();
+        self.vl.nbytes()
+            + category(&self.state_encoder)
+            + self.action_encoder.nbytes()
+            + 4 * (self.future_tokens.len() + self.position_embedding.as_ref().map_or(0, Vec::len))
+            + self.dit.nbytes()
+            + category(&self.action_decoder)
+    }
+
+    /// Encodes observations: `vlln`, the VL self-attention, and the keys and values of every cross-attention block.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for features or masks that do not fit.
+    pub fn encode(&self, features: &Features<'_>) -> Result<Context> {
+        let (batch, num_vl_tokens) = self.check_features(features)?;
+        let removed = features
+            .drop_vl
+            .filter(|mask| mask.data.contains(&true))
+            .map(|mask| RemovedKeys::new(mask.data, num_vl_tokens));
+        let cross = self.dit.cross_attentions();
+        let (vl_embs, keys_values) = self.with_workspace(|workspace| {
+            let data = features.backbone_features.data;
+            let buffers = &mut workspace.encode;
+            self.vl.encode(
+                self.engine,
+                &cross,
+                data,
+                num_vl_tokens,
+                removed.as_ref(),
+                buffers,
+            )
+        });
+        Ok(Context {
+            head: self.id,
+            batch,
+            num_vl_tokens,
+            vl_embs,
+            keys_values,
+            removed,
+            image_mask: features.image_mask.map(|mask| mask.data.to_vec()),
+        })
+    }
+
+    /// Samples a chunk of actions: `num_steps` Euler steps from `noise` (spec 1.8).
+    ///
+    /// `state` is `(batch, state_dim)` or `(batch, state_history, state_dim)`, `embodiment_id` a scalar or `(batch)`, `noise`
+    /// `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with `num_samples`.
+    /// `out` has the shape of the noise, with `action_dim` for its last axis.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit; `out` is then untouched.
+    #[allow(clippy::too_many_arguments)] // The sampler's inputs, as in the paper.
+    pub fn sample(
+        &self,
+        context: &Context,
+        state: Array<'_>,
+        embodiment_id: Array<'_, i64>,
+        noise: Array<'_>,
+        num_steps: Option<usize>,
+        num_samples: Option<usize>,
+        out: &mut [f32],
+    ) -> Result<()> {
+        self.check_context(context)?;
+        let state = self.check_state(state, context.batch)?;
+        let num_steps = self.check_num_steps(num_steps)?;
+        let samples = self.check_noise(noise, context.batch, num_samples)?;
+        self.with_workspace(|workspace| {
+            self.check_embodiments(embodiment_id, context.batch, &mut workspace.embodiment_ids)?;
+            self.encode_state(state, workspace);
+            let Workspace { x, .. } = workspace;
+            sized(x, noise.data.len()).copy_from_slice(noise.data);
+            let dt = 1.0 / num_steps as f32;
+            for step in 0..num_steps {
+                let time = self.dit.time(self.engine, self.bucket(step, num_steps));
+                workspace.times.clear();
+                workspace.times.resize(context.batch, time);
+                let bucket = self.bucket(step, num_steps);
+                self.step_velocity(context, samples, |_| bucket, LastBlock::ActionRows, workspace);
+                for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
+                    *x += dt * v;
+                }
+            }
+            out.copy_from_slice(&workspace.x);
+            Ok(())
+        })
+    }
+
+    /// The velocity of noisy `actions (batch, action_horizon, encoder_action_dim)` at `timestep`, a bucket: a scalar or `(batch)`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit; `out` is then untouched.
+    pub fn velocity(
+        &self,
+        context: &Context,
+        state: Array<'_>,
+        embodiment_id: Array<'_, i64>,
+        actions: Array<'_>,
+        timestep: Array<'_, i64>,
+        out: &mut [f32],
+    ) -> Result<()> {
+        self.check_context(context)?;
+        let batch = context.batch;
+        let state = self.check_state(state, batch)?;
+        let expected = [batch, self.config.action_horizon, self.config.encoder_action_dim];
+        let actions = actions
+            .check_shape(
+                "actions",
+                "(batch, action_horizon, encoder_action_dim)",
+                &expected,
+            )?
+            .check_finite("actions")?;
+        let timesteps = self.check_timestep(timestep, batch)?;
+        self.with_workspace(|workspace| {
+            self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
+            self.encode_state(state, workspace);
+            sized(&mut workspace.x, actions.data.len()).copy_from_slice(actions.data);
+            workspace.times.clear();
+            workspace
+                .times
+                .extend(timesteps.iter().map(|&bucket| self.dit.time(self.engine, bucket)));
+            self.step_velocity(
+                context,
+                1,
+                |element| timesteps[element],
+                LastBlock::ActionRows,
+                workspace,
+            );
+            out.copy_from_slice(&workspace.velocity);
+            Ok(())
+        })
+    }
+
+    /// Allocates and touches all that calls of this size need: weights, caches, buffers and threads.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for a size of zero.
+    pub fn warmup(&self, num_vl_tokens: usize, batch: usize, num_samples: Option<usize>) -> Result<()> {
+        for (name, size) in [
+            ("num_vl_tokens", num_vl_tokens),
+            ("batch", batch),
+            ("num_samples", num_samples.unwrap_or(1)),
+        ] {
+            if size == 0 {
+                return Err(Error::Input(format!("{name}: expected at least 1, got 0")));
+            }
+        }
+        let config = &self.config;
+        let features = vec![0.0; batch * num_vl_tokens * config.context_dim];
+        let shape = [batch, num_vl_tokens, config.context_dim];
+        let context = self.encode(&Features::new(Array::new(&features, &shape)))?;
+        let (state, state_shape) = (vec![0.0; batch * config.state_dim], [batch, config.state_dim]);
+        let state = Array::new(&state, &state_shape);
+        let chunk = [config.action_horizon, config.encoder_action_dim];
+        let shape: Vec<usize> = [batch].into_iter().chain(num_samples).chain(chunk).collect();
+        let noise = vec![0.0; shape.iter().product()];
+        let mut out = vec![0.0; noise.len() / config.encoder_action_dim * config.action_dim];
+        for &id in &self.embodiment_ids {
+            for step in 0..config.num_steps {
+                self.bracket(id, self.bucket(step, config.num_steps));
+            }
+        }
+        let embodiment_id = [self.embodiment_ids[0] as i64];
+        let embodiment_id = Array::new(&embodiment_id, &[]);
+        self.sample(
+            &context,
+            state,
+            embodiment_id,
+            Array::new(&noise, &shape),
+            None,
+            num_samples,
+            &mut out,
+        )
+    }
+
+    /// The bucket of Euler step `step`: float64, truncated, as the released sampler does.
+    fn bucket(&self, step: usize, num_steps: usize) -> usize {
+        (step as f64 / num_steps as f64 * self.config.num_timestep_buckets as f64) as usize
+    }
+
+    /// One state row for each batch element, to `workspace.state (batch, width)`.
+    fn encode_state(&self, state: &[f32], workspace: &mut Workspace) {
+        let Workspace {
+            embodiment_ids,
+            state_hidden,
+            state: encoded,
+            ..
+        } = workspace;
+        let batch = embodiment_ids.len();
+        let [layer1, layer2] = &self.state_encoder;
+        let hidden = sized(state_hidden, batch * self.config.hidden_dim);
+        layer1.apply(self.engine, embodiment_ids, state, Epilogue::Relu, hidden);
+        layer2.apply(
+            self.engine,
+            embodiment_ids,
+            hidden,
+            Epilogue::Store,
+            sized(encoded, batch * self.config.width),
+        );
+    }
+
+    /// One forward pass over `workspace.x (batch, samples, action_horizon, encoder_action_dim)`, to `workspace.velocity`.
+    fn step_velocity(
+        &self,
+        context: &Context,
+        samples: usize,
+        bucket: impl Fn(usize) -> usize,
+        last: LastBlock,
+        workspace: &mut Workspace,
+    ) {
+        self.encode_actions(samples, bucket, workspace);
+        self.assemble_rows(samples, workspace);
+        let Workspace {
+            dit,
+            embodiment_ids,
+            times,
+            output,
+            decoder_hidden,
+            velocity,
+            ..
+        } = workspace;
+        let sequences = Sequences {
+            context,
+            samples,
+            rows: self.config.num_rows(),
+            action_rows: self.config.action_horizon,
+            times,
+        };
+        self.dit.forward(self.engine, &sequences, last, dit, output);
+        let [layer1, layer2] = &self.action_decoder;
+        let hidden = sized(decoder_hidden, output.len());
+        layer1.apply(self.engine, embodiment_ids, output, Epilogue::Relu, hidden);
+        let velocity = sized(
+            velocity,
+            output.len() / self.config.hidden_dim * self.config.action_dim,
+        );
+        layer2.apply(self.engine, embodiment_ids, hidden, Epilogue::Store, velocity);
+    }
+
+    /// Action rows from noisy actions (spec 1.3 with I12), to `workspace.encoded (batch, samples, action_horizon, width)`.
+    fn encode_actions(&self, samples: usize, bucket: impl Fn(usize) -> usize, workspace: &mut Workspace) {
+        let Workspace {
+            embodiment_ids,
+            x,
+            tokens,
+            encoded,
+            ..
+        } = workspace;
+        let (width, horizon) = (self.config.width, self.config.action_horizon);
+        let element = samples * horizon * width;
+        let tokens = sized(tokens, embodiment_ids.len() * element);
+        for (index, (rows, &id)) in tokens
+            .chunks_exact_mut(element)
+            .zip(embodiment_ids.iter())
+            .enumerate()
+        {
+            let bracket = self.bracket(id, bucket(index));
+            rows.chunks_exact_mut(width)
+                .for_each(|row| row.copy_from_slice(&bracket));
+        }
+        let encoder = &self.action_encoder;
+        encoder
+            .action
+            .apply(self.engine, embodiment_ids, x, Epilogue::Add, tokens);
+        silu(self.engine.isa, tokens);
+        let encoded = sized(encoded, tokens.len());
+        encoder
+            .out
+            .apply(self.engine, embodiment_ids, tokens, Epilogue::Store, encoded);
+        if let Some(positions) = &self.position_embedding {
+            for chunk in encoded.chunks_exact_mut(positions.len()) {
+                for (value, position) in chunk.iter_mut().zip(positions) {
+                    *value += position;
+                }
+            }
+        }
+    }
+
+    /// The part of the action encoder that depends on embodiment and bucket only, `(width)`.
+    fn bracket(&self, embodiment_id: usize, bucket: usize) -> Arc<Vec<f32>> {
+        self.brackets.get_or_insert((embodiment_id, bucket), || {
+            let width = self.config.width;
+            let mut tau = vec![0.0; width];
+            action_time(bucket, &mut tau);
+            let mut bracket = vec![0.0; width];
+            self.action_encoder.time.apply(
+                self.engine,
+                &[embodiment_id],
+                &tau,
+                Epilogue::Store,
+                &mut bracket,
+            );
+            bracket
+        })
+    }
+
+    /// `[state, future, action]` for each sequence, to the transformer's residual stream.
+    fn assemble_rows(&self, samples: usize, workspace: &mut Workspace) {
+        let Workspace {
+            state, encoded, dit, ..
+        } = workspace;
+        let width = self.config.width;
+        let actions = self.config.action_horizon * width;
+        let sequence = self.config.num_rows() * width;
+        let h = sized(&mut dit.h, encoded.len() / actions * sequence);
+        for (index, (h, action)) in h
+            .chunks_exact_mut(sequence)
+            .zip(encoded.chunks_exact(actions))
+            .enumerate()
+        {
+            let element = index / samples;
+            let (h_state, rest) = h.split_at_mut(width);
+            let (h_future, h_action) = rest.split_at_mut(self.future_tokens.len());
+            h_state.copy_from_slice(&state[element * width..(element + 1) * width]);
+            h_future.copy_from_slice(&self.future_tokens);
+            h_action.copy_from_slice(action);
+        }
+    }
+
+    /// Lends a workspace to `call`. Like the caches, the list is never waited for: see [`Cache::get_or_insert`].
+    fn with_workspace<R>(&self, call: impl FnOnce(&mut Workspace) -> R) -> R {
+        let kept = self.workspaces.try_lock().ok().and_then(|mut kept| kept.pop());
+        let mut workspace = kept.unwrap_or_else(Workspace::new);
+        let result = call(&mut workspace);
+        if let Ok(mut kept) = self.workspaces.try_lock() {
+            kept.push(workspace);
+        }
+        result
+    }
+
+    fn check_features(&self, features: &Features<'_>) -> Result<(usize, usize)> {
+        let array = features.backbone_features;
+        let context_dim = self.config.context_dim;
+        let &[batch, num_vl_tokens, width] = array.shape else {
+            return Err(Error::Shape(format!(
+                "backbone_features: expected (batch, num_vl_tokens, {context_dim}), got {}",
+                show_shape(array.shape)
+            )));
+        };
+        if width != context_dim || batch == 0 || num_vl_tokens == 0 {
+            return Err(Error::Shape(format!(
+                "backbone_features: expected (batch, num_vl_tokens, {context_dim}) with at least one observation and token, got {}",
+                show_shape(array.shape)
+            )));
+        }
+        array.check_finite("backbone_features")?;
+        let masks = [
+            ("attention_mask", features.attention_mask),
+            ("image_mask", features.image_mask),
+            ("drop_vl", features.drop_vl),
+        ];
+        for (name, mask) in masks {
+            if let Some(mask) = mask {
+                mask.check_shape(name, "(batch, num_vl_tokens)", &[batch, num_vl_tokens])?;
+            }
+        }
+        if features
+            .attention_mask
+            .is_some_and(|mask| mask.data.contains(&false))
+        {
+            return Err(Error::Input(
+                "attention_mask: GR00T N1.5 ignores padding masks, so a mask with a false entry would promise what the head does not do; \
+                 pass None to reproduce the released code (padding is attended), or drop_vl=~attention_mask to remove these positions"
+                    .to_owned(),
+            ));
+        }
+        Ok((batch, num_vl_tokens))
+    }
+
+    fn check_context(&self, context: &Context) -> Result<()> {
+        if context.head == self.id {
+            return Ok(());
+        }
+        Err(Error::Input(
+            "context: it was made by another head, whose keys and values mean nothing here; call this head's encode".to_owned(),
+        ))
+    }
+
+    fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
+        let (history, width) = (self.config.state_history, self.config.state_dim);
+        if state.shape != [batch, width] && state.shape != [batch, history, width] {
+            return Err(Error::Shape(format!(
+                "state: expected (batch, state_dim) = {} or (batch, state_history, state_dim) = {}, normalised and zero-padded to state_dim \
+                 as the checkpoint's normaliser does, got {}",
+                show_shape(&[batch, width]),
+                show_shape(&[batch, history, width]),
+                show_shape(state.shape)
+            )));
+        }
+        Ok(state.check_finite("state")?.data)
+    }
+
+    fn check_num_steps(&self, num_steps: Option<usize>) -> Result<usize> {
+        let num_steps = num_steps.unwrap_or(self.config.num_steps);
+        let buckets = self.config.num_timestep_buckets;
+        if (1..=buckets).contains(&num_steps) {
+            return Ok(num_steps);
+        }
+        Err(Error::Input(format!(
+            "num_steps: expected 1 to {buckets} (num_timestep_buckets), got {num_steps}"
+        )))
+    }
+
+    /// The number of samples an observation.
+    fn check_noise(&self, noise: Array<'_>, batch: usize, num_samples: Option<usize>) -> Result<usize> {
+        let (horizon, width) = (self.config.action_horizon, self.config.encoder_action_dim);
+        match num_samples {
+            None => {
+                let axes = "(batch, action_horizon, encoder_action_dim)";
+                noise.check_shape("noise", axes, &[batch, horizon, width])?;
+            }
+            Some(0) => return Err(Error::Input("num_samples: expected at least 1, got 0".to_owned())),
+            Some(samples) => {
+                let axes = "(batch, num_samples, action_horizon, encoder_action_dim)";
+                noise.check_shape("noise", axes, &[batch, samples, horizon, width])?;
+            }
+        }
+        noise.check_finite("noise")?;
+        Ok(num_samples.unwrap_or(1))
+    }
+
+    fn check_embodiments(&self, ids: Array<'_, i64>, batch: usize, checked: &mut Vec<usize>) -> Result<()> {
+        checked.clear();
+        if !ids.shape.is_empty() {
+            ids.check_shape("embodiment_id", "(batch,)", &[batch])?;
+        }
+        for &id in ids.data {
+            let loaded = usize::try_from(id)
+                .ok()
+                .filter(|id| self.embodiment_ids.contains(id));
+            checked.push(loaded.ok_or_else(|| self.embodiment_error(id))?);
+        }
+        checked.resize(batch, checked[0]);
+        Ok(())
+    }
+
+    fn embodiment_error(&self, id: i64) -> Error {
+        let last = self.config.num_embodiments - 1;
+        if (0..=last as i64).contains(&id) {
+            return Error::Input(format!(
+                "embodiment_id: {id} is not loaded, only {:?} are",
+                self.embodiment_ids
+            ));
+        }
+        Error::Input(format!("embodiment_id: expected 0 to {last}, got {id}"))
+    }
+
+    fn check_timestep(&self, timestep: Array<'_, i64>, batch: usize) -> Result<Vec<usize>> {
+        if !timestep.shape.is_empty() {
+            timestep.check_shape("timestep", "(batch,)", &[batch])?;
+        }
+        let last = self.config.num_timestep_buckets - 1;
+        let mut buckets = Vec::with_capacity(batch);
+        for &given in timestep.data {
+            let bucket = usize::try_from(given).ok().filter(|bucket| *bucket <= last);
+            buckets.push(bucket.ok_or_else(|| {
+                Error::Input(format!(
+                    "timestep: expected a bucket from 0 to {last}, got {given}"
+                ))
+            })?);
+        }
+        buckets.resize(batch, buckets[0]);
+        Ok(buckets)
+    }
+}
+
+/// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a problem.
+const MAX_THREADS: usize = 1024;
+
+/// The engine that the environment and `num_threads` ask for.
+pub(crate) fn engine(num_threads: Option<usize>) -> Result<Engine> {
+    let isa = Isa::from_env().map_err(|error| Error::Input(error.to_string()))?;
+    let threads = match num_threads {
+        Some(threads) if (1..=MAX_THREADS).contains(&threads) => threads,
+        Some(threads) => {
+            return Err(Error::Input(format!(
+                "num_threads: expected 1 to {MAX_THREADS}, got {threads}"
+            )));
+        }
+        None => saccade_kernels::default_num_threads()
+            .map_err(|error| Error::Input(error.to_string()))?
+            .get(),
+    };
+    Ok(Engine { isa, threads })
+}
+
+fn next_id() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    NEXT.fetch_add(1, Ordering::Relaxed)
+}
+
+fn read_config_beside(source: &Path) -> Result<String> {
+    let directory = if source.is_dir() {
+        source
+    } else {
+        source.parent().unwrap_or(Path::new(""))
+    };
+    let path: PathBuf = directory.join("config.json");
+    std::fs::read_to_string(&path).map_err(|error| Error::from_io("config", &path, &error))
+}
+
+fn chosen_embodiments(ids: Option<&[i64]>, num_embodiments: usize) -> Result<Vec<usize>> {
+    let Some(ids) = ids else {
+        return Ok((0..num_embodiments).collect());
+    };
+    let mut chosen = Vec::with_capacity(ids.len());
+    for &id in ids {
+        match usize::try_from(id) {
+            Ok(id) if id < num_embodiments => chosen.push(id),
+            _ => {
+                let last = num_embodiments - 1;
+                return Err(Error::Input(format!(
+                    "embodiment_ids: expected ids from 0 to {last}, got {id}"
+                )));
+            }
+        }
+    }
+    chosen.sort_unstable();
+    chosen.dedup();
+    if chosen.is_empty() {
+        return Err(Error::Input(
+            "embodiment_ids: expected at least one id, got none".to_owned(),
+        ));
+    }
+    Ok(chosen)
+}

@@ -1,0 +1,295 @@
+//! The layers that the head is made of: loaded by name, run by the kernels.
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Mat, MatMut, MatRef, Par};
+use saccade_kernels::{Epilogue, Isa, PackedLinear, WeightRef, layer_norm};
+
+use crate::checkpoint::{Checkpoint, Elements};
+use crate::error::{Error, Result};
+use crate::layout::{CategoryLinearNames, LinearNames, NormNames};
+
+/// Which instruction set and how many threads the kernels use.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Engine {
+    pub isa: Isa,
+    pub threads: usize,
+}
+
+/// Where layers get their tensors from.
+pub(crate) trait TensorSource {
+    /// Tensor `name`, whole.
+    fn tensor(&self, name: &str) -> Result<Elements>;
+}
+
+/// A checkpoint in which the head stands under a prefix.
+pub(crate) struct HeadTensors<'a> {
+    pub checkpoint: &'a Checkpoint,
+    pub prefix: &'static str,
+}
+
+impl HeadTensors<'_> {
+    /// Slice `index` of the first axis of tensor `name`.
+    fn slice(&self, name: &str, index: usize) -> Result<Elements> {
+        self.checkpoint
+            .read_slice(&format!("{}{name}", self.prefix), index)
+    }
+}
+
+impl TensorSource for HeadTensors<'_> {
+    fn tensor(&self, name: &str) -> Result<Elements> {
+        self.checkpoint.read(&format!("{}{name}", self.prefix))
+    }
+}
+
+/// `data` as rows of `width`.
+pub(crate) fn rows(data: &[f32], width: usize) -> MatRef<'_, f32> {
+    MatRef::from_row_major_slice(data, data.len() / width, width)
+}
+
+/// `data` as rows of `width`, to be written.
+pub(crate) fn rows_mut(data: &mut [f32], width: usize) -> MatMut<'_, f32> {
+    let count = data.len() / width;
+    MatMut::from_row_major_slice_mut(data, count, width)
+}
+
+/// Sets the length of a buffer that keeps its memory.
+pub(crate) fn sized(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
+    buffer.resize(len, 0.0);
+    buffer
+}
+
+fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> WeightRef<'_> {
+    match elements {
+        Elements::F32(data) => WeightRef::F32(MatRef::from_row_major_slice(data, out_features, in_features)),
+        Elements::Bf16(data) => {
+            WeightRef::Bf16(MatRef::from_row_major_slice(data, out_features, in_features))
+        }
+    }
+}
+
+/// Weights stored in-major `(in_features, out_features)`, as the category-specific layers are.
+fn in_major_view(elements: &Elements, in_features: usize, out_features: usize) -> WeightRef<'_> {
+    match weight_view(elements, in_features, out_features) {
+        WeightRef::F32(view) => WeightRef::F32(view.transpose()),
+        WeightRef::Bf16(view) => WeightRef::Bf16(view.transpose()),
+    }
+}
+
+fn pack(isa: Isa, parts: &[(WeightRef<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
+    PackedLinear::pack(isa, parts).map_err(|error| Error::Checkpoint(format!("source: {error}")))
+}
+
+/// Packs the layers `parts`, which have the same inputs, as one: their outputs stand side by side.
+pub(crate) fn load_linear(
+    source: &dyn TensorSource,
+    isa: Isa,
+    parts: &[&LinearNames],
+) -> Result<PackedLinear> {
+    let mut tensors = Vec::with_capacity(parts.len());
+    for names in parts {
+        tensors.push((
+            source.tensor(&names.weight)?,
+            source.tensor(&names.bias)?.into_f32(),
+        ));
+    }
+    let views: Vec<_> = parts
+        .iter()
+        .zip(&tensors)
+        .map(|(names, (weight, bias))| {
+            (
+                weight_view(weight, names.out_features, names.in_features),
+                Some(bias.as_slice()),
+            )
+        })
+        .collect();
+    pack(isa, &views)
+}
+
+/// An affine layer norm's weight and bias.
+pub(crate) struct Norm {
+    weight: Vec<f32>,
+    bias: Vec<f32>,
+    eps: f32,
+}
+
+impl Norm {
+    pub(crate) fn load(source: &dyn TensorSource, names: &NormNames, eps: f32) -> Result<Self> {
+        let weight = source.tensor(&names.weight)?.into_f32();
+        let bias = source.tensor(&names.bias)?.into_f32();
+        debug_assert_eq!(weight.len(), names.width);
+        Ok(Self { weight, bias, eps })
+    }
+
+    pub(crate) fn apply(&self, engine: Engine, x: &[f32], out: &mut [f32]) {
+        let width = self.weight.len();
+        let scale_shift = Some((self.weight.as_slice(), self.bias.as_slice()));
+        layer_norm(
+            engine.isa,
+            engine.threads,
+            rows(x, width),
+            self.eps,
+            scale_shift,
+            rows_mut(out, width),
+        );
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        4 * (self.weight.len() + self.bias.len())
+    }
+}
+
+/// One linear layer per embodiment: `y = x W[embodiment_id] + b[embodiment_id]`. Only the slices in use are in memory.
+pub(crate) struct CategoryLinear {
+    /// By embodiment id; `None` where it was not loaded.
+    slices: Vec<Option<PackedLinear>>,
+}
+
+impl CategoryLinear {
+    pub(crate) fn load(
+        tensors: &HeadTensors<'_>,
+        isa: Isa,
+        names: &CategoryLinearNames,
+        embodiment_ids: &[usize],
+    ) -> Result<Self> {
+        Self::build(names.num_embodiments, embodiment_ids, |id| {
+            let weight = tensors.slice(&names.weight, id)?;
+            let bias = tensors.slice(&names.bias, id)?.into_f32();
+            let view = in_major_view(&weight, names.in_features, names.out_features);
+            pack(isa, &[(view, Some(&bias))])
+        })
+    }
+
+    fn build(
+        num_embodiments: usize,
+        embodiment_ids: &[usize],
+        mut slice: impl FnMut(usize) -> Result<PackedLinear>,
+    ) -> Result<Self> {
+        let mut slices: Vec<_> = (0..num_embodiments).map(|_| None).collect();
+        for &id in embodiment_ids {
+            slices[id] = Some(slice(id)?);
+        }
+        Ok(Self { slices })
+    }
+
+    /// The layer of one embodiment, which the caller has checked to be loaded.
+    pub(crate) fn of(&self, embodiment_id: usize) -> &PackedLinear {
+        self.slices[embodiment_id]
+            .as_ref()
+            .expect("embodiment ids are checked against the loaded ones")
+    }
+
+    /// Runs the rows of each batch element, equally many, through the layer of its embodiment.
+    pub(crate) fn apply(
+        &self,
+        engine: Engine,
+        embodiment_ids: &[usize],
+        x: &[f32],
+        epilogue: Epilogue,
+        out: &mut [f32],
+    ) {
+        let (mut x, mut out) = (x, out);
+        let (x_element, out_element) = (x.len() / embodiment_ids.len(), out.len() / embodiment_ids.len());
+        // Neighbours of one embodiment share a product: the weights are then read once.
+        for run in embodiment_ids.chunk_by(|a, b| a == b) {
+            let layer = self.of(run[0]);
+            let (x_run, x_rest) = x.split_at(x_element * run.len());
+            let (out_run, out_rest) = std::mem::take(&mut out).split_at_mut(out_element * run.len());
+            layer.apply(
+                engine.threads,
+                rows(x_run, layer.in_features()),
+                epilogue,
+                rows_mut(out_run, layer.out_features()),
+            );
+            (x, out) = (x_rest, out_rest);
+        }
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        self.slices.iter().flatten().map(PackedLinear::nbytes).sum()
+    }
+}
+
+/// The action encoder with its first two layers taken apart (spec I12).
+///
+/// The released layers compute `W2([W1(x); tau])`. The action half of that is linear in `x` and becomes one small layer; the time half,
+/// with everything constant added to it, depends on embodiment and bucket only.
+pub(crate) struct ActionEncoder {
+    /// `W1 W2[0:width]`, without bias: `(encoder_action_dim -> width)`.
+    pub action: CategoryLinear,
+    /// `tau -> tau W2[width:] + b1 W2[0:width] + b2`.
+    pub time: CategoryLinear,
+    /// `W3`.
+    pub out: CategoryLinear,
+}
+
+impl ActionEncoder {
+    pub(crate) fn load(
+        tensors: &HeadTensors<'_>,
+        isa: Isa,
+        [w1, w2, w3]: &[CategoryLinearNames; 3],
+        embodiment_ids: &[usize],
+    ) -> Result<Self> {
+        let width = w3.in_features;
+        let num_embodiments = w1.num_embodiments;
+        let mut time = Vec::with_capacity(embodiment_ids.len());
+        let action = CategoryLinear::build(num_embodiments, embodiment_ids, |id| {
+            let first = tensors.slice(&w1.weight, id)?.into_f32();
+            let first_bias = tensors.slice(&w1.bias, id)?.into_f32();
+            let second = tensors.slice(&w2.weight, id)?;
+            let second_bias = tensors.slice(&w2.bias, id)?.into_f32();
+            let second_view = in_major_view(&second, 2 * width, width);
+
+            // Products in float64: the fused layer is then closer to the exact one than two float32 layers are.
+            let action_half = widened(submatrix(second_view, 0, width)); // (out, in)
+            let fused = product(action_half.as_ref(), widened_rows(&first, width).transpose()); // (out, action)
+            let bias = product(action_half.as_ref(), widened_rows(&first_bias, width).transpose()); // (out, 1)
+            let constant: Vec<f32> = second_bias
+                .iter()
+                .enumerate()
+                .map(|(row, &b)| (f64::from(b) + bias[(row, 0)]) as f32)
+                .collect();
+            time.push(Some(pack(
+                isa,
+                &[(submatrix(second_view, width, width), Some(&constant))],
+            )?));
+
+            let fused = Mat::from_fn(fused.nrows(), fused.ncols(), |i, j| fused[(i, j)] as f32);
+            pack(isa, &[(WeightRef::F32(fused.as_ref()), None)])
+        })?;
+        let mut time = time.into_iter();
+        let time = CategoryLinear::build(num_embodiments, embodiment_ids, |_| {
+            Ok(time.next().flatten().expect("one per loaded embodiment"))
+        })?;
+        let out = CategoryLinear::load(tensors, isa, w3, embodiment_ids)?;
+        Ok(Self { action, time, out })
+    }
+
+    pub(crate) fn nbytes(&self) -> usize {
+        self.action.nbytes() + self.time.nbytes() + self.out.nbytes()
+    }
+}
+
+/// Columns `first .. first + count` of a `(out, in)` weight.
+fn submatrix(weight: WeightRef<'_>, first: usize, count: usize) -> WeightRef<'_> {
+    match weight {
+        WeightRef::F32(view) => WeightRef::F32(view.subcols(first, count)),
+        WeightRef::Bf16(view) => WeightRef::Bf16(view.subcols(first, count)),
+    }
+}
+
+fn widened(weight: WeightRef<'_>) -> Mat<f64> {
+    match weight {
+        WeightRef::F32(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| f64::from(view[(i, j)])),
+        WeightRef::Bf16(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| view[(i, j)].to_f64()),
+    }
+}
+
+fn widened_rows(data: &[f32], width: usize) -> Mat<f64> {
+    widened(WeightRef::F32(rows(data, width)))
+}
+
+fn product(lhs: MatRef<'_, f64>, rhs: MatRef<'_, f64>) -> Mat<f64> {
+    let mut out = Mat::zeros(lhs.nrows(), rhs.ncols());
+    matmul(&mut out, Accum::Replace, lhs, rhs, 1.0, Par::Seq);
+    out
+}

@@ -1,0 +1,23 @@
+"""saccade: the action head of GR00T-style robot policies on CPUs, exact and fast."""
+
+from saccade._saccade import __version__
+from saccade.attention import CrossAttention, KeyValues
+from saccade.config import HeadConfig
+from saccade.environment import show_config
+from saccade.errors import CheckpointError, DtypeError, InputError, SaccadeError, ShapeError
+from saccade.head import ActionHead, Context
+
+__all__ = [
+    "ActionHead",
+    "CheckpointError",
+    "Context",
+    "CrossAttention",
+    "DtypeError",
+    "HeadConfig",
+    "InputError",
+    "KeyValues",
+    "SaccadeError",
+    "ShapeError",
+    "__version__",
+    "show_config",
+]

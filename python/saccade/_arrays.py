@@ -1,0 +1,168 @@
+"""Arguments to the arrays that the engine takes, and results back to what the caller uses: NumPy or torch."""
+
+from __future__ import annotations
+
+import operator
+import sys
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade.errors import DtypeError, InputError, ShapeError
+
+if TYPE_CHECKING:
+    import torch
+
+    Tensor: TypeAlias = torch.Tensor
+
+Float32Array: TypeAlias = npt.NDArray[np.float32]
+#: What array arguments may be: NumPy arrays of any strides, torch CPU tensors, or nested sequences of floats.
+ArrayLike: TypeAlias = "npt.ArrayLike | Tensor"
+#: What results are: float32, NumPy or torch like the features they come from.
+Array: TypeAlias = "Float32Array | Tensor"
+
+
+def is_torch(value: object) -> bool:
+    """Whether ``value`` is a torch tensor; torch is not imported to find out."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def float32(name: str, value: ArrayLike) -> Float32Array:
+    """``value`` as a C-contiguous float32 array, without a copy where it is one already.
+
+    float64, float16 and bfloat16 are converted; a value beyond float32's range becomes infinite, which the engine refuses.
+
+    Raises:
+        DtypeError: ``value`` holds integers, booleans or anything else that is not a real float, or is not on the CPU.
+        ShapeError: ``value`` is a ragged sequence.
+    """
+    if is_torch(value):
+        value = _from_torch(name, value, "floating point")
+    array = _asarray(name, value)
+    # bfloat16 of the ml_dtypes package is of kind "V".
+    if array.dtype.kind != "f" and array.dtype.name != "bfloat16":
+        raise DtypeError(f"{name}: expected floating point values, got {array.dtype}")
+    with np.errstate(over="ignore"):
+        return np.require(array, np.float32, ["C", "A"])
+
+
+def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
+    """``value`` as a C-contiguous boolean array; None stays None.
+
+    Raises:
+        DtypeError: ``value`` holds anything but booleans, or is not on the CPU.
+    """
+    if value is None:
+        return None
+    if is_torch(value):
+        value = _from_torch(name, value, "boolean")
+    array = _asarray(name, value)
+    if array.dtype != np.bool_:
+        raise DtypeError(f"{name}: expected booleans, got {array.dtype}")
+    return np.require(array, np.bool_, ["C", "A"])
+
+
+def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
+    """``value``, one integer or several, as a C-contiguous int64 array.
+
+    Raises:
+        InputError: ``value`` is not made of integers that int64 can hold.
+    """
+    if is_torch(value):
+        value = _from_torch(name, value, "integer")
+    array = _asarray(name, value)
+    if array.dtype.kind not in "iu":
+        raise InputError(f"{name}: expected an integer or an array of integers, got {_shown(value, array)}")
+    if array.dtype.kind == "u" and array.size and int(array.max()) > np.iinfo(np.int64).max:
+        raise InputError(f"{name}: expected integers that fit in 64 bits, got {array.max()}")
+    # ascontiguousarray would give a scalar an axis.
+    return np.require(array, np.int64, ["C", "A"])
+
+
+def integer(name: str, value: int, least: int = 1) -> int:
+    """``value`` as an integer of at least ``least``.
+
+    Raises:
+        InputError: it is not one.
+    """
+    try:
+        if isinstance(value, (bool, np.bool_)):
+            raise TypeError
+        number = operator.index(value)
+    except TypeError:
+        raise InputError(f"{name}: expected an integer, got {value!r}") from None
+    # The engine counts in 64 bits.
+    if not least <= number < 2**63:
+        raise InputError(f"{name}: expected at least {least}, got {number}")
+    return number
+
+
+def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:
+    """The array that a result of this shape is written to: a new one, or ``out``'s own memory.
+
+    Raises:
+        DtypeError: ``out`` is not an array of float32 on the CPU.
+        ShapeError: ``out`` has another shape.
+        InputError: ``out`` cannot be written to, or is not C-contiguous.
+    """
+    if out is None:
+        return np.empty(shape, np.float32)
+    array: Any = out
+    if is_torch(out):
+        if out.requires_grad:  # type: ignore[union-attr]
+            raise InputError("out: expected a tensor that does not require a gradient")
+        array = _torch_memory("out", out)
+    if not isinstance(array, np.ndarray):
+        raise DtypeError(f"out: expected a float32 array, got {type(out).__name__}")
+    if array.dtype != np.float32:
+        raise DtypeError(f"out: expected float32, got {array.dtype}")
+    if array.shape != shape:
+        raise ShapeError(f"out: expected {shape}, got {array.shape}")
+    if not (array.flags.c_contiguous and array.flags.writeable and array.flags.aligned):
+        raise InputError("out: expected a writable, C-contiguous array")
+    return array
+
+
+def apart(array: Float32Array, output: Float32Array) -> Float32Array:
+    """``array``, copied if it lies in the memory that the result will be written to."""
+    return array.copy() if np.may_share_memory(array, output) else array
+
+
+def like_features(array: Float32Array, use_torch: bool) -> Array:
+    """``array`` as it is, or as a torch tensor on the same memory."""
+    if use_torch:
+        return sys.modules["torch"].from_numpy(array)  # type: ignore[no-any-return]
+    return array
+
+
+def _asarray(name: str, value: Any) -> npt.NDArray[Any]:
+    try:
+        return np.asarray(value)
+    except OverflowError as error:
+        raise InputError(f"{name}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise ShapeError(f"{name}: expected an array, got {type(value).__name__} ({error})") from None
+
+
+def _from_torch(name: str, tensor: Any, kind: str) -> npt.NDArray[Any]:
+    torch = sys.modules["torch"]
+    if kind == "floating point":
+        if not tensor.dtype.is_floating_point:
+            raise DtypeError(f"{name}: expected floating point values, got {tensor.dtype}")
+        return _torch_memory(name, tensor.detach(), torch.float32)
+    return _torch_memory(name, tensor.detach())
+
+
+def _torch_memory(name: str, tensor: Any, dtype: Any = None) -> npt.NDArray[Any]:
+    if tensor.device.type != "cpu":
+        raise DtypeError(f"{name}: expected a tensor on the CPU, got one on {tensor.device}")
+    try:
+        return (tensor if dtype is None else tensor.to(dtype)).numpy()  # type: ignore[no-any-return]
+    except (TypeError, RuntimeError) as error:
+        raise DtypeError(f"{name}: expected a dense tensor that NumPy can hold: {error}") from None
+
+
+def _shown(value: Any, array: npt.NDArray[Any]) -> str:
+    return repr(value) if array.ndim == 0 else f"an array of {array.dtype}"

@@ -1,0 +1,109 @@
+"""The head's configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from saccade import _saccade
+from saccade.errors import CheckpointError
+
+
+@dataclasses.dataclass(frozen=True)
+class HeadConfig:
+    """Sizes and switches of an action head.
+
+    The names of a published ``config.json`` are in parentheses where they differ.
+
+    Attributes:
+        version: Release of the architecture, ``"n1.5"``.
+        width: Width of the diffusion transformer (``input_embedding_dim``).
+        num_layers: Its blocks.
+        num_heads: Its attention heads (``num_attention_heads``).
+        head_dim: Width of one of them (``attention_head_dim``).
+        context_dim: Width of the vision-language tokens (``backbone_embedding_dim``).
+        interleave_self_attention: Every second block is self-attention; otherwise all are cross-attention.
+        use_vlln: Whether the vision-language tokens pass a norm and the VL self-attention.
+        vl_num_layers: Blocks of the VL self-attention; 0 without ``use_vlln``.
+        vl_num_heads: Its attention heads.
+        vl_head_dim: Width of one of them.
+        num_future_tokens: Learned query rows between state and actions (``num_target_vision_tokens``).
+        action_horizon: Actions in a chunk.
+        action_dim: Width of an action as it is returned.
+        encoder_action_dim: Width of an action as it is denoised.
+        state_dim: Width of the state vector (``max_state_dim``).
+        state_history: State vectors that make the state row.
+        hidden_dim: Hidden width of encoders and decoder (``hidden_size``).
+        num_embodiments: Slices of the category-specific layers (``max_num_embodiments``).
+        num_timestep_buckets: Buckets that the time 0..1 is cut into.
+        num_steps: Euler steps unless a call says otherwise (``num_inference_timesteps``).
+        max_positions: Rows of the position table (``max_seq_len``).
+        add_pos_embed: Whether action rows get a position.
+    """
+
+    version: str
+    width: int
+    num_layers: int
+    num_heads: int
+    head_dim: int
+    context_dim: int
+    interleave_self_attention: bool
+    use_vlln: bool
+    vl_num_layers: int
+    vl_num_heads: int
+    vl_head_dim: int
+    num_future_tokens: int
+    action_horizon: int
+    action_dim: int
+    encoder_action_dim: int
+    state_dim: int
+    state_history: int
+    hidden_dim: int
+    num_embodiments: int
+    num_timestep_buckets: int
+    num_steps: int
+    max_positions: int
+    add_pos_embed: bool
+
+    @classmethod
+    def from_dict(cls, config: Mapping[str, Any]) -> HeadConfig:
+        """Reads a published config: a whole checkpoint's (with ``action_head_cfg``) or the head's own.
+
+        Raises:
+            CheckpointError: with everything that is missing, of the wrong type or contradictory.
+        """
+        return cls(**_saccade.parse_config(to_json(config)))
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> HeadConfig:
+        """Reads ``path``, a ``config.json``; see :meth:`from_dict`.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            CheckpointError: as :meth:`from_dict`.
+        """
+        return cls(**_saccade.parse_config(read_json(path)))
+
+
+def to_json(config: Mapping[str, Any] | str | os.PathLike[str]) -> str:
+    """The JSON text of a config given as a mapping or as the path of a file."""
+    if isinstance(config, (str, os.PathLike)):
+        return read_json(config)
+    try:
+        return json.dumps(dict(config))
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"config: expected a mapping as JSON has it, or a path: {error}") from None
+
+
+def read_json(path: str | os.PathLike[str]) -> str:
+    """The text of a config file."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"config: no such file: {os.fspath(path)}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"config: {os.fspath(path)} cannot be read: {error}") from None

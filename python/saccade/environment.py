@@ -1,0 +1,44 @@
+"""What saccade uses on this machine."""
+
+from __future__ import annotations
+
+import platform
+from typing import Any, Literal, overload
+
+import numpy as np
+
+from saccade import _saccade
+
+
+@overload
+def show_config(mode: Literal["stdout"] = "stdout") -> None: ...
+@overload
+def show_config(mode: Literal["dicts"]) -> dict[str, Any]: ...
+def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] | None:
+    """Prints, or with ``mode="dicts"`` returns, what a head loaded now would use.
+
+    ``isa`` is the instruction set (``SACCADE_ISA`` forces one of ``available_isas``), ``num_threads`` the default thread count
+    (``SACCADE_NUM_THREADS``).
+
+    Raises:
+        InputError: ``SACCADE_ISA`` or ``SACCADE_NUM_THREADS`` holds something that cannot be used here.
+
+    Example:
+        >>> import saccade
+        >>> "portable" in saccade.show_config(mode="dicts")["available_isas"]
+        True
+    """
+    config = {
+        "saccade": _saccade.__version__,
+        "isa": _saccade.selected_isa(),
+        "available_isas": _saccade.available_isas(),
+        "num_threads": _saccade.default_num_threads(),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+    }
+    if mode == "dicts":
+        return config
+    for name, value in config.items():
+        print(f"{name}: {', '.join(value) if isinstance(value, list) else value}")
+    return None

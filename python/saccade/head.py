@@ -1,0 +1,358 @@
+"""The action head: encode an observation once, sample chunks of actions from it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from saccade import _saccade
+from saccade._arrays import (
+    Array,
+    ArrayLike,
+    Float32Array,
+    apart,
+    boolean,
+    float32,
+    int64,
+    integer,
+    is_torch,
+    like_features,
+    result,
+)
+from saccade.attention import check_precision
+from saccade.config import HeadConfig, to_json
+from saccade.errors import InputError
+
+
+class Context:
+    """An encoded observation: immutable, for any number of calls and threads. Made by :meth:`ActionHead.encode`."""
+
+    def __init__(self, held: _saccade.Context, use_torch: bool) -> None:
+        self._held = held
+        self._torch = use_torch
+
+    @property
+    def batch(self) -> int:
+        """Observations."""
+        return self._held.batch
+
+    @property
+    def num_vl_tokens(self) -> int:
+        """Vision-language tokens of each observation, removed ones counted."""
+        return self._held.num_vl_tokens
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return self._held.nbytes
+
+    @property
+    def vl_embs(self) -> Array:
+        """A copy of what the cross-attention blocks see: ``(batch, T_vl, context_dim)`` float32, zero where ``drop_vl`` was true."""
+        return like_features(self._held.vl_embs(), self._torch)
+
+    @property
+    def image_mask(self) -> Any:
+        """The bool ``(batch, T_vl)`` mask given to ``encode``, or None."""
+        mask = self._held.image_mask()
+        return None if mask is None else like_features(mask, self._torch)
+
+    def __repr__(self) -> str:
+        return f"<saccade.Context batch={self.batch} num_vl_tokens={self.num_vl_tokens} nbytes={self.nbytes}>"
+
+
+class ActionHead:
+    """A loaded action head. Made by :meth:`load`; immutable, for any number of threads.
+
+    A row's result has the same bits in any batch, with any ``num_samples``, at any thread count.
+
+    Example:
+        Loads the tiny head that the tests use, and samples a chunk of actions for two observations.
+
+        >>> import numpy as np, saccade
+        >>> from saccade import examples
+        >>> head = saccade.ActionHead.load(examples.tiny_checkpoint())
+        >>> config = head.config
+        >>> features = np.zeros((2, 11, config.context_dim), np.float32)
+        >>> context = head.encode(features)
+        >>> actions = head.sample(context, np.zeros((2, config.state_dim), np.float32), embodiment_id=1, seed=0)
+        >>> actions.shape == (2, config.action_horizon, config.action_dim)
+        True
+    """
+
+    def __init__(self, head: _saccade.ActionHead, source: str, options: dict[str, Any]) -> None:
+        self._head = head
+        self._source = source
+        self._options = options
+        self._config = HeadConfig(**head.config())
+
+    @classmethod
+    def load(
+        cls,
+        source: str | os.PathLike[str],
+        *,
+        config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
+        embodiment_ids: Sequence[int] | None = None,
+        precision: str = "float32",
+        num_threads: int | None = None,
+    ) -> ActionHead:
+        """Loads a head from a checkpoint.
+
+        Tensors are found under ``action_head.``, ``_groot_model.action_head.`` or no prefix. What lies outside the prefix is
+        ignored; inside it every tensor must be known, present and of the right shape. Weights stored as bfloat16 stay so in
+        memory, which loses nothing; all arithmetic is float32.
+
+        Args:
+            source: A directory (``config.json`` beside one or more ``.safetensors``, with or without an index) or one ``.safetensors`` file.
+            config: A dict or the path of a JSON file: a whole checkpoint config (with ``action_head_cfg``) or the head's own.
+                Default: ``config.json`` beside the weights.
+            embodiment_ids: Keep only these embodiments' layers; ids keep their numbers. Default all.
+            precision: ``"float32"``.
+            num_threads: Threads that a call uses. Default: the environment's ``SACCADE_NUM_THREADS``, else the physical cores that
+                the process may use (affinity and container quota counted).
+
+        Raises:
+            FileNotFoundError: ``source`` or the config is not there.
+            CheckpointError: config or weights are broken or do not fit each other; all that is wrong is listed.
+            InputError: an option is out of range.
+        """
+        check_precision(precision)
+        path = _path("source", source)
+        text = None if config is None else to_json(config)
+        ids = None if embodiment_ids is None else int64("embodiment_ids", embodiment_ids).reshape(-1).tolist()
+        threads = None if num_threads is None else integer("num_threads", num_threads)
+        head = _saccade.ActionHead.load(path, text, ids, threads)
+        options = {"config": text, "embodiment_ids": ids, "precision": precision, "num_threads": threads}
+        return cls(head, os.path.abspath(path), options)
+
+    @property
+    def config(self) -> HeadConfig:
+        """Sizes and switches."""
+        return self._config
+
+    @property
+    def embodiment_ids(self) -> tuple[int, ...]:
+        """The loaded embodiments, ascending."""
+        return tuple(self._head.embodiment_ids)
+
+    @property
+    def num_threads(self) -> int:
+        """Threads that a call uses."""
+        return self._head.num_threads
+
+    @property
+    def isa(self) -> str:
+        """The instruction set that the kernels use: ``"avx512"``, ``"avx2"`` or ``"portable"``."""
+        return self._head.isa
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of weights in memory."""
+        return self._head.nbytes
+
+    def warmup(self, num_vl_tokens: int, batch: int = 1, num_samples: int | None = None) -> None:
+        """Allocates and touches all that calls of this size need, so that the first one is not slow.
+
+        Args:
+            num_vl_tokens: T_vl of the calls to come.
+            batch: Their batch.
+            num_samples: Their ``num_samples``.
+
+        Raises:
+            InputError: a size is not an integer of at least 1.
+        """
+        samples = None if num_samples is None else integer("num_samples", num_samples)
+        self._head.warmup(integer("num_vl_tokens", num_vl_tokens), integer("batch", batch), samples)
+
+    def encode(
+        self,
+        backbone_features: ArrayLike,
+        *,
+        attention_mask: ArrayLike | None = None,
+        image_mask: ArrayLike | None = None,
+        drop_vl: ArrayLike | None = None,
+    ) -> Context:
+        """Runs what depends on the observation alone: ``vlln``, the VL self-attention, every cross block's keys and values.
+
+        Args:
+            backbone_features: ``(batch, T_vl, context_dim)``.
+            attention_mask: bool ``(batch, T_vl)``, True = attended. GR00T N1.5 ignores padding, as released: only an all-true mask is taken.
+            image_mask: bool ``(batch, T_vl)``, True = image token; kept in the context for maps.
+            drop_vl: bool ``(batch, T_vl)``, True = removed before the VL self-attention and everywhere after, as if it had not been there.
+
+        Raises:
+            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity.
+        """
+        held = self._head.encode(
+            float32("backbone_features", backbone_features),
+            boolean("attention_mask", attention_mask),
+            boolean("image_mask", image_mask),
+            boolean("drop_vl", drop_vl),
+        )
+        return Context(held, is_torch(backbone_features))
+
+    def sample(
+        self,
+        context: Context,
+        state: ArrayLike,
+        embodiment_id: int | ArrayLike,
+        *,
+        noise: ArrayLike | None = None,
+        seed: Any = None,
+        num_steps: int | None = None,
+        num_samples: int | None = None,
+        out: ArrayLike | None = None,
+    ) -> Array:
+        """Samples a chunk of actions: Euler steps from noise.
+
+        Args:
+            context: From this head's :meth:`encode`.
+            state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``, already normalised and padded.
+            embodiment_id: An integer, or ``(batch,)`` integers.
+            noise: ``(batch, action_horizon, encoder_action_dim)``; with ``num_samples`` an axis of that size after batch.
+            seed: Whatever ``numpy.random.default_rng`` takes; the noise is its ``standard_normal`` in float32. A ``Generator`` advances,
+                an integer repeats the same noise at every call. With neither ``noise`` nor ``seed``: fresh entropy.
+            num_steps: Euler steps, 1 to ``num_timestep_buckets``. Default the config's.
+            num_samples: Chunks for each observation, from one context. None adds no axis to noise and result; any integer adds one.
+            out: Where the result goes: writable float32, C-contiguous, of the result's shape.
+
+        Returns:
+            ``(batch, action_horizon, action_dim)``, or ``(batch, num_samples, action_horizon, action_dim)``; float32, torch if
+            the features were torch. Normalised, as the head was trained.
+
+        Raises:
+            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; both ``noise`` and ``seed``.
+        """
+        held = _held(context)
+        samples = None if num_samples is None else integer("num_samples", num_samples)
+        steps = None if num_steps is None else integer("num_steps", num_steps)
+        config = self._config
+        leading = (held.batch,) if samples is None else (held.batch, samples)
+        output = result((*leading, config.action_horizon, config.action_dim), out)
+        start = _noise(noise, seed, (*leading, config.action_horizon, config.encoder_action_dim))
+        self._head.sample(
+            held,
+            apart(float32("state", state), output),
+            int64("embodiment_id", embodiment_id),
+            apart(start, output),
+            steps,
+            samples,
+            output,
+        )
+        return like_features(output, context._torch) if out is None else out  # type: ignore[return-value]
+
+    def __call__(
+        self,
+        backbone_features: ArrayLike,
+        state: ArrayLike,
+        embodiment_id: int | ArrayLike,
+        *,
+        attention_mask: ArrayLike | None = None,
+        image_mask: ArrayLike | None = None,
+        drop_vl: ArrayLike | None = None,
+        noise: ArrayLike | None = None,
+        seed: Any = None,
+        num_steps: int | None = None,
+        num_samples: int | None = None,
+        out: ArrayLike | None = None,
+    ) -> Array:
+        """:meth:`encode`, then :meth:`sample`."""
+        context = self.encode(
+            backbone_features, attention_mask=attention_mask, image_mask=image_mask, drop_vl=drop_vl
+        )
+        return self.sample(
+            context,
+            state,
+            embodiment_id,
+            noise=noise,
+            seed=seed,
+            num_steps=num_steps,
+            num_samples=num_samples,
+            out=out,
+        )
+
+    def velocity(
+        self,
+        context: Context,
+        state: ArrayLike,
+        embodiment_id: int | ArrayLike,
+        actions: ArrayLike,
+        timestep: int | ArrayLike,
+    ) -> Array:
+        """The velocity that the head predicts for noisy actions.
+
+        Args:
+            context: From this head's :meth:`encode`.
+            state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``.
+            embodiment_id: An integer, or ``(batch,)`` integers.
+            actions: Noisy actions, ``(batch, action_horizon, encoder_action_dim)``.
+            timestep: The bucket, 0 to ``num_timestep_buckets - 1``: an integer, or ``(batch,)`` integers.
+
+        Returns:
+            ``(batch, action_horizon, action_dim)`` float32, torch if the features were torch.
+
+        Raises:
+            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity.
+        """
+        held = _held(context)
+        output = result((held.batch, self._config.action_horizon, self._config.action_dim), None)
+        self._head.velocity(
+            held,
+            float32("state", state),
+            int64("embodiment_id", embodiment_id),
+            float32("actions", actions),
+            int64("timestep", timestep),
+            output,
+        )
+        return like_features(output, context._torch)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _load, (self._source, self._options)
+
+    def __repr__(self) -> str:
+        config = self._config
+        return (
+            f"<saccade.ActionHead {config.version} width={config.width} num_layers={config.num_layers} "
+            f"num_future_tokens={config.num_future_tokens} isa={self.isa} num_threads={self.num_threads}>"
+        )
+
+
+def _load(source: str, options: dict[str, Any]) -> ActionHead:
+    """Unpickles a head: the weights are loaded anew."""
+    config, rest = options["config"], {name: value for name, value in options.items() if name != "config"}
+    return ActionHead.load(source, config=None if config is None else json.loads(config), **rest)
+
+
+def _path(name: str, value: str | os.PathLike[str]) -> str:
+    try:
+        path = os.fspath(value)
+    except TypeError:
+        path = None
+    if not isinstance(path, str):
+        raise InputError(f"{name}: expected a path, got {type(value).__name__}")
+    if "\0" in path:
+        raise InputError(f"{name}: expected a path, got one with a null character")
+    return path
+
+
+def _held(context: Context) -> _saccade.Context:
+    if not isinstance(context, Context):
+        raise InputError(f"context: expected what encode returns, got {type(context).__name__}")
+    return context._held
+
+
+def _noise(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float32Array:
+    """The start of the Euler loop: as given, or drawn."""
+    if noise is not None:
+        if seed is not None:
+            raise InputError("noise, seed: expected at most one of them, got both")
+        return float32("noise", noise)
+    try:
+        generator = np.random.default_rng(seed)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"seed: expected what numpy.random.default_rng takes, got {seed!r} ({error})") from None
+    return generator.standard_normal(shape, dtype=np.float32)
