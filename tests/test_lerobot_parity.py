@@ -1,4 +1,4 @@
-"""The reference against the released code itself, at the released widths.
+"""The reference and the Rust head against the released code itself, at the released widths.
 
 lerobot is installed by the test set-up without its dependencies; if it is missing, these tests fail.
 Tables differ: the released code calls torch's float32 sin and cos, so up to 2e-4 may come from them alone.
@@ -7,6 +7,7 @@ Tables differ: the released code calls torch's float32 sin and cos, so up to 2e-
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -16,21 +17,22 @@ from reference_cases import relative_error, small_config
 from released import Released
 from torch import Tensor, nn
 
+import saccade
 from saccade.reference import ActionHead, lerobot_head
-from saccade.reference.random_weights import n15_config, random_head, random_inputs
+from saccade.reference.random_weights import n15_config, random_head, random_inputs, write_checkpoint
 
 TOLERANCE = 3e-4
+WIDE_CONFIG = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
 INPUTS = ("backbone_features", "state", "embodiment_id", "noise")
 
 
 @pytest.fixture(scope="module")
 def wide() -> tuple[ActionHead, nn.Module, dict[str, Tensor]]:
     """Both heads at N1.5's widths with fewer blocks and embodiments, equal weights, one view's tokens."""
-    config = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
-    head = random_head(config, seed=0)
-    theirs = lerobot_head.build(config)
+    head = random_head(WIDE_CONFIG, seed=0)
+    theirs = lerobot_head.build(WIDE_CONFIG)
     theirs.load_state_dict(head.state_dict(), strict=True, assign=True)
-    return head, theirs, random_inputs(head.config, seed=1, batch=2, num_vl_tokens=296)
+    return head, theirs, random_inputs(head.config, seed=1, batch=1, num_vl_tokens=296)
 
 
 def their_actions(theirs: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
@@ -56,6 +58,20 @@ def test_lerobot_reproduces_the_recorded_outputs(released: Released) -> None:
     theirs.load_state_dict(ActionHead.load(released.path).state_dict(), strict=True)
     inputs = {name: torch.tensor(getattr(released, name)) for name in INPUTS}
     assert np.abs(their_actions(theirs, inputs).numpy() - released.actions_f64).max() <= TOLERANCE
+
+
+def test_rust_equals_lerobot_at_full_width(
+    wide: tuple[ActionHead, nn.Module, dict[str, Tensor]], isa: str, tmp_path: Path
+) -> None:
+    reference, theirs, inputs = wide
+    write_checkpoint(tmp_path, WIDE_CONFIG, seed=0)
+    head = saccade.ActionHead.load(tmp_path)
+    assert head.isa == isa
+    features, state, ids, noise = (inputs[name].numpy() for name in INPUTS)
+    actions = head(features, state, ids, noise=noise)
+    assert np.abs(actions - their_actions(theirs, inputs).numpy()).max() <= TOLERANCE
+    with torch.no_grad():
+        assert relative_error(actions, reference(**inputs)) <= 1e-5
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ import importlib.util
 import io
 import sys
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,18 +29,25 @@ from torch import Tensor, nn
 HEAD = "lerobot.policies.groot.action_head.flow_matching_action_head"
 
 
-def build(config: Mapping[str, Any]) -> nn.Module:
+def build(config: Mapping[str, Any], *, device: str = "cpu") -> nn.Module:
     """A `FlowmatchingActionHead` in eval mode with the released code's own initialisation.
 
     Args:
         config: a head's config with the released key names, or a whole checkpoint's.
+        device: where it is built; on `"meta"` no time is spent on weights that are to be replaced.
 
     Raises:
         ModuleNotFoundError: lerobot, diffusers or transformers is not installed.
     """
     module = import_head()
     head_config = dict(config.get("action_head_cfg", config))
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints what it tunes
+    checked_beta = torch.distributions.Beta
+    # It prints what it tunes, and checks its time distribution by value, which a meta tensor has not.
+    with (
+        contextlib.redirect_stdout(io.StringIO()),
+        mock.patch.object(module, "Beta", partial(checked_beta, validate_args=False)),
+        torch.device(device),
+    ):
         head = module.FlowmatchingActionHead(module.FlowmatchingActionHeadConfig(**head_config))
     return head.eval()
 

@@ -94,6 +94,7 @@ def write_checkpoint(
     seed: int,
     *,
     dtype: torch.dtype = torch.float32,
+    through: torch.dtype = torch.float32,
     shard_bytes: int = 2**28,
 ) -> None:
     """Writes the tensors of `random_head(config, seed)` in the published layout, shard by shard.
@@ -102,7 +103,8 @@ def write_checkpoint(
         folder: gets `config.json` and `model-*.safetensors`.
         config: the head's config in the released key names.
         seed: of the weights.
-        dtype: that the tensors are rounded to and stored in.
+        dtype: that the tensors are stored in.
+        through: that they are rounded to before, so that files in two dtypes can hold equal numbers.
         shard_bytes: a shard is closed when it reaches this size.
     """
     with torch.device("meta"):
@@ -111,7 +113,7 @@ def write_checkpoint(
     shard: dict[str, Tensor] = {}
     num_shards, held = 0, 0
     for index, (name, shape) in enumerate(shapes.items(), start=1):
-        shard[f"action_head.{name}"] = random_tensor(name, shape, generator).to(dtype)
+        shard[f"action_head.{name}"] = random_tensor(name, shape, generator).to(through).to(dtype)
         held += shard[f"action_head.{name}"].nbytes
         if held >= shard_bytes or index == len(shapes):
             num_shards += 1

@@ -1,0 +1,197 @@
+"""The Rust head against the torch reference in float64, on random configurations and on each instruction set.
+
+Tolerance: 1e-5 * max(1, |value|), as the engine computes in float32.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from reference_cases import relative_error, small_config
+from released import Released
+from safetensors.torch import save_file
+from torch import Tensor
+
+import saccade
+from saccade.reference import ActionHead as Reference
+from saccade.reference.random_weights import random_head, random_inputs
+
+TOLERANCE = 1e-5
+
+
+@st.composite
+def configs(draw: st.DrawFn) -> dict[str, Any]:
+    """Sizes from the smallest up to a little more than a kernel's tile, odd ones among them."""
+    num_heads, vl_num_heads = draw(st.integers(1, 4)), draw(st.integers(1, 3))
+    # The table beside the action tokens is half sines and half cosines, so the width is even.
+    head_dim = draw(st.sampled_from([2, 4, 6, 16, 48]) if num_heads % 2 else st.integers(1, 20))
+    return small_config(
+        num_layers=draw(st.integers(1, 5)),
+        num_heads=num_heads,
+        head_dim=head_dim,
+        interleave=draw(st.booleans()),
+        context_dim=vl_num_heads * draw(st.sampled_from([1, 3, 8, 17, 64])),
+        vl_num_layers=draw(st.integers(0, 2)),
+        vl_num_heads=vl_num_heads,
+        use_vlln=draw(st.booleans()),
+        num_future_tokens=draw(st.sampled_from([0, 1, 2, 5, 32])),
+        action_horizon=draw(st.integers(1, 17)),
+        action_dim=draw(st.integers(1, 33)),
+        state_dim=draw(st.integers(1, 65)),
+        hidden_dim=draw(st.integers(1, 50)),
+        num_embodiments=draw(st.integers(1, 4)),
+        num_steps=draw(st.integers(1, 6)),
+        add_pos_embed=draw(st.booleans()),
+    )
+
+
+def save(
+    folder: Path, reference: Reference, config: dict[str, Any], dtype: torch.dtype = torch.float32
+) -> None:
+    """The reference's weights in the published layout."""
+    tensors = {f"action_head.{name}": t.to(dtype).contiguous() for name, t in reference.state_dict().items()}
+    save_file(tensors, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(config))
+
+
+def both(
+    config: dict[str, Any], seed: int, dtype: torch.dtype = torch.float32
+) -> tuple[saccade.ActionHead, Reference]:
+    """The same weights, rounded to `dtype`, in the Rust head and in the reference in float64."""
+    reference = random_head(config, seed, dtype=dtype).double()
+    with tempfile.TemporaryDirectory() as folder:
+        save(Path(folder), reference, config, dtype)
+        return saccade.ActionHead.load(folder), reference
+
+
+def arrays(inputs: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: tensor.numpy() for name, tensor in inputs.items()}
+
+
+# The instruction set is set once for all of a test's examples.
+per_isa = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=40
+)
+
+
+@per_isa
+@given(
+    config=configs(),
+    seed=st.integers(0, 2**31 - 1),
+    batch=st.integers(1, 3),
+    num_vl_tokens=st.sampled_from([1, 2, 7, 16, 33, 65]),
+    num_steps=st.none() | st.integers(1, 9),
+)
+def test_encode_and_sample_equal_the_reference(
+    isa: str, config: dict[str, Any], seed: int, batch: int, num_vl_tokens: int, num_steps: int | None
+) -> None:
+    head, reference = both(config, seed)
+    assert head.isa == isa
+    assert head.config == reference.config
+    inputs = random_inputs(reference.config, seed, batch=batch, num_vl_tokens=num_vl_tokens)
+    given_arrays = arrays(inputs)
+    context = head.encode(given_arrays.pop("backbone_features"))
+    actions = head.sample(context, **given_arrays, num_steps=num_steps)
+    with torch.no_grad():
+        vl_embs = reference.encode(inputs.pop("backbone_features"))
+        expected = reference.sample(vl_embs, **inputs, num_steps=num_steps)
+    assert relative_error(context.vl_embs, vl_embs) <= TOLERANCE
+    assert relative_error(actions, expected) <= TOLERANCE
+
+
+@per_isa
+@given(
+    config=configs(),
+    seed=st.integers(0, 2**31 - 1),
+    timesteps=st.integers(0, 999) | st.lists(st.integers(0, 999), min_size=3, max_size=3),
+)
+def test_velocity_equals_the_reference(
+    isa: str, config: dict[str, Any], seed: int, timesteps: int | list[int]
+) -> None:
+    head, reference = both(config, seed)
+    inputs = random_inputs(reference.config, seed, batch=3, num_vl_tokens=5)
+    features, state, ids, actions = (
+        inputs[name] for name in ("backbone_features", "state", "embodiment_id", "noise")
+    )
+    buckets = timesteps if isinstance(timesteps, int) else np.array(timesteps)
+    given_velocity = head.velocity(
+        head.encode(features.numpy()), state.numpy(), ids.numpy(), actions.numpy(), buckets
+    )
+    with torch.no_grad():
+        expected = reference.velocity(reference.encode(features), state, ids, actions, buckets)
+    assert relative_error(given_velocity, expected) <= TOLERANCE
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+def test_narrow_weights_are_widened_exactly(isa: str, dtype: torch.dtype) -> None:
+    head, reference = both(small_config(), seed=1, dtype=dtype)
+    inputs = random_inputs(reference.config, seed=2, batch=2, num_vl_tokens=6)
+    with torch.no_grad():
+        assert relative_error(head(**arrays(inputs)), reference(**inputs)) <= TOLERANCE
+
+
+def test_one_embodiment_for_all_rows(isa: str) -> None:
+    head, reference = both(small_config(), seed=1)
+    inputs = random_inputs(reference.config, seed=2, batch=3, num_vl_tokens=6)
+    given_arrays = arrays(inputs)
+    for embodiment_id in range(reference.config.num_embodiments):
+        with torch.no_grad():
+            expected = reference(**(inputs | {"embodiment_id": torch.full((3,), embodiment_id)}))
+        actions = head(**(given_arrays | {"embodiment_id": embodiment_id}))
+        assert relative_error(actions, expected) <= TOLERANCE
+
+
+@per_isa
+@given(
+    seed=st.integers(0, 2**31 - 1),
+    dropped=st.lists(st.booleans(), min_size=9, max_size=9).filter(lambda d: not all(d)),
+)
+def test_dropped_positions_are_as_if_never_there(isa: str, seed: int, dropped: list[bool]) -> None:
+    head, reference = both(small_config(vl_num_layers=2), seed)
+    inputs = random_inputs(reference.config, seed, batch=1, num_vl_tokens=9)
+    drop_vl = np.array([dropped])
+    actions = head(**arrays(inputs), drop_vl=drop_vl)
+    kept = inputs | {"backbone_features": inputs["backbone_features"][:, torch.from_numpy(~drop_vl[0])]}
+    with torch.no_grad():
+        assert relative_error(actions, reference(**kept)) <= TOLERANCE
+
+
+def permuted(reference: Reference) -> Tensor:
+    return reference.future_tokens.weight.flip(0)
+
+
+def repeated(reference: Reference) -> Tensor:
+    return torch.cat((reference.future_tokens.weight, reference.future_tokens.weight[:1]))
+
+
+@pytest.mark.parametrize("tokens", [permuted, repeated])
+def test_other_future_tokens_equal_the_reference(isa: str, tokens: Callable[[Reference], Tensor]) -> None:
+    """More tokens, or others, with all other weights kept: what a resized checkpoint is."""
+    reference = random_head(small_config(num_future_tokens=5), seed=3, dtype=torch.float64)
+    changed = torch.nn.Parameter(tokens(reference).detach())
+    config = small_config(num_future_tokens=len(changed))
+    reference.future_tokens.weight = changed
+    with tempfile.TemporaryDirectory() as folder:
+        save(Path(folder), reference, config)
+        head = saccade.ActionHead.load(folder)
+    inputs = random_inputs(reference.config, seed=4, batch=2, num_vl_tokens=6)
+    with torch.no_grad():
+        assert relative_error(head(**arrays(inputs)), reference(**inputs)) <= TOLERANCE
+
+
+def test_rust_is_as_close_to_the_released_code_as_it_is_to_itself(isa: str, released: Released) -> None:
+    head = saccade.ActionHead.load(released.path, config=released.config)
+    context = head.encode(released.backbone_features)
+    actions = head.sample(context, released.state, released.embodiment_id, noise=released.noise)
+    assert head.isa == isa
+    assert (np.abs(actions - released.actions_f64) <= released.tolerance).all()
+    assert relative_error(context.vl_embs, released.vl_embs) <= 4e-6
