@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from reference_cases import relative_error, small_config
 from released import Released
@@ -26,6 +26,9 @@ from saccade.reference import ActionHead as Reference
 from saccade.reference.random_weights import random_head, random_inputs
 
 TOLERANCE = 1e-5
+TAME = (
+    TOLERANCE / 4
+)  # weights are tame if torch's own float32 is this close; others say nothing about the engine
 
 
 @st.composite
@@ -33,13 +36,16 @@ def configs(draw: st.DrawFn) -> dict[str, Any]:
     """Sizes from the smallest up to a little more than a kernel's tile, odd ones among them."""
     num_heads, vl_num_heads = draw(st.integers(1, 4)), draw(st.integers(1, 3))
     # The table beside the action tokens is half sines and half cosines, so the width is even.
-    head_dim = draw(st.sampled_from([2, 4, 6, 16, 48]) if num_heads % 2 else st.integers(1, 20))
+    # A LayerNorm over two or three values can blow up rounding, so norms are a little wider than that.
+    head_dims = [6, 10, 16, 48] if num_heads % 2 else [3, 4, 7, 16, 20]
+    vl_head_dims = [7, 8, 64] if vl_num_heads == 1 else [3, 8, 17]
+    head_dim, vl_head_dim = draw(st.sampled_from(head_dims)), draw(st.sampled_from(vl_head_dims))
     return small_config(
         num_layers=draw(st.integers(1, 5)),
         num_heads=num_heads,
         head_dim=head_dim,
         interleave=draw(st.booleans()),
-        context_dim=vl_num_heads * draw(st.sampled_from([1, 3, 8, 17, 64])),
+        context_dim=vl_num_heads * vl_head_dim,
         vl_num_layers=draw(st.integers(0, 2)),
         vl_num_heads=vl_num_heads,
         use_vlln=draw(st.booleans()),
@@ -102,8 +108,9 @@ def test_encode_and_sample_equal_the_reference(
     context = head.encode(given_arrays.pop("backbone_features"))
     actions = head.sample(context, **given_arrays, num_steps=num_steps)
     with torch.no_grad():
-        vl_embs = reference.encode(inputs.pop("backbone_features"))
-        expected = reference.sample(vl_embs, **inputs, num_steps=num_steps)
+        vl_embs = reference.encode(inputs["backbone_features"])
+        expected = reference(**inputs, num_steps=num_steps)
+        assume(relative_error(reference.float()(**inputs, num_steps=num_steps), expected) <= TAME)
     assert relative_error(context.vl_embs, vl_embs) <= TOLERANCE
     assert relative_error(actions, expected) <= TOLERANCE
 
@@ -128,6 +135,9 @@ def test_velocity_equals_the_reference(
     )
     with torch.no_grad():
         expected = reference.velocity(reference.encode(features), state, ids, actions, buckets)
+        reference.float()
+        in_float32 = reference.velocity(reference.encode(features), state, ids, actions, buckets)
+    assume(relative_error(in_float32, expected) <= TAME)
     assert relative_error(given_velocity, expected) <= TOLERANCE
 
 

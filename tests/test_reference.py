@@ -6,6 +6,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -185,6 +186,29 @@ def test_one_embodiment_for_all_equals_one_per_row() -> None:
     expected = head(**inputs)
     torch.testing.assert_close(head(**(inputs | {"embodiment_id": 2})), expected)
     torch.testing.assert_close(head(**(inputs | {"embodiment_id": np.int64(2)})), expected)
+
+
+@pytest.mark.parametrize("name", ["backbone_features", "state", "embodiment_id", "noise"])
+def test_other_shapes_are_refused_by_name(name: str) -> None:
+    head = random_head(small_config(), seed=1)
+    inputs = random_inputs(head.config, seed=2, batch=2, num_vl_tokens=6)
+    said = "actions" if name == "noise" else name
+    for wrong in (inputs[name][:1], inputs[name][..., :1], inputs[name][None]):
+        if name == "backbone_features" and wrong.shape[0] == 1 and wrong.ndim == 3:
+            continue  # another batch: then it is the others that do not fit
+        with pytest.raises(saccade.ShapeError, match=said):
+            head(**(inputs | {name: wrong}))
+
+
+def test_values_out_of_range_are_refused() -> None:
+    head = random_head(small_config(), seed=1)
+    inputs: dict[str, Any] = random_inputs(head.config, seed=2, batch=2, num_vl_tokens=6)
+    for ids in (3, -1, torch.tensor([0, 3]), 1.0, torch.tensor([True, False])):
+        with pytest.raises(saccade.InputError, match="embodiment_id"):
+            head(**(inputs | {"embodiment_id": ids}))
+    for steps in (0, -1, 1001):
+        with pytest.raises(saccade.InputError, match="num_steps"):
+            head(**inputs, num_steps=steps)
 
 
 # Training

@@ -107,17 +107,18 @@ def run(args: argparse.Namespace) -> int:
             source = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="saccade-parity-")))
             write_random(source, args)
         inputs = read_inputs(args.inputs) if args.inputs else random_inputs(source, args)
+        outputs = {}
+        for engine, run_engine in engines(
+            source, inputs, args
+        ):  # the Rust head first: it refuses bad inputs in plain words
+            note(engine)
+            outputs[engine] = run_engine()
         note(f"reference in float64: {describe(inputs)}")
         expected = run_reference(source, inputs, args.num_steps, "float64")
-        results = []
-        for engine, run_engine in engines(source, inputs, args):
-            note(engine)
-            vl_embs, actions = run_engine()
-            results.append(
-                Result(
-                    engine, Deviation.between(vl_embs, expected[0]), Deviation.between(actions, expected[1])
-                )
-            )
+    results = [
+        Result(engine, Deviation.between(vl_embs, expected[0]), Deviation.between(actions, expected[1]))
+        for engine, (vl_embs, actions) in outputs.items()
+    ]
     rust = [result for result in results if result.engine.startswith("rust")]
     passed = all(result.actions.max_rel <= args.tolerance for result in rust)
     report = {
@@ -230,8 +231,10 @@ def run_rust(
     source: Path, inputs: dict[str, NDArray[Any]], num_steps: int | None, threads: int | None, isa: str
 ) -> Outputs:
     """`vl_embs` and actions of the Rust head on one instruction set."""
+    from saccade.reference import loading
+
     with forced_isa(isa):
-        head = saccade.ActionHead.load(source, num_threads=threads)
+        head = saccade.ActionHead.load(source, config=loading.read_config(source), num_threads=threads)
         context = head.encode(inputs["backbone_features"])
         actions = head.sample(
             context, inputs["state"], inputs["embodiment_id"], noise=inputs["noise"], num_steps=num_steps

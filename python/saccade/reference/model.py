@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade.config import HeadConfig
+from saccade.errors import InputError, ShapeError
 from saccade.reference import loading, tables
 
 NORM_EPS = 1e-5  # every LayerNorm but the last
@@ -389,6 +390,7 @@ class ActionHead(nn.Module):
             `vl_embs (B, S, context_dim)`; the features themselves if the config has `use_vlln` false.
         """
         features = self.as_input(backbone_features)
+        check_shape("backbone_features", features, (None, None, self.config.context_dim))
         if not self.config.use_vlln:
             return features
         return self.vl_self_attention(self.vlln(features))
@@ -412,17 +414,26 @@ class ActionHead(nn.Module):
 
         Returns:
             `(B, T, action_dim)`.
+
+        Raises:
+            ShapeError: an array of another shape.
+            InputError: an embodiment that the head does not have.
         """
-        vl_embs, actions = self.as_input(vl_embs), self.as_input(actions)
-        batch, horizon = actions.shape[:2]
-        embodiment_id = self.as_embodiment(embodiment_id)
+        config, horizon = self.config, self.config.action_horizon
+        vl_embs, actions, state = self.as_input(vl_embs), self.as_input(actions), self.as_input(state)
+        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
+        batch = vl_embs.shape[0]
+        check_shape("actions", actions, (batch, horizon, config.encoder_action_dim))
+        state = state[:, None] if state.ndim == 2 else state
+        check_shape("state", state, (batch, config.state_history, config.state_dim))
+        state = state.flatten(1)[:, None]  # (B, 1, history * state_dim)
+        embodiment_id = self.as_embodiment(embodiment_id, batch)
         timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
-        state = self.as_input(state).reshape(batch, 1, -1)  # (B, 1, history * state_dim)
 
         state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
         future_rows = self.future_tokens.weight.expand(batch, -1, -1)  # (B, N, width)
         action_rows = self.action_encoder(actions, timestep, embodiment_id)  # (B, T, width)
-        if self.config.add_pos_embed:
+        if config.add_pos_embed:
             action_rows = action_rows + self.position_embedding.weight[:horizon]
         rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
 
@@ -449,6 +460,8 @@ class ActionHead(nn.Module):
             Actions `(B, T, action_dim)`, normalised.
         """
         num_steps = self.config.num_steps if num_steps is None else num_steps
+        if not 1 <= num_steps <= self.config.num_timestep_buckets:
+            raise InputError(f"num_steps: {num_steps}, expected 1 to {self.config.num_timestep_buckets}")
         vl_embs, actions = self.as_input(vl_embs), self.as_input(noise)
         for step in range(num_steps):
             bucket = int(step / num_steps * self.config.num_timestep_buckets)
@@ -525,10 +538,29 @@ class ActionHead(nn.Module):
             return array.to(dtype=self.dtype, device=self.device)
         return torch.tensor(array, dtype=self.dtype, device=self.device)  # a copy: the array may be read-only
 
-    def as_embodiment(self, embodiment_id: int | Tensor | np.ndarray) -> int | Tensor:
+    def as_embodiment(self, embodiment_id: int | Tensor | np.ndarray, batch: int) -> int | Tensor:
         """One id stays an int (one matrix product for the whole batch), several become a long tensor."""
         ids = embodiment_id if isinstance(embodiment_id, Tensor) else torch.tensor(embodiment_id)
+        if ids.ndim > 0:
+            check_shape("embodiment_id", ids, (batch,))
+        if ids.is_floating_point() or ids.dtype == torch.bool:
+            raise InputError(f"embodiment_id: {ids.dtype}, expected integers")
+        if ids.numel() and not 0 <= int(ids.min()) <= int(ids.max()) < self.config.num_embodiments:
+            raise InputError(
+                f"embodiment_id: {ids.tolist()}, expected 0 to {self.config.num_embodiments - 1}"
+            )
         return int(ids) if ids.ndim == 0 else ids.to(dtype=torch.long, device=self.device)
+
+
+def check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
+    """Refuses a tensor of another shape; None stands for any size."""
+    given = tuple(tensor.shape)
+    if len(given) == len(expected) and all(
+        want in (None, have) for have, want in zip(given, expected, strict=True)
+    ):
+        return
+    wanted = ", ".join("any" if size is None else str(size) for size in expected)
+    raise ShapeError(f"{name}: shape {given}, expected ({wanted})")
 
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:
