@@ -272,13 +272,15 @@ def exact_macs(config: HeadConfig, num_vl_tokens: int) -> dict[str, float]:
     return {"encode": encode, "sample": sample, "both": encode + sample}
 
 
-def measured_peak(program: str, threads: int) -> float:
-    """GMAC/s that a program prints as the last word of its output, run with that many threads."""
-    environment = os.environ | {"SACCADE_NUM_THREADS": str(threads)}
-    output = subprocess.run(
-        program, shell=True, check=True, env=environment, capture_output=True, text=True
-    ).stdout
-    return float(output.split()[-1])
+def measured_peak(isa: str, threads: int) -> float:
+    """GMAC/s of float32 multiply-adds from registers, as `cargo bench --bench peak` measures them now."""
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        command = ["cargo", "bench", "--quiet", "--package", "saccade-benches", "--bench", "peak", "--"]
+        command += ["--threads", str(threads), "--rounds", "10", "--json", file.name]
+        subprocess.run(command, check=True, cwd=Path(__file__).parent, stdout=subprocess.DEVNULL)
+        report = json.load(file)
+    rates = (rate for case in report["cases"] for rate in case["rates"])
+    return float(next(rate["gmacs"]["median"] for rate in rates if rate["name"].endswith(isa)))
 
 
 def quartiles(values: list[float]) -> tuple[float, float, float]:
@@ -406,9 +408,7 @@ def parse() -> argparse.Namespace:
         "--size", choices=("full", "small"), default="full", help="small: to see that it works"
     )
     parser.add_argument("--vl-tokens", type=int, default=296, help="T_vl (default 296, one view)")
-    parser.add_argument(
-        "--peak", help="command whose last word is the FMA peak in GMAC/s with SACCADE_NUM_THREADS threads"
-    )
+    parser.add_argument("--peak", action="store_true", help="measure the FMA peak too (needs cargo)")
     parser.add_argument(
         "--pause", type=float, default=0.2, help="seconds of rest before each measurement (default 0.2)"
     )
@@ -441,7 +441,7 @@ def main() -> None:
         inputs = random_inputs(config, args.vl_tokens)
         for threads in args.threads:
             with contenders(args.contenders, folders, inputs, threads) as (pipes, actions):
-                peak = measured_peak(args.peak, threads) if args.peak else None
+                peak = measured_peak(report["isa"], threads) if args.peak else None
                 seconds = measure(pipes, args.rounds, args.pause)
             records = summarise(seconds, actions, report["macs"], peak)
             report["runs"].append({"threads": threads, "peak_gmacs": peak, "contenders": records})

@@ -92,8 +92,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tolerance",
         type=float,
-        default=1e-4,
-        help="exit status 1 above this max |error| / max(1, |action|) (default 1e-4)",
+        default=1e-5,
+        help="exit status 1 above this max |error| / max(1, |action|) (default 1e-5)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
