@@ -14,6 +14,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
+MAKEFLAGS += --no-print-directory
 .PHONY: help rollout test test-rust test-python lint format setup-rollout setup-test clean
 
 help:
@@ -53,13 +54,13 @@ format: setup-test
 # One after the other, in this order, also under `make -j`.
 setup-rollout:
 	@$(PYTHON) .ci/needs.py python rust opengl
-	@$(MAKE) --no-print-directory $(VENV)/.rollout
-	@$(MAKE) --no-print-directory $(VENV)/.extension
+	@$(MAKE) $(VENV)/.rollout
+	@$(MAKE) $(VENV)/.extension
 
 setup-test:
 	@$(PYTHON) .ci/needs.py python rust opengl
-	@$(MAKE) --no-print-directory $(VENV)/.test
-	@$(MAKE) --no-print-directory $(VENV)/.extension
+	@$(MAKE) $(VENV)/.test
+	@$(MAKE) $(VENV)/.extension
 
 # A copied or moved checkout has an environment that points elsewhere: it is made anew.
 $(VENV)/.tools: constraints.txt

@@ -1,7 +1,7 @@
-"""Writes constraints.txt anew: one exact version of every Python package that saccade's own environments hold.
+"""Writes constraints.txt anew: one exact version of every Python package that saccade's environment holds.
 
-Each interpreter given resolves `.[all]` and the released N1.5 head to the newest versions that fit it. Where they differ, lines carry
-a marker: the last interpreter's versions also hold for every newer Python.
+Each interpreter given resolves `.[all]` to the newest versions that fit it. Where they differ, lines carry a
+marker: the last interpreter's versions also hold for every newer Python.
 
     python .ci/lock.py python3.10 python3.11
 """
@@ -20,8 +20,8 @@ RELEASED_HEAD = "lerobot==0.4.4"  # installed without its own requirements, so i
 # What the numbers in the docs were made with; raising one is a decision, not a refresh.
 HELD = ("torch==2.13.0", "gymnasium==1.4.0")
 HEADER = f"""\
-# Every Python package of the development environment, one version each; read by the Makefile as `pip install -c`.
-# Written by `python .ci/lock.py python3.10 python3.11`: do not edit by hand. Then run `make test` and look at what changed.
+# Every Python package of the development environment, one version each; the Makefile's pip reads it.
+# Written by `python .ci/lock.py python3.10 python3.11`, not by hand. Then run `make test` and read the diff.
 {RELEASED_HEAD}
 """
 

@@ -2,50 +2,50 @@
 
     python3 .ci/needs.py python rust opengl
 
-Written for any Python 3, so that an old one is told what is wrong and does not stop at a syntax error.
+Written for Python 3.6 and later, so that an old one is told what is wrong and does not stop at a syntax error.
 """
 
 import ctypes
-import os
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 OLDEST_PYTHON = (3, 10)
-CARGO_TOML = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "Cargo.toml")
+CARGO_TOML = Path(__file__).resolve().parent.parent / "Cargo.toml"
 
 
 def lacks_python():
     """What is wrong with this interpreter, or None."""
     if sys.version_info[:2] < OLDEST_PYTHON:
+        oldest = ".".join(map(str, OLDEST_PYTHON))
         return (
-            "Python %d.%d or newer is needed; %s is %s." % (OLDEST_PYTHON + (sys.executable, sys.version.split()[0]))
-            + "\n    Another one is chosen by: make PYTHON=/path/to/python3.11 ..."
+            f"Python {oldest} or newer is needed; {sys.executable} is {sys.version.split()[0]}."
+            "\n    Another one is chosen by: make PYTHON=/path/to/python3 ..."
         )
     try:
         import ensurepip  # noqa: F401
         import venv  # noqa: F401
     except ImportError:
         return (
-            "%s cannot make virtual environments." % sys.executable
-            + "\n    Debian, Ubuntu: apt-get install python3-venv"
+            f"{sys.executable} cannot make virtual environments."
+            "\n    Debian, Ubuntu: apt-get install python3-venv"
         )
     return None
 
 
 def lacks_rust():
     """What is wrong with the Rust toolchain, or None."""
-    with open(CARGO_TOML) as file:
-        oldest = re.search(r'rust-version = "([\d.]+)"', file.read()).group(1)
+    oldest = re.search(r'rust-version = "([\d.]+)"', CARGO_TOML.read_text()).group(1)
     how = "\n    Install or update it with rustup (rustup.rs), then: rustup update stable"
-    try:
-        said = subprocess.check_output(["cargo", "--version"]).decode()
-    except (OSError, subprocess.CalledProcessError):
-        return "Rust %s or newer is needed; no cargo was found on PATH." % oldest + how
-    found = re.search(r"(\d+)\.(\d+)", said).groups()
-    if tuple(map(int, found)) < tuple(map(int, oldest.split(".")[:2])):
-        return "Rust %s or newer is needed; found %s." % (oldest, said.strip()) + how
-    if not any(os.access(os.path.join(path, "cc"), os.X_OK) for path in os.environ["PATH"].split(os.pathsep)):
+    if not shutil.which("cargo"):
+        return f"Rust {oldest} or newer is needed; no cargo was found on PATH.{how}"
+    said = subprocess.run(["cargo", "--version"], stdout=subprocess.PIPE, check=False).stdout.decode().strip()
+    found = re.search(r"(\d+)\.(\d+)", said)
+    if not found or tuple(map(int, found.groups())) < tuple(map(int, oldest.split(".")[:2])):
+        return f"Rust {oldest} or newer is needed; found {said or 'a cargo that does not run'}.{how}"
+    if not shutil.which("cc"):
         return (
             "Rust needs a C compiler to link with; no cc was found on PATH."
             "\n    Debian, Ubuntu: apt-get install build-essential"
@@ -79,7 +79,7 @@ def main():
     """Prints one paragraph for each thing that is missing; the exit status is 1 if there is any."""
     problems = [problem for problem in (CHECKS[name]() for name in sys.argv[1:]) if problem]
     for problem in problems:
-        sys.stderr.write("missing: %s\n" % problem)
+        print(f"missing: {problem}", file=sys.stderr)
     return 1 if problems else 0
 
 

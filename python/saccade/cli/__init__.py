@@ -97,7 +97,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
 
     parser = Parser(
         prog="saccade",
-        description="GR00T-style action heads on CPUs: run a policy closed-loop, train one, check its numbers.",
+        description="GR00T-style action heads on CPUs: run a policy closed-loop, train one, check it.",
         epilog="examples:\n"
         "  saccade rollout --help\n"
         "  saccade rollout --tasks reach --episodes 2 --out out/rollout",
@@ -155,9 +155,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
-        status = dispatch(argv)
-        sys.stdout.flush()  # a closed pipe is found here, not while the interpreter shuts down
-        return status
+        try:
+            return dispatch(argv)
+        finally:
+            sys.stdout.flush()  # a closed pipe is found here, not while the interpreter shuts down
     except KeyboardInterrupt:
         print("saccade: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

@@ -1,0 +1,36 @@
+"""Settings of the test run, and the fixtures that many test files use."""
+
+from __future__ import annotations
+
+import os
+
+import hypothesis
+import pytest
+from released import NAMES, Released, load_released
+
+from saccade import _saccade
+
+# No deadline: the machine may be shared. On CI the same examples each time, so that a failure is the
+# change's and not the draw's.
+hypothesis.settings.register_profile(
+    "saccade",
+    deadline=None,
+    derandomize="CI" in os.environ,
+    database=None,
+    print_blob=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("saccade")
+
+
+@pytest.fixture(params=NAMES)
+def released(request: pytest.FixtureRequest) -> Released:
+    """Each file of tests/data in turn."""
+    return load_released(request.param)
+
+
+@pytest.fixture(params=_saccade.available_isas())
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each instruction set that this machine has, in turn; heads built in the test use it."""
+    monkeypatch.setenv("SACCADE_ISA", request.param)
+    return str(request.param)
