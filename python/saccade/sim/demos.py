@@ -1,0 +1,210 @@
+"""Demonstrations: scripted experts recorded through the policy's cameras, one file per episode.
+
+A directory holds `<task>/<seed>.npz` and, beside them, `<task>/recording.json` with the settings. Files are
+written under a temporary name and renamed, so an interrupted recording goes on where it stopped. Each episode
+depends on its task, its seed and the settings only, so a recording can also be split between processes by
+task.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade.errors import InputError
+from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
+from saccade.sim.environment import DEFAULT_IMAGE_SIZE, TaskEnvironment
+from saccade.sim.experts import Expert, NoiseBursts
+from saccade.sim.files import write_atomically, write_json
+from saccade.sim.tasks import DEMONSTRATION_SEEDS, TASKS
+
+MAX_STEPS = 250  # bursts make the expert's way longer
+STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to stay
+MAX_MISSES = 0.5  # give up a task when more than this share of its episodes fails, once 20 have been tried
+# reach is judged by where the hand is and by nothing else, so it needs the most precision and the most
+# examples.
+DEFAULT_COUNTS = {name: 300 if name == "reach" else 100 for name in TASKS}
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """What a recording depends on besides task and seed.
+
+    Attributes:
+        image_size: Pixels along each side.
+        frame_stride: One observation is kept for that many control steps.
+        cameras: What is recorded.
+    """
+
+    image_size: int = DEFAULT_IMAGE_SIZE
+    frame_stride: int = 3
+    cameras: tuple[Camera, ...] = DEFAULT_CAMERAS
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "image_size": self.image_size,
+            "frame_stride": self.frame_stride,
+            "cameras": [camera.to_dict() for camera in self.cameras],
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "RecordingSettings":
+        """Reads what `to_dict` wrote."""
+        cameras = tuple(Camera.from_dict(camera) for camera in values["cameras"])
+        return cls(int(values["image_size"]), int(values["frame_stride"]), cameras)
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One recorded episode of `steps` control steps and `frames` observations.
+
+    Attributes:
+        images: `(frames, cameras, H, W, 3)` uint8.
+        proprio: `(frames, 4)` float32.
+        targets: `(frames, 6)` float32, positions of object and goal, metres.
+        frame_steps: `(frames,)` int32, the control step before which a frame was seen.
+        actions: `(steps, 4)` float32, what the expert would do at each step.
+        disturbed: `(steps,)` bool, where something else was executed.
+    """
+
+    images: npt.NDArray[np.uint8]
+    proprio: npt.NDArray[np.float32]
+    targets: npt.NDArray[np.float32]
+    frame_steps: npt.NDArray[np.int32]
+    actions: npt.NDArray[np.float32]
+    disturbed: npt.NDArray[np.bool_]
+
+
+def record_episode(
+    environment: TaskEnvironment, seed: int, settings: RecordingSettings
+) -> Demonstration | None:
+    """Lets the expert do one episode; `None` if it did not succeed."""
+    environment.restart(seed)
+    expert = Expert(environment)
+    task_number = list(TASKS).index(environment.task.name)
+    bursts = NoiseBursts(np.random.default_rng((task_number, seed)))
+    images: list[npt.NDArray[np.uint8]] = []
+    proprio: list[npt.NDArray[np.float32]] = []
+    targets: list[npt.NDArray[np.float32]] = []
+    frame_steps: list[int] = []
+    actions: list[npt.NDArray[np.float32]] = []
+    disturbed: list[bool] = []
+    steps_left, succeeded = MAX_STEPS, False
+    while steps_left > 0:
+        if len(actions) % settings.frame_stride == 0:
+            observation = environment.observe()
+            images.append(np.stack(list(observation["images"].values())))
+            proprio.append(observation["proprio"])
+            targets.append(environment.privileged_targets())
+            frame_steps.append(len(actions))
+        action = expert.action()
+        executed, replaced = bursts.apply(action)
+        actions.append(action)
+        disturbed.append(replaced)
+        steps_left -= 1
+        if environment.advance(executed).success and not succeeded:
+            succeeded, steps_left = True, min(steps_left, STEPS_AFTER_SUCCESS)
+    if not succeeded:
+        return None
+    return Demonstration(
+        images=np.stack(images),
+        proprio=np.stack(proprio),
+        targets=np.stack(targets),
+        frame_steps=np.array(frame_steps, dtype=np.int32),
+        actions=np.stack(actions),
+        disturbed=np.array(disturbed, dtype=np.bool_),
+    )
+
+
+def record_task(
+    task: str, count: int, out: Path, settings: RecordingSettings, on_episode: Callable[[], None]
+) -> None:
+    """Records until `count` episodes of a task lie in `out`, going on from what is there.
+
+    Args:
+        task: its name.
+        count: how many; the first seeds at which the expert succeeds.
+        out: directory of the whole recording.
+        settings: must be those of what is there already.
+        on_episode: called after each episode that is new or was found.
+
+    Raises:
+        InputError: what is there was recorded with other settings, or the expert fails too often.
+    """
+    directory = out / task
+    directory.mkdir(parents=True, exist_ok=True)
+    claim_directory(directory / "recording.json", settings)
+    environment = TaskEnvironment(task, image_size=settings.image_size, cameras=settings.cameras)
+    try:
+        done = tried = 0
+        for seed in DEMONSTRATION_SEEDS:
+            if done == count:
+                return
+            path = directory / f"{seed}.npz"
+            if not path.exists():
+                demonstration = record_episode(environment, seed, settings)
+                tried += 1
+                if demonstration is None:
+                    if tried >= 20 and done < (1 - MAX_MISSES) * tried:
+                        raise InputError(f"{task}: the expert failed in {tried - done} of {tried} episodes")
+                    continue
+                save(demonstration, path)
+            done += 1
+            on_episode()
+    finally:
+        environment.close()
+
+
+def claim_directory(path: Path, settings: RecordingSettings) -> None:
+    """Writes the settings, or checks that they are those of an earlier recording."""
+    if not path.exists():
+        write_json(path, settings.to_dict())
+    elif json.loads(path.read_text()) != json.loads(json.dumps(settings.to_dict())):
+        raise InputError(f"{path.parent}: was recorded with other settings; choose another directory")
+
+
+def save(demonstration: Demonstration, path: Path) -> None:
+    """Writes one episode, compressed."""
+    with write_atomically(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **vars(demonstration))
+
+
+def load(path: Path) -> Demonstration:
+    """Reads one episode."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return Demonstration(**{name: arrays[name] for name in Demonstration.__dataclass_fields__})
+
+
+def recorded_tasks(directory: Path) -> list[str]:
+    """Tasks with a recording in the directory, in the order of `TASKS`.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    tasks = [name for name in TASKS if (directory / name / "recording.json").is_file()]
+    if not tasks:
+        raise FileNotFoundError(f"{directory}: no demonstrations there; `saccade demos` records them")
+    return tasks
+
+
+def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
+    """The settings that all tasks of a recording share.
+
+    Raises:
+        InputError: they differ.
+    """
+    found = [json.loads((directory / name / "recording.json").read_text()) for name in tasks]
+    if any(settings != found[0] for settings in found):
+        raise InputError(f"{directory}: the tasks were recorded with different settings")
+    return RecordingSettings.from_dict(found[0])
+
+
+def episodes(directory: Path, task: str) -> Iterator[tuple[int, Demonstration]]:
+    """Seeds and episodes of a task, in the order of their seeds."""
+    for path in sorted((directory / task).glob("[0-9]*.npz"), key=lambda path: int(path.stem)):
+        yield int(path.stem), load(path)

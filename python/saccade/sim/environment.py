@@ -1,0 +1,188 @@
+"""The gymnasium environment: a Meta-World task seen through cameras and told in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+from saccade.errors import InputError, ShapeError
+from saccade.sim.cameras import DEFAULT_CAMERAS, VIDEO_CAMERA, Camera, Renderer, UInt8Array, prepare_model
+from saccade.sim.tasks import find_task
+
+Observation = dict[
+    str, Any
+]  # {"images": {camera: (H, W, 3) uint8}, "proprio": (4,) float32, "instruction": str}
+
+ACTION_DIM = 4  # hand velocity along x, y, z and gripper effort, each in [-1, 1]
+PROPRIO_DIM = 4  # hand position in metres and gripper opening in [0, 1]
+DEFAULT_IMAGE_SIZE = 64
+VIDEO_SIZE = 360
+SIMULATION_HZ = 80  # control steps in a second of simulated time
+
+
+@dataclass(frozen=True)
+class StepOutcome:
+    """What the simulator says about one control step."""
+
+    reward: float
+    success: bool
+
+
+class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+    """One task as a language-conditioned pixel task.
+
+    An observation holds what a real robot would have: the pictures, where its hand is, and the instruction.
+    Positions of objects and goals are not in it; experts and training targets get them from
+    `privileged_state`.
+
+    Made by name: `gymnasium.make("saccade/reach-v0")` after `import saccade.sim`. The same seed gives the
+    same layout, the same wording and the same pixels. An episode ends (`terminated`) at its first success.
+
+    Args:
+        task: its name, see `saccade.sim.tasks`.
+        image_size: pixels along each side.
+        cameras: what the policy looks through.
+        render_mode: `"rgb_array"` lets `render` draw the whole robot for videos.
+
+    Raises:
+        InputError: no such task; image size or cameras that cannot be used.
+
+    Example:
+        >>> env = TaskEnvironment("push")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> info["success"]
+        False
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": SIMULATION_HZ}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        image_size: int = DEFAULT_IMAGE_SIZE,
+        cameras: Sequence[Camera] = DEFAULT_CAMERAS,
+        render_mode: str | None = None,
+    ) -> None:
+        if image_size < 8:
+            raise InputError(f"image_size: given {image_size}, expected at least 8")
+        if not cameras or len({camera.name for camera in cameras}) != len(cameras):
+            raise InputError("cameras: expected at least one, each with a name of its own")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode: given {render_mode!r}, expected 'rgb_array' or None")
+        self.task = find_task(task)
+        self.cameras = tuple(cameras)
+        self.image_size = image_size
+        self.render_mode = render_mode
+        self.instruction = self.task.instructions[0]
+        self.observation_space = observation_space(self.cameras, image_size)
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+
+        self._world = ALL_V3_ENVIRONMENTS[self.task.scene]()
+        # Otherwise every seed gives the first layout again.
+        self._world._freeze_rand_vec = False
+        self._world.seeded_rand_vec = True
+        self._world._set_task_called = True
+        self._world._partially_observable = False  # experts are told the goal; the policy sees `observe` only
+        # Meta-World clips what it reports to this space, which was formed while the goal was still hidden: to
+        # zeros.
+        self._world.__dict__.pop("sawyer_observation_space", None)
+        prepare_model(self._world.model, draws_goal=self.task.draws_goal)
+        self._full_state = np.zeros(39)
+        self._steps = 0
+        self._renderer: Renderer | None = None
+        self._video_renderer: Renderer | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode; without a seed one of the evaluation seeds is drawn."""
+        super().reset(seed=seed)
+        self.restart(int(self.np_random.integers(1_000_000)) if seed is None else seed)
+        return self.observe(), {"success": False, "task": self.task.name}
+
+    def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Applies one action `(4,)`, clipped to [-1, 1]; `info["success"]` says whether the task is done."""
+        outcome = self.advance(action)
+        truncated = self._steps >= self.task.max_steps and not outcome.success
+        info = {"success": outcome.success, "task": self.task.name}
+        return self.observe(), outcome.reward, outcome.success, truncated, info
+
+    def restart(self, seed: int) -> None:
+        """Like `reset`, without drawing an observation."""
+        self.instruction = self.task.instruction(seed)
+        self._world.seed(seed)
+        self._full_state, _ = self._world.reset()
+        # Meta-World moves the goal marker in the model only; without this the picture shows the last
+        # episode's.
+        mujoco.mj_forward(self._world.model, self._world.data)
+        self._steps = 0
+
+    def advance(self, action: npt.ArrayLike) -> StepOutcome:
+        """Like `step`, without drawing an observation: policies that act in chunks look only now and then."""
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (ACTION_DIM,):
+            raise ShapeError(f"action: given shape {action.shape}, expected ({ACTION_DIM},)")
+        if not np.isfinite(action).all():
+            raise InputError(f"action: expected finite numbers, given {action}")
+        self._full_state, reward, _, _, info = self._world.step(np.clip(action, -1.0, 1.0))
+        self._steps += 1
+        return StepOutcome(reward=float(reward), success=bool(info["success"]))
+
+    def observe(self) -> Observation:
+        """What the policy may know now."""
+        if self._renderer is None:
+            self._renderer = Renderer(self._world.model, self.image_size)
+        return {
+            "images": self._renderer.draw_all(self._world.data, self.cameras),
+            "proprio": self._full_state[:PROPRIO_DIM].astype(np.float32),
+            "instruction": self.instruction,
+        }
+
+    def render(self) -> UInt8Array | None:
+        """The whole robot from the side, `(360, 360, 3)`, if `render_mode` is `"rgb_array"`."""
+        if self.render_mode is None:
+            return None
+        if self._video_renderer is None:
+            self._video_renderer = Renderer(self._world.model, VIDEO_SIZE, show_arm=True)
+        return self._video_renderer.draw(self._world.data, VIDEO_CAMERA)
+
+    def privileged_state(self) -> npt.NDArray[np.float64]:
+        """Meta-World's own observation `(39,)`, goal included. For experts; never for a policy."""
+        return self._full_state.copy()
+
+    def privileged_targets(self) -> npt.NDArray[np.float32]:
+        """Positions of the object and of the goal `(6,)`, metres: training targets, never an input."""
+        goal = np.asarray(self._world._target_pos, dtype=np.float64)
+        return np.concatenate((self._full_state[4:7], goal)).astype(np.float32)
+
+    def fingertips(self) -> npt.NDArray[np.float64]:
+        """The point between the fingertips `(3,)`, metres; Meta-World judges a reach by it. For experts."""
+        return np.asarray(self._world.tcp_center, dtype=np.float64).copy()
+
+    def close(self) -> None:
+        """Frees the OpenGL contexts; may be called twice."""
+        for renderer in (self._renderer, self._video_renderer):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = self._video_renderer = None
+        self._world.close()
+
+
+def observation_space(cameras: Sequence[Camera], image_size: int) -> spaces.Dict:
+    """The space of `TaskEnvironment.observe`."""
+    shape = (image_size, image_size, 3)
+    return spaces.Dict(
+        {
+            "images": spaces.Dict({camera.name: spaces.Box(0, 255, shape, np.uint8) for camera in cameras}),
+            "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO_DIM,), np.float32),
+            "instruction": spaces.Text(max_length=200, charset=spaces.text.alphanumeric | frozenset(" ,.'-")),
+        }
+    )

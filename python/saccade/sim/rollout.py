@@ -1,0 +1,93 @@
+"""Closed loop: look, decide on a chunk, carry out its first actions, look again."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from saccade.sim.environment import TaskEnvironment
+from saccade.sim.policy import Policy
+from saccade.sim.tasks import TASKS, find_task
+
+PARTS = ("render", "backbone", "encode", "sample")
+
+
+@dataclass
+class Episode:
+    """One episode and how it went.
+
+    Attributes:
+        task: The task that was judged.
+        seed: Of the layout, the wording and the noise.
+        instruction: What the policy was told.
+        success: Whether the task was done within its `max_steps`.
+        steps: Control steps until success, or until the end.
+        chunks: How often the policy looked and decided.
+        milliseconds: Per chunk, by part of `PARTS`: the mean over the episode.
+    """
+
+    task: str
+    seed: int
+    instruction: str
+    success: bool = False
+    steps: int = 0
+    chunks: int = 0
+    milliseconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
+
+
+def told(task: str, seed: int, instruction_from: str | None) -> str:
+    """The episode's instruction; with `instruction_from`, the words of that task instead."""
+    return find_task(instruction_from or task).instruction(seed)
+
+
+def run_episode(
+    environment: TaskEnvironment,
+    policy: Policy,
+    seed: int,
+    *,
+    instruction_from: str | None = None,
+    on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
+) -> Episode:
+    """Runs one episode to its first success or to the task's `max_steps`.
+
+    Args:
+        environment: with the cameras and image size of the policy, see `environment_for`.
+        policy: decides.
+        seed: of layout, wording and noise; the noise does not depend on the engine.
+        instruction_from: tell the policy this task's words (a control: it should then fail).
+        on_step: called after the reset and after every control step, for videos.
+    """
+    task = environment.task
+    environment.restart(seed)
+    environment.instruction = told(task.name, seed, instruction_from)
+    rng = np.random.default_rng((list(TASKS).index(task.name), seed))
+    episode = Episode(task.name, seed, environment.instruction)
+    total = dict.fromkeys(PARTS, 0.0)
+    on_step(environment, episode)
+    while episode.steps < task.max_steps and not episode.success:
+        start = time.perf_counter()
+        observation = environment.observe()
+        total["render"] += 1e3 * (time.perf_counter() - start)
+        chunk = policy.act(observation, noise=policy.noise(rng))
+        for part, spent in chunk.milliseconds.items():
+            total[part] += spent
+        episode.chunks += 1
+        for action in chunk.actions[: min(policy.config.execute_steps, task.max_steps - episode.steps)]:
+            episode.success = environment.advance(action).success
+            episode.steps += 1
+            on_step(environment, episode)
+            if episode.success:
+                break
+    episode.milliseconds = {part: total[part] / episode.chunks for part in PARTS}
+    return episode
+
+
+def environment_for(policy: Policy, task: str, *, render_mode: str | None = None) -> TaskEnvironment:
+    """The task as the policy was trained to see it."""
+    return TaskEnvironment(
+        task,
+        image_size=policy.config.backbone.image_size,
+        cameras=policy.config.cameras,
+        render_mode=render_mode,
+    )

@@ -1,0 +1,378 @@
+"""Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
+
+A run lives in a directory: `training.pt` (all that is needed to go on), `config.json` and `model.safetensors`
+(the policy so far), `history.json` and `loss.png`. They are written about once a minute, each under a
+temporary name that is then renamed, so a run can be stopped at any time and goes on where it was. Every step
+draws its samples and noise from the seed and its own number, so a resumed run gives what an uninterrupted one
+gives.
+"""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from saccade.config import HeadConfig
+from saccade.errors import InputError
+from saccade.sim import demos
+from saccade.sim.backbone import BackboneConfig
+from saccade.sim.dataset import Samples, load_samples, statistics
+from saccade.sim.environment import ACTION_DIM, PROPRIO_DIM
+from saccade.sim.files import write_atomically, write_json
+from saccade.sim.instructions import Tokenizer, build_vocabulary, words
+from saccade.sim.learner import Learner
+from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
+from saccade.sim.tasks import TASKS, find_task
+
+STATE_FILE = "training.pt"
+CHECKPOINT_SECONDS = 60.0
+VALIDATION_FRAMES = 256
+WARMUP_STEPS = 200
+MAX_GRADIENT_NORM = 1.0
+WEIGHT_DECAY = 0.01
+BETAS = (0.9, 0.95)
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What a run depends on besides the demonstrations.
+
+    Attributes:
+        steps: Optimiser steps; the learning rate falls to zero over them.
+        batch_size: Frames per step. More small steps beat fewer large ones at equal time.
+        learning_rate: Of AdamW, after the warm-up.
+        ema_decay: Of the averaged weights, which are the ones that are kept.
+        target_weight: Weight of the loss that finds object and goal.
+        seed: Of initial weights, order and noise.
+        width, num_layers, num_heads: Of the head; the backbone has its width and heads.
+        backbone_layers: Transformer blocks of the backbone.
+        vl_num_layers: Of the head's VL self-attention.
+        num_future_tokens: N.
+        horizon: Actions per chunk.
+        execute_steps: Of them carried out before the next look.
+        num_steps: Euler steps at run time.
+        patch_size: Pixels along each side of an image token's patch.
+    """
+
+    steps: int = 8000
+    batch_size: int = 16
+    learning_rate: float = 6e-4
+    ema_decay: float = 0.999
+    target_weight: float = 1.0
+    seed: int = 0
+    width: int = 128
+    num_layers: int = 4
+    num_heads: int = 4
+    backbone_layers: int = 2
+    vl_num_layers: int = 1
+    num_future_tokens: int = 32
+    horizon: int = 16
+    execute_steps: int = 8
+    num_steps: int = 4
+    patch_size: int = 16
+
+
+@dataclass
+class Progress:
+    """Where a run is, for a progress bar."""
+
+    step: int
+    steps: int
+    loss: float
+    target_loss: float
+    validation_loss: float | None
+
+
+@dataclass
+class Run:
+    """A training run in memory."""
+
+    settings: TrainingSettings
+    config: PolicyConfig
+    target_statistics: Statistics
+    learner: Learner
+    optimizer: torch.optim.Optimizer
+    average: dict[str, Tensor]
+    step: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+def policy_config(
+    settings: TrainingSettings,
+    recording: demos.RecordingSettings,
+    tasks: list[str],
+    found: dict[str, Statistics],
+) -> PolicyConfig:
+    """The config of the policy that a run trains."""
+    instructions = [text for name in tasks for text in find_task(name).instructions]
+    vocabulary = build_vocabulary(instructions)
+    config = PolicyConfig(
+        head=head_config(
+            width=settings.width,
+            num_layers=settings.num_layers,
+            num_heads=settings.num_heads,
+            vl_num_layers=settings.vl_num_layers,
+            num_future_tokens=settings.num_future_tokens,
+            horizon=settings.horizon,
+            num_steps=settings.num_steps,
+            state_dim=PROPRIO_DIM,
+            action_dim=ACTION_DIM,
+        ),
+        backbone=BackboneConfig(
+            width=settings.width,
+            num_layers=settings.backbone_layers,
+            num_heads=settings.num_heads,
+            image_size=recording.image_size,
+            patch_size=settings.patch_size,
+            num_cameras=len(recording.cameras),
+            text_length=max(len(words(text)) for text in instructions),
+            vocabulary_size=len(vocabulary),
+        ),
+        cameras=recording.cameras,
+        vocabulary=vocabulary,
+        execute_steps=settings.execute_steps,
+        tasks=tuple(tasks),
+        state=found["state"],
+        action=found["action"],
+    )
+    config.check()
+    return config
+
+
+def new_run(settings: TrainingSettings, config: PolicyConfig, target_statistics: Statistics) -> Run:
+    """A run before its first step."""
+    torch.manual_seed(settings.seed)
+    learner = Learner(config.backbone, HeadConfig.from_dict(config.head), settings.target_weight)
+    matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
+    others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
+    optimizer = torch.optim.AdamW(
+        [{"params": matrices, "weight_decay": WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}],
+        lr=settings.learning_rate,
+        betas=BETAS,
+        foreach=True,
+    )
+    average = {name: tensor.detach().clone() for name, tensor in learner.policy_tensors().items()}
+    return Run(settings, config, target_statistics, learner, optimizer, average)
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """Linear warm-up, then half a cosine down to zero."""
+    warmup = min(1.0, (step + 1) / WARMUP_STEPS)
+    return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+
+
+class Batches:
+    """Draws normalised batches.
+
+    Args:
+        samples: what to draw from.
+        config: for statistics and vocabulary.
+        target_statistics: of the positions.
+        batch_size: frames per batch.
+    """
+
+    def __init__(
+        self, samples: Samples, config: PolicyConfig, target_statistics: Statistics, batch_size: int
+    ) -> None:
+        self._samples = samples
+        self._batch_size = batch_size
+        self._state = config.state.normalize(samples.state)
+        self._actions = config.action.normalize(samples.actions) * samples.mask
+        self._targets = target_statistics.normalize(samples.targets)
+        tokenizer = Tokenizer(config.vocabulary, config.backbone.text_length)
+        self._wordings = [
+            np.stack([tokenizer(text) for text in task.instructions]) for task in TASKS.values()
+        ]  # per task (wordings, text_length)
+
+    def draw(self, *key: int) -> dict[str, Tensor]:
+        """The batch that belongs to `key`, with a wording drawn anew for each frame."""
+        rng = np.random.default_rng(key)
+        rows = rng.integers(len(self._samples), size=self._batch_size)
+        said = [self._wordings[task] for task in self._samples.tasks[rows]]
+        arrays = {
+            "images": self._samples.images[rows],
+            "words": np.stack([wordings[rng.integers(len(wordings))] for wordings in said]),
+            "state": self._state[rows],
+            "actions": self._actions[rows],
+            "mask": self._samples.mask[rows],
+            "targets": self._targets[rows],
+        }
+        return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
+def train_step(run: Run, batches: Batches) -> tuple[float, float]:
+    """One optimiser step; returns the two losses."""
+    settings = run.settings
+    for group in run.optimizer.param_groups:
+        group["lr"] = learning_rate(settings, run.step)
+    generator = torch.Generator().manual_seed(
+        int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
+    )
+    flow, targets = run.learner.losses(batches.draw(settings.seed, run.step), generator)
+    run.optimizer.zero_grad(set_to_none=True)
+    (flow + settings.target_weight * targets).backward()
+    torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
+    run.optimizer.step()
+    # A short memory at first, so that the average is not held back by the initial weights.
+    decay = min(settings.ema_decay, (1 + run.step) / (10 + run.step))
+    with torch.no_grad():
+        current = run.learner.policy_tensors()
+        torch._foreach_lerp_(list(run.average.values()), list(current.values()), 1.0 - decay)
+    run.step += 1
+    return flow.item(), targets.item()
+
+
+@torch.no_grad()
+def validation_loss(run: Run, batches: Batches) -> tuple[float, float]:
+    """The two losses of the averaged weights on the same held-out frames and noise each time."""
+    current = {name: tensor.clone() for name, tensor in run.learner.policy_tensors().items()}
+    run.learner.load_state_dict(run.average, strict=False)
+    flow, targets = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0))
+    run.learner.load_state_dict(current, strict=False)
+    return flow.item(), targets.item()
+
+
+def export(run: Run, out: Path) -> None:
+    """Writes the averaged weights as a policy.
+
+    They are stored as bfloat16, which the head reads without loss: half the size, and the rounding is far
+    below what training with noise leaves undecided.
+    """
+    tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
+    with write_atomically(out / TENSOR_FILE) as temporary:
+        save_file(tensors, temporary, metadata={"format": "pt"})
+    write_json(out / CONFIG_FILE, run.config.to_dict())
+
+
+def save(run: Run, out: Path) -> None:
+    """Writes all files of the run."""
+    state = {
+        "settings": asdict(run.settings),
+        "config": run.config.to_dict(),
+        "step": run.step,
+        "history": run.history,
+        "learner": run.learner.state_dict(),
+        "optimizer": run.optimizer.state_dict(),
+        "average": run.average,
+    }
+    with write_atomically(out / STATE_FILE) as temporary:
+        torch.save(state, temporary)
+    export(run, out)
+    write_json(out / "history.json", run.history)
+    plot_history(run.history, out / "loss.png")
+
+
+def resume(run: Run, path: Path) -> None:
+    """Takes up a run where it was saved.
+
+    Raises:
+        InputError: it was started with other settings or other demonstrations.
+    """
+    state = torch.load(path, weights_only=True)
+    if state["settings"] != asdict(run.settings):
+        changed = [
+            name for name, value in asdict(run.settings).items() if state["settings"].get(name) != value
+        ]
+        raise InputError(f"{path}: the run was started with other settings ({', '.join(changed)})")
+    if state["config"] != run.config.to_dict():
+        raise InputError(f"{path}: the run was started with other demonstrations")
+    run.step, run.history = state["step"], state["history"]
+    run.learner.load_state_dict(state["learner"])
+    run.optimizer.load_state_dict(state["optimizer"])
+    run.average = state["average"]
+
+
+def train(
+    demonstrations: Path, out: Path, settings: TrainingSettings, on_step: Callable[[Progress], None]
+) -> PolicyConfig:
+    """Trains a policy, going on from what lies in `out`.
+
+    Args:
+        demonstrations: directory written by `saccade demos`.
+        out: directory of the run.
+        settings: of the run.
+        on_step: called after each step.
+
+    Returns:
+        The config of the policy.
+
+    Raises:
+        FileNotFoundError: no demonstrations there.
+        InputError: demonstrations of several kinds, or a run with other settings in `out`.
+    """
+    tasks = demos.recorded_tasks(demonstrations)
+    recording = demos.read_settings(demonstrations, tasks)
+    training, validation = load_samples(demonstrations, tasks, settings.horizon)
+    found = statistics(training)
+    config = policy_config(settings, recording, tasks, found)
+    run = new_run(settings, config, found["targets"])
+    if (out / STATE_FILE).exists():
+        resume(run, out / STATE_FILE)
+    batches = Batches(training, config, found["targets"], settings.batch_size)
+    held_out = Batches(validation, config, found["targets"], VALIDATION_FRAMES)
+    try:
+        loop(run, batches, held_out, out, on_step)
+    finally:
+        if run.step:
+            save(run, out)
+    return config
+
+
+def loop(
+    run: Run, batches: Batches, held_out: Batches, out: Path, on_step: Callable[[Progress], None]
+) -> None:
+    """Trains to the last step, saving about once a minute."""
+    saved, sums, count = time.monotonic(), np.zeros(2), 0
+    latest: float | None = None
+    while run.step < run.settings.steps:
+        sums += train_step(run, batches)
+        count += 1
+        if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == run.settings.steps:
+            latest, latest_targets = validation_loss(run, held_out)
+            means = sums / count
+            run.history.append(
+                {
+                    "step": run.step,
+                    "loss": means[0].item(),
+                    "target_loss": means[1].item(),
+                    "validation_loss": latest,
+                    "validation_target_loss": latest_targets,
+                }
+            )
+            save(run, out)
+            saved, sums, count = time.monotonic(), np.zeros(2), 0
+        shown = sums / count if count else np.array([run.history[-1]["loss"], run.history[-1]["target_loss"]])
+        on_step(Progress(run.step, run.settings.steps, float(shown[0]), float(shown[1]), latest))
+
+
+def plot_history(history: list[dict[str, Any]], path: Path) -> None:
+    """Draws the losses over the steps, on a logarithmic scale."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    names = {
+        "loss": "velocity, training",
+        "validation_loss": "velocity, held out",
+        "target_loss": "positions, training",
+        "validation_target_loss": "positions, held out",
+    }
+    for key, label in names.items():
+        axes.plot([entry["step"] for entry in history], [entry[key] for entry in history], label=label)
+    axes.set(xlabel="step", ylabel="mean squared error", yscale="log")
+    axes.legend()
+    with write_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+    pyplot.close(figure)
