@@ -1,1 +1,24 @@
 //! Packed linear layers, fused attention, norms and the private thread pool: the numerics of saccade, knowing nothing of GR00T.
+//!
+//! Every kernel is written once over a small vector type and compiled for each instruction set ([`Isa`]); this is the only crate of saccade
+//! with `unsafe` code. What all kernels promise: a row's result has the same bits whatever the number of rows, its place among
+//! them, and the number of threads.
+
+mod activation;
+mod aligned;
+mod attention;
+mod isa;
+mod linear;
+mod norm;
+mod pool;
+mod simd;
+mod threads;
+
+pub use activation::{exp, gelu_tanh, relu, silu};
+pub use attention::{LogitBias, PackedKeyValues, attention};
+pub use half::bf16;
+pub use isa::{ISA_VARIABLE, Isa, IsaError};
+pub use linear::{Element, Epilogue, KernelError, PackedLinear, WeightRef};
+pub use norm::layer_norm;
+pub use pool::parallel_for;
+pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};

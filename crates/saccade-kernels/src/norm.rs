@@ -1,0 +1,166 @@
+//! LayerNorm over rows, plain or with a scale and a shift applied in the same pass.
+
+use faer::{MatMut, MatRef};
+
+use crate::isa::Isa;
+use crate::pool::parallel_for;
+use crate::simd::{Kernel, Vector, dispatch};
+
+/// Elements from which a second thread pays: below, one core is done in less time than it takes to wake another.
+const ELEMENTS_FOR_THREADS: usize = 1 << 16;
+
+/// Elements of one task: long enough that dealing it costs nothing, short enough that threads finish together.
+const ELEMENTS_PER_TASK: usize = 1 << 13;
+
+/// `out = norm(x) * scale + shift`, row by row, with `norm(x) = (x - mean) / sqrt(variance + eps)` over the columns.
+///
+/// `x` and `out` are `(rows, width)`, row-major with any row stride; `scale` and `shift` have `width` elements and hold for all rows: the
+/// learned affine, or `1 + scale` and `shift` of an adaptive norm. The variance is the mean of squared distances from the mean, in a second
+/// pass over the row. A row of zero variance gives `shift`; one with NaN or infinity gives NaN.
+///
+/// # Panics
+/// If a shape does not fit, columns are not contiguous, or, in debug builds, this CPU lacks `isa`.
+///
+/// ```
+/// use faer::{MatMut, MatRef};
+/// let mut out = [0.0; 2];
+/// let x = MatRef::from_row_major_slice(&[1.0, 3.0], 1, 2);
+/// let out_view = MatMut::from_row_major_slice_mut(&mut out, 1, 2);
+/// saccade_kernels::layer_norm(saccade_kernels::Isa::best(), 1, x, 0.0, Some((&[2.0, 2.0], &[0.5, 0.5])), out_view);
+/// assert_eq!(out, [-1.5, 2.5]);
+/// ```
+pub fn layer_norm(
+    isa: Isa,
+    threads: usize,
+    x: MatRef<'_, f32>,
+    eps: f32,
+    scale_shift: Option<(&[f32], &[f32])>,
+    out: MatMut<'_, f32>,
+) {
+    let (rows, width) = (x.nrows(), x.ncols());
+    assert_eq!((out.nrows(), out.ncols()), (rows, width), "out: expected the shape of x");
+    assert!(x.col_stride() == 1 || width <= 1, "x: expected contiguous rows");
+    assert!(out.col_stride() == 1 || width <= 1, "out: expected contiguous rows");
+    if let Some((scale, shift)) = scale_shift {
+        assert_eq!((scale.len(), shift.len()), (width, width), "scale and shift: expected one element per column");
+    }
+    if rows == 0 || width == 0 {
+        return;
+    }
+    let job = Job {
+        x: x.as_ptr(),
+        x_stride: x.row_stride(),
+        out_stride: out.row_stride(),
+        out: out.as_ptr_mut(),
+        width,
+        eps,
+        scale_shift,
+    };
+    let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).min(rows);
+    let threads = if rows * width < ELEMENTS_FOR_THREADS { 1 } else { threads };
+    parallel_for(threads, tasks, &|task| {
+        let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
+        dispatch(isa, Rows { job: &job, first, end });
+    });
+}
+
+struct Job<'a> {
+    x: *const f32,
+    x_stride: isize,
+    out: *mut f32,
+    out_stride: isize,
+    width: usize,
+    eps: f32,
+    scale_shift: Option<(&'a [f32], &'a [f32])>,
+}
+
+// SAFETY: tasks read `x` and write different rows of `out`; both views are borrowed for the whole call.
+unsafe impl Sync for Job<'_> {}
+
+struct Rows<'a> {
+    job: &'a Job<'a>,
+    first: usize,
+    end: usize,
+}
+
+impl Kernel for Rows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<V: Vector>(self) {
+        for row in self.first..self.end {
+            // SAFETY: rows are within the views; the caller has the instruction set.
+            unsafe {
+                let x = self.job.x.offset(row as isize * self.job.x_stride);
+                let out = self.job.out.offset(row as isize * self.job.out_stride);
+                norm_row::<V>(self.job, x, out);
+            }
+        }
+    }
+}
+
+/// # Safety
+/// `x` and `out` point to `job.width` elements; the CPU has the instruction set of `V`.
+#[inline(always)]
+unsafe fn norm_row<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
+    let width = job.width;
+    let whole = width / V::LANES * V::LANES;
+    let rest = width - whole;
+    // SAFETY: vectors lie within the first `width` elements, the last one is partial; scale and shift are as long.
+    unsafe {
+        let mean = sum::<V>(x, width, 0.0, false) / width as f32;
+        let centre = V::splat(mean);
+        let variance = sum::<V>(x, width, mean, true) / width as f32;
+        let factor = V::splat(1.0 / (variance + job.eps).sqrt());
+        let normed = |x: V| x.sub(centre).mul(factor);
+        if let Some((scale, shift)) = job.scale_shift {
+            let (scale, shift) = (scale.as_ptr(), shift.as_ptr());
+            for i in (0..whole).step_by(V::LANES) {
+                normed(V::load(x.add(i))).fma(V::load(scale.add(i)), V::load(shift.add(i))).store(out.add(i));
+            }
+            let (scale, shift) = (V::load_partial(scale.add(whole), rest), V::load_partial(shift.add(whole), rest));
+            normed(V::load_partial(x.add(whole), rest)).fma(scale, shift).store_partial(out.add(whole), rest);
+        } else {
+            for i in (0..whole).step_by(V::LANES) {
+                normed(V::load(x.add(i))).store(out.add(i));
+            }
+            normed(V::load_partial(x.add(whole), rest)).store_partial(out.add(whole), rest);
+        }
+    }
+}
+
+/// Sum of `x - centre`, or of its squares, in four chains: short ones round less, and do not wait for each other.
+///
+/// # Safety
+/// `x` points to `width` elements; the CPU has the instruction set of `V`.
+#[inline(always)]
+unsafe fn sum<V: Vector>(x: *const f32, width: usize, centre: f32, squares: bool) -> f32 {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let term = |x: V, total: V| {
+            let distance = x.sub(V::splat(centre));
+            if squares { distance.fma(distance, total) } else { total.add(distance) }
+        };
+        let mut totals = [V::splat(0.0); 4];
+        let mut i = 0;
+        while i + 4 * V::LANES <= width {
+            for (chain, total) in totals.iter_mut().enumerate() {
+                *total = term(V::load(x.add(i + chain * V::LANES)), *total);
+            }
+            i += 4 * V::LANES;
+        }
+        let mut total = totals[0].add(totals[1]).add(totals[2].add(totals[3]));
+        while i + V::LANES <= width {
+            total = term(V::load(x.add(i)), total);
+            i += V::LANES;
+        }
+        let mut total = total.reduce_add();
+        // One by one: lanes beyond the row would count as zeros, whose distance from the centre is not zero.
+        while i < width {
+            let distance = *x.add(i) - centre;
+            total += if squares { distance * distance } else { distance };
+            i += 1;
+        }
+        total
+    }
+}
