@@ -2,7 +2,7 @@
 
     python3 .ci/needs.py python rust opengl
 
-Written for Python 3.6 and later, so that an old one is told what is wrong and does not stop at a syntax error.
+Written for Python 3.6 and later, so that an old one is told what is wrong.
 """
 
 import ctypes

@@ -163,10 +163,17 @@ def test_a_commands_status_is_the_programs(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_reader_that_goes_away_is_no_error() -> None:
+    code = (
+        "import sys, types; from saccade import cli\n"
+        "command = types.SimpleNamespace(add_arguments=lambda _: None, run=lambda _: print('a line'))\n"
+        "cli.load_command = lambda name: command\n"
+        "sys.exit(cli.main(['parity']))"
+    )
     read_end, write_end = os.pipe()
     os.close(read_end)
-    command = [sys.executable, "-m", "saccade", "--help"]
-    done = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=write_end, stderr=subprocess.PIPE, text=True, check=False
+    )
     os.close(write_end)
     assert (done.returncode, done.stderr) == (141, "")
 

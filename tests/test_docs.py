@@ -1,0 +1,126 @@
+"""What the docs say is what runs: examples in docstrings and README, commands, links."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import os
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import saccade
+from saccade import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "ARCHITECTURE.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+MODULES = sorted(
+    info.name
+    for info in pkgutil.walk_packages(saccade.__path__, "saccade.")
+    if info.name not in ("saccade._saccade", "saccade.__main__")
+)
+
+
+def code_blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def command_lines(text: str, program: str) -> list[list[str]]:
+    """The arguments of each line of `text` that calls `program`; comments after two blanks are left out."""
+    lines = (re.split(r"\s{2,}|\s#", line.strip())[0] for line in text.replace("\\\n", " ").splitlines())
+    return [shlex.split(line)[1:] for line in lines if line.split(" ")[0] == program]
+
+
+def page_id(page: Path) -> str:
+    """A page's path as a test id."""
+    return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_in_docstrings(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.failed == 0
+
+
+def test_the_public_classes_have_examples() -> None:
+    finder = doctest.DocTestFinder()
+    for public in (saccade.ActionHead, saccade.CrossAttention, saccade.show_config):
+        assert any(test.examples for test in finder.find(public)), f"{public} has no example"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
+    blocks = code_blocks(page, "python")
+    if blocks:  # one program from top to bottom, as a reader would paste it
+        code = "\n".join(blocks)
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_commands_on_pages_exist(page: Path) -> None:
+    targets = set(re.findall(r"^([\w-]+):(?!=)", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for block in code_blocks(page, "bash"):
+        for arguments in command_lines(block, "make"):
+            assert set(arguments) <= targets
+        for arguments in command_lines(block, "saccade"):
+            assert_parses(arguments)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_examples_of_commands_parse(name: str) -> None:
+    parser = cli.Parser(prog=f"saccade {name}")
+    cli.load_command(name).add_arguments(parser)
+    examples = command_lines(parser.epilog or "", "saccade")
+    assert examples
+    for arguments in examples:
+        assert arguments[0] == name
+        assert_parses(arguments)
+
+
+def assert_parses(arguments: list[str]) -> None:
+    """That the command line takes these arguments."""
+    parser = cli.build_parser(arguments[0])
+    if "--help" not in arguments:
+        parser.parse_args(arguments)  # a SystemExit fails the test; its message is on standard error
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#\s]+)", page.read_text()) + re.findall(r'src="([^"]+)"', page.read_text())
+    for target in targets:
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+def test_nothing_names_a_package_registry_or_a_path_of_one_machine() -> None:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    words = [
+        "py" + "pi.org",
+        "python" + "hosted.org",
+        "index.cra" + "tes.io",
+        "/ro" + "ot/",
+        os.sep + "work" + os.sep,
+    ]
+    found = []
+    for name in filter(None, listed.stdout.split("\0")):
+        path = ROOT / name
+        if path.suffix in (".safetensors", ".png", ".mp4") or path.name == "Cargo.lock" or not path.is_file():
+            continue
+        text = path.read_text(errors="replace")
+        found += [f"{name}: {word}" for word in words if word in text]
+    assert found == []
