@@ -7,12 +7,14 @@ Tables differ: the released code calls torch's float32 sin and cos, so up to 2e-
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
+from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from reference_cases import relative_error, small_config
 from released import Released
 from torch import Tensor, nn
@@ -22,17 +24,30 @@ from saccade.reference import ActionHead, lerobot_head
 from saccade.reference.random_weights import n15_config, random_head, random_inputs, write_checkpoint
 
 TOLERANCE = 3e-4
-WIDE_CONFIG = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
 INPUTS = ("backbone_features", "state", "embodiment_id", "noise")
 
 
+@dataclass(frozen=True)
+class Wide:
+    """One observation at N1.5's widths with fewer blocks and embodiments, and what the torch heads make of it."""
+
+    checkpoint: Path
+    inputs: dict[str, Tensor]
+    reference_actions: NDArray[np.float32]
+    lerobot_actions: NDArray[np.float32]
+
+
 @pytest.fixture(scope="module")
-def wide() -> tuple[ActionHead, nn.Module, dict[str, Tensor]]:
-    """Both heads at N1.5's widths with fewer blocks and embodiments, equal weights, one view's tokens."""
-    head = random_head(WIDE_CONFIG, seed=0)
-    theirs = lerobot_head.build(WIDE_CONFIG)
-    theirs.load_state_dict(head.state_dict(), strict=True, assign=True)
-    return head, theirs, random_inputs(head.config, seed=1, batch=1, num_vl_tokens=296)
+def wide(tmp_path_factory: pytest.TempPathFactory) -> Wide:
+    checkpoint = tmp_path_factory.mktemp("wide")
+    config = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
+    write_checkpoint(checkpoint, config, seed=0)
+    reference = ActionHead.load(checkpoint)
+    theirs = lerobot_head.build(config, device="meta")
+    theirs.load_state_dict(reference.state_dict(), strict=True, assign=True)
+    inputs = random_inputs(reference.config, seed=1, batch=1, num_vl_tokens=296)
+    with torch.no_grad():
+        return Wide(checkpoint, inputs, reference(**inputs).numpy(), their_actions(theirs, inputs).numpy())
 
 
 def their_actions(theirs: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
@@ -41,15 +56,18 @@ def their_actions(theirs: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
     )
 
 
-def test_reference_equals_lerobot_at_full_width(
-    wide: tuple[ActionHead, nn.Module, dict[str, Tensor]],
-) -> None:
-    head, theirs, inputs = wide
-    with torch.no_grad():
-        ours = head(**inputs)
-    expected = their_actions(theirs, inputs)
-    assert expected.std() > 0.5
-    assert (ours - expected).abs().max() <= TOLERANCE
+def test_reference_equals_lerobot_at_full_width(wide: Wide) -> None:
+    assert wide.lerobot_actions.std() > 0.5
+    assert np.abs(wide.reference_actions - wide.lerobot_actions).max() <= TOLERANCE
+
+
+def test_rust_equals_lerobot_at_full_width(wide: Wide, isa: str) -> None:
+    head = saccade.ActionHead.load(wide.checkpoint)
+    assert head.isa == isa
+    features, state, ids, noise = (wide.inputs[name].numpy() for name in INPUTS)
+    actions = head(features, state, ids, noise=noise)
+    assert np.abs(actions - wide.lerobot_actions).max() <= TOLERANCE
+    assert relative_error(actions, wide.reference_actions) <= 1e-5
 
 
 def test_lerobot_reproduces_the_recorded_outputs(released: Released) -> None:
@@ -58,20 +76,6 @@ def test_lerobot_reproduces_the_recorded_outputs(released: Released) -> None:
     theirs.load_state_dict(ActionHead.load(released.path).state_dict(), strict=True)
     inputs = {name: torch.tensor(getattr(released, name)) for name in INPUTS}
     assert np.abs(their_actions(theirs, inputs).numpy() - released.actions_f64).max() <= TOLERANCE
-
-
-def test_rust_equals_lerobot_at_full_width(
-    wide: tuple[ActionHead, nn.Module, dict[str, Tensor]], isa: str, tmp_path: Path
-) -> None:
-    reference, theirs, inputs = wide
-    write_checkpoint(tmp_path, WIDE_CONFIG, seed=0)
-    head = saccade.ActionHead.load(tmp_path)
-    assert head.isa == isa
-    features, state, ids, noise = (inputs[name].numpy() for name in INPUTS)
-    actions = head(features, state, ids, noise=noise)
-    assert np.abs(actions - their_actions(theirs, inputs).numpy()).max() <= TOLERANCE
-    with torch.no_grad():
-        assert relative_error(actions, reference(**inputs)) <= 1e-5
 
 
 @pytest.mark.parametrize(
