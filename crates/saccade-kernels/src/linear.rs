@@ -142,12 +142,18 @@ impl PackedLinear {
         for (weight, bias) in parts {
             let (outputs, inputs) = weight.shape();
             if inputs != in_features {
-                return Err(KernelError::InFeatures { expected: in_features, given: inputs });
+                return Err(KernelError::InFeatures {
+                    expected: in_features,
+                    given: inputs,
+                });
             }
             if let Some(bias) = bias
                 && bias.len() != outputs
             {
-                return Err(KernelError::Bias { expected: outputs, given: bias.len() });
+                return Err(KernelError::Bias {
+                    expected: outputs,
+                    given: bias.len(),
+                });
             }
             out_features += outputs;
         }
@@ -161,13 +167,21 @@ impl PackedLinear {
             }
             column += weight.shape().0;
         }
-        let bf16 = parts.iter().all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
+        let bf16 = parts
+            .iter()
+            .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
         let panels = if bf16 {
             Panels::Bf16(pack_bf16(parts, in_features, columns, num_panels))
         } else {
             Panels::F32(pack_f32(parts, in_features, columns, num_panels))
         };
-        Ok(Self { isa, in_features, out_features, panels, bias })
+        Ok(Self {
+            isa,
+            in_features,
+            out_features,
+            panels,
+            bias,
+        })
     }
 
     /// Width of the input rows.
@@ -214,23 +228,40 @@ impl PackedLinear {
     pub fn apply(&self, threads: usize, x: MatRef<'_, f32>, epilogue: Epilogue, out: MatMut<'_, f32>) {
         let rows = x.nrows();
         assert_eq!(x.ncols(), self.in_features, "x: expected in_features columns");
-        assert_eq!((out.nrows(), out.ncols()), (rows, self.out_features), "out: expected (rows, out_features)");
+        assert_eq!(
+            (out.nrows(), out.ncols()),
+            (rows, self.out_features),
+            "out: expected (rows, out_features)"
+        );
         if rows == 0 || self.out_features == 0 {
             return;
         }
-        assert!(x.col_stride() == 1 || x.ncols() <= 1, "x: expected contiguous rows");
-        assert!(out.col_stride() == 1 || out.ncols() <= 1, "out: expected contiguous rows");
+        assert!(
+            x.col_stride() == 1 || x.ncols() <= 1,
+            "x: expected contiguous rows"
+        );
+        assert!(
+            out.col_stride() == 1 || out.ncols() <= 1,
+            "out: expected contiguous rows"
+        );
         let columns = panel_columns(self.isa);
         let num_panels = self.out_features.div_ceil(columns);
         let job = Job::new(x, out, epilogue);
         let blocks = rows.div_ceil(ROW_BLOCK);
-        let threads = if rows * self.in_features * self.out_features < MACS_FOR_THREADS { 1 } else { threads };
+        let threads = if rows * self.in_features * self.out_features < MACS_FOR_THREADS {
+            1
+        } else {
+            threads
+        };
         // The panel that this thread will probably take next.
         let ahead = threads;
         // Row blocks outside, panels inside: threads then share a block of activations and walk the weights side by side.
         parallel_for(threads, blocks * num_panels, &|task| {
             let (block, panel) = (task / num_panels, task % num_panels);
-            let rows = Rows { first: rows * block / blocks, end: rows * (block + 1) / blocks };
+            let rows = Rows {
+                first: rows * block / blocks,
+                end: rows * (block + 1) / blocks,
+            };
             let first = panel * columns;
             let width = columns.min(self.out_features - first);
             let bias = &self.bias[first..first + columns];
@@ -238,12 +269,38 @@ impl PackedLinear {
                 Panels::F32(panels) => {
                     let size = self.in_features * columns;
                     let weights = &panels[panel * size..][..size];
-                    dispatch(self.isa, PanelRun { job: &job, rows, panel: Panel { weights, bias, first, width, ahead } });
+                    dispatch(
+                        self.isa,
+                        PanelRun {
+                            job: &job,
+                            rows,
+                            panel: Panel {
+                                weights,
+                                bias,
+                                first,
+                                width,
+                                ahead,
+                            },
+                        },
+                    );
                 }
                 Panels::Bf16(panels) => {
                     let size = self.in_features.div_ceil(2) * columns;
                     let weights = &panels[panel * size..][..size];
-                    dispatch(self.isa, PanelRun { job: &job, rows, panel: Panel { weights, bias, first, width, ahead } });
+                    dispatch(
+                        self.isa,
+                        PanelRun {
+                            job: &job,
+                            rows,
+                            panel: Panel {
+                                weights,
+                                bias,
+                                first,
+                                width,
+                                ahead,
+                            },
+                        },
+                    );
                 }
             }
         });
@@ -270,9 +327,13 @@ fn pack_f32(
     for (weight, _) in parts {
         let start = |row: usize| (first + row) / columns * columns * in_features + (first + row) % columns;
         match weight {
-            WeightRef::F32(view) => for_each(*view, start, |start, k, value| panels[start + k * columns] = value),
+            WeightRef::F32(view) => for_each(*view, start, |start, k, value| {
+                panels[start + k * columns] = value
+            }),
             WeightRef::Bf16(view) => {
-                for_each(*view, start, |start, k, value| panels[start + k * columns] = value.to_f32());
+                for_each(*view, start, |start, k, value| {
+                    panels[start + k * columns] = value.to_f32()
+                });
             }
         }
         first += weight.shape().0;
@@ -290,7 +351,9 @@ fn pack_bf16(
     let mut panels = AlignedBuffer::zeroed(num_panels * columns * pairs);
     let mut first = 0;
     for (weight, _) in parts {
-        let WeightRef::Bf16(view) = weight else { unreachable!("the caller has looked at all parts") };
+        let WeightRef::Bf16(view) = weight else {
+            unreachable!("the caller has looked at all parts")
+        };
         let start = |row: usize| (first + row) / columns * columns * pairs + (first + row) % columns;
         for_each(*view, start, |start, k, value| {
             panels[start + k / 2 * columns] |= u32::from(value.to_bits()) << (16 * (k % 2));

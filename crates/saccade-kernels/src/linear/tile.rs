@@ -21,6 +21,9 @@ const MAX_COLUMNS: usize = AVX512_COLUMNS;
 /// the second-level cache over all tiles. Putting float32 sums down and taking them up again changes no bit.
 const K_BLOCK: usize = 1024;
 
+/// Elements, of four bytes, in a cache line.
+const LINE: usize = 16;
+
 /// The activations and results of one call, as raw parts that tasks write to side by side.
 pub(super) struct Job {
     x: *const f32,
@@ -90,7 +93,13 @@ impl Stored for u32 {
     #[inline(always)]
     unsafe fn widen<V: Vector>(pointer: *const Self, part: usize) -> V {
         // SAFETY: as promised by the caller.
-        unsafe { if part == 0 { V::load_low_halves(pointer) } else { V::load_high_halves(pointer) } }
+        unsafe {
+            if part == 0 {
+                V::load_low_halves(pointer)
+            } else {
+                V::load_high_halves(pointer)
+            }
+        }
     }
 }
 
@@ -108,12 +117,13 @@ impl<E: Stored> Kernel for PanelRun<'_, E> {
     unsafe fn run<V: Vector>(self) {
         let Self { job, rows, panel } = self;
         assert!(rows.end - rows.first <= ROW_BLOCK);
+        // Widening takes registers: 8 rows of bf16 weights spill (0.77 of the FMA peak at 296 x 2048 x 1536), 7 do not (0.94).
         // SAFETY: the caller has the instruction set; the panel was packed for it, and the job's views cover rows and columns.
         unsafe {
             match V::ISA {
                 Isa::Portable => panel_rows::<V, E, { PORTABLE.0 }>(job, rows, &panel, PORTABLE.1),
                 Isa::Avx2 => panel_rows::<V, E, { AVX2.0 }>(job, rows, &panel, AVX2.1),
-                Isa::Avx512 => panel_rows::<V, E, { AVX512.0 }>(job, rows, &panel, AVX512.1),
+                Isa::Avx512 => panel_rows::<V, E, { AVX512.0 }>(job, rows, &panel, AVX512.1 + 1 - E::STEP),
             }
         }
     }
@@ -214,16 +224,47 @@ unsafe fn tile_part<V: Vector, E: Stored, const NV: usize, const MR: usize>(
         }
         let weights = panel.weights.as_ptr();
         // Each tile asks for its share of a later panel, spread over its steps: memory then works while the sums are made.
-        let next = weights.wrapping_add(panel.ahead * panel.weights.len() + panel.weights.len() * place.tile / place.tiles);
-        let stride = row_elements / place.tiles;
+        // Measured at 49 x 1536 x 6144 on Zen 4, share of the FMA peak without and with it: 0.89 and 0.95 (AVX-512), 0.69 and 0.85 (AVX2).
+        let next = weights
+            .wrapping_add(panel.ahead * panel.weights.len() + panel.weights.len() * place.tile / place.tiles);
+        let stride = row_elements.div_ceil(place.tiles);
         // An odd `in_features` leaves the last step of a two-element panel half filled: `x` ends there.
         let whole = part.end.min(job.in_features / E::STEP);
-        for step in part.first..whole {
-            V::prefetch(next.wrapping_add(step * stride).cast());
-            multiply_add::<V, E, NV, MR>(&mut acc, &x, weights.add(step * row_elements), step * E::STEP, E::STEP);
+        // Few rows leave little time: a step's share is then longer than a cache line. The loops are apart because one register more
+        // for the general case makes the common one spill.
+        if place.tiles < NV {
+            for step in part.first..whole {
+                for line in 0..NV {
+                    V::prefetch(next.wrapping_add(step * stride + line * LINE).cast());
+                }
+                multiply_add::<V, E, NV, MR>(
+                    &mut acc,
+                    &x,
+                    weights.add(step * row_elements),
+                    step * E::STEP,
+                    E::STEP,
+                );
+            }
+        } else {
+            for step in part.first..whole {
+                V::prefetch(next.wrapping_add(step * stride).cast());
+                multiply_add::<V, E, NV, MR>(
+                    &mut acc,
+                    &x,
+                    weights.add(step * row_elements),
+                    step * E::STEP,
+                    E::STEP,
+                );
+            }
         }
         if whole < part.end {
-            multiply_add::<V, E, NV, MR>(&mut acc, &x, weights.add(whole * row_elements), whole * E::STEP, 1);
+            multiply_add::<V, E, NV, MR>(
+                &mut acc,
+                &x,
+                weights.add(whole * row_elements),
+                whole * E::STEP,
+                1,
+            );
         }
         if part.is_last {
             for (r, sums) in acc.iter().enumerate() {
@@ -300,7 +341,11 @@ unsafe fn finish<V: Vector, E: Stored, const NV: usize>(
                 Epilogue::Add if lanes == V::LANES => V::load(out).add(value),
                 Epilogue::Add => V::load_partial(out, lanes).add(value),
             };
-            if lanes == V::LANES { value.store(out) } else { value.store_partial(out, lanes) }
+            if lanes == V::LANES {
+                value.store(out)
+            } else {
+                value.store_partial(out, lanes)
+            }
         }
     }
 }
