@@ -29,7 +29,7 @@ INPUTS = ("backbone_features", "state", "embodiment_id", "noise")
 
 @dataclass(frozen=True)
 class Wide:
-    """One observation at N1.5's widths with fewer blocks and embodiments, and what the torch heads make of it."""
+    """One observation at N1.5's widths, fewer blocks and embodiments; what the torch heads make of it."""
 
     checkpoint: Path
     inputs: dict[str, Tensor]
