@@ -32,6 +32,7 @@ EXTRAS: dict[str, str] = {
     "mujoco": "sim",
     "packaging": "sim",
     "PIL": "sim",
+    "threadpoolctl": "sim",
 }
 
 # A path that the user named and that cannot be used. Other `OSError`s are not the user's doing.
