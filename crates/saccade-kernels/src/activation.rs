@@ -129,12 +129,20 @@ impl<A: Activation> Kernel for Map<'_, A> {
         }
         let rest = chunks.into_remainder();
         // SAFETY: as many lanes as there are elements.
-        unsafe { A::of(V::load_partial(rest.as_ptr(), rest.len())).store_partial(rest.as_mut_ptr(), rest.len()) }
+        unsafe {
+            A::of(V::load_partial(rest.as_ptr(), rest.len())).store_partial(rest.as_mut_ptr(), rest.len())
+        }
     }
 }
 
 fn map<A: Activation>(isa: Isa, x: &mut [f32]) {
-    dispatch(isa, Map::<A> { x, activation: std::marker::PhantomData });
+    dispatch(
+        isa,
+        Map::<A> {
+            x,
+            activation: std::marker::PhantomData,
+        },
+    );
 }
 
 /// GELU in its tanh form, `0.5 x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3)))`, in place.
@@ -148,7 +156,7 @@ fn map<A: Activation>(isa: Isa, x: &mut [f32]) {
 /// ```
 ///
 /// # Panics
-/// In debug builds, if this CPU lacks `isa`.
+/// If this CPU lacks `isa`.
 pub fn gelu_tanh(isa: Isa, x: &mut [f32]) {
     map::<GeluTanh>(isa, x);
 }
@@ -164,7 +172,7 @@ pub fn gelu_tanh(isa: Isa, x: &mut [f32]) {
 /// ```
 ///
 /// # Panics
-/// In debug builds, if this CPU lacks `isa`.
+/// If this CPU lacks `isa`.
 pub fn silu(isa: Isa, x: &mut [f32]) {
     map::<Silu>(isa, x);
 }
@@ -178,7 +186,7 @@ pub fn silu(isa: Isa, x: &mut [f32]) {
 /// ```
 ///
 /// # Panics
-/// In debug builds, if this CPU lacks `isa`.
+/// If this CPU lacks `isa`.
 pub fn relu(isa: Isa, x: &mut [f32]) {
     map::<Relu>(isa, x);
 }
@@ -194,7 +202,7 @@ pub fn relu(isa: Isa, x: &mut [f32]) {
 /// ```
 ///
 /// # Panics
-/// In debug builds, if this CPU lacks `isa`.
+/// If this CPU lacks `isa`.
 pub fn exp(isa: Isa, x: &mut [f32]) {
     map::<Exp>(isa, x);
 }
@@ -205,7 +213,10 @@ mod tests {
 
     /// Values of the whole range: a coarse walk over the bits, a fine one over where it matters.
     fn sweep() -> Vec<f32> {
-        let coarse = (0..=u32::MAX).step_by(9973).map(f32::from_bits).filter(|x| x.is_finite());
+        let coarse = (0..=u32::MAX)
+            .step_by(9973)
+            .map(f32::from_bits)
+            .filter(|x| x.is_finite());
         let fine = (-1_100_000..=1_000_000).map(|i| i as f32 * 1e-4);
         coarse.chain(fine).collect()
     }
@@ -253,7 +264,10 @@ mod tests {
 
     fn bound(what: &str, isa: Isa, (worst, at): (f64, f32), limit: f64) {
         println!("{isa} {what}: {worst:.3e} at {at}");
-        assert!(worst <= limit, "{isa} {what}: {worst} at {at}, expected at most {limit}");
+        assert!(
+            worst <= limit,
+            "{isa} {what}: {worst} at {at}, expected at most {limit}"
+        );
     }
 
     #[test]
@@ -261,29 +275,62 @@ mod tests {
         for isa in Isa::available() {
             let normal = |x| (-87.33..=88.72).contains(&x);
             bound("exp, ULP", isa, worst(exp, isa, f64::exp, ulps, normal), 2.0);
-            bound("exp, denormal", isa, worst(exp, isa, f64::exp, absolute, |x| x < -87.33), 3e-45);
+            bound(
+                "exp, denormal",
+                isa,
+                worst(exp, isa, f64::exp, absolute, |x| x < -87.33),
+                3e-45,
+            );
         }
     }
 
     #[test]
     fn accuracy_of_gelu() {
         for isa in Isa::available() {
-            bound("GELU, ULP", isa, worst(gelu_tanh, isa, exact_gelu, ulps, |x| x >= -1.0), 4.0);
-            bound("GELU, absolute", isa, worst(gelu_tanh, isa, exact_gelu, absolute, |x| x < -1.0), 1e-7);
+            bound(
+                "GELU, ULP",
+                isa,
+                worst(gelu_tanh, isa, exact_gelu, ulps, |x| x >= -1.0),
+                4.0,
+            );
+            bound(
+                "GELU, absolute",
+                isa,
+                worst(gelu_tanh, isa, exact_gelu, absolute, |x| x < -1.0),
+                1e-7,
+            );
         }
     }
 
     #[test]
     fn accuracy_of_silu() {
         for isa in Isa::available() {
-            bound("SiLU, ULP", isa, worst(silu, isa, exact_silu, ulps, |x| x >= -87.0), 4.0);
-            bound("SiLU, absolute", isa, worst(silu, isa, exact_silu, absolute, |x| x < -87.0), 1e-35);
+            bound(
+                "SiLU, ULP",
+                isa,
+                worst(silu, isa, exact_silu, ulps, |x| x >= -87.0),
+                4.0,
+            );
+            bound(
+                "SiLU, absolute",
+                isa,
+                worst(silu, isa, exact_silu, absolute, |x| x < -87.0),
+                1e-35,
+            );
         }
     }
 
     #[test]
     fn the_ends_of_the_range() {
-        let ends = [f32::NEG_INFINITY, f32::MIN, -104.1, 89.0, f32::MAX, f32::INFINITY, f32::NAN];
+        let ends = [
+            f32::NEG_INFINITY,
+            f32::MIN,
+            -104.1,
+            89.0,
+            f32::MAX,
+            f32::INFINITY,
+            f32::NAN,
+        ];
         let of = |f: fn(Isa, &mut [f32]), isa| {
             let mut x = ends;
             f(isa, &mut x);

@@ -29,7 +29,10 @@ impl<T: sealed::Zeroable> AlignedBuffer<T> {
     pub(crate) fn zeroed(len: usize) -> Self {
         let layout = Self::layout(len);
         if layout.size() == 0 {
-            return Self { pointer: NonNull::dangling(), len };
+            return Self {
+                pointer: NonNull::dangling(),
+                len,
+            };
         }
         // SAFETY: the layout is not of size zero.
         let memory = unsafe { alloc_zeroed(layout) };

@@ -13,7 +13,7 @@ use crate::activation::exp_vector;
 use crate::aligned::AlignedBuffer;
 use crate::isa::Isa;
 use crate::pool::parallel_for;
-use crate::simd::{Kernel, Vector, dispatch, lanes};
+use crate::simd::{Kernel, Vector, dispatch, lanes, load, store};
 
 /// Keys between two updates of a query's running maximum: whole vectors and whole tiles of every instruction set.
 const KEY_BLOCK: usize = 96;
@@ -61,7 +61,15 @@ impl PackedKeyValues {
         assert!(head_dim > 0, "head_dim: expected at least 1");
         assert!(isa.is_available(), "this CPU lacks {isa}");
         let empty = || AlignedBuffer::zeroed(0);
-        Self { isa, num_heads, head_dim, len: 0, keys: empty(), values: empty(), finite: true }
+        Self {
+            isa,
+            num_heads,
+            head_dim,
+            len: 0,
+            keys: empty(),
+            values: empty(),
+            finite: true,
+        }
     }
 
     /// Replaces what is held by `keys` and `values`, `(len, num_heads * head_dim)` each, row-major with any row stride.
@@ -73,9 +81,19 @@ impl PackedKeyValues {
         let width = self.num_heads * self.head_dim;
         let len = keys.nrows();
         assert_eq!(keys.ncols(), width, "keys: expected num_heads * head_dim columns");
-        assert_eq!((values.nrows(), values.ncols()), (len, width), "values: expected the shape of keys");
-        assert!(keys.col_stride() == 1 || width <= 1, "keys: expected contiguous rows");
-        assert!(values.col_stride() == 1 || width <= 1, "values: expected contiguous rows");
+        assert_eq!(
+            (values.nrows(), values.ncols()),
+            (len, width),
+            "values: expected the shape of keys"
+        );
+        assert!(
+            keys.col_stride() == 1 || width <= 1,
+            "keys: expected contiguous rows"
+        );
+        assert!(
+            values.col_stride() == 1 || width <= 1,
+            "values: expected contiguous rows"
+        );
         self.len = len;
         let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
         reserve(&mut self.keys, self.num_heads * keys_size);
@@ -93,7 +111,11 @@ impl PackedKeyValues {
             lanes: lanes(self.isa),
             head_dim: self.head_dim,
         };
-        let threads = if 2 * len * width < ELEMENTS_FOR_THREADS { 1 } else { threads };
+        let threads = if 2 * len * width < ELEMENTS_FOR_THREADS {
+            1
+        } else {
+            threads
+        };
         parallel_for(threads, self.num_heads, &|head| {
             // SAFETY: heads write their own parts of the two buffers, which have room for all of them.
             let head_is_finite = unsafe { job.head(head, keys_size, values_size) };
@@ -187,7 +209,10 @@ impl Pack<'_> {
         let row = |of: MatRef<'_, f32>, key: usize| {
             // SAFETY: the row is in the view, its columns are contiguous, and the head's are among them.
             unsafe {
-                let start = of.as_ptr().offset(key as isize * of.row_stride()).add(head * head_dim);
+                let start = of
+                    .as_ptr()
+                    .offset(key as isize * of.row_stride())
+                    .add(head * head_dim);
                 std::slice::from_raw_parts(start, head_dim)
             }
         };
@@ -204,7 +229,10 @@ impl Pack<'_> {
             }
         }
         let mut finite = true;
-        for (key, to) in values_to.chunks_exact_mut(head_dim.next_multiple_of(lanes)).enumerate() {
+        for (key, to) in values_to
+            .chunks_exact_mut(head_dim.next_multiple_of(lanes))
+            .enumerate()
+        {
             let from = row(self.values, key);
             finite &= from.iter().fold(true, |finite, value| finite & value.is_finite());
             to[..head_dim].copy_from_slice(from);
@@ -257,19 +285,41 @@ pub fn attention(
     out: MatMut<'_, f32>,
 ) {
     let (rows, width) = (queries.nrows(), kv.num_heads * kv.head_dim);
-    assert_eq!(queries.ncols(), width, "queries: expected num_heads * head_dim columns");
-    assert_eq!((out.nrows(), out.ncols()), (rows, width), "out: expected the shape of queries");
-    assert!(queries.col_stride() == 1 || width <= 1, "queries: expected contiguous rows");
-    assert!(out.col_stride() == 1 || width <= 1, "out: expected contiguous rows");
+    assert_eq!(
+        queries.ncols(),
+        width,
+        "queries: expected num_heads * head_dim columns"
+    );
+    assert_eq!(
+        (out.nrows(), out.ncols()),
+        (rows, width),
+        "out: expected the shape of queries"
+    );
+    assert!(
+        queries.col_stride() == 1 || width <= 1,
+        "queries: expected contiguous rows"
+    );
+    assert!(
+        out.col_stride() == 1 || width <= 1,
+        "out: expected contiguous rows"
+    );
     if let Some(weights) = &weights {
-        assert_eq!(weights.len(), kv.num_heads * rows * kv.len, "weights: expected (num_heads, queries, len)");
+        assert_eq!(
+            weights.len(),
+            kv.num_heads * rows * kv.len,
+            "weights: expected (num_heads, queries, len)"
+        );
     }
     if rows == 0 || kv.num_heads == 0 {
         return;
     }
     if let Some(bias) = &bias {
         let needed = (kv.num_heads - 1) * bias.head_stride + (rows - 1) * bias.query_stride + kv.len;
-        assert!(bias.values.len() >= needed, "bias: expected {needed} elements, got {}", bias.values.len());
+        assert!(
+            bias.values.len() >= needed,
+            "bias: expected {needed} elements, got {}",
+            bias.values.len()
+        );
     }
     let job = Job {
         kv,
@@ -283,13 +333,25 @@ pub fn attention(
         out: out.as_ptr_mut(),
     };
     let tiles = rows.div_ceil(tile_rows(kv.isa));
-    let threads = if 2 * rows * kv.len * width < MACS_FOR_THREADS { 1 } else { threads };
+    let threads = if 2 * rows * kv.len * width < MACS_FOR_THREADS {
+        1
+    } else {
+        threads
+    };
     // Tiles of one head follow each other: its keys and values are then in the caches of all threads.
     parallel_for(threads, kv.num_heads * tiles, &|task| {
         let (head, tile) = (task / tiles, task % tiles);
         // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
         let (first, end) = (rows * tile / tiles, rows * (tile + 1) / tiles);
-        dispatch(kv.isa, Tile { job: &job, head, first, rows: end - first });
+        dispatch(
+            kv.isa,
+            Tile {
+                job: &job,
+                head,
+                first,
+                rows: end - first,
+            },
+        );
     });
 }
 
@@ -340,7 +402,10 @@ impl Kernel for Tile<'_> {
     unsafe fn run<V: Vector>(self) {
         let dims = self.job.kv.head_dim;
         for first in (0..dims).step_by(MAX_VALUES) {
-            let columns = Columns { first, count: MAX_VALUES.min(dims - first) };
+            let columns = Columns {
+                first,
+                count: MAX_VALUES.min(dims - first),
+            };
             // SAFETY: the rows and columns are in the job's views; the caller has the instruction set.
             unsafe {
                 match self.rows {
@@ -403,16 +468,25 @@ unsafe fn attend<V: Vector, const MR: usize>(tile: &Tile<'_>, columns: &Columns)
     let probabilities = probabilities.pointer();
     let mut sums = Scratch::<{ MAX_ROWS * MAX_VALUES }>::new();
     let sums = sums.pointer();
-    let mut running = [Running { max: f32::NEG_INFINITY, sum: 0.0 }; MR];
+    let mut running = [Running {
+        max: f32::NEG_INFINITY,
+        sum: 0.0,
+    }; MR];
     // SAFETY: the scratch holds MR rows of KEY_BLOCK probabilities and of `padded` sums; blocks end at the last key, whose vector is
     // padded in `keys`; everything else is the caller's promise.
     unsafe {
         for i in (0..MR * padded).step_by(V::LANES) {
             V::splat(0.0).store(sums.add(i));
         }
-        let queries = job.queries.offset(tile.first as isize * job.queries_stride).add(tile.head * kv.head_dim);
+        let queries = job
+            .queries
+            .offset(tile.first as isize * job.queries_stride)
+            .add(tile.head * kv.head_dim);
         let keys = kv.keys.as_ptr().add(tile.head * kv.keys_of_head());
-        let values = kv.values.as_ptr().add(tile.head * kv.values_of_head() + columns.first);
+        let values = kv
+            .values
+            .as_ptr()
+            .add(tile.head * kv.values_of_head() + columns.first);
         for first in (0..kv.len).step_by(KEY_BLOCK) {
             let count = KEY_BLOCK.min(kv.len - first);
             let product = Product {
@@ -427,7 +501,13 @@ unsafe fn attend<V: Vector, const MR: usize>(tile: &Tile<'_>, columns: &Columns)
             };
             product.all::<V, MR, false>(count.div_ceil(V::LANES));
             for (r, running) in running.iter_mut().enumerate() {
-                let row = Row { job, head: tile.head, query: tile.first + r, first, count };
+                let row = Row {
+                    job,
+                    head: tile.head,
+                    query: tile.first + r,
+                    first,
+                    count,
+                };
                 let rescale = row.softmax::<V>(probabilities.add(r * KEY_BLOCK), running);
                 for i in (0..padded).step_by(V::LANES) {
                     let at = sums.add(r * padded + i);
@@ -458,10 +538,20 @@ unsafe fn attend<V: Vector, const MR: usize>(tile: &Tile<'_>, columns: &Columns)
             for i in (0..columns.count).step_by(V::LANES) {
                 let value = V::load(sums.add(r * padded + i)).div(V::splat(divisor));
                 let lanes = V::LANES.min(columns.count - i);
-                if lanes == V::LANES { value.store(out.add(i)) } else { value.store_partial(out.add(i), lanes) }
+                if lanes == V::LANES {
+                    value.store(out.add(i))
+                } else {
+                    value.store_partial(out.add(i), lanes)
+                }
             }
             if columns.first == 0 {
-                let row = Row { job, head: tile.head, query: tile.first + r, first: 0, count: kv.len };
+                let row = Row {
+                    job,
+                    head: tile.head,
+                    query: tile.first + r,
+                    first: 0,
+                    count: kv.len,
+                };
                 row.normalise_weights::<V>(running, divisor);
             }
         }
@@ -489,7 +579,9 @@ impl Row<'_> {
     unsafe fn weights(&self) -> Option<*mut f32> {
         let row = self.head * self.job.rows + self.query;
         // SAFETY: `(num_heads, queries, len)`, checked by `attention`.
-        self.job.weights.map(|weights| unsafe { weights.add(row * self.job.kv.len) })
+        self.job
+            .weights
+            .map(|weights| unsafe { weights.add(row * self.job.kv.len) })
     }
 
     /// Turns the scores of a block into probabilities relative to the running maximum. Returns the factor by which sums so far change.
@@ -498,7 +590,10 @@ impl Row<'_> {
     /// `scores` points to the block's scores in whole vectors; the CPU has the instruction set of `V`.
     #[inline(always)]
     unsafe fn softmax<V: Vector>(&self, scores: *mut f32, running: &mut Running) -> f32 {
-        let bias = self.job.bias(self.head, self.query).map(|bias| bias[self.first..].as_ptr());
+        let bias = self
+            .job
+            .bias(self.head, self.query)
+            .map(|bias| bias[self.first..].as_ptr());
         let removed = f32::NEG_INFINITY;
         // SAFETY: the caller's promise; the bias has `count` elements from here on, and so have the weights.
         unsafe {
@@ -534,7 +629,10 @@ impl Row<'_> {
                 sum = sum.add(probability);
             }
             let rescale = first_lane(rescale);
-            *running = Running { max, sum: running.sum * rescale + sum.reduce_add() };
+            *running = Running {
+                max,
+                sum: running.sum * rescale + sum.reduce_add(),
+            };
             rescale
         }
     }
@@ -551,27 +649,12 @@ impl Row<'_> {
             for i in (0..self.count).step_by(V::LANES) {
                 let lanes = V::LANES.min(self.count - i);
                 let logits = load::<V>(weights.add(i), lanes);
-                let probability = exp_vector(logits.sub(V::splat(finite_max(running.max)))).div(V::splat(divisor));
+                let probability =
+                    exp_vector(logits.sub(V::splat(finite_max(running.max)))).div(V::splat(divisor));
                 store(probability, weights.add(i), lanes);
             }
         }
     }
-}
-
-/// # Safety
-/// As [`Vector::load_partial`].
-#[inline(always)]
-unsafe fn load<V: Vector>(from: *const f32, lanes: usize) -> V {
-    // SAFETY: the caller's promise.
-    unsafe { if lanes == V::LANES { V::load(from) } else { V::load_partial(from, lanes) } }
-}
-
-/// # Safety
-/// As [`Vector::store_partial`].
-#[inline(always)]
-unsafe fn store<V: Vector>(vector: V, to: *mut f32, lanes: usize) {
-    // SAFETY: the caller's promise.
-    unsafe { if lanes == V::LANES { vector.store(to) } else { vector.store_partial(to, lanes) } }
 }
 
 /// # Safety

@@ -76,7 +76,14 @@ impl Isa {
             Some(given) if !given.is_empty() => {
                 let given = given.to_string_lossy();
                 let isa: Self = given.parse()?;
-                if isa.is_available() { Ok(isa) } else { Err(IsaError { given: given.into_owned(), known: true }) }
+                if isa.is_available() {
+                    Ok(isa)
+                } else {
+                    Err(IsaError {
+                        given: given.into_owned(),
+                        known: true,
+                    })
+                }
             }
             _ => Ok(Self::best()),
         }
@@ -98,7 +105,10 @@ impl FromStr for Isa {
 
     fn from_str(name: &str) -> Result<Self, IsaError> {
         let known = ALL.into_iter().find(|isa| isa.to_string() == name);
-        known.ok_or_else(|| IsaError { given: name.to_owned(), known: false })
+        known.ok_or_else(|| IsaError {
+            given: name.to_owned(),
+            known: false,
+        })
     }
 }
 

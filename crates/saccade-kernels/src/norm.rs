@@ -4,7 +4,7 @@ use faer::{MatMut, MatRef};
 
 use crate::isa::Isa;
 use crate::pool::parallel_for;
-use crate::simd::{Kernel, Vector, dispatch};
+use crate::simd::{Kernel, Vector, dispatch, load, store};
 
 /// Elements from which a second thread pays: below, one core is done in less time than it takes to wake another.
 const ELEMENTS_FOR_THREADS: usize = 1 << 16;
@@ -16,10 +16,10 @@ const ELEMENTS_PER_TASK: usize = 1 << 13;
 ///
 /// `x` and `out` are `(rows, width)`, row-major with any row stride; `scale` and `shift` have `width` elements and hold for all rows: the
 /// learned affine, or `1 + scale` and `shift` of an adaptive norm. The variance is the mean of squared distances from the mean, in a second
-/// pass over the row. A row of zero variance gives `shift`; one with NaN or infinity gives NaN.
+/// pass over the row, which also finds what rounding has left of the mean: rows far from zero are as exact as others. A row of zero variance gives `shift`; one with NaN or infinity gives NaN.
 ///
 /// # Panics
-/// If a shape does not fit, columns are not contiguous, or, in debug builds, this CPU lacks `isa`.
+/// If a shape does not fit, columns are not contiguous, or this CPU lacks `isa`.
 ///
 /// ```
 /// use faer::{MatMut, MatRef};
@@ -38,11 +38,22 @@ pub fn layer_norm(
     out: MatMut<'_, f32>,
 ) {
     let (rows, width) = (x.nrows(), x.ncols());
-    assert_eq!((out.nrows(), out.ncols()), (rows, width), "out: expected the shape of x");
+    assert_eq!(
+        (out.nrows(), out.ncols()),
+        (rows, width),
+        "out: expected the shape of x"
+    );
     assert!(x.col_stride() == 1 || width <= 1, "x: expected contiguous rows");
-    assert!(out.col_stride() == 1 || width <= 1, "out: expected contiguous rows");
+    assert!(
+        out.col_stride() == 1 || width <= 1,
+        "out: expected contiguous rows"
+    );
     if let Some((scale, shift)) = scale_shift {
-        assert_eq!((scale.len(), shift.len()), (width, width), "scale and shift: expected one element per column");
+        assert_eq!(
+            (scale.len(), shift.len()),
+            (width, width),
+            "scale and shift: expected one element per column"
+        );
     }
     if rows == 0 || width == 0 {
         return;
@@ -57,10 +68,21 @@ pub fn layer_norm(
         scale_shift,
     };
     let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).min(rows);
-    let threads = if rows * width < ELEMENTS_FOR_THREADS { 1 } else { threads };
+    let threads = if rows * width < ELEMENTS_FOR_THREADS {
+        1
+    } else {
+        threads
+    };
     parallel_for(threads, tasks, &|task| {
         let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        dispatch(isa, Rows { job: &job, first, end });
+        dispatch(
+            isa,
+            Rows {
+                job: &job,
+                first,
+                end,
+            },
+        );
     });
 }
 
@@ -104,63 +126,87 @@ impl Kernel for Rows<'_> {
 #[inline(always)]
 unsafe fn norm_row<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
     let width = job.width;
-    let whole = width / V::LANES * V::LANES;
-    let rest = width - whole;
+    let columns = width as f32;
     // SAFETY: vectors lie within the first `width` elements, the last one is partial; scale and shift are as long.
     unsafe {
-        let mean = sum::<V>(x, width, 0.0, false) / width as f32;
-        let centre = V::splat(mean);
-        let variance = sum::<V>(x, width, mean, true) / width as f32;
-        let factor = V::splat(1.0 / (variance + job.eps).sqrt());
-        let normed = |x: V| x.sub(centre).mul(factor);
-        if let Some((scale, shift)) = job.scale_shift {
-            let (scale, shift) = (scale.as_ptr(), shift.as_ptr());
-            for i in (0..whole).step_by(V::LANES) {
-                normed(V::load(x.add(i))).fma(V::load(scale.add(i)), V::load(shift.add(i))).store(out.add(i));
-            }
-            let (scale, shift) = (V::load_partial(scale.add(whole), rest), V::load_partial(shift.add(whole), rest));
-            normed(V::load_partial(x.add(whole), rest)).fma(scale, shift).store_partial(out.add(whole), rest);
-        } else {
-            for i in (0..whole).step_by(V::LANES) {
-                normed(V::load(x.add(i))).store(out.add(i));
-            }
-            normed(V::load_partial(x.add(whole), rest)).store_partial(out.add(whole), rest);
+        let (total, _) = sums::<V>(x, width, 0.0);
+        let mean = total / columns;
+        // What the distances from the mean add up to is the error of the mean, which matters where it is large beside them.
+        let (distances, squares) = sums::<V>(x, width, mean);
+        let error = distances / columns;
+        let variance = (squares - distances * error) / columns;
+        let row = Normed {
+            mean: V::splat(mean),
+            error: V::splat(error),
+            factor: V::splat(1.0 / (variance + job.eps).sqrt()),
+        };
+        for i in (0..width).step_by(V::LANES) {
+            let lanes = V::LANES.min(width - i);
+            let y = row.of(load::<V>(x.add(i), lanes));
+            let y = match job.scale_shift {
+                Some((scale, shift)) => {
+                    let scale = load::<V>(scale.as_ptr().add(i), lanes);
+                    y.fma(scale, load(shift.as_ptr().add(i), lanes))
+                }
+                None => y,
+            };
+            store(y, out.add(i), lanes);
         }
     }
 }
 
-/// Sum of `x - centre`, or of its squares, in four chains: short ones round less, and do not wait for each other.
+/// What a row's elements are normed with.
+struct Normed<V> {
+    mean: V,
+    /// To be taken off as well: the part of the mean that it has no digits for.
+    error: V,
+    factor: V,
+}
+
+impl<V: Vector> Normed<V> {
+    /// # Safety
+    /// The CPU has the instruction set of `V`.
+    #[inline(always)]
+    unsafe fn of(&self, x: V) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { x.sub(self.mean).sub(self.error).mul(self.factor) }
+    }
+}
+
+/// Sums of `x - centre` and of its squares, in four chains: short ones round less, and do not wait for each other.
 ///
 /// # Safety
 /// `x` points to `width` elements; the CPU has the instruction set of `V`.
 #[inline(always)]
-unsafe fn sum<V: Vector>(x: *const f32, width: usize, centre: f32, squares: bool) -> f32 {
+unsafe fn sums<V: Vector>(x: *const f32, width: usize, centre: f32) -> (f32, f32) {
+    const CHAINS: usize = 4;
     // SAFETY: the caller's promise.
     unsafe {
-        let term = |x: V, total: V| {
-            let distance = x.sub(V::splat(centre));
-            if squares { distance.fma(distance, total) } else { total.add(distance) }
-        };
-        let mut totals = [V::splat(0.0); 4];
-        let mut i = 0;
-        while i + 4 * V::LANES <= width {
-            for (chain, total) in totals.iter_mut().enumerate() {
-                *total = term(V::load(x.add(i + chain * V::LANES)), *total);
+        let mut sums = [V::splat(0.0); CHAINS];
+        let mut squares = [V::splat(0.0); CHAINS];
+        let vectors = width / V::LANES;
+        // A loop over chains, so that their sums stay in registers.
+        for i in (0..vectors / CHAINS * CHAINS).step_by(CHAINS) {
+            for chain in 0..CHAINS {
+                let distance = V::load(x.add((i + chain) * V::LANES)).sub(V::splat(centre));
+                sums[chain] = sums[chain].add(distance);
+                squares[chain] = distance.fma(distance, squares[chain]);
             }
-            i += 4 * V::LANES;
         }
-        let mut total = totals[0].add(totals[1]).add(totals[2].add(totals[3]));
-        while i + V::LANES <= width {
-            total = term(V::load(x.add(i)), total);
-            i += V::LANES;
+        let mut sum = sums[0].add(sums[1]).add(sums[2].add(sums[3]));
+        let mut square = squares[0].add(squares[1]).add(squares[2].add(squares[3]));
+        for i in vectors / CHAINS * CHAINS..vectors {
+            let distance = V::load(x.add(i * V::LANES)).sub(V::splat(centre));
+            sum = sum.add(distance);
+            square = distance.fma(distance, square);
         }
-        let mut total = total.reduce_add();
+        let (mut sum, mut square) = (sum.reduce_add(), square.reduce_add());
         // One by one: lanes beyond the row would count as zeros, whose distance from the centre is not zero.
-        while i < width {
+        for i in vectors * V::LANES..width {
             let distance = *x.add(i) - centre;
-            total += if squares { distance * distance } else { distance };
-            i += 1;
+            sum += distance;
+            square += distance * distance;
         }
-        total
+        (sum, square)
     }
 }

@@ -43,7 +43,11 @@ impl Job<'_> {
             if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.f)(task))) {
                 let mut first = lock(&self.panic);
                 // A later one is forgotten, not dropped: dropping runs code of its thrower, which may panic again.
-                if first.is_none() { *first = Some(panic) } else { std::mem::forget(panic) }
+                if first.is_none() {
+                    *first = Some(panic)
+                } else {
+                    std::mem::forget(panic)
+                }
             }
         }
     }
@@ -85,7 +89,12 @@ impl Slot {
         // SAFETY: non-null after entering: the caller will not leave, nor end the job's life, before `inside` is zero again.
         if let Some(job) = unsafe { job.as_ref() } {
             let take = |seats: usize| seats.checked_sub(1);
-            if !job.is_exhausted() && job.seats.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take).is_ok() {
+            if !job.is_exhausted()
+                && job
+                    .seats
+                    .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
+                    .is_ok()
+            {
                 job.run();
                 helped = true;
             }
@@ -126,7 +135,12 @@ impl Pool {
     fn start_workers(&'static self, wanted: usize) {
         while self.workers.load(Ordering::Relaxed) < wanted {
             let take = |count: usize| (count < wanted).then_some(count + 1);
-            let Ok(index) = self.workers.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take) else { return };
+            let Ok(index) = self
+                .workers
+                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
+            else {
+                return;
+            };
             let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));
             if thread.spawn(|| self.work()).is_err() {
                 // The caller manages alone; a later call tries again.
@@ -158,7 +172,9 @@ impl Pool {
 
     fn help(&self) -> bool {
         // No short circuit: a worker visits all slots before it looks for new offers.
-        self.slots.iter().fold(false, |helped, slot| slot.help() || helped)
+        self.slots
+            .iter()
+            .fold(false, |helped, slot| slot.help() || helped)
     }
 
     fn sleep(&self, seen: u32) {
@@ -196,9 +212,13 @@ impl Pool {
             seats: AtomicUsize::new(helpers),
             panic: Mutex::new(None),
         };
-        let slot = self.slots.iter().find(|slot| !slot.taken.swap(true, Ordering::Acquire));
+        let slot = self
+            .slots
+            .iter()
+            .find(|slot| !slot.taken.swap(true, Ordering::Acquire));
         if let Some(slot) = slot {
-            slot.job.store((&raw const job).cast_mut().cast(), Ordering::SeqCst);
+            slot.job
+                .store((&raw const job).cast_mut().cast(), Ordering::SeqCst);
             self.ring(helpers);
         }
         // Panics of tasks are kept in the job, so that this thread always comes to the end of this function.
@@ -212,7 +232,11 @@ impl Pool {
             while slot.inside.load(Ordering::SeqCst) != 0 {
                 turns += 1;
                 // More threads than cores: let the worker run.
-                if turns.is_multiple_of(128) { std::thread::yield_now() } else { std::hint::spin_loop() }
+                if turns.is_multiple_of(128) {
+                    std::thread::yield_now()
+                } else {
+                    std::hint::spin_loop()
+                }
             }
             slot.taken.store(false, Ordering::Release);
         }
@@ -240,7 +264,10 @@ fn pool() -> &'static Pool {
             Some(pool) if pool.process == process => return pool,
             _ => {
                 let fresh = Box::into_raw(Box::new(Pool::new(process)));
-                if POOL.compare_exchange(known, fresh, Ordering::AcqRel, Ordering::Acquire).is_err() {
+                if POOL
+                    .compare_exchange(known, fresh, Ordering::AcqRel, Ordering::Acquire)
+                    .is_err()
+                {
                     // SAFETY: another thread was faster; nobody has seen this one.
                     drop(unsafe { Box::from_raw(fresh) });
                 }
@@ -296,7 +323,11 @@ mod tests {
     fn every_task_runs_once() {
         for threads in [0, 1, 2, 3, 8, 33] {
             for tasks in [0, 1, 2, 3, 7, 100, 5000] {
-                assert_eq!(visits(threads, tasks), vec![1; tasks], "{threads} threads, {tasks} tasks");
+                assert_eq!(
+                    visits(threads, tasks),
+                    vec![1; tasks],
+                    "{threads} threads, {tasks} tasks"
+                );
             }
         }
     }
@@ -340,7 +371,12 @@ mod tests {
                 });
             }));
             let message = outcome.unwrap_err();
-            assert!(message.downcast_ref::<String>().unwrap().contains("this one fails"));
+            assert!(
+                message
+                    .downcast_ref::<String>()
+                    .unwrap()
+                    .contains("this one fails")
+            );
             assert_eq!(done.into_inner(), 49);
             assert_eq!(visits(threads, 50), vec![1; 50]);
         }

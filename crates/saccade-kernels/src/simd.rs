@@ -55,6 +55,38 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn prefetch(at: *const u8);
 }
 
+/// The first `lanes` elements, by the plain load where that is all of them.
+///
+/// # Safety
+/// As [`Vector::load_partial`].
+#[inline(always)]
+pub(crate) unsafe fn load<V: Vector>(from: *const f32, lanes: usize) -> V {
+    // SAFETY: the caller's promise.
+    unsafe {
+        if lanes == V::LANES {
+            V::load(from)
+        } else {
+            V::load_partial(from, lanes)
+        }
+    }
+}
+
+/// The first `lanes` elements, by the plain store where that is all of them.
+///
+/// # Safety
+/// As [`Vector::store_partial`].
+#[inline(always)]
+pub(crate) unsafe fn store<V: Vector>(vector: V, to: *mut f32, lanes: usize) {
+    // SAFETY: the caller's promise.
+    unsafe {
+        if lanes == V::LANES {
+            vector.store(to)
+        } else {
+            vector.store_partial(to, lanes)
+        }
+    }
+}
+
 /// Work written once for all vectors. `run` must be `#[inline(always)]`.
 pub(crate) trait Kernel {
     type Output;
@@ -67,18 +99,18 @@ pub(crate) trait Kernel {
 /// Runs a kernel with the vectors of `isa`.
 ///
 /// # Panics
-/// In debug builds, if this CPU lacks `isa`; types that keep an [`Isa`] check it when they are made.
+/// If this CPU lacks `isa`: looking is a few loads, and makes every kernel sound.
 #[inline]
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
-    debug_assert!(isa.is_available(), "this CPU lacks {isa}");
+    assert!(isa.is_available(), "this CPU lacks {isa}");
     match isa {
         // SAFETY: plain arithmetic, on any CPU.
         Isa::Portable => unsafe { kernel.run::<Portable>() },
         #[cfg(target_arch = "x86_64")]
-        // SAFETY: callers pass instruction sets that this CPU has.
+        // SAFETY: this CPU has it, as was just checked.
         Isa::Avx2 => unsafe { x86::run_avx2(kernel) },
         #[cfg(target_arch = "x86_64")]
-        // SAFETY: callers pass instruction sets that this CPU has.
+        // SAFETY: this CPU has it, as was just checked.
         Isa::Avx512 => unsafe { x86::run_avx512(kernel) },
         #[cfg(not(target_arch = "x86_64"))]
         _ => unreachable!("{isa} is never available on this architecture"),
@@ -117,7 +149,10 @@ mod portable {
     /// `2^exponent` for whole exponents in -126..=127.
     #[inline(always)]
     fn power_of_two(exponent: f32) -> f32 {
-        let biased = (exponent + ROUND).to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127);
+        let biased = (exponent + ROUND)
+            .to_bits()
+            .wrapping_sub(ROUND.to_bits())
+            .wrapping_add(127);
         f32::from_bits(biased << 23)
     }
 
@@ -215,7 +250,11 @@ mod portable {
         unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
             let mut out = self.0;
             for lane in 0..8 {
-                out[lane] = if probe.0[lane] == value.0[lane] { value.0[lane] } else { out[lane] };
+                out[lane] = if probe.0[lane] == value.0[lane] {
+                    value.0[lane]
+                } else {
+                    out[lane]
+                };
             }
             Self(out)
         }
@@ -228,7 +267,9 @@ mod portable {
 
         #[inline(always)]
         unsafe fn reduce_max(self) -> f32 {
-            self.0.into_iter().fold(f32::NEG_INFINITY, |a, b| if a > b { a } else { b })
+            self.0
+                .into_iter()
+                .fold(f32::NEG_INFINITY, |a, b| if a > b { a } else { b })
         }
 
         #[inline(always)]
@@ -417,7 +458,12 @@ mod x86 {
         #[inline(always)]
         unsafe fn load_high_halves(from: *const u32) -> Self {
             // SAFETY: the caller gives eight words.
-            unsafe { _mm256_castsi256_ps(_mm256_and_si256(_mm256_loadu_si256(from.cast()), _mm256_set1_epi32(0xffff_0000_u32 as i32))) }
+            unsafe {
+                _mm256_castsi256_ps(_mm256_and_si256(
+                    _mm256_loadu_si256(from.cast()),
+                    _mm256_set1_epi32(0xffff_0000_u32 as i32),
+                ))
+            }
         }
 
         #[inline(always)]
@@ -558,7 +604,12 @@ mod x86 {
         #[inline(always)]
         unsafe fn load_high_halves(from: *const u32) -> Self {
             // SAFETY: the caller gives sixteen words.
-            unsafe { _mm512_castsi512_ps(_mm512_and_si512(_mm512_loadu_si512(from.cast()), _mm512_set1_epi32(0xffff_0000_u32 as i32))) }
+            unsafe {
+                _mm512_castsi512_ps(_mm512_and_si512(
+                    _mm512_loadu_si512(from.cast()),
+                    _mm512_set1_epi32(0xffff_0000_u32 as i32),
+                ))
+            }
         }
 
         #[inline(always)]

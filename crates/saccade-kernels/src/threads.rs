@@ -30,7 +30,9 @@ pub fn default_num_threads() -> Result<NonZeroUsize, NumThreadsError> {
 }
 
 fn parse(given: &str) -> Result<NonZeroUsize, NumThreadsError> {
-    given.trim().parse().map_err(|_| NumThreadsError { given: given.to_owned() })
+    given.trim().parse().map_err(|_| NumThreadsError {
+        given: given.to_owned(),
+    })
 }
 
 fn usable_cores() -> NonZeroUsize {
@@ -57,7 +59,9 @@ mod linux {
     /// Distinct cores among the processors that the affinity mask allows.
     fn allowed_cores(read: &impl Fn(&Path) -> Option<String>) -> Option<usize> {
         let status = read(Path::new("/proc/self/status"))?;
-        let list = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:"))?;
+        let list = status
+            .lines()
+            .find_map(|line| line.strip_prefix("Cpus_allowed_list:"))?;
         let core = |cpu: usize| {
             let topology = format!("/sys/devices/system/cpu/cpu{cpu}/topology");
             let siblings = read(&PathBuf::from(topology).join("thread_siblings_list"));
@@ -85,7 +89,9 @@ mod linux {
         let mut tightest = None;
         for line in groups.lines() {
             let mut fields = line.splitn(3, ':').skip(1);
-            let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else { continue };
+            let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else {
+                continue;
+            };
             let (root, v2) = if controllers.is_empty() {
                 ("/sys/fs/cgroup", true)
             } else if controllers.split(',').any(|controller| controller == "cpu") {
@@ -111,7 +117,11 @@ mod linux {
             let number = |name| read(&group.join(name))?.trim().parse::<u64>().ok();
             (number("cpu.cfs_quota_us")?, number("cpu.cfs_period_us")?)
         };
-        (period > 0).then(|| usize::try_from(quota.div_ceil(period)).unwrap_or(usize::MAX).max(1))
+        (period > 0).then(|| {
+            usize::try_from(quota.div_ceil(period))
+                .unwrap_or(usize::MAX)
+                .max(1)
+        })
     }
 
     #[cfg(test)]
@@ -129,18 +139,36 @@ mod linux {
         fn siblings_count_once() {
             let read = files(&[
                 ("/proc/self/status", "Name:\tx\nCpus_allowed_list:\t0-2,5\n"),
-                ("/sys/devices/system/cpu/cpu0/topology/thread_siblings_list", "0,4\n"),
-                ("/sys/devices/system/cpu/cpu1/topology/thread_siblings_list", "1,5\n"),
-                ("/sys/devices/system/cpu/cpu2/topology/thread_siblings_list", "2,6\n"),
-                ("/sys/devices/system/cpu/cpu5/topology/thread_siblings_list", "1,5\n"),
+                (
+                    "/sys/devices/system/cpu/cpu0/topology/thread_siblings_list",
+                    "0,4\n",
+                ),
+                (
+                    "/sys/devices/system/cpu/cpu1/topology/thread_siblings_list",
+                    "1,5\n",
+                ),
+                (
+                    "/sys/devices/system/cpu/cpu2/topology/thread_siblings_list",
+                    "2,6\n",
+                ),
+                (
+                    "/sys/devices/system/cpu/cpu5/topology/thread_siblings_list",
+                    "1,5\n",
+                ),
             ]);
             assert_eq!(allowed_cores(&read), Some(3));
         }
 
         #[test]
         fn without_topology_every_processor_is_a_core() {
-            assert_eq!(allowed_cores(&files(&[("/proc/self/status", "Cpus_allowed_list:\t0-2,5\n")])), Some(4));
-            assert_eq!(allowed_cores(&files(&[("/proc/self/status", "Cpus_allowed_list:\tx\n")])), None);
+            assert_eq!(
+                allowed_cores(&files(&[("/proc/self/status", "Cpus_allowed_list:\t0-2,5\n")])),
+                Some(4)
+            );
+            assert_eq!(
+                allowed_cores(&files(&[("/proc/self/status", "Cpus_allowed_list:\tx\n")])),
+                None
+            );
             assert_eq!(allowed_cores(&files(&[])), None);
         }
 
@@ -171,7 +199,13 @@ mod linux {
 
         #[test]
         fn no_quota() {
-            assert_eq!(quota(&files(&[("/proc/self/cgroup", "0::/\n"), ("/sys/fs/cgroup/cpu.max", "max 100000\n")])), None);
+            assert_eq!(
+                quota(&files(&[
+                    ("/proc/self/cgroup", "0::/\n"),
+                    ("/sys/fs/cgroup/cpu.max", "max 100000\n")
+                ])),
+                None
+            );
             assert_eq!(quota(&files(&[])), None);
         }
     }
@@ -186,7 +220,10 @@ mod tests {
         assert_eq!(parse(" 3 ").unwrap().get(), 3);
         for given in ["0", "-1", "two", "1.5"] {
             let message = parse(given).unwrap_err().to_string();
-            assert!(message.contains("SACCADE_NUM_THREADS") && message.contains(given), "{message}");
+            assert!(
+                message.contains("SACCADE_NUM_THREADS") && message.contains(given),
+                "{message}"
+            );
         }
     }
 
