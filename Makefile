@@ -54,13 +54,13 @@ format: setup-test
 # One after the other, in this order, also under `make -j`.
 setup-rollout:
 	@$(PYTHON) .ci/needs.py python rust opengl
-	@$(MAKE) $(VENV)/.rollout
-	@$(MAKE) $(VENV)/.extension
+	@$(MAKE) -s $(VENV)/.rollout
+	@$(MAKE) -s $(VENV)/.extension
 
 setup-test:
 	@$(PYTHON) .ci/needs.py python rust opengl
-	@$(MAKE) $(VENV)/.test
-	@$(MAKE) $(VENV)/.extension
+	@$(MAKE) -s $(VENV)/.test
+	@$(MAKE) -s $(VENV)/.extension
 
 # A copied or moved checkout has an environment that points elsewhere: it is made anew.
 $(VENV)/.tools: constraints.txt
