@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import sys
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -32,10 +32,12 @@ def is_torch(value: object) -> bool:
 def float32(name: str, value: ArrayLike) -> Float32Array:
     """``value`` as a C-contiguous float32 array, without a copy where it is one already.
 
-    float64, float16 and bfloat16 are converted; a value beyond float32's range becomes infinite, which the engine refuses.
+    float64, float16 and bfloat16 are converted; a value beyond float32's range becomes infinite, which the
+    engine refuses.
 
     Raises:
-        DtypeError: ``value`` holds integers, booleans or anything else that is not a real float, or is not on the CPU.
+        DtypeError: ``value`` holds integers, booleans or anything else that is not a real float, or is not
+            on the CPU.
         ShapeError: ``value`` is a ragged sequence.
     """
     if is_torch(value):
@@ -130,11 +132,9 @@ def apart(array: Float32Array, output: Float32Array) -> Float32Array:
     return array.copy() if np.may_share_memory(array, output) else array
 
 
-def like_features(array: Float32Array, use_torch: bool) -> Array:
+def like_features(array: npt.NDArray[Any], use_torch: bool) -> Array:
     """``array`` as it is, or as a torch tensor on the same memory."""
-    if use_torch:
-        return sys.modules["torch"].from_numpy(array)  # type: ignore[no-any-return]
-    return array
+    return cast("Array", sys.modules["torch"].from_numpy(array)) if use_torch else array
 
 
 def _asarray(name: str, value: Any) -> npt.NDArray[Any]:

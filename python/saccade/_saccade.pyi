@@ -1,6 +1,6 @@
 """The extension module: what the Python package calls. Arrays are C-contiguous."""
 
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -9,4 +9,106 @@ _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
 
+__all__ = [
+    "ActionHead",
+    "Context",
+    "CrossAttention",
+    "KeyValues",
+    "__version__",
+    "available_isas",
+    "default_num_threads",
+    "parse_config",
+    "read_tensors",
+    "selected_isa",
+]
+
 __version__: str
+
+@final
+class Context:
+    @property
+    def batch(self) -> int: ...
+    @property
+    def num_vl_tokens(self) -> int: ...
+    @property
+    def nbytes(self) -> int: ...
+    def vl_embs(self) -> _Float32: ...
+    def image_mask(self) -> _Bool | None: ...
+
+@final
+class ActionHead:
+    @staticmethod
+    def load(
+        source: str, config: str | None, embodiment_ids: list[int] | None, num_threads: int | None
+    ) -> ActionHead: ...
+    def config(self) -> dict[str, Any]: ...
+    @property
+    def embodiment_ids(self) -> list[int]: ...
+    @property
+    def num_threads(self) -> int: ...
+    @property
+    def isa(self) -> str: ...
+    @property
+    def nbytes(self) -> int: ...
+    def warmup(self, num_vl_tokens: int, batch: int, num_samples: int | None) -> None: ...
+    def encode(
+        self,
+        backbone_features: _Float32,
+        attention_mask: _Bool | None,
+        image_mask: _Bool | None,
+        drop_vl: _Bool | None,
+    ) -> Context: ...
+    def sample(
+        self,
+        context: Context,
+        state: _Float32,
+        embodiment_id: _Int64,
+        noise: _Float32,
+        num_steps: int | None,
+        num_samples: int | None,
+        out: _Float32,
+    ) -> None: ...
+    def velocity(
+        self,
+        context: Context,
+        state: _Float32,
+        embodiment_id: _Int64,
+        actions: _Float32,
+        timestep: _Int64,
+        out: _Float32,
+    ) -> None: ...
+
+@final
+class KeyValues:
+    @property
+    def batch(self) -> int: ...
+    @property
+    def num_vl_tokens(self) -> int: ...
+    @property
+    def nbytes(self) -> int: ...
+
+@final
+class CrossAttention:
+    def __new__(cls, tensors: dict[str, _Float32], num_heads: int) -> CrossAttention: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def context_dim(self) -> int: ...
+    @property
+    def num_heads(self) -> int: ...
+    def project(self, encoder_hidden_states: _Float32) -> KeyValues: ...
+    def attend(
+        self,
+        hidden_states: _Float32,
+        kv: KeyValues,
+        key_mask: _Bool | None,
+        key_bias: _Float32 | None,
+        weights: _Float32 | None,
+        out: _Float32,
+    ) -> None: ...
+
+def parse_config(text: str) -> dict[str, Any]: ...
+def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
+def available_isas() -> list[str]: ...
+def selected_isa() -> str: ...
+def default_num_threads() -> int: ...

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, overload
+from typing import Literal, overload
 
 import numpy as np
 
 from saccade import _saccade
-from saccade._arrays import Array, ArrayLike, apart, boolean, float32, integer, is_torch, like_features, result
+from saccade._arrays import (
+    Array,
+    ArrayLike,
+    apart,
+    boolean,
+    float32,
+    integer,
+    is_torch,
+    like_features,
+    result,
+)
 from saccade.errors import DtypeError, InputError
 
 
@@ -42,7 +52,8 @@ class CrossAttention:
 
     Args:
         tensors: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
-            ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``, ``to_out.0.bias (width,)``.
+            ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
+            ``to_out.0.bias (width,)``.
         num_heads: A divisor of the width.
         precision: ``"float32"``.
 
@@ -63,7 +74,9 @@ class CrossAttention:
         (2, 5, 64)
     """
 
-    def __init__(self, tensors: Mapping[str, ArrayLike], num_heads: int, *, precision: str = "float32") -> None:
+    def __init__(
+        self, tensors: Mapping[str, ArrayLike], num_heads: int, *, precision: str = "float32"
+    ) -> None:
         if not isinstance(tensors, Mapping):
             raise DtypeError(f"tensors: expected a mapping of names to arrays, got {type(tensors).__name__}")
         check_precision(precision)
@@ -137,14 +150,15 @@ class CrossAttention:
         Args:
             hidden_states: ``(batch, queries, width)``.
             kv: From :meth:`project`.
-            key_mask: bool ``(batch, T_vl)``, True = attended. A query with no key left gets zeros: the output is then ``to_out``'s bias.
+            key_mask: bool ``(batch, T_vl)``, True = attended. A query with no key left gets zeros: the
+                output is then ``to_out``'s bias.
             key_bias: ``(batch, T_vl)``, added to the logits; minus infinity removes a key.
             return_weights: Also return the attention probabilities.
             out: Where the result goes: writable float32, C-contiguous, ``(batch, queries, width)``.
 
         Returns:
-            ``(batch, queries, width)`` float32, torch if the tokens of ``kv`` were torch; with ``return_weights`` also
-            ``(batch, heads, queries, T_vl)``.
+            ``(batch, queries, width)`` float32, torch if the tokens of ``kv`` were torch; with
+            ``return_weights`` also ``(batch, heads, queries, T_vl)``.
 
         Raises:
             ShapeError, DtypeError, InputError: an argument does not fit.
@@ -157,7 +171,9 @@ class CrossAttention:
         if return_weights:
             weights = np.empty((kv.batch, self.num_heads, *states.shape[1:2], kv.num_vl_tokens), np.float32)
         bias = None if key_bias is None else float32("key_bias", key_bias)
-        self._attention.attend(apart(states, output), kv._held, boolean("key_mask", key_mask), bias, weights, output)
+        self._attention.attend(
+            apart(states, output), kv._held, boolean("key_mask", key_mask), bias, weights, output
+        )
         attended = like_features(output, kv._torch) if out is None else out
         if weights is None:
             return attended  # type: ignore[return-value]

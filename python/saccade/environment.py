@@ -17,8 +17,8 @@ def show_config(mode: Literal["dicts"]) -> dict[str, Any]: ...
 def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] | None:
     """Prints, or with ``mode="dicts"`` returns, what a head loaded now would use.
 
-    ``isa`` is the instruction set (``SACCADE_ISA`` forces one of ``available_isas``), ``num_threads`` the default thread count
-    (``SACCADE_NUM_THREADS``).
+    ``isa`` is the instruction set (``SACCADE_ISA`` forces one of ``available_isas``), ``num_threads`` the
+    default thread count (``SACCADE_NUM_THREADS``).
 
     Raises:
         InputError: ``SACCADE_ISA`` or ``SACCADE_NUM_THREADS`` holds something that cannot be used here.

@@ -2,7 +2,9 @@
 
 
 class SaccadeError(Exception):
-    """Base of everything that saccade raises on its own, except ``FileNotFoundError`` for a path that is not there."""
+    """Base of everything that saccade raises on its own, except ``FileNotFoundError`` for a path that is not
+    there.
+    """
 
 
 class ShapeError(SaccadeError, ValueError):
@@ -18,4 +20,6 @@ class InputError(SaccadeError, ValueError):
 
 
 class CheckpointError(SaccadeError, ValueError):
-    """A checkpoint or its config is broken, incomplete, or of another kind; the message lists all that is wrong."""
+    """A checkpoint or its config is broken, incomplete, or of another kind; the message lists all that is
+    wrong.
+    """

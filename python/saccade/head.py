@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,9 @@ from saccade.errors import InputError
 
 
 class Context:
-    """An encoded observation: immutable, for any number of calls and threads. Made by :meth:`ActionHead.encode`."""
+    """An encoded observation: immutable, for any number of calls and threads. Made by
+    :meth:`ActionHead.encode`.
+    """
 
     def __init__(self, held: _saccade.Context, use_torch: bool) -> None:
         self._held = held
@@ -52,11 +55,13 @@ class Context:
 
     @property
     def vl_embs(self) -> Array:
-        """A copy of what the cross-attention blocks see: ``(batch, T_vl, context_dim)`` float32, zero where ``drop_vl`` was true."""
+        """A copy of what the cross-attention blocks see: ``(batch, T_vl, context_dim)`` float32, zero where
+        ``drop_vl`` was true.
+        """
         return like_features(self._held.vl_embs(), self._torch)
 
     @property
-    def image_mask(self) -> Any:
+    def image_mask(self) -> Array | None:
         """The bool ``(batch, T_vl)`` mask given to ``encode``, or None."""
         mask = self._held.image_mask()
         return None if mask is None else like_features(mask, self._torch)
@@ -71,17 +76,22 @@ class ActionHead:
     A row's result has the same bits in any batch, with any ``num_samples``, at any thread count.
 
     Example:
-        Loads the tiny head that the tests use, and samples a chunk of actions for two observations.
+        The head of the demo policy that is shipped with the package, on features of two observations:
 
+        >>> import importlib.resources
         >>> import numpy as np, saccade
-        >>> from saccade import examples
-        >>> head = saccade.ActionHead.load(examples.tiny_checkpoint())
-        >>> config = head.config
-        >>> features = np.zeros((2, 11, config.context_dim), np.float32)
-        >>> context = head.encode(features)
-        >>> actions = head.sample(context, np.zeros((2, config.state_dim), np.float32), embodiment_id=1, seed=0)
-        >>> actions.shape == (2, config.action_horizon, config.action_dim)
+        >>> demo = importlib.resources.files("saccade") / "sim" / "demo"
+        >>> head = saccade.ActionHead.load(demo)
+        >>> context = head.encode(np.zeros((2, 60, head.config.context_dim), np.float32))
+        >>> state = np.zeros((2, head.config.state_dim), np.float32)
+        >>> actions = head.sample(context, state, embodiment_id=0, seed=7)
+        >>> actions.shape == (2, head.config.action_horizon, head.config.action_dim)
         True
+
+        Encoded once, sampled often: four chunks for each of the two observations.
+
+        >>> head.sample(context, state, embodiment_id=0, seed=7, num_samples=4).shape
+        (2, 4, 16, 4)
     """
 
     def __init__(self, head: _saccade.ActionHead, source: str, options: dict[str, Any]) -> None:
@@ -102,22 +112,25 @@ class ActionHead:
     ) -> ActionHead:
         """Loads a head from a checkpoint.
 
-        Tensors are found under ``action_head.``, ``_groot_model.action_head.`` or no prefix. What lies outside the prefix is
-        ignored; inside it every tensor must be known, present and of the right shape. Weights stored as bfloat16 stay so in
-        memory, which loses nothing; all arithmetic is float32.
+        Tensors are found under ``action_head.``, ``_groot_model.action_head.`` or no prefix. What lies
+        outside the prefix is ignored; inside it every tensor must be known, present and of the right shape.
+        Weights stored as bfloat16 stay so in memory, which loses nothing; all arithmetic is float32.
 
         Args:
-            source: A directory (``config.json`` beside one or more ``.safetensors``, with or without an index) or one ``.safetensors`` file.
-            config: A dict or the path of a JSON file: a whole checkpoint config (with ``action_head_cfg``) or the head's own.
+            source: A directory (``config.json`` beside one or more ``.safetensors``, with or without an
+                index) or one ``.safetensors`` file.
+            config: A dict or the path of a JSON file: a whole checkpoint config (with ``action_head_cfg``)
+                or the head's own.
                 Default: ``config.json`` beside the weights.
             embodiment_ids: Keep only these embodiments' layers; ids keep their numbers. Default all.
             precision: ``"float32"``.
-            num_threads: Threads that a call uses. Default: the environment's ``SACCADE_NUM_THREADS``, else the physical cores that
-                the process may use (affinity and container quota counted).
+            num_threads: Threads that a call uses. Default: the environment's ``SACCADE_NUM_THREADS``, else
+                the physical cores that the process may use (affinity and container quota counted).
 
         Raises:
             FileNotFoundError: ``source`` or the config is not there.
-            CheckpointError: config or weights are broken or do not fit each other; all that is wrong is listed.
+            CheckpointError: config or weights are broken or do not fit each other; all that is wrong is
+                listed.
             InputError: an option is out of range.
         """
         check_precision(precision)
@@ -127,7 +140,7 @@ class ActionHead:
         threads = None if num_threads is None else integer("num_threads", num_threads)
         head = _saccade.ActionHead.load(path, text, ids, threads)
         options = {"config": text, "embodiment_ids": ids, "precision": precision, "num_threads": threads}
-        return cls(head, os.path.abspath(path), options)
+        return cls(head, str(Path(path).absolute()), options)
 
     @property
     def config(self) -> HeadConfig:
@@ -176,13 +189,16 @@ class ActionHead:
         image_mask: ArrayLike | None = None,
         drop_vl: ArrayLike | None = None,
     ) -> Context:
-        """Runs what depends on the observation alone: ``vlln``, the VL self-attention, every cross block's keys and values.
+        """Runs what depends on the observation alone: ``vlln``, the VL self-attention, every cross block's
+        keys and values.
 
         Args:
             backbone_features: ``(batch, T_vl, context_dim)``.
-            attention_mask: bool ``(batch, T_vl)``, True = attended. GR00T N1.5 ignores padding, as released: only an all-true mask is taken.
+            attention_mask: bool ``(batch, T_vl)``, True = attended. GR00T N1.5 ignores padding, as released:
+                only an all-true mask is taken.
             image_mask: bool ``(batch, T_vl)``, True = image token; kept in the context for maps.
-            drop_vl: bool ``(batch, T_vl)``, True = removed before the VL self-attention and everywhere after, as if it had not been there.
+            drop_vl: bool ``(batch, T_vl)``, True = removed before the VL self-attention and everywhere
+                after, as if it had not been there.
 
         Raises:
             ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity.
@@ -211,21 +227,26 @@ class ActionHead:
 
         Args:
             context: From this head's :meth:`encode`.
-            state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``, already normalised and padded.
+            state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``, already normalised and
+                padded.
             embodiment_id: An integer, or ``(batch,)`` integers.
-            noise: ``(batch, action_horizon, encoder_action_dim)``; with ``num_samples`` an axis of that size after batch.
-            seed: Whatever ``numpy.random.default_rng`` takes; the noise is its ``standard_normal`` in float32. A ``Generator`` advances,
-                an integer repeats the same noise at every call. With neither ``noise`` nor ``seed``: fresh entropy.
+            noise: ``(batch, action_horizon, encoder_action_dim)``; with ``num_samples`` an axis of that size
+                after batch.
+            seed: Whatever ``numpy.random.default_rng`` takes; the noise is its ``standard_normal`` in
+                float32. A ``Generator`` advances, an integer repeats the same noise at every call. With
+                neither ``noise`` nor ``seed``: fresh entropy.
             num_steps: Euler steps, 1 to ``num_timestep_buckets``. Default the config's.
-            num_samples: Chunks for each observation, from one context. None adds no axis to noise and result; any integer adds one.
+            num_samples: Chunks for each observation, from one context. None adds no axis to noise and
+                result; any integer adds one.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
 
         Returns:
-            ``(batch, action_horizon, action_dim)``, or ``(batch, num_samples, action_horizon, action_dim)``; float32, torch if
-            the features were torch. Normalised, as the head was trained.
+            ``(batch, action_horizon, action_dim)``, or ``(batch, num_samples, action_horizon, action_dim)``;
+            float32, torch if the features were torch. Normalised, as the head was trained.
 
         Raises:
-            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; both ``noise`` and ``seed``.
+            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; both ``noise`` and
+            ``seed``.
         """
         held = _held(context)
         samples = None if num_samples is None else integer("num_samples", num_samples)
@@ -354,5 +375,7 @@ def _noise(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float3
     try:
         generator = np.random.default_rng(seed)
     except (TypeError, ValueError) as error:
-        raise InputError(f"seed: expected what numpy.random.default_rng takes, got {seed!r} ({error})") from None
+        raise InputError(
+            f"seed: expected what numpy.random.default_rng takes, got {seed!r} ({error})"
+        ) from None
     return generator.standard_normal(shape, dtype=np.float32)
