@@ -5,12 +5,8 @@ from __future__ import annotations
 import argparse
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from saccade.cli import EXIT_OK, UsageError
-
-if TYPE_CHECKING:
-    from saccade.sim.demos import RecordingSettings
 
 HELP = "record demonstrations of the tasks with scripted experts"
 
@@ -43,14 +39,17 @@ def run(args: argparse.Namespace) -> int:
 
     from saccade.cli.rollout import parse_tasks
     from saccade.sim import graphics
-    from saccade.sim.demos import DEFAULT_COUNTS, record_task
     from saccade.sim.files import writable_directory
     from saccade.sim.tasks import TASKS
 
-    settings = recording_settings(args)
+    check_numbers(args)
     tasks = list(TASKS) if args.tasks is None else parse_tasks(args.tasks)
-    counts = {task: DEFAULT_COUNTS[task] if args.count is None else args.count for task in tasks}
     graphics.check()
+    # These import mujoco, which needs a working OpenGL.
+    from saccade.sim.demos import DEFAULT_COUNTS, RecordingSettings, record_task
+
+    settings = RecordingSettings(image_size=args.image_size, frame_stride=args.frame_stride)
+    counts = {task: DEFAULT_COUNTS[task] if args.count is None else args.count for task in tasks}
     writable_directory(args.out)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
@@ -61,12 +60,9 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def recording_settings(args: argparse.Namespace) -> RecordingSettings:
-    """The settings, checked."""
-    from saccade.sim.demos import RecordingSettings
-
+def check_numbers(args: argparse.Namespace) -> None:
+    """Raises `UsageError` for a number that is too small."""
     for name, smallest in (("count", 1), ("image_size", 8), ("frame_stride", 1)):
         value = getattr(args, name)
         if value is not None and value < smallest:
             raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected at least {smallest}")
-    return RecordingSettings(image_size=args.image_size, frame_stride=args.frame_stride)

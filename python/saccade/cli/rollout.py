@@ -15,9 +15,9 @@ from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, UsageError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from saccade.sim.cameras import UInt8Array
     from saccade.sim.environment import TaskEnvironment
     from saccade.sim.policy import Policy
+    from saccade.sim.rendering import UInt8Array
     from saccade.sim.report import Summary
     from saccade.sim.rollout import Episode
 
@@ -126,9 +126,10 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from saccade.sim.files import writable_directory, write_json
-    from saccade.sim.report import write_contact_sheet
 
     session = prepare(args)
+    from saccade.sim.report import write_contact_sheet  # imports mujoco, which needs a working OpenGL
+
     writable_directory(session.out)
     if session.video:
         writable_directory(session.out / "videos")

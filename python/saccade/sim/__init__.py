@@ -26,12 +26,9 @@ def register_environments() -> None:
         import gymnasium
     except ModuleNotFoundError:  # the numpy side (`policy`, `backbone`) works without the simulator
         return
+    entry_point = "saccade.sim.environment:TaskEnvironment"
     for name in TASKS:
-        gymnasium.register(
-            id=f"saccade/{name}-v0",
-            entry_point="saccade.sim.environment:TaskEnvironment",
-            kwargs={"task": name},
-        )
+        gymnasium.register(f"saccade/{name}-v0", entry_point=entry_point, kwargs={"task": name})
 
 
 register_environments()

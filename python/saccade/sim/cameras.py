@@ -1,35 +1,8 @@
-"""Free cameras and fast drawing: what the policy sees, and the larger picture for videos.
+"""Where the cameras stand: plain numbers, kept in a policy's config. `rendering` draws through them."""
 
-All that makes drawing fast is set here, once, for demonstrations and evaluation alike. Measured with Mesa's
-software
-renderer on one core, milliseconds a picture at 128 px: as Meta-World ships it 200, without shadows,
-multisampling and reflections 5.1, with the arm above the wrist left out 3.5. Almost all of the rest is the
-vertices of hand and scene, so pictures are drawn at twice their size and averaged down, which costs little
-and places edges to a part of a pixel.
-"""
-
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
-
-import mujoco
-import numpy as np
-import numpy.typing as npt
-
-UInt8Array = npt.NDArray[np.uint8]
-
-SUPERSAMPLING = 2
-HIDDEN_GROUP = 5  # geoms of this group are not drawn for the policy
-# The arm above the wrist: 52 thousand of 67 thousand triangles, and it covers what the hand does.
-ARM_BODIES = frozenset(
-    (
-        *("pedestal", "pedestal_feet", "torso", "head", "screen", "controller_box", "right_arm_base_link"),
-        *(f"right_l{link}" for link in range(6)),
-    )
-)
-GOAL_SITE = "goal"
-GOAL_RADIUS = 0.03  # metres; Meta-World's own 0.02 is 2 pixels wide at 64 px
-GOAL_RGBA = (0.0, 1.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -61,13 +34,6 @@ class Camera:
         """For JSON."""
         return asdict(self)
 
-    def view(self) -> mujoco.MjvCamera:
-        """The camera as MuJoCo takes it."""
-        view = mujoco.MjvCamera()
-        view.lookat[:] = self.lookat
-        view.distance, view.azimuth, view.elevation = self.distance, self.azimuth, self.elevation
-        return view
-
 
 CENTRE = (0.0, 0.72, 0.12)  # of where things happen on the table
 DEFAULT_CAMERAS = (
@@ -76,72 +42,3 @@ DEFAULT_CAMERAS = (
     Camera("top", CENTRE, 0.8, 90.0, -75.0),
 )
 VIDEO_CAMERA = Camera("video", (0.0, 0.68, 0.15), 1.25, 140.0, -28.0)
-
-
-def prepare_model(model: mujoco.MjModel, *, draws_goal: bool) -> None:
-    """Sets the scene up for fast drawing, in place.
-
-    Args:
-        model: a Meta-World model.
-        draws_goal: mark the goal with a green ball, or hide Meta-World's marker.
-    """
-    model.vis.quality.shadowsize = 0
-    model.vis.quality.offsamples = 0
-    model.mat_reflectance[:] = 0.0
-    for geom in range(model.ngeom):
-        if model.body(model.geom_bodyid[geom]).name in ARM_BODIES:
-            model.geom_group[geom] = HIDDEN_GROUP
-    for site in range(model.nsite):
-        if model.site(site).name == GOAL_SITE:
-            model.site_rgba[site] = GOAL_RGBA if draws_goal else (0.0, 0.0, 0.0, 0.0)
-            model.site_size[site, 0] = GOAL_RADIUS
-
-
-def average_down(picture: UInt8Array, factor: int) -> UInt8Array:
-    """Means of `factor x factor` pixels: `(factor * H, factor * W, 3)` to `(H, W, 3)`, rounded."""
-    height, width, channels = picture.shape
-    blocks = picture.reshape(height // factor, factor, width // factor, factor, channels)
-    total = blocks.sum(axis=(1, 3), dtype=np.uint16)  # (H, W, 3)
-    averaged: UInt8Array = ((total + factor * factor // 2) // (factor * factor)).astype(np.uint8)
-    return averaged
-
-
-class Renderer:
-    """Draws one simulation through several cameras.
-
-    Close it before the interpreter ends: with EGL, MuJoCo otherwise prints an exception at exit.
-
-    Args:
-        model: prepared by `prepare_model`.
-        size: pixels along each side of the result.
-        show_arm: draw the whole robot.
-        supersampling: pixels drawn along each side of a resulting pixel.
-    """
-
-    def __init__(
-        self, model: mujoco.MjModel, size: int, *, show_arm: bool = False, supersampling: int = SUPERSAMPLING
-    ) -> None:
-        self.supersampling = supersampling
-        drawn = size * supersampling
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, drawn)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, drawn)
-        self._options = mujoco.MjvOption()
-        self._options.geomgroup[HIDDEN_GROUP] = 1 if show_arm else 0
-        self._renderer: mujoco.Renderer | None = mujoco.Renderer(model, drawn, drawn)
-
-    def draw(self, data: mujoco.MjData, camera: Camera) -> UInt8Array:
-        """The picture `(size, size, 3)`."""
-        if self._renderer is None:
-            raise RuntimeError("this renderer is closed")
-        self._renderer.update_scene(data, camera.view(), self._options)
-        return average_down(self._renderer.render(), self.supersampling)
-
-    def draw_all(self, data: mujoco.MjData, cameras: Iterable[Camera]) -> dict[str, UInt8Array]:
-        """One picture per camera, by its name."""
-        return {camera.name: self.draw(data, camera) for camera in cameras}
-
-    def close(self) -> None:
-        """Frees the OpenGL context; may be called twice."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None

@@ -12,7 +12,8 @@ from gymnasium import spaces
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
 from saccade.errors import InputError, ShapeError
-from saccade.sim.cameras import DEFAULT_CAMERAS, VIDEO_CAMERA, Camera, Renderer, UInt8Array, prepare_model
+from saccade.sim.cameras import DEFAULT_CAMERAS, VIDEO_CAMERA, Camera
+from saccade.sim.rendering import Renderer, UInt8Array, prepare_model
 from saccade.sim.tasks import find_task
 
 Observation = dict[
@@ -97,6 +98,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         prepare_model(self._world.model, draws_goal=self.task.draws_goal)
         self._full_state = np.zeros(39)
         self._steps = 0
+        self.last_observation: Observation = {}
         self._renderer: Renderer | None = None
         self._video_renderer: Renderer | None = None
 
@@ -137,21 +139,22 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         return StepOutcome(reward=float(reward), success=bool(info["success"]))
 
     def observe(self) -> Observation:
-        """What the policy may know now."""
+        """What the policy may know now; also kept as `last_observation`."""
         if self._renderer is None:
             self._renderer = Renderer(self._world.model, self.image_size)
-        return {
+        self.last_observation = {
             "images": self._renderer.draw_all(self._world.data, self.cameras),
             "proprio": self._full_state[:PROPRIO_DIM].astype(np.float32),
             "instruction": self.instruction,
         }
+        return self.last_observation
 
     def render(self) -> UInt8Array | None:
         """The whole robot from the side, `(360, 360, 3)`, if `render_mode` is `"rgb_array"`."""
         if self.render_mode is None:
             return None
         if self._video_renderer is None:
-            self._video_renderer = Renderer(self._world.model, VIDEO_SIZE, show_arm=True)
+            self._video_renderer = Renderer(self._world.model, VIDEO_SIZE, for_video=True)
         return self._video_renderer.draw(self._world.data, VIDEO_CAMERA)
 
     def privileged_state(self) -> npt.NDArray[np.float64]:

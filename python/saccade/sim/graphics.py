@@ -4,7 +4,10 @@ A missing or broken OpenGL may end the process (MuJoCo aborts), so the question 
 own.
 """
 
+import importlib
+import importlib.util
 import os
+import re
 import subprocess
 import sys
 
@@ -45,12 +48,26 @@ def choose_backend() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "0")
 
 
+def load_triton_first() -> None:
+    """Loads torch's compiler, where it is installed, before OpenGL is.
+
+    Both bring an LLVM of their own. Mesa's may come second; loading triton after it ends the process, and
+    torch does that on its own at some later call. Costs a fifth of a second, and nothing where there is no
+    triton.
+    """
+    if importlib.util.find_spec("triton") is not None:
+        importlib.import_module("triton")
+
+
 def check() -> None:
     """Draws one picture in a process of its own.
 
     Raises:
         GraphicsError: it did not work; names the Debian packages and the last line of what went wrong.
+        ModuleNotFoundError: mujoco is not installed.
     """
+    if importlib.util.find_spec("mujoco") is None:
+        raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
     try:
         outcome = subprocess.run(
             [sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
@@ -60,7 +77,7 @@ def check() -> None:
     if outcome.returncode != 0 or "drawn" not in outcome.stdout:
         errors = outcome.stderr.strip().splitlines() or [f"it ended with status {outcome.returncode}"]
         # The interpreter may add errors of clean-up after the first exception; that one says the most.
-        reasons = [line for line in errors if "Error" in line and not line.startswith("Exception ignored")]
+        reasons = [line for line in errors if re.match(r"[\w.]*Error\b", line)]
         raise GraphicsError(advice((reasons or errors)[0].strip()))
 
 

@@ -12,9 +12,9 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 import saccade
-from saccade.sim.cameras import UInt8Array
 from saccade.sim.files import write_atomically
 from saccade.sim.policy import Policy
+from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import PARTS, Episode
 
 CONFIDENCE_95 = 1.959964  # quantile of the normal distribution, two-sided

@@ -56,7 +56,7 @@ def run_episode(
         policy: decides.
         seed: of layout, wording and noise; the noise does not depend on the engine.
         instruction_from: tell the policy this task's words (a control: it should then fail).
-        on_step: called after the reset and after every control step, for videos.
+        on_step: called after the first look and after every control step, for videos.
     """
     task = environment.task
     environment.restart(seed)
@@ -64,7 +64,6 @@ def run_episode(
     rng = np.random.default_rng((list(TASKS).index(task.name), seed))
     episode = Episode(task.name, seed, environment.instruction)
     total = dict.fromkeys(PARTS, 0.0)
-    on_step(environment, episode)
     while episode.steps < task.max_steps and not episode.success:
         start = time.perf_counter()
         observation = environment.observe()
@@ -73,6 +72,8 @@ def run_episode(
         for part, spent in chunk.milliseconds.items():
             total[part] += spent
         episode.chunks += 1
+        if episode.steps == 0:
+            on_step(environment, episode)
         for action in chunk.actions[: min(policy.config.execute_steps, task.max_steps - episode.steps)]:
             episode.success = environment.advance(action).success
             episode.steps += 1

@@ -251,11 +251,13 @@ def export(run: Run, out: Path) -> None:
     tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
     with write_atomically(out / TENSOR_FILE) as temporary:
         save_file(tensors, temporary, metadata={"format": "pt"})
+        temporary.chmod(0o644)  # safetensors lets only the owner read
     write_json(out / CONFIG_FILE, run.config.to_dict())
 
 
 def save(run: Run, out: Path) -> None:
     """Writes all files of the run."""
+    out.mkdir(parents=True, exist_ok=True)
     state = {
         "settings": asdict(run.settings),
         "config": run.config.to_dict(),

@@ -1,4 +1,4 @@
-"""Videos of episodes: the robot from the side, what the policy sees, and what it was told."""
+"""Videos of episodes: the robot from the side, what the policy saw at its last look, and what it was told."""
 
 from pathlib import Path
 from types import TracebackType
@@ -7,8 +7,8 @@ import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from saccade.sim.cameras import UInt8Array
 from saccade.sim.environment import SIMULATION_HZ, VIDEO_SIZE, TaskEnvironment
+from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import Episode
 
 EVERY = 2  # control steps between pictures
@@ -68,7 +68,7 @@ def compose(
     if view is None:
         raise ValueError("environment: expected render_mode='rgb_array'")
     canvas.paste(Image.fromarray(view), (0, TITLE_HEIGHT))
-    images = list(environment.observe()["images"].values())[: VIDEO_SIZE // INSET]
+    images = list(environment.last_observation["images"].values())[: VIDEO_SIZE // INSET]
     for row, picture in enumerate(images):
         inset = Image.fromarray(picture).resize((INSET, INSET), Image.Resampling.NEAREST)
         canvas.paste(inset, (VIDEO_SIZE, TITLE_HEIGHT + row * INSET))
