@@ -320,9 +320,12 @@ class ActionHead(nn.Module):
         time_distribution: how `sample_time` draws.
 
     Example:
-        >>> head = ActionHead.load("GR00T-N1.5-3B", dtype=torch.float64)
-        >>> vl_embs = head.encode(backbone_features)
-        >>> actions = head.sample(vl_embs, state, 31, noise=noise)
+        >>> from saccade.reference import random_weights
+        >>> head = random_weights.random_head(random_weights.small_config(), seed=0, dtype=torch.float64)
+        >>> inputs = random_weights.random_inputs(head.config, seed=1, batch=2, num_vl_tokens=7)
+        >>> vl_embs = head.encode(inputs["backbone_features"])
+        >>> head.sample(vl_embs, inputs["state"], 2, noise=inputs["noise"]).shape
+        torch.Size([2, 16, 32])
     """
 
     def __init__(self, config: HeadConfig, *, time_distribution: TimeDistribution | None = None) -> None:
