@@ -55,7 +55,7 @@ pub(crate) unsafe fn silu_vector<V: Vector>(x: V) -> V {
 #[inline(always)]
 pub(crate) unsafe fn gelu_tanh_vector<V: Vector>(x: V) -> V {
     // -2 sqrt(2 / pi), and the same times 0.044715.
-    const LINEAR: f32 = -1.595_769_1;
+    const LINEAR: f32 = -1.595_769_2;
     const CUBIC: f32 = -0.071_354_82;
     // SAFETY: the caller's promise.
     unsafe {

@@ -171,10 +171,12 @@ impl Pool {
     }
 
     fn help(&self) -> bool {
-        // No short circuit: a worker visits all slots before it looks for new offers.
-        self.slots
-            .iter()
-            .fold(false, |helped, slot| slot.help() || helped)
+        let mut helped = false;
+        // Not `any`, which stops at the first: a worker visits all slots before it looks for new offers.
+        for slot in &self.slots {
+            helped |= slot.help();
+        }
+        helped
     }
 
     fn sleep(&self, seen: u32) {

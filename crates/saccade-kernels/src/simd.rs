@@ -139,9 +139,10 @@ mod portable {
 
     #[inline(always)]
     fn zip(a: Portable, b: Portable, f: impl Fn(f32, f32) -> f32) -> Portable {
-        let mut out = [0.0; 8];
-        for lane in 0..8 {
-            out[lane] = f(a.0[lane], b.0[lane]);
+        // Loops, not `array::map`: these are spread over vectors more reliably.
+        let mut out = a.0;
+        for (out, &b) in out.iter_mut().zip(&b.0) {
+            *out = f(*out, b);
         }
         Portable(out)
     }
@@ -249,12 +250,8 @@ mod portable {
         #[inline(always)]
         unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
             let mut out = self.0;
-            for lane in 0..8 {
-                out[lane] = if probe.0[lane] == value.0[lane] {
-                    value.0[lane]
-                } else {
-                    out[lane]
-                };
+            for ((out, probe), value) in out.iter_mut().zip(probe.0).zip(value.0) {
+                *out = if probe == value { value } else { *out };
             }
             Self(out)
         }
