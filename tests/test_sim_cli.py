@@ -52,12 +52,14 @@ def test_rollout_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert results["packages"].keys() >= {"saccade", "numpy", "mujoco", "metaworld"}
     assert [episode["seed"] for episode in results["episodes"]] == [0, 1]
     assert all(0 < episode["steps"] <= 200 for episode in results["episodes"])
+    names = ["button-press-topdown-0.mp4", "button-press-topdown-1.mp4"]
+    assert [episode["video"] for episode in results["episodes"]] == [f"videos/{name}" for name in names]
     assert results["summary"][0]["milliseconds"].keys() == {"render", "backbone", "encode", "sample"}
 
     with Image.open(out / "contact-sheet.png") as sheet:
         assert sheet.size == (2 * report.TILE, report.TILE + report.LABEL_HEIGHT)
     videos = sorted((out / "videos").iterdir())
-    assert [video.name for video in videos] == ["button-press-topdown-0.mp4", "button-press-topdown-1.mp4"]
+    assert [video.name for video in videos] == names
     pictures = [np.asarray(picture) for picture in imageio.mimread(videos[0])]
     assert len(pictures) > 20
     assert pictures[0].shape == (400, 480, 3)

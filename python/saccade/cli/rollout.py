@@ -115,10 +115,13 @@ class Session:
 
         if not self.video:
             return run_episode(environment, self.policy, seed, instruction_from=self.instruction_from)
-        with VideoWriter(self.out / "videos" / f"{environment.task.name}-{seed}.mp4") as video:
-            return run_episode(
+        name = f"videos/{environment.task.name}-{seed}.mp4"
+        with VideoWriter(self.out / name) as video:
+            episode = run_episode(
                 environment, self.policy, seed, instruction_from=self.instruction_from, on_step=video.add
             )
+        episode.video = name
+        return episode
 
 
 def run(args: argparse.Namespace) -> int:
@@ -220,7 +223,9 @@ def make_table(title: str) -> Table:
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
     table.caption = "milliseconds per chunk: render, backbone, encode, sample"
     table.caption_justify = "left"
     table.add_column("task", no_wrap=True)

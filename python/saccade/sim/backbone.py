@@ -129,8 +129,12 @@ class Backbone:
         CheckpointError: tensors are missing, unknown or of the wrong shape; all of them are listed.
 
     Example:
-        >>> backbone = Backbone(config, saccade.checkpoints.read_tensors(path, "backbone."))
-        >>> features = backbone(images, words)
+        >>> from saccade.sim.policy import Policy
+        >>> backbone = Policy.load().backbone
+        >>> images = np.zeros((1, 3, 64, 64, 3), dtype=np.uint8)
+        >>> features = backbone(images, np.zeros((1, backbone.config.text_length), dtype=np.int64))
+        >>> features.shape == (1, backbone.config.num_tokens, 128)
+        True
     """
 
     def __init__(self, config: BackboneConfig, tensors: Mapping[str, Float32Array]) -> None:

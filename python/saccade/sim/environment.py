@@ -60,6 +60,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         >>> info["success"]
         False
+        >>> env.close()
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": SIMULATION_HZ}  # noqa: RUF012

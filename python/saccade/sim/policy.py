@@ -145,10 +145,13 @@ class Policy:
         checkpoint: where it was loaded from.
 
     Example:
-        >>> policy = Policy.load()
+        >>> import gymnasium, saccade.sim
+        >>> policy, env = Policy.load(), gymnasium.make("saccade/reach-v0")
+        >>> observation, info = env.reset(seed=0)
         >>> chunk = policy.act(observation, noise=policy.noise(np.random.default_rng(0)))
         >>> for action in chunk.actions[: policy.config.execute_steps]:
         ...     observation, reward, done, truncated, info = env.step(action)
+        >>> env.close()
     """
 
     def __init__(

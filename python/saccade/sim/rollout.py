@@ -25,6 +25,7 @@ class Episode:
         steps: Control steps until success, or until the end.
         chunks: How often the policy looked and decided.
         milliseconds: Per chunk, by part of `PARTS`: the mean over the episode.
+        video: Its video beside the result file, if one was written.
     """
 
     task: str
@@ -34,6 +35,7 @@ class Episode:
     steps: int = 0
     chunks: int = 0
     milliseconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
+    video: str | None = None
 
 
 def told(task: str, seed: int, instruction_from: str | None) -> str:
