@@ -1,0 +1,209 @@
+//! Fused attention at the head's sizes beside the same work as faer products with the scores in memory.
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, MatMut, MatRef, Par};
+use saccade_benches::measure::{Contender, measure};
+use saccade_benches::options::Options;
+use saccade_benches::peak::multiply_adds;
+use saccade_benches::random::Random;
+use saccade_benches::report::Report;
+use saccade_kernels::{Isa, LogitBias, PackedKeyValues, attention};
+
+/// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, self-attention of a VL block.
+const SHAPES: [(usize, usize, usize, usize); 3] = [(49, 296, 32, 48), (49, 49, 32, 48), (296, 296, 32, 64)];
+
+struct Shape {
+    queries: usize,
+    keys: usize,
+    num_heads: usize,
+    head_dim: usize,
+    q: Vec<f32>,
+    k: Vec<f32>,
+    v: Vec<f32>,
+}
+
+impl Shape {
+    fn width(&self) -> usize {
+        self.num_heads * self.head_dim
+    }
+}
+
+fn main() {
+    let options = Options::from_args();
+    let mut report = Report::begin("attention, float32 arithmetic", &options);
+    for (queries, keys, num_heads, head_dim) in SHAPES {
+        let name = format!("{queries} queries, {keys} keys, {num_heads} heads x {head_dim}");
+        if !options.wants(&name) {
+            continue;
+        }
+        let width = num_heads * head_dim;
+        let mut random = Random::new(2);
+        let (q, k, v) = (
+            random.vec(queries * width, 1.0),
+            random.vec(keys * width, 1.0),
+            random.vec(keys * width, 1.0),
+        );
+        let shape = Shape {
+            queries,
+            keys,
+            num_heads,
+            head_dim,
+            q,
+            k,
+            v,
+        };
+        let bias = random.vec(num_heads * queries * keys, 1.0);
+        let mut contenders = Vec::new();
+        for &threads in &options.threads {
+            for isa in Isa::available() {
+                let (work, run) = multiply_adds(isa, threads);
+                let name = peak_name(isa);
+                contenders.push(Contender {
+                    name,
+                    threads,
+                    work,
+                    relative_to: None,
+                    run: Box::new(run),
+                });
+                saccade(&shape, isa, threads, &bias, &mut contenders);
+            }
+        }
+        if options.threads.contains(&1) {
+            plain(&shape, &mut contenders);
+        }
+        report.case(&name, &measure(&options, &mut contenders));
+    }
+    report.end(&options);
+}
+
+fn peak_name(isa: Isa) -> String {
+    format!("peak {isa}")
+}
+
+fn saccade<'a>(
+    shape: &'a Shape,
+    isa: Isa,
+    threads: usize,
+    bias: &'a [f32],
+    contenders: &mut Vec<Contender<'a>>,
+) {
+    let width = shape.width();
+    let scale = 1.0 / (shape.head_dim as f32).sqrt();
+    let mut held = PackedKeyValues::new(isa, shape.num_heads, shape.head_dim);
+    let (k, v) = (rows(&shape.k, width), rows(&shape.v, width));
+    held.pack(threads, k, v);
+    let base = if isa == Isa::Portable { Isa::best() } else { isa };
+    let mut add = |what: &str, run: Box<dyn FnMut() + 'a>| {
+        contenders.push(Contender {
+            name: format!("saccade {isa}{what}"),
+            threads,
+            work: macs(shape),
+            relative_to: Some(peak_name(base)),
+            run,
+        });
+    };
+    let biases = [
+        ("", None),
+        (
+            ", with a bias",
+            Some(LogitBias {
+                values: bias,
+                head_stride: shape.queries * shape.keys,
+                query_stride: shape.keys,
+            }),
+        ),
+    ];
+    for (what, bias) in biases {
+        let mut out = vec![0.0; shape.queries * width];
+        let held = held.clone();
+        add(
+            what,
+            Box::new(move || {
+                attention(
+                    threads,
+                    rows(&shape.q, width),
+                    &held,
+                    scale,
+                    bias,
+                    None,
+                    rows_mut(&mut out, width),
+                );
+            }),
+        );
+    }
+    let mut out = vec![0.0; shape.queries * width];
+    add(
+        ", packing too",
+        Box::new(move || {
+            held.pack(threads, k, v);
+            attention(
+                threads,
+                rows(&shape.q, width),
+                &held,
+                scale,
+                None,
+                None,
+                rows_mut(&mut out, width),
+            );
+        }),
+    );
+}
+
+/// Scores of a head as one product, rows of softmax with `exp` of the standard library, and a second product.
+fn plain<'a>(shape: &'a Shape, contenders: &mut Vec<Contender<'a>>) {
+    let width = shape.width();
+    let scale = 1.0 / (shape.head_dim as f32).sqrt();
+    let mut out = vec![0.0; shape.queries * width];
+    let mut scores = vec![0.0; shape.queries * shape.keys];
+    let run = move || {
+        let mut out = rows_mut(&mut out, width);
+        for head in 0..shape.num_heads {
+            let columns = |data: &'a [f32]| rows(data, width).subcols(head * shape.head_dim, shape.head_dim);
+            let view = rows_mut(&mut scores, shape.keys);
+            matmul(
+                view,
+                Accum::Replace,
+                columns(&shape.q),
+                columns(&shape.k).transpose(),
+                scale,
+                Par::Seq,
+            );
+            for row in scores.chunks_exact_mut(shape.keys) {
+                let max = row.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+                row.iter_mut().for_each(|score| *score = (*score - max).exp());
+                let sum: f32 = row.iter().sum();
+                row.iter_mut().for_each(|score| *score /= sum);
+            }
+            let part = out.as_mut().subcols_mut(head * shape.head_dim, shape.head_dim);
+            matmul(
+                part,
+                Accum::Replace,
+                rows(&scores, shape.keys),
+                columns(&shape.v),
+                1.0,
+                Par::Seq,
+            );
+        }
+    };
+    contenders.push(Contender {
+        name: "faer products, plain softmax".to_owned(),
+        threads: 1,
+        work: macs(shape),
+        relative_to: Some(peak_name(Isa::best())),
+        run: Box::new(run),
+    });
+}
+
+/// Of both products; the softmax is what keeps attention from its peak.
+fn macs(shape: &Shape) -> f64 {
+    (2 * shape.queries * shape.keys * shape.width()) as f64
+}
+
+fn rows(data: &[f32], width: usize) -> MatRef<'_, f32> {
+    MatRef::from_row_major_slice(data, data.len() / width, width)
+}
+
+fn rows_mut(data: &mut [f32], width: usize) -> MatMut<'_, f32> {
+    let count = data.len() / width;
+    MatMut::from_row_major_slice_mut(data, count, width)
+}

@@ -1,0 +1,411 @@
+//! Fused attention against float64 on every instruction set; removed keys, weights, and the bits that must not change.
+
+mod common;
+
+use common::{ROUNDING, Strided, bits, numbers, rows, rows_mut};
+use proptest::prelude::*;
+use saccade_kernels::{Isa, LogitBias, PackedKeyValues, attention};
+
+const REMOVED: f32 = f32::NEG_INFINITY;
+
+struct Case {
+    queries: Strided,
+    keys: Strided,
+    values: Strided,
+    num_heads: usize,
+    head_dim: usize,
+    scale: f32,
+}
+
+impl Case {
+    fn new(seed: u64, queries: usize, keys: usize, num_heads: usize, head_dim: usize, gap: usize) -> Self {
+        let width = num_heads * head_dim;
+        let matrix = |seed, rows: usize| Strided::new(&numbers(seed, rows * width, 2.0), rows, width, gap);
+        let (queries, keys, values) = (
+            matrix(seed, queries),
+            matrix(seed + 1, keys),
+            matrix(seed + 2, keys),
+        );
+        Self {
+            queries,
+            keys,
+            values,
+            num_heads,
+            head_dim,
+            scale: 1.0 / (head_dim as f32).sqrt(),
+        }
+    }
+
+    fn held(&self, isa: Isa) -> PackedKeyValues {
+        let mut held = PackedKeyValues::new(isa, self.num_heads, self.head_dim);
+        held.pack(1, self.keys.view(), self.values.view());
+        held
+    }
+
+    fn run(
+        &self,
+        isa: Isa,
+        threads: usize,
+        bias: Option<LogitBias<'_>>,
+        weights: Option<&mut [f32]>,
+    ) -> Vec<f32> {
+        let blank = vec![f32::NAN; self.queries.rows * self.queries.columns];
+        let mut out = Strided::new(&blank, self.queries.rows, self.queries.columns, 3);
+        attention(
+            threads,
+            self.queries.view(),
+            &self.held(isa),
+            self.scale,
+            bias,
+            weights,
+            out.view_mut(),
+        );
+        out.values()
+    }
+
+    /// In float64, with what rounding may change: `(out, its bound, probabilities, their bounds)`.
+    fn exact(&self, bias: impl Fn(usize, usize, usize) -> f32) -> (Vec<f64>, Vec<f64>, Vec<f64>, Vec<f64>) {
+        let (queries, keys, values) = (self.queries.view(), self.keys.view(), self.values.view());
+        let (mut out, mut bounds) = (
+            vec![0.0; queries.nrows() * queries.ncols()],
+            vec![0.0; queries.nrows() * queries.ncols()],
+        );
+        let (mut weights, mut weight_bounds) = (Vec::new(), Vec::new());
+        for head in 0..self.num_heads {
+            let columns = head * self.head_dim..(head + 1) * self.head_dim;
+            for query in 0..queries.nrows() {
+                // The error of a logit is an error of its probability, as a factor.
+                let mut logit_error: f64 = 0.0;
+                let logits: Vec<f64> = (0..keys.nrows())
+                    .map(|key| {
+                        let products = columns
+                            .clone()
+                            .map(|c| f64::from(queries[(query, c)]) * f64::from(keys[(key, c)]));
+                        let magnitude: f64 =
+                            products.clone().map(f64::abs).sum::<f64>() * f64::from(self.scale);
+                        let bias = f64::from(bias(head, query, key));
+                        let logit = products.sum::<f64>() * f64::from(self.scale) + bias;
+                        if logit.is_finite() {
+                            logit_error = logit_error
+                                .max((self.head_dim + 3) as f64 * ROUNDING * (magnitude + bias.abs()));
+                        }
+                        logit
+                    })
+                    .collect();
+                let max = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+                let shares: Vec<f64> = logits
+                    .iter()
+                    .map(|logit| if max.is_finite() { (logit - max).exp() } else { 0.0 })
+                    .collect();
+                let sum: f64 = shares.iter().sum();
+                // Twice the logits' error (own and in the sum), `exp`, sums over keys, and the division; small logits lose the digits of the largest.
+                let relative = 2.0 * logit_error + (keys.nrows() as f64 + 40.0) * ROUNDING;
+                for (key, &share) in shares.iter().enumerate() {
+                    let weight = if sum > 0.0 { share / sum } else { 0.0 };
+                    weights.push(weight);
+                    let distance = if share > 0.0 {
+                        (max - logits[key]) * ROUNDING * 2.0
+                    } else {
+                        0.0
+                    };
+                    weight_bounds.push(weight * (relative + distance) + 1e-38);
+                    for column in columns.clone() {
+                        let index = query * queries.ncols() + column;
+                        let value = f64::from(values[(key, column)]);
+                        if weight > 0.0 {
+                            out[index] += weight * value;
+                            bounds[index] += (weight * (relative + distance) + 1e-38) * value.abs();
+                        }
+                    }
+                }
+            }
+        }
+        (out, bounds, weights, weight_bounds)
+    }
+}
+
+fn assert_close(what: &str, given: &[f32], exact: &[f64], bounds: &[f64]) {
+    assert_eq!(given.len(), exact.len());
+    for (index, ((&given, &exact), &bound)) in given.iter().zip(exact).zip(bounds).enumerate() {
+        let error = (f64::from(given) - exact).abs();
+        assert!(
+            error <= bound,
+            "{what} {index}: {given} instead of {exact}, off by {error}, allowed {bound}"
+        );
+    }
+}
+
+/// The three ways in which a bias is given.
+#[derive(Clone, Copy, Debug)]
+enum Rank {
+    Keys,
+    QueriesKeys,
+    HeadsQueriesKeys,
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    #[test]
+    fn agrees_with_float64(
+        queries in 0..40_usize,
+        keys in 0..220_usize,
+        num_heads in 1..4_usize,
+        head_dim in prop_oneof![Just(48_usize), Just(64), 1..100_usize],
+        gap in 0..4_usize,
+        threads in 1..4_usize,
+        rank in prop_oneof![Just(None), Just(Some(Rank::Keys)), Just(Some(Rank::QueriesKeys)), Just(Some(Rank::HeadsQueriesKeys))],
+        removed in 0.0..1.2_f32,
+        seed in 0..u64::MAX / 2,
+    ) {
+        let case = Case::new(seed, queries, keys, num_heads, head_dim, gap);
+        let (head_stride, query_stride, rows) = match rank {
+            Some(Rank::HeadsQueriesKeys) => (queries * keys, keys, num_heads * queries),
+            Some(Rank::QueriesKeys) => (0, keys, queries),
+            _ => (0, 0, 1),
+        };
+        let chance = numbers(seed + 3, rows * keys, 1.0);
+        let bias: Vec<f32> =
+            numbers(seed + 4, rows * keys, 3.0).iter().zip(&chance).map(|(&bias, chance)| if chance.abs() < removed { REMOVED } else { bias }).collect();
+        let at = |head: usize, query: usize, key: usize| match rank {
+            None => 0.0,
+            Some(_) => bias[head * head_stride + query * query_stride + key],
+        };
+        let (out, bounds, weights, weight_bounds) = case.exact(at);
+        for isa in Isa::available() {
+            let bias = rank.map(|_| LogitBias { values: &bias, head_stride, query_stride });
+            let plain = case.run(isa, threads, bias, None);
+            assert_close(&format!("{isa}, output"), &plain, &out, &bounds);
+            let mut given = vec![f32::NAN; num_heads * queries * keys];
+            let with_weights = case.run(isa, threads, bias, Some(&mut given));
+            prop_assert_eq!(bits(&with_weights), bits(&plain));
+            assert_close(&format!("{isa}, weight"), &given, &weights, &weight_bounds);
+        }
+    }
+}
+
+#[test]
+fn agrees_with_float64_at_the_heads_sizes() {
+    for (queries, keys, head_dim) in [(49, 296, 48), (49, 49, 48), (60, 296, 64), (5, 700, 300)] {
+        let case = Case::new(1, queries, keys, 2, head_dim, 0);
+        let (out, bounds, _, _) = case.exact(|_, _, _| 0.0);
+        for isa in Isa::available() {
+            assert_close(&isa.to_string(), &case.run(isa, 2, None, None), &out, &bounds);
+        }
+    }
+}
+
+#[test]
+fn logits_that_would_overflow_are_stable() {
+    let mut case = Case::new(2, 7, 150, 2, 48, 0);
+    case.scale = 60.0;
+    let (out, bounds, _, _) = case.exact(|_, _, _| 0.0);
+    for isa in Isa::available() {
+        assert_close(&isa.to_string(), &case.run(isa, 1, None, None), &out, &bounds);
+    }
+}
+
+#[test]
+fn a_query_with_no_key_left_gets_zeros() {
+    let case = Case::new(3, 9, 130, 2, 48, 0);
+    let mut bias = vec![0.0; 9 * 130];
+    for query in [0, 4, 8] {
+        bias[query * 130..][..130].fill(REMOVED);
+    }
+    for isa in Isa::available() {
+        let mut weights = vec![f32::NAN; 2 * 9 * 130];
+        let bias = LogitBias {
+            values: &bias,
+            head_stride: 0,
+            query_stride: 130,
+        };
+        let out = case.run(isa, 1, Some(bias), Some(&mut weights));
+        let none = case.run(isa, 1, None, None);
+        for query in 0..9 {
+            let row = &out[query * 96..][..96];
+            if query % 4 == 0 {
+                assert_eq!(row, [0.0; 96]);
+                assert_eq!(weights[query * 130..][..130], [0.0; 130]);
+            } else {
+                assert_eq!(bits(row), bits(&none[query * 96..][..96]));
+            }
+        }
+    }
+    let empty = Case::new(4, 3, 0, 2, 48, 0);
+    for isa in Isa::available() {
+        assert_eq!(empty.run(isa, 2, None, Some(&mut [])), [0.0; 3 * 96]);
+    }
+}
+
+#[test]
+fn a_removed_key_has_no_influence_whatever_it_holds() {
+    for poison in [f32::NAN, f32::INFINITY, 3e38] {
+        let clean = Case::new(5, 9, 130, 2, 48, 0);
+        let mut poisoned = Case::new(5, 9, 130, 2, 48, 0);
+        let mut bias = vec![0.0; 130];
+        for key in [0, 40, 95, 96, 129] {
+            bias[key] = REMOVED;
+            for column in 0..96 {
+                poisoned.keys.view_mut()[(key, column)] = poison;
+                poisoned.values.view_mut()[(key, column)] = poison;
+            }
+        }
+        let bias = LogitBias {
+            values: &bias,
+            head_stride: 0,
+            query_stride: 0,
+        };
+        for isa in Isa::available() {
+            let mut weights = vec![f32::NAN; 2 * 9 * 130];
+            let out = poisoned.run(isa, 1, Some(bias), Some(&mut weights));
+            let expected = clean.run(isa, 1, Some(bias), None);
+            for (out, expected) in out.iter().zip(&expected) {
+                assert!(
+                    (out - expected).abs() <= 1e-6,
+                    "{isa}, {poison}: {out} instead of {expected}"
+                );
+            }
+            for row in weights.chunks_exact(130) {
+                assert!(
+                    [0, 40, 95, 96, 129].iter().all(|&key| row[key] == 0.0),
+                    "{isa}, {poison}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn nan_stays_with_its_query_and_head() {
+    let clean = Case::new(6, 20, 100, 3, 48, 0);
+    let mut case = Case::new(6, 20, 100, 3, 48, 0);
+    case.queries.view_mut()[(7, 50)] = f32::NAN;
+    for isa in Isa::available() {
+        let (out, expected) = (case.run(isa, 2, None, None), clean.run(isa, 1, None, None));
+        for (index, (out, expected)) in out.iter().zip(&expected).enumerate() {
+            let (query, head) = (index / 144, index % 144 / 48);
+            if (query, head) == (7, 1) {
+                assert!(out.is_nan());
+            } else {
+                assert_eq!(out.to_bits(), expected.to_bits());
+            }
+        }
+    }
+}
+
+#[test]
+fn weights_are_the_probabilities_that_were_used() {
+    let case = Case::new(7, 11, 205, 3, 40, 0);
+    for isa in Isa::available() {
+        let mut weights = vec![f32::NAN; 3 * 11 * 205];
+        let out = case.run(isa, 2, None, Some(&mut weights));
+        for (index, row) in weights.chunks_exact(205).enumerate() {
+            let (head, query) = (index / 11, index % 11);
+            let sum: f64 = row.iter().map(|&weight| f64::from(weight)).sum();
+            assert!((sum - 1.0).abs() < 1e-5, "{isa}: weights add up to {sum}");
+            for column in head * 40..(head + 1) * 40 {
+                let expected: f64 = row
+                    .iter()
+                    .enumerate()
+                    .map(|(key, &weight)| f64::from(weight) * f64::from(case.values.view()[(key, column)]))
+                    .sum();
+                assert!((f64::from(out[query * 120 + column]) - expected).abs() < 1e-5);
+            }
+        }
+    }
+}
+
+#[test]
+fn bits_do_not_depend_on_threads_nor_on_other_queries() {
+    for (queries, keys, head_dim) in [(100, 296, 64), (49, 97, 48), (30, 5, 7)] {
+        let case = Case::new(8, queries, keys, 4, head_dim, 0);
+        let all = case.queries.values();
+        let width = 4 * head_dim;
+        for isa in Isa::available() {
+            let held = case.held(isa);
+            let mut weights = vec![0.0; 4 * queries * keys];
+            let expected = bits(&case.run(isa, 1, None, Some(&mut weights)));
+            for threads in [2, 3, 8] {
+                let mut other = vec![0.0; 4 * queries * keys];
+                assert_eq!(
+                    bits(&case.run(isa, threads, None, Some(&mut other))),
+                    expected,
+                    "{isa}, {threads} threads"
+                );
+                assert_eq!(bits(&other), bits(&weights));
+            }
+            for (first, count) in [(0, 1), (17, 1), (3, 2), (1, 8), (2, 9), (10, 17)] {
+                let mut out = vec![0.0; count * width];
+                let part = rows(&all[first * width..][..count * width], width);
+                attention(1, part, &held, case.scale, None, None, rows_mut(&mut out, width));
+                assert_eq!(
+                    bits(&out),
+                    expected[first * width..][..count * width],
+                    "{isa}, {count} from {first}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn packing_again_replaces_everything() {
+    let (long, short) = (Case::new(9, 5, 211, 2, 30, 1), Case::new(10, 5, 34, 2, 30, 0));
+    for isa in Isa::available() {
+        let mut held = long.held(isa);
+        let nbytes = held.nbytes();
+        held.pack(2, short.keys.view(), short.values.view());
+        assert_eq!(
+            (held.len(), held.num_heads(), held.head_dim(), held.isa()),
+            (34, 2, 30, isa)
+        );
+        assert!(!held.is_empty() && held.nbytes() <= nbytes);
+        for held in [&held, &held.clone()] {
+            let mut out = vec![0.0; 5 * 60];
+            attention(
+                1,
+                short.queries.view(),
+                held,
+                short.scale,
+                None,
+                None,
+                rows_mut(&mut out, 60),
+            );
+            assert_eq!(bits(&out), bits(&short.run(isa, 1, None, None)));
+        }
+    }
+}
+
+#[test]
+#[should_panic(expected = "queries: expected")]
+fn queries_of_another_width_panic() {
+    let case = Case::new(11, 2, 3, 2, 4, 0);
+    attention(
+        1,
+        rows(&[0.0; 12], 6),
+        &case.held(Isa::best()),
+        1.0,
+        None,
+        None,
+        rows_mut(&mut [0.0; 12], 6),
+    );
+}
+
+#[test]
+#[should_panic(expected = "bias: expected")]
+fn a_bias_that_is_too_short_panics() {
+    let case = Case::new(11, 2, 3, 2, 4, 0);
+    let bias = LogitBias {
+        values: &[0.0; 11],
+        head_stride: 6,
+        query_stride: 3,
+    };
+    case.run(Isa::best(), 1, Some(bias), None);
+}
+
+#[test]
+#[should_panic(expected = "weights: expected")]
+fn weights_of_another_shape_panic() {
+    let case = Case::new(11, 2, 3, 2, 4, 0);
+    case.run(Isa::best(), 1, None, Some(&mut [0.0; 11]));
+}

@@ -1,0 +1,98 @@
+//! What the tests of this folder share: numbers to compute with, and the error that rounding may cause.
+
+#![allow(dead_code, reason = "each test file uses a part")]
+
+use faer::{MatMut, MatRef};
+
+/// Half a unit in the last place of 1.
+pub const ROUNDING: f64 = 1.0 / (1u64 << 24) as f64;
+
+/// How much `operations` roundings in a row may change a value, relative to the sum of magnitudes (Higham's gamma).
+pub fn gamma(operations: usize) -> f64 {
+    let total = operations as f64 * ROUNDING;
+    total / (1.0 - total)
+}
+
+/// Reproducible uniform numbers in `[-scale, scale)`.
+pub fn numbers(seed: u64, len: usize, scale: f32) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        ((state >> 40) as f32 / (1u64 << 23) as f32 - 1.0) * scale
+    };
+    // The first ones of small seeds resemble each other.
+    (0..8).for_each(|_| _ = next());
+    (0..len).map(|_| next()).collect()
+}
+
+/// A matrix whose rows stand `gap` elements apart, with NaN between them: whoever reads there spreads it, whoever writes there removes it.
+#[derive(Clone)]
+pub struct Strided {
+    data: Vec<f32>,
+    pub rows: usize,
+    pub columns: usize,
+    stride: usize,
+}
+
+impl Strided {
+    pub fn new(values: &[f32], rows: usize, columns: usize, gap: usize) -> Self {
+        let stride = columns + gap;
+        let mut data = vec![f32::NAN; rows * stride];
+        for row in 0..rows {
+            data[row * stride..][..columns].copy_from_slice(&values[row * columns..][..columns]);
+        }
+        Self {
+            data,
+            rows,
+            columns,
+            stride,
+        }
+    }
+
+    pub fn view(&self) -> MatRef<'_, f32> {
+        MatRef::from_row_major_slice_with_stride(&self.data, self.rows, self.columns, self.stride)
+    }
+
+    pub fn view_mut(&mut self) -> MatMut<'_, f32> {
+        // Not `from_row_major_slice_with_stride_mut`, which swaps the strides in faer 0.24.4.
+        MatMut::from_column_major_slice_with_stride_mut(&mut self.data, self.columns, self.rows, self.stride)
+            .transpose_mut()
+    }
+
+    /// The values without the gaps. Panics if a gap was written to.
+    pub fn values(&self) -> Vec<f32> {
+        let mut values = Vec::with_capacity(self.rows * self.columns);
+        for row in 0..self.rows {
+            let (row, gap) = self.data[row * self.stride..][..self.stride].split_at(self.columns);
+            values.extend_from_slice(row);
+            assert!(
+                gap.iter().all(|value| value.is_nan()),
+                "something was written beside the rows"
+            );
+        }
+        values
+    }
+}
+
+pub fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+pub fn rows(values: &[f32], columns: usize) -> MatRef<'_, f32> {
+    MatRef::from_row_major_slice(values, values.len() / columns.max(1), columns)
+}
+
+pub fn rows_mut(values: &mut [f32], columns: usize) -> MatMut<'_, f32> {
+    let count = values.len() / columns.max(1);
+    MatMut::from_row_major_slice_mut(values, count, columns)
+}
+
+pub fn gelu_tanh(x: f64) -> f64 {
+    0.5 * x * (1.0 + ((2.0 / std::f64::consts::PI).sqrt() * (x + 0.044715 * x * x * x)).tanh())
+}
+
+pub fn silu(x: f64) -> f64 {
+    x / (1.0 + (-x).exp())
+}

@@ -1,0 +1,392 @@
+//! The packed linear layer against float64, on every instruction set, with the bound that rounding allows; and the bits that must not change.
+
+mod common;
+
+use common::{Strided, bits, gamma, numbers, rows, rows_mut};
+use faer::MatRef;
+use half::bf16;
+use proptest::prelude::*;
+use saccade_kernels::{Element, Epilogue, Isa, KernelError, PackedLinear, WeightRef};
+
+const EPILOGUES: [Epilogue; 5] = [
+    Epilogue::Store,
+    Epilogue::GeluTanh,
+    Epilogue::Relu,
+    Epilogue::Silu,
+    Epilogue::Add,
+];
+
+/// A part of a stacked layer.
+#[derive(Clone, Debug)]
+struct Part {
+    outputs: usize,
+    bf16: bool,
+    /// Stored `(in_features, out_features)`, as the category-specific layers are.
+    transposed: bool,
+    bias: bool,
+}
+
+fn part() -> impl Strategy<Value = Part> {
+    (0..120_usize, any::<bool>(), any::<bool>(), any::<bool>()).prop_map(
+        |(outputs, bf16, transposed, bias)| Part {
+            outputs,
+            bf16,
+            transposed,
+            bias,
+        },
+    )
+}
+
+/// Weights of a part, always representable in bf16 where the part is.
+struct Weights {
+    f32: Vec<f32>,
+    bf16: Vec<bf16>,
+    bias: Vec<f32>,
+}
+
+fn weights(part: &Part, inputs: usize, seed: u64) -> Weights {
+    let mut f32 = numbers(seed, part.outputs * inputs, 1.0);
+    let bf16: Vec<_> = f32.iter().map(|&value| bf16::from_f32(value)).collect();
+    if part.bf16 {
+        f32 = bf16.iter().map(|value| value.to_f32()).collect();
+    }
+    Weights {
+        f32,
+        bf16,
+        bias: numbers(seed + 1, part.outputs, 1.0),
+    }
+}
+
+/// `data` as `(outputs, inputs)`: as it lies, or as the transpose of what lies there.
+fn view<'a, T>(data: &'a [T], part: &Part, inputs: usize) -> MatRef<'a, T> {
+    if part.transposed {
+        MatRef::from_row_major_slice(data, inputs, part.outputs).transpose()
+    } else {
+        MatRef::from_row_major_slice(data, part.outputs, inputs)
+    }
+}
+
+fn pack(isa: Isa, parts: &[Part], weights: &[Weights], inputs: usize) -> PackedLinear {
+    let views: Vec<_> = parts
+        .iter()
+        .zip(weights)
+        .map(|(part, weights)| {
+            let weight = if part.bf16 {
+                WeightRef::Bf16(view(&weights.bf16, part, inputs))
+            } else {
+                WeightRef::F32(view(&weights.f32, part, inputs))
+            };
+            (weight, part.bias.then_some(&weights.bias[..]))
+        })
+        .collect();
+    PackedLinear::pack(isa, &views).unwrap()
+}
+
+/// The function of an epilogue, and how far a change of its input can change it at most (its steepest slope).
+fn exact(epilogue: Epilogue, value: f64, before: f32) -> (f64, f64) {
+    match epilogue {
+        Epilogue::GeluTanh => (common::gelu_tanh(value), 1.13),
+        Epilogue::Relu => (value.max(0.0), 1.0),
+        Epilogue::Silu => (common::silu(value), 1.1),
+        Epilogue::Add => (value + f64::from(before), 1.0),
+        _ => (value, 1.0),
+    }
+}
+
+/// Every element against float64: the sum may be off by one rounding for each product and addition, the epilogue by a few more.
+fn check(parts: &[Part], weights: &[Weights], x: &Strided, before: &[f32], out: &[f32], epilogue: Epilogue) {
+    let (inputs, outputs) = (x.columns, out.len() / x.rows.max(1));
+    let x = x.view();
+    for row in 0..x.nrows() {
+        let mut column = 0;
+        for (part, weights) in parts.iter().zip(weights) {
+            let weight = view(&weights.f32, part, inputs);
+            for output in 0..part.outputs {
+                let bias = if part.bias {
+                    f64::from(weights.bias[output])
+                } else {
+                    0.0
+                };
+                let (mut sum, mut magnitude) = (bias, bias.abs());
+                for k in 0..inputs {
+                    let product = f64::from(x[(row, k)]) * f64::from(weight[(output, k)]);
+                    sum += product;
+                    magnitude += product.abs();
+                }
+                let index = row * outputs + column;
+                let (value, slope) = exact(epilogue, sum, before[index]);
+                let bound = slope * gamma(inputs + 2) * magnitude
+                    + gamma(16) * (value.abs() + f64::from(before[index]).abs())
+                    + 1e-7 * f64::from(u8::from(epilogue == Epilogue::GeluTanh));
+                let error = (f64::from(out[index]) - value).abs();
+                assert!(
+                    error <= bound,
+                    "({row}, {column}): {} instead of {value}, off by {error}, allowed {bound}",
+                    out[index]
+                );
+                column += 1;
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    #[test]
+    fn agrees_with_float64(
+        row_count in 0..60_usize,
+        inputs in 0..300_usize,
+        parts in proptest::collection::vec(part(), 1..4),
+        gaps in (0..5_usize, 0..5_usize),
+        threads in 1..4_usize,
+        epilogue in 0..EPILOGUES.len(),
+        seed in 0..u64::MAX / 2,
+    ) {
+        let epilogue = EPILOGUES[epilogue];
+        let weights: Vec<_> = parts.iter().zip(0..).map(|(part, i)| weights(part, inputs, seed + 2 * i)).collect();
+        let outputs = parts.iter().map(|part| part.outputs).sum();
+        let x = Strided::new(&numbers(seed + 100, row_count * inputs, 1.0), row_count, inputs, gaps.0);
+        let before = numbers(seed + 101, row_count * outputs, 1.0);
+        for isa in Isa::available() {
+            let layer = pack(isa, &parts, &weights, inputs);
+            let stored = if parts.iter().all(|part| part.bf16) { Element::Bf16 } else { Element::F32 };
+            prop_assert_eq!((layer.in_features(), layer.out_features(), layer.element(), layer.isa()), (inputs, outputs, stored, isa));
+            let mut out = Strided::new(&before, row_count, outputs, gaps.1);
+            layer.apply(threads, x.view(), epilogue, out.view_mut());
+            check(&parts, &weights, &x, &before, &out.values(), epilogue);
+        }
+    }
+}
+
+/// A layer with sizes of the head, one per element type.
+fn layers(isa: Isa, inputs: usize, outputs: usize) -> [PackedLinear; 2] {
+    [false, true].map(|bf16| {
+        let parts = [Part {
+            outputs,
+            bf16,
+            transposed: false,
+            bias: true,
+        }];
+        let weights = [weights(&parts[0], inputs, 7)];
+        pack(isa, &parts, &weights, inputs)
+    })
+}
+
+fn apply(layer: &PackedLinear, threads: usize, x: &[f32], epilogue: Epilogue) -> Vec<f32> {
+    let mut out = vec![0.5; x.len() / layer.in_features() * layer.out_features()];
+    let columns = layer.out_features();
+    layer.apply(
+        threads,
+        rows(x, layer.in_features()),
+        epilogue,
+        rows_mut(&mut out, columns),
+    );
+    out
+}
+
+#[test]
+fn long_sums_agree_with_float64() {
+    let (inputs, part) = (
+        6144,
+        Part {
+            outputs: 50,
+            bf16: false,
+            transposed: false,
+            bias: true,
+        },
+    );
+    let weights = [weights(&part, inputs, 3)];
+    let x = Strided::new(&numbers(4, 9 * inputs, 1.0), 9, inputs, 0);
+    let before = vec![0.0; 9 * part.outputs];
+    for isa in Isa::available() {
+        let layer = pack(isa, std::slice::from_ref(&part), &weights, inputs);
+        let out = apply(&layer, 1, &x.values(), Epilogue::Store);
+        check(
+            std::slice::from_ref(&part),
+            &weights,
+            &x,
+            &before,
+            &out,
+            Epilogue::Store,
+        );
+    }
+}
+
+#[test]
+fn bits_do_not_depend_on_threads() {
+    for (inputs, outputs, row_count) in [(96, 500, 49), (1100, 200, 49), (2048, 130, 300)] {
+        let x = numbers(8, row_count * inputs, 1.0);
+        for isa in Isa::available() {
+            for layer in layers(isa, inputs, outputs) {
+                for epilogue in EPILOGUES {
+                    let one = bits(&apply(&layer, 1, &x, epilogue));
+                    for threads in [2, 3, 8] {
+                        assert_eq!(
+                            bits(&apply(&layer, threads, &x, epilogue)),
+                            one,
+                            "{isa}, {threads} threads"
+                        );
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn bits_of_a_row_do_not_depend_on_the_others() {
+    for (inputs, outputs) in [(70, 99), (1500, 50), (3001, 49)] {
+        let x = numbers(9, 210 * inputs, 1.0);
+        for isa in Isa::available() {
+            for layer in layers(isa, inputs, outputs) {
+                let all = bits(&apply(&layer, 2, &x, Epilogue::GeluTanh));
+                for (first, count) in [
+                    (0, 1),
+                    (13, 1),
+                    (209, 1),
+                    (5, 2),
+                    (40, 7),
+                    (11, 49),
+                    (96, 97),
+                    (3, 200),
+                ] {
+                    let part = &x[first * inputs..][..count * inputs];
+                    let part = bits(&apply(&layer, 1, part, Epilogue::GeluTanh));
+                    assert_eq!(
+                        part,
+                        all[first * outputs..][..count * outputs],
+                        "{isa}, {count} rows from {first}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn bf16_storage_gives_the_bits_of_f32_storage() {
+    for inputs in [1, 2, 63, 640, 1537] {
+        let part = Part {
+            outputs: 101,
+            bf16: true,
+            transposed: false,
+            bias: true,
+        };
+        let weights = [weights(&part, inputs, 10)];
+        let x = numbers(11, 20 * inputs, 1.0);
+        for isa in Isa::available() {
+            let narrow = pack(isa, std::slice::from_ref(&part), &weights, inputs);
+            let wide = pack(
+                isa,
+                &[Part {
+                    bf16: false,
+                    ..part.clone()
+                }],
+                &weights,
+                inputs,
+            );
+            assert_eq!((narrow.element(), wide.element()), (Element::Bf16, Element::F32));
+            assert!(narrow.nbytes() < wide.nbytes() || inputs == 1);
+            assert_eq!(
+                bits(&apply(&narrow, 1, &x, Epilogue::Silu)),
+                bits(&apply(&wide, 1, &x, Epilogue::Silu))
+            );
+        }
+    }
+}
+
+#[test]
+fn nan_and_infinity_stay_in_their_row() {
+    let (inputs, outputs) = (130, 70);
+    let clean = numbers(12, 20 * inputs, 1.0);
+    for isa in Isa::available() {
+        for layer in layers(isa, inputs, outputs) {
+            for epilogue in EPILOGUES {
+                let expected = bits(&apply(&layer, 1, &clean, epilogue));
+                for poison in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                    let mut x = clean.clone();
+                    x[6 * inputs + 129] = poison;
+                    let out = apply(&layer, 2, &x, epilogue);
+                    for row in 0..20 {
+                        let part = &out[row * outputs..][..outputs];
+                        if row != 6 {
+                            assert_eq!(
+                                bits(part),
+                                expected[row * outputs..][..outputs],
+                                "{isa}, {epilogue:?}"
+                            );
+                        } else if poison.is_nan() {
+                            assert!(part.iter().all(|value| value.is_nan()), "{isa}, {epilogue:?}");
+                        } else {
+                            // An infinite sum is NaN nowhere: the activations have limits.
+                            assert!(
+                                part.iter().all(|value| !value.is_nan()),
+                                "{isa}, {epilogue:?}: {part:?}"
+                            );
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn huge_and_tiny_values_survive() {
+    for isa in Isa::available() {
+        let weight = [f32::MAX, 1.0, f32::MIN_POSITIVE / 4.0];
+        let layer = PackedLinear::pack(
+            isa,
+            &[(WeightRef::F32(MatRef::from_row_major_slice(&weight, 3, 1)), None)],
+        )
+        .unwrap();
+        assert_eq!(
+            apply(&layer, 1, &[2.0], Epilogue::Store),
+            [f32::INFINITY, 2.0, f32::MIN_POSITIVE / 2.0]
+        );
+    }
+}
+
+#[test]
+fn parts_that_do_not_fit_are_refused() {
+    let weight = [0.0; 12];
+    let weight = |outputs, inputs| WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs));
+    let isa = Isa::best();
+    assert!(matches!(PackedLinear::pack(isa, &[]), Err(KernelError::NoParts)));
+    let widths = PackedLinear::pack(isa, &[(weight(3, 4), None), (weight(4, 3), None)]);
+    assert!(matches!(
+        widths,
+        Err(KernelError::InFeatures {
+            expected: 4,
+            given: 3
+        })
+    ));
+    let bias = PackedLinear::pack(isa, &[(weight(3, 4), Some(&[1.0; 4]))]);
+    assert!(matches!(
+        bias,
+        Err(KernelError::Bias {
+            expected: 3,
+            given: 4
+        })
+    ));
+}
+
+#[test]
+#[should_panic(expected = "x: expected")]
+fn an_input_of_another_width_panics() {
+    let layer = &layers(Isa::best(), 4, 4)[0];
+    layer.apply(1, rows(&[0.0; 6], 3), Epilogue::Store, rows_mut(&mut [0.0; 8], 4));
+}
+
+#[test]
+#[should_panic(expected = "out: expected")]
+fn an_output_of_another_shape_panics() {
+    let layer = &layers(Isa::best(), 4, 4)[0];
+    layer.apply(
+        1,
+        rows(&[0.0; 8], 4),
+        Epilogue::Store,
+        rows_mut(&mut [0.0; 12], 4),
+    );
+}

@@ -1,0 +1,91 @@
+//! After the first call of a shape, no kernel allocates: a robot's control loop must not meet the allocator.
+
+mod common;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::Barrier;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use common::{numbers, rows, rows_mut};
+use faer::MatRef;
+use saccade_kernels::{
+    Epilogue, Isa, LogitBias, PackedKeyValues, PackedLinear, WeightRef, attention, gelu_tanh, layer_norm,
+    parallel_for, silu,
+};
+
+/// The system's allocator, counting what all threads ask of it.
+struct Counting;
+
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: everything is passed on to the system's allocator as it came.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// One test in this file, so that no other runs beside it.
+#[test]
+fn the_second_call_of_a_shape_allocates_nothing() {
+    const WIDTH: usize = 384;
+    let weight = numbers(1, WIDTH * WIDTH, 1.0);
+    let x = numbers(2, 296 * WIDTH, 1.0);
+    let bias = numbers(3, 296, 1.0);
+    for isa in Isa::available() {
+        let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, WIDTH, WIDTH));
+        let layer = PackedLinear::pack(isa, &[(weight, None)]).unwrap();
+        let mut held = PackedKeyValues::new(isa, 8, WIDTH / 8);
+        let mut out = vec![0.0; 296 * WIDTH];
+        let mut weights = vec![0.0; 8 * 296 * 296];
+        let mut pass = |threads, count: usize| {
+            let x = rows(&x[..count * WIDTH], WIDTH);
+            let out = &mut out[..count * WIDTH];
+            layer.apply(threads, x, Epilogue::GeluTanh, rows_mut(out, WIDTH));
+            layer.apply(threads, x, Epilogue::Add, rows_mut(out, WIDTH));
+            layer_norm(isa, threads, x, 1e-5, None, rows_mut(out, WIDTH));
+            held.pack(threads, x, x);
+            let bias = LogitBias {
+                values: &bias,
+                head_stride: 0,
+                query_stride: 0,
+            };
+            attention(threads, x, &held, 0.1, Some(bias), None, rows_mut(out, WIDTH));
+            let weights = &mut weights[..8 * count * count];
+            attention(threads, x, &held, 0.1, None, Some(weights), rows_mut(out, WIDTH));
+            gelu_tanh(isa, out);
+            silu(isa, out);
+            parallel_for(threads, 10, &|_| {});
+        };
+        for threads in [1, 2, 5] {
+            // Each thread holds one task until all are there: a worker that starts late would allocate what a new thread needs.
+            let all = Barrier::new(threads);
+            parallel_for(threads, threads, &|_| {
+                all.wait();
+            });
+            for count in [296, 49, 1] {
+                pass(threads, count);
+                let before = ALLOCATIONS.load(Ordering::Relaxed);
+                (0..5).for_each(|_| pass(threads, count));
+                let allocations = ALLOCATIONS.load(Ordering::Relaxed) - before;
+                assert_eq!(allocations, 0, "{isa}, {threads} threads, {count} rows");
+            }
+        }
+    }
+}
