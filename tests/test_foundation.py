@@ -75,7 +75,17 @@ def test_only_numpy_is_required_and_extras_are_named() -> None:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel made from this tree, with the Rust code as it was built for the tests."""
     folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "maturin", "build", "--release", "--locked", "--quiet", "--out", folder]
+    command = [
+        sys.executable,
+        "-m",
+        "maturin",
+        "build",
+        "--release",
+        "--locked",
+        "--quiet",
+        "--out",
+        str(folder),
+    ]
     subprocess.run(command, cwd=ROOT, check=True)
     (path,) = folder.glob("*.whl")
     return path
