@@ -30,9 +30,9 @@ def python(code: str, *, env: dict[str, str] | None = None, cwd: Path | None = N
 
 
 def test_import_costs_little_more_than_numpy() -> None:
-    code = (
-        "import numpy, time; start = time.perf_counter(); import saccade; print(time.perf_counter() - start)"
-    )
+    # Processor time: what a busy machine adds to it is not the package's doing.
+    clock = "time.process_time()"
+    code = f"import numpy, time; start = {clock}; import saccade; print({clock} - start)"
     assert min(float(python(code)) for _ in range(5)) < 0.1
 
 
