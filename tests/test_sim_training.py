@@ -14,7 +14,7 @@ from saccade import CheckpointError, InputError
 from saccade.sim import demos, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.dataset import chunks, load_samples
-from saccade.sim.policy import Policy
+from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.tasks import DEMONSTRATION_SEEDS
 
 RECORDING = demos.RecordingSettings(image_size=16, frame_stride=6, cameras=DEFAULT_CAMERAS[:2])
@@ -185,3 +185,25 @@ def test_learning_rate_warms_up_and_falls_to_zero() -> None:
     assert max(rates) <= settings.learning_rate
     assert np.argmax(rates) == train.WARMUP_STEPS - 1
     assert rates[-1] < 1e-4 * settings.learning_rate
+
+
+def test_training_starts_from_a_policy(recording: Path, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    train.train(recording, first, TINY, ignore)
+    settings = train.TrainingSettings(
+        **{**vars(TINY), "steps": 2, "learning_rate": 1e-9, "absent_share": 0.5}
+    )
+    train.train(recording, second, settings, ignore, start=first)
+    tensors = load_file(second / "model.safetensors")
+    for name, tensor in load_file(first / "model.safetensors").items():
+        torch.testing.assert_close(tensors[name], tensor)
+    with pytest.raises(InputError, match=r"other settings \(start_sha256\)"):
+        train.train(recording, second, settings, ignore)
+
+
+def test_a_policy_of_other_sizes_cannot_be_started_from(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="other sizes or other demonstrations"):
+        train.train(recording, tmp_path / "out", TINY, ignore, start=DEMO_CHECKPOINT)
+    with pytest.raises(FileNotFoundError):
+        train.train(recording, tmp_path / "out", TINY, ignore, start=tmp_path / "nowhere")
+    assert not (tmp_path / "out").exists()

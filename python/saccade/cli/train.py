@@ -17,10 +17,13 @@ HELP = "train the policy on recorded demonstrations"
 EPILOG = """\
 Writes config.json and model.safetensors (the policy, for `saccade rollout --checkpoint OUT`), loss.png,
 history.json and training.pt about once a minute. Stopped at any time, the same command goes on where it was
-and ends with the same weights as an uninterrupted run. The defaults are those of the shipped policy.
+and ends with the same weights as an uninterrupted run. The shipped policy was trained by the first two
+examples, one after the other.
 
 examples:
-  saccade train --demos out/demos --out out/policy
+  saccade train --demos out/demos --out out/first
+  saccade train --demos out/demos --start-from out/first --absent-share 0.1 --steps 1200 \\
+    --learning-rate 3e-4 --ema-decay 0.99 --seed 1 --out out/policy
   saccade train --demos out/demos --out out/n0 --num-future-tokens 0
   saccade train --demos out/demos --out out/quick --steps 2000 --threads 2
 """
@@ -37,6 +40,13 @@ INTEGERS = (
     ("num_layers", 1, "blocks of the head"),
 )
 
+# The same for numbers below 1.
+FRACTIONS = (
+    ("learning_rate", 1e-9, "of AdamW after the warm-up"),
+    ("ema_decay", 0.0, "of the averaged weights, which are the ones that are kept"),
+    ("absent_share", 0.0, "share of frames told a task whose object is not there, and shown to stand still"),
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments; every setting left out keeps the shipped policy's value."""
@@ -46,7 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1)")
     for name, _, what in INTEGERS:
         parser.add_argument(f"--{name.replace('_', '-')}", type=int, help=what)
-    parser.add_argument("--learning-rate", type=float, help="of AdamW after the warm-up")
+    for name, _, what in FRACTIONS:
+        parser.add_argument(f"--{name.replace('_', '-')}", type=float, help=what)
+    parser.add_argument(
+        "--start-from", type=Path, metavar="DIR", help="policy to start from (default: random weights)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -85,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
             progress.update(bar, completed=now.step, description=f"loss {now.loss:.3f}{held_out}")
 
         try:
-            train.train(args.demos, args.out, settings, on_step)
+            train.train(args.demos, args.out, settings, on_step, start=args.start_from)
         except KeyboardInterrupt:
             progress.stop()
             print(f"stopped; the same command goes on from {args.out / train.STATE_FILE}")
@@ -102,8 +116,12 @@ def training_settings(args: argparse.Namespace) -> TrainingSettings:
         value = getattr(args, name)
         if value is not None and value < smallest:
             raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected at least {smallest}")
-    if args.learning_rate is not None and not 0 < args.learning_rate < 1:
-        raise UsageError(f"--learning-rate: given {args.learning_rate}, expected above 0 and below 1")
-    names = [name for name, _, _ in INTEGERS] + ["learning_rate"]
+    for name, lowest, _ in FRACTIONS:
+        value = getattr(args, name)
+        if value is not None and not lowest <= value < 1:
+            raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected {lowest:g} to below 1")
+    if args.start_from is not None and not (args.start_from / "model.safetensors").is_file():
+        raise FileNotFoundError(f"{args.start_from}: no policy there")
+    names = [name for name, _, _ in (*INTEGERS, *FRACTIONS)]
     chosen = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     return dataclasses.replace(TrainingSettings(), **chosen)

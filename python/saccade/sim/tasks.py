@@ -19,6 +19,7 @@ class Task:
         name: How users call it.
         scene: Meta-World's name of its environment.
         expert: Class of its scripted expert in `metaworld.policies`.
+        objects: What stands on the table. Tasks with the same objects can all be done in the same scene.
         instructions: Wordings; an episode's seed picks one of them. The first is the plainest.
         draws_goal: Whether the goal is marked in the picture. Where the goal is an object's own state (an
             open drawer), a marker would only give the answer away.
@@ -29,6 +30,7 @@ class Task:
     name: str
     scene: str
     expert: str
+    objects: str
     instructions: tuple[str, ...]
     draws_goal: bool = False
     max_steps: int = 200
@@ -44,6 +46,7 @@ ALL_TASKS = (
         name="reach",
         scene="reach-v3",
         expert="SawyerReachV3Policy",
+        objects="puck and ball",
         draws_goal=True,
         instructions=(
             "reach the green ball",
@@ -57,6 +60,7 @@ ALL_TASKS = (
         name="push",
         scene="push-v3",
         expert="SawyerPushV3Policy",
+        objects="puck and ball",
         draws_goal=True,
         instructions=(
             "push the puck to the green ball",
@@ -70,6 +74,7 @@ ALL_TASKS = (
         name="drawer-open",
         scene="drawer-open-v3",
         expert="SawyerDrawerOpenV3Policy",
+        objects="drawer",
         instructions=(
             "open the drawer",
             "pull the drawer open",
@@ -82,6 +87,7 @@ ALL_TASKS = (
         name="button-press-topdown",
         scene="button-press-topdown-v3",
         expert="SawyerButtonPressTopdownV3Policy",
+        objects="button",
         instructions=(
             "press the button",
             "press the red button down",
@@ -94,6 +100,7 @@ ALL_TASKS = (
         name="window-open",
         scene="window-open-v3",
         expert="SawyerWindowOpenV3Policy",
+        objects="window",
         instructions=(
             "open the window",
             "slide the window open",

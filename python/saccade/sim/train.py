@@ -10,16 +10,17 @@ gives.
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
+import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from saccade.config import HeadConfig
@@ -53,6 +54,9 @@ class TrainingSettings:
         learning_rate: Of AdamW, after the warm-up.
         ema_decay: Of the averaged weights, which are the ones that are kept.
         target_weight: Weight of the loss that finds object and goal.
+        absent_share: Share of frames that are told a task whose object is not there, and shown to stand
+            still. Without them the pictures alone tell most tasks apart, and their words go unread.
+        start_sha256: Of the tensors that it starts from; empty for random ones. `train` sets it.
         seed: Of initial weights, order and noise.
         width, num_layers, num_heads: Of the head; the backbone has its width and heads.
         backbone_layers: Transformer blocks of the backbone.
@@ -69,6 +73,8 @@ class TrainingSettings:
     learning_rate: float = 6e-4
     ema_decay: float = 0.999
     target_weight: float = 1.0
+    absent_share: float = 0.0
+    start_sha256: str = ""
     seed: int = 0
     width: int = 128
     num_layers: int = 4
@@ -179,13 +185,20 @@ class Batches:
         config: for statistics and vocabulary.
         target_statistics: of the positions.
         batch_size: frames per batch.
+        absent_share: see `TrainingSettings`.
     """
 
     def __init__(
-        self, samples: Samples, config: PolicyConfig, target_statistics: Statistics, batch_size: int
+        self,
+        samples: Samples,
+        config: PolicyConfig,
+        target_statistics: Statistics,
+        batch_size: int,
+        absent_share: float = 0.0,
     ) -> None:
         self._samples = samples
         self._batch_size = batch_size
+        self._absent_share = absent_share
         self._state = config.state.normalize(samples.state)
         self._actions = config.action.normalize(samples.actions) * samples.mask
         self._targets = target_statistics.normalize(samples.targets)
@@ -193,18 +206,30 @@ class Batches:
         self._wordings = [
             np.stack([tokenizer(text) for text in task.instructions]) for task in TASKS.values()
         ]  # per task (wordings, text_length)
+        known = [list(TASKS).index(name) for name in config.tasks]
+        self._impossible = [
+            [other for other in known if list(TASKS.values())[other].objects != task.objects]
+            for task in TASKS.values()
+        ]  # per task, the tasks that cannot be done in its scene
+        self._still = config.action.normalize(np.zeros(samples.actions.shape[1:], np.float32))
 
     def draw(self, *key: int) -> dict[str, Tensor]:
         """The batch that belongs to `key`, with a wording drawn anew for each frame."""
         rng = np.random.default_rng(key)
         rows = rng.integers(len(self._samples), size=self._batch_size)
-        said = [self._wordings[task] for task in self._samples.tasks[rows]]
+        tasks = self._samples.tasks[rows]
+        actions, mask = self._actions[rows], self._samples.mask[rows]
+        for row in np.flatnonzero(rng.random(len(rows)) < self._absent_share):
+            if self._impossible[tasks[row]]:
+                tasks[row] = rng.choice(self._impossible[tasks[row]])
+                actions[row], mask[row] = self._still, 1.0
+        said = [self._wordings[task] for task in tasks]
         arrays = {
             "images": self._samples.images[rows],
             "words": np.stack([wordings[rng.integers(len(wordings))] for wordings in said]),
             "state": self._state[rows],
-            "actions": self._actions[rows],
-            "mask": self._samples.mask[rows],
+            "actions": actions,
+            "mask": mask,
             "targets": self._targets[rows],
         }
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
@@ -294,8 +319,27 @@ def resume(run: Run, path: Path) -> None:
     run.average = state["average"]
 
 
+def start_from(run: Run, policy: Path) -> None:
+    """Takes the weights of a policy as the initial ones.
+
+    Raises:
+        FileNotFoundError: no policy there.
+        InputError: it has other sizes, tasks or statistics.
+    """
+    if PolicyConfig.from_file(policy / CONFIG_FILE) != run.config:
+        raise InputError(f"{policy}: was trained with other sizes or other demonstrations")
+    tensors = load_file(policy / TENSOR_FILE)
+    run.learner.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, strict=False)
+    run.average = {name: tensor.detach().clone() for name, tensor in run.learner.policy_tensors().items()}
+
+
 def train(
-    demonstrations: Path, out: Path, settings: TrainingSettings, on_step: Callable[[Progress], None]
+    demonstrations: Path,
+    out: Path,
+    settings: TrainingSettings,
+    on_step: Callable[[Progress], None],
+    *,
+    start: Path | None = None,
 ) -> PolicyConfig:
     """Trains a policy, going on from what lies in `out`.
 
@@ -304,12 +348,13 @@ def train(
         out: directory of the run.
         settings: of the run.
         on_step: called after each step.
+        start: a policy to start from; default random weights.
 
     Returns:
         The config of the policy.
 
     Raises:
-        FileNotFoundError: no demonstrations there.
+        FileNotFoundError: no demonstrations there, or no policy to start from.
         InputError: demonstrations of several kinds, or a run with other settings in `out`.
     """
     tasks = demos.recorded_tasks(demonstrations)
@@ -317,10 +362,15 @@ def train(
     training, validation = load_samples(demonstrations, tasks, settings.horizon)
     found = statistics(training)
     config = policy_config(settings, recording, tasks, found)
+    if start is not None:
+        digest = hashlib.sha256((start / TENSOR_FILE).read_bytes()).hexdigest()
+        settings = replace(settings, start_sha256=digest)
     run = new_run(settings, config, found["targets"])
+    if start is not None:
+        start_from(run, start)
     if (out / STATE_FILE).exists():
         resume(run, out / STATE_FILE)
-    batches = Batches(training, config, found["targets"], settings.batch_size)
+    batches = Batches(training, config, found["targets"], settings.batch_size, settings.absent_share)
     held_out = Batches(validation, config, found["targets"], VALIDATION_FRAMES)
     try:
         loop(run, batches, held_out, out, on_step)
