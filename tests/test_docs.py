@@ -38,7 +38,9 @@ def code_blocks(page: Path, language: str) -> list[str]:
 
 def command_lines(text: str, program: str) -> list[list[str]]:
     """The arguments of each line of `text` that calls `program`; comments after two blanks are left out."""
-    lines = (re.split(r"\s{2,}|\s#", line.strip())[0] for line in text.replace("\\\n", " ").splitlines())
+    lines = (
+        re.split(r"\s{2,}|\s#", line.strip())[0] for line in re.sub(r"\s*\\\n\s*", " ", text).splitlines()
+    )
     return [shlex.split(line)[1:] for line in lines if line.split(" ")[0] == program]
 
 
