@@ -1,11 +1,14 @@
 //! Memory that begins on a cache line, so that whole vectors never straddle two.
 
-use std::alloc::{Layout, alloc_zeroed, dealloc, handle_alloc_error};
+use std::alloc::{Layout, alloc, alloc_zeroed, dealloc, handle_alloc_error};
 use std::ops::{Deref, DerefMut};
 use std::ptr::NonNull;
 
 /// A cache line, and the widest vector.
 const ALIGNMENT: usize = 64;
+
+/// A huge page of x86-64 and most others.
+const HUGE_PAGE: usize = 2 << 20;
 
 mod sealed {
     /// Types for which all bytes zero is a value.
@@ -34,16 +37,47 @@ impl<T: sealed::Zeroable> AlignedBuffer<T> {
                 len,
             };
         }
-        // SAFETY: the layout is not of size zero.
-        let memory = unsafe { alloc_zeroed(layout) };
+        // SAFETY: the layout is not of size zero; memory that was not zeroed by the allocator is zeroed here.
+        let memory = unsafe {
+            if layout.align() == ALIGNMENT {
+                alloc_zeroed(layout)
+            } else {
+                let memory = alloc(layout);
+                if !memory.is_null() {
+                    // Before it is touched: pages are given at first touch.
+                    advise_huge_pages(memory, layout.size());
+                    memory.write_bytes(0, layout.size());
+                }
+                memory
+            }
+        };
         let pointer = NonNull::new(memory.cast()).unwrap_or_else(|| handle_alloc_error(layout));
         Self { pointer, len }
     }
 
     fn layout(len: usize) -> Layout {
-        let layout = Layout::array::<T>(len).and_then(|layout| layout.align_to(ALIGNMENT));
+        let alignment = if len * size_of::<T>() < 2 * HUGE_PAGE {
+            ALIGNMENT
+        } else {
+            HUGE_PAGE
+        };
+        let layout = Layout::array::<T>(len).and_then(|layout| layout.align_to(alignment));
         layout.expect("weights fit in the address space")
     }
+}
+
+/// Asks for huge pages: weights are streamed, and with small pages the CPU looks up an address every 4 kB of them.
+///
+/// # Safety
+/// `memory` is `size` bytes that nobody else uses.
+unsafe fn advise_huge_pages(memory: *mut u8, size: usize) {
+    #[cfg(target_os = "linux")]
+    // SAFETY: advice changes neither contents nor validity of the memory. It may be refused: then pages stay small.
+    unsafe {
+        libc::madvise(memory.cast(), size, libc::MADV_HUGEPAGE);
+    }
+    #[cfg(not(target_os = "linux"))]
+    let _ = (memory, size);
 }
 
 impl<T: sealed::Zeroable> Drop for AlignedBuffer<T> {
