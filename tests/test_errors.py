@@ -116,6 +116,9 @@ OTHER_CONTEXT = saccade.ActionHead.load(TINY.path, config=TINY.config).encode(FE
         (Input, "num_steps: ", {"num_steps": 2**64}),
         (Input, "num_samples: expected at least 1, got 0", {"num_samples": 0}),
         (Input, "num_samples: expected an integer, got True", {"num_samples": True}),
+        (Input, "does not fit in memory", {"num_samples": 2**61, "noise": None}),
+        (Input, "num_steps: expected a number below", {"num_steps": 2**70}),
+        (Input, "embodiment_id: ", {"embodiment_id": [[0], [0, 1]]}),
         (Shape, r"out: expected \(2, 6, 5\), got \(2, 6, 4\)", {"out": np.empty((2, 6, 4), np.float32)}),
         (Dtype, "out: expected float32, got float64", {"out": np.empty((2, 6, 5))}),
         (Dtype, "out: expected a float32 array, got list", {"out": [1.0]}),
@@ -234,6 +237,7 @@ def test_a_config_that_lacks_a_key(key: str) -> None:
         ("num_inference_timesteps is 1001", {"num_inference_timesteps": 1001}),
         ("use_alternate_vl_dit is true", {"use_alternate_vl_dit": True}),
         ("diffusion_model_cfg: expected an object", {"diffusion_model_cfg": 3}),
+        ("norm_eps is 0.5", {"diffusion_model_cfg": TINY.config["diffusion_model_cfg"] | {"norm_eps": 0.5}}),
     ],
 )
 def test_a_config_that_cannot_be(message: str, change: dict[str, Any]) -> None:
@@ -328,6 +332,13 @@ def test_hostile_indexes(tmp_path: Path, message: str, weight_map: dict[str, Any
     (tmp_path / "model.safetensors.index.json").write_text(json.dumps({"weight_map": weight_map}))
     with pytest.raises(saccade.CheckpointError, match=message):
         saccade.ActionHead.load(tmp_path, config=TINY.config)
+
+
+def test_a_name_in_two_files_outside_the_head_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / "model.safetensors").write_bytes(TINY.path.read_bytes())
+    for name in ("policy_preprocessor_step_3.safetensors", "policy_postprocessor_step_0.safetensors"):
+        save_file({"action.min": np.zeros(1, np.float32)}, tmp_path / name)
+    saccade.ActionHead.load(tmp_path, config=TINY.config)
 
 
 def test_a_tensor_in_two_files(tmp_path: Path) -> None:

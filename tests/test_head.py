@@ -250,6 +250,9 @@ def test_warmup(head: saccade.ActionHead) -> None:
     head.warmup(5, batch=2, num_samples=3)
     with pytest.raises(saccade.InputError, match="num_vl_tokens: expected at least 1, got 0"):
         head.warmup(0)
+    for size in (2**40, 2**57, 2**62):
+        with pytest.raises(saccade.InputError, match="num_vl_tokens, batch, num_samples: "):
+            head.warmup(size)
 
 
 def test_many_threads_share_a_head_and_a_context(tiny: Released) -> None:

@@ -74,7 +74,10 @@ def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
     """
     if is_torch(value):
         value = _from_torch(name, value, "integer")
-    array = _asarray(name, value)
+    try:
+        array = _asarray(name, value)
+    except ShapeError as error:
+        raise InputError(str(error)) from None
     if array.dtype.kind not in "iu":
         raise InputError(f"{name}: expected an integer or an array of integers, got {_shown(value, array)}")
     if array.dtype.kind == "u" and array.size and int(array.max()) > np.iinfo(np.int64).max:
@@ -96,8 +99,10 @@ def integer(name: str, value: int, least: int = 1) -> int:
     except TypeError:
         raise InputError(f"{name}: expected an integer, got {value!r}") from None
     # The engine counts in 64 bits.
-    if not least <= number < 2**63:
+    if number < least:
         raise InputError(f"{name}: expected at least {least}, got {number}")
+    if number >= 2**63:
+        raise InputError(f"{name}: expected a number below 2**63, got {number}")
     return number
 
 
@@ -110,7 +115,10 @@ def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:
         InputError: ``out`` cannot be written to, or is not C-contiguous.
     """
     if out is None:
-        return np.empty(shape, np.float32)
+        try:
+            return np.empty(shape, np.float32)
+        except (MemoryError, ValueError) as error:
+            raise InputError(f"a result of shape {shape} does not fit in memory: {error}") from None
     array: Any = out
     if is_torch(out):
         if out.requires_grad:  # type: ignore[union-attr]
@@ -142,7 +150,7 @@ def _asarray(name: str, value: Any) -> npt.NDArray[Any]:
         return np.asarray(value)
     except OverflowError as error:
         raise InputError(f"{name}: {error}") from None
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise ShapeError(f"{name}: expected an array, got {type(value).__name__} ({error})") from None
 
 

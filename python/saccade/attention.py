@@ -170,7 +170,7 @@ class CrossAttention:
         weights = None
         if return_weights:
             weights = np.empty((kv.batch, self.num_heads, *states.shape[1:2], kv.num_vl_tokens), np.float32)
-        bias = None if key_bias is None else float32("key_bias", key_bias)
+        bias = None if key_bias is None else apart(float32("key_bias", key_bias), output)
         self._attention.attend(
             apart(states, output), kv._held, boolean("key_mask", key_mask), bias, weights, output
         )

@@ -94,7 +94,7 @@ def to_json(config: Mapping[str, Any] | str | os.PathLike[str]) -> str:
     if isinstance(config, (str, os.PathLike)):
         return read_json(config)
     try:
-        return json.dumps(dict(config))
+        return json.dumps(dict(config), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"config: expected a mapping as JSON has it, or a path: {error}") from None
 
@@ -105,5 +105,5 @@ def read_json(path: str | os.PathLike[str]) -> str:
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise FileNotFoundError(f"config: no such file: {os.fspath(path)}") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, TypeError, ValueError) as error:
         raise CheckpointError(f"config: {os.fspath(path)} cannot be read: {error}") from None

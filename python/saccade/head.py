@@ -378,4 +378,7 @@ def _noise(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float3
         raise InputError(
             f"seed: expected what numpy.random.default_rng takes, got {seed!r} ({error})"
         ) from None
-    return generator.standard_normal(shape, dtype=np.float32)
+    try:
+        return generator.standard_normal(shape, dtype=np.float32)
+    except (MemoryError, ValueError) as error:
+        raise InputError(f"noise of shape {shape} does not fit in memory: {error}") from None

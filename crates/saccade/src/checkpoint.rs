@@ -52,6 +52,8 @@ struct Entry {
 pub struct Checkpoint {
     files: Vec<(PathBuf, File)>,
     entries: BTreeMap<String, Entry>,
+    /// Names that stand in more than one file, with what to say of them: fatal only where the tensor is wanted.
+    duplicates: BTreeMap<String, String>,
 }
 
 impl Checkpoint {
@@ -61,12 +63,13 @@ impl Checkpoint {
     ///
     /// # Errors
     /// [`Error::NotFound`] for a path that is not there; [`Error::Checkpoint`] for a file that is not safetensors, is truncated,
-    /// or names a tensor twice.
+    /// or names a tensor twice. A name in two files is an error only where that tensor is wanted.
     pub fn open(path: &Path) -> Result<Self> {
         let metadata = std::fs::metadata(path).map_err(|error| Error::from_io("source", path, &error))?;
         let mut checkpoint = Self {
             files: Vec::new(),
             entries: BTreeMap::new(),
+            duplicates: BTreeMap::new(),
         };
         if metadata.is_dir() {
             let listing = Listing::of(path)?;
@@ -136,6 +139,11 @@ impl Checkpoint {
             }
             known.insert(name);
         }
+        let twice = self
+            .duplicates
+            .iter()
+            .filter(|(name, _)| name.starts_with(prefix));
+        problems.extend(twice.map(|(_, problem)| problem.clone()));
         let unknown = self
             .names()
             .filter(|name| name.starts_with(prefix) && !known.contains(*name));
@@ -179,9 +187,13 @@ impl Checkpoint {
     }
 
     fn entry(&self, name: &str) -> Result<&Entry> {
-        self.entries
-            .get(name)
-            .ok_or_else(|| Error::Checkpoint(format!("source: {name} is missing")))
+        match self.duplicates.get(name) {
+            Some(problem) => Err(Error::Checkpoint(format!("source: {problem}"))),
+            None => self
+                .entries
+                .get(name)
+                .ok_or_else(|| Error::Checkpoint(format!("source: {name} is missing"))),
+        }
     }
 
     fn read_elements(&self, name: &str, entry: &Entry, first: usize, count: usize) -> Result<Elements> {
@@ -249,7 +261,9 @@ impl Checkpoint {
             let start = data_start + info.data_offsets.0 as u64;
             if let Some(other) = self.entries.get(&name) {
                 let other = self.files[other.file].0.display();
-                return Err(bad(format!("{name} is also in {other}")));
+                let problem = format!("{name} is also in {other}, beside {}", path.display());
+                self.duplicates.insert(name, problem);
+                continue;
             }
             self.entries.insert(
                 name,

@@ -126,7 +126,16 @@ impl Reader {
         let context_dim = self.size(head, "", "backbone_embedding_dim", 1);
         let (vl_num_layers, vl_num_heads, vl_head_dim) = if use_vlln {
             let vl = self.object(head, "vl_self_attention_cfg").unwrap_or(&empty);
-            self.expect_defaults(vl, vl_path, &[("positional_embeddings", Value::Null)]);
+            self.expect_defaults(
+                vl,
+                vl_path,
+                &[
+                    ("positional_embeddings", Value::Null),
+                    ("activation_fn", Value::from("gelu-approximate")),
+                    ("attention_bias", Value::from(true)),
+                    ("norm_eps", Value::from(1e-5)),
+                ],
+            );
             (
                 self.size(vl, vl_path, "num_layers", 0),
                 self.size(vl, vl_path, "num_attention_heads", 1),
@@ -144,6 +153,7 @@ impl Reader {
                 ("activation_fn", Value::from("gelu-approximate")),
                 ("attention_bias", Value::from(true)),
                 ("norm_elementwise_affine", Value::from(false)),
+                ("norm_eps", Value::from(1e-5)),
             ],
         );
         let action_dim = self.size(head, "", "action_dim", 1);

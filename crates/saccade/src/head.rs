@@ -338,6 +338,20 @@ impl ActionHead {
             }
         }
         let config = &self.config;
+        let rows = num_samples
+            .unwrap_or(1)
+            .checked_mul(config.num_rows())
+            .and_then(|rows| rows.checked_mul(config.width));
+        let tokens = num_vl_tokens.checked_mul(config.context_dim);
+        let elements = rows
+            .zip(tokens)
+            .and_then(|(rows, tokens)| rows.checked_add(tokens)?.checked_mul(batch));
+        if elements.is_none_or(|elements| elements > MAX_WARMUP_ELEMENTS) {
+            return Err(Error::Input(format!(
+                "num_vl_tokens, batch, num_samples: expected sizes whose rows fit in memory, got {num_vl_tokens}, {batch}, {}",
+                num_samples.unwrap_or(1)
+            )));
+        }
         let features = vec![0.0; batch * num_vl_tokens * config.context_dim];
         let shape = [batch, num_vl_tokens, config.context_dim];
         let context = self.encode(&Features::new(Array::new(&features, &shape)))?;
@@ -655,6 +669,9 @@ impl ActionHead {
         Ok(buckets)
     }
 }
+
+/// Elements of tokens and rows that a warm-up may ask for: 8 GB in float32, far above any batch that a CPU is given.
+const MAX_WARMUP_ELEMENTS: usize = 1 << 31;
 
 /// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a problem.
 const MAX_THREADS: usize = 1024;
