@@ -14,7 +14,7 @@ use crate::aligned::AlignedBuffer;
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::simd::dispatch;
-use tile::{Job, Panel, PanelRun, Rows};
+use tile::{Job, Panel, PanelRun, Rows, Stored};
 
 /// Weights to pack, `(out_features, in_features)`, of any strides.
 #[derive(Clone, Copy, Debug)]
@@ -262,48 +262,26 @@ impl PackedLinear {
                 first: rows * block / blocks,
                 end: rows * (block + 1) / blocks,
             };
-            let first = panel * columns;
-            let width = columns.min(self.out_features - first);
-            let bias = &self.bias[first..first + columns];
             match &self.panels {
-                Panels::F32(panels) => {
-                    let size = self.in_features * columns;
-                    let weights = &panels[panel * size..][..size];
-                    dispatch(
-                        self.isa,
-                        PanelRun {
-                            job: &job,
-                            rows,
-                            panel: Panel {
-                                weights,
-                                bias,
-                                first,
-                                width,
-                                ahead,
-                            },
-                        },
-                    );
-                }
-                Panels::Bf16(panels) => {
-                    let size = self.in_features.div_ceil(2) * columns;
-                    let weights = &panels[panel * size..][..size];
-                    dispatch(
-                        self.isa,
-                        PanelRun {
-                            job: &job,
-                            rows,
-                            panel: Panel {
-                                weights,
-                                bias,
-                                first,
-                                width,
-                                ahead,
-                            },
-                        },
-                    );
-                }
+                Panels::F32(panels) => self.run_panel(&job, rows, panels, panel, ahead),
+                Panels::Bf16(panels) => self.run_panel(&job, rows, panels, panel, ahead),
             }
         });
+    }
+
+    /// Runs a block of rows through panel number `panel` of `panels`, all of this layer's.
+    fn run_panel<E: Stored>(&self, job: &Job, rows: Rows, panels: &[E], panel: usize, ahead: usize) {
+        let columns = panel_columns(self.isa);
+        let size = self.in_features.div_ceil(E::STEP) * columns;
+        let first = panel * columns;
+        let panel = Panel {
+            weights: &panels[panel * size..][..size],
+            bias: &self.bias[first..first + columns],
+            first,
+            width: columns.min(self.out_features - first),
+            ahead,
+        };
+        dispatch(self.isa, PanelRun { job, rows, panel });
     }
 }
 

@@ -264,10 +264,11 @@ impl ActionHead {
             sized(x, noise.data.len()).copy_from_slice(noise.data);
             let dt = 1.0 / num_steps as f32;
             for step in 0..num_steps {
-                let time = self.dit.time(self.engine, self.bucket(step, num_steps));
-                workspace.times.clear();
-                workspace.times.resize(context.batch, time);
                 let bucket = self.bucket(step, num_steps);
+                workspace.times.clear();
+                workspace
+                    .times
+                    .resize(context.batch, self.dit.time(self.engine, bucket));
                 self.step_velocity(context, samples, |_| bucket, LastBlock::ActionRows, workspace);
                 for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
                     *x += dt * v;
