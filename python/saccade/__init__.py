@@ -6,6 +6,7 @@ from saccade.config import HeadConfig
 from saccade.environment import show_config
 from saccade.errors import CheckpointError, DtypeError, InputError, SaccadeError, ShapeError
 from saccade.head import ActionHead, Context
+from saccade.intervention import Intervention
 
 __all__ = [
     "ActionHead",
@@ -15,6 +16,7 @@ __all__ = [
     "DtypeError",
     "HeadConfig",
     "InputError",
+    "Intervention",
     "KeyValues",
     "SaccadeError",
     "ShapeError",
