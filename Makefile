@@ -28,6 +28,7 @@ rollout: setup-rollout
 	$(BIN)/saccade rollout $(ROLLOUT_ARGS) --out $(ROLLOUT_OUT)
 
 test: setup-test
+	-@$(PYTHON) .ci/needs.py browser
 	$(MAKE) test-rust
 	$(MAKE) test-python
 

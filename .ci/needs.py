@@ -72,7 +72,17 @@ def lacks_opengl():
     )
 
 
-CHECKS = {"python": lacks_python, "rust": lacks_rust, "opengl": lacks_opengl}
+def lacks_browser():
+    """What is missing for clicking through a page without a screen, or None."""
+    if shutil.which("chromium") and shutil.which("chromedriver"):
+        return None
+    return (
+        "The tests of the attention page need Chromium and its driver; they are skipped without."
+        "\n    Debian: apt-get install chromium chromium-driver"
+    )
+
+
+CHECKS = {"python": lacks_python, "rust": lacks_rust, "opengl": lacks_opengl, "browser": lacks_browser}
 
 
 def main():
