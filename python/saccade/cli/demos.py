@@ -40,10 +40,10 @@ def run(args: argparse.Namespace) -> int:
     from saccade.cli.rollout import parse_tasks
     from saccade.sim import graphics
     from saccade.sim.files import writable_directory
-    from saccade.sim.tasks import TASKS
+    from saccade.sim.tasks import DEMO_TASKS
 
     check_numbers(args)
-    tasks = list(TASKS) if args.tasks is None else parse_tasks(args.tasks)
+    tasks = [task.name for task in DEMO_TASKS] if args.tasks is None else parse_tasks(args.tasks)
     graphics.check()
     # These import mujoco, which needs a working OpenGL.
     from saccade.sim.demos import DEFAULT_COUNTS, RecordingSettings, record_task

@@ -20,14 +20,16 @@ from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
 from saccade.sim.environment import DEFAULT_IMAGE_SIZE, TaskEnvironment
 from saccade.sim.experts import Expert, NoiseBursts
 from saccade.sim.files import write_atomically, write_json
-from saccade.sim.tasks import DEMONSTRATION_SEEDS, TASKS
+from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
 
 MAX_STEPS = 250  # bursts make the expert's way longer
 STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to stay
 MAX_MISSES = 0.5  # give up a task when more than this share of its episodes fails, once 20 have been tried
-# reach is judged by where the hand is and by nothing else, so it needs the most precision and the most
-# examples.
-DEFAULT_COUNTS = {name: 300 if name == "reach" else 100 for name in TASKS}
+# reach and the study's tasks are judged by where the hand is and by nothing else, so they need the most
+# precision and the most examples.
+DEFAULT_COUNTS = (
+    {task.name: 100 for task in DEMO_TASKS} | {"reach": 300} | {task.name: 200 for task in STUDY_TASKS}
+)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """The gymnasium environment: a Meta-World task seen through cameras and told in words."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import gymnasium
@@ -14,6 +13,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from saccade.errors import InputError, ShapeError
 from saccade.sim.cameras import DEFAULT_CAMERAS, VIDEO_CAMERA, Camera
 from saccade.sim.rendering import Renderer, UInt8Array, prepare_model
+from saccade.sim.scenarios import StepOutcome
 from saccade.sim.tasks import find_task
 
 Observation = dict[
@@ -25,14 +25,6 @@ PROPRIO_DIM = 4  # hand position in metres and gripper opening in [0, 1]
 DEFAULT_IMAGE_SIZE = 64
 VIDEO_SIZE = 360
 SIMULATION_HZ = 80  # control steps in a second of simulated time
-
-
-@dataclass(frozen=True)
-class StepOutcome:
-    """What the simulator says about one control step."""
-
-    reward: float
-    success: bool
 
 
 class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
@@ -49,10 +41,11 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         task: its name, see `saccade.sim.tasks`.
         image_size: pixels along each side.
         cameras: what the policy looks through.
+        blanked: names of cameras whose pictures are black, a control: what does the policy do without them?
         render_mode: `"rgb_array"` lets `render` draw the whole robot for videos.
 
     Raises:
-        InputError: no such task; image size or cameras that cannot be used.
+        InputError: no such task; image size or cameras that cannot be used; no camera with a blanked name.
 
     Example:
         >>> env = TaskEnvironment("push")
@@ -71,16 +64,21 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         *,
         image_size: int = DEFAULT_IMAGE_SIZE,
         cameras: Sequence[Camera] = DEFAULT_CAMERAS,
+        blanked: Collection[str] = (),
         render_mode: str | None = None,
     ) -> None:
         if image_size < 8:
             raise InputError(f"image_size: given {image_size}, expected at least 8")
         if not cameras or len({camera.name for camera in cameras}) != len(cameras):
             raise InputError("cameras: expected at least one, each with a name of its own")
+        names = [camera.name for camera in cameras]
+        if isinstance(blanked, str) or not set(blanked) <= set(names):
+            raise InputError(f"blanked: given {blanked!r}, expected names out of {', '.join(names)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode: given {render_mode!r}, expected 'rgb_array' or None")
         self.task = find_task(task)
         self.cameras = tuple(cameras)
+        self.blanked = frozenset(blanked)
         self.image_size = image_size
         self.render_mode = render_mode
         self.instruction = self.task.instructions[0]
@@ -96,6 +94,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         # Meta-World clips what it reports to this space, which was formed while the goal was still hidden: to
         # zeros.
         self._world.__dict__.pop("sawyer_observation_space", None)
+        self.scenario = self.task.scenario(self._world)
         prepare_model(self._world.model, draws_goal=self.task.draws_goal)
         self._full_state = np.zeros(39)
         self._steps = 0
@@ -123,6 +122,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.instruction = self.task.instruction(seed)
         self._world.seed(seed)
         self._full_state, _ = self._world.reset()
+        self.scenario.start(seed)
         # Meta-World moves the goal marker in the model only; without this the picture shows the last
         # episode's.
         mujoco.mj_forward(self._world.model, self._world.data)
@@ -137,18 +137,24 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             raise InputError(f"action: expected finite numbers, given {action}")
         self._full_state, reward, _, _, info = self._world.step(np.clip(action, -1.0, 1.0))
         self._steps += 1
-        return StepOutcome(reward=float(reward), success=bool(info["success"]))
+        return self.scenario.outcome(float(reward), bool(info["success"]))
 
     def observe(self) -> Observation:
         """What the policy may know now; also kept as `last_observation`."""
-        if self._renderer is None:
-            self._renderer = Renderer(self._world.model, self.image_size)
         self.last_observation = {
-            "images": self._renderer.draw_all(self._world.data, self.cameras),
+            "images": {camera.name: self._picture(camera) for camera in self.cameras},
             "proprio": self._full_state[:PROPRIO_DIM].astype(np.float32),
             "instruction": self.instruction,
         }
         return self.last_observation
+
+    def _picture(self, camera: Camera) -> UInt8Array:
+        """What one of the policy's cameras sees now."""
+        if camera.name in self.blanked:
+            return np.zeros((self.image_size, self.image_size, 3), dtype=np.uint8)
+        if self._renderer is None:
+            self._renderer = Renderer(self._world.model, self.image_size)
+        return self._renderer.draw(self._world.data, camera, self.scenario.balls())
 
     def render(self) -> UInt8Array | None:
         """The whole robot from the side, `(360, 360, 3)`, if `render_mode` is `"rgb_array"`."""
@@ -156,19 +162,21 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             return None
         if self._video_renderer is None:
             self._video_renderer = Renderer(self._world.model, VIDEO_SIZE, for_video=True)
-        return self._video_renderer.draw(self._world.data, VIDEO_CAMERA)
+        return self._video_renderer.draw(self._world.data, VIDEO_CAMERA, self.scenario.balls())
 
     def privileged_state(self) -> npt.NDArray[np.float64]:
         """Meta-World's own observation `(39,)`, goal included. For experts; never for a policy."""
         return self._full_state.copy()
 
     def privileged_targets(self) -> npt.NDArray[np.float32]:
-        """Positions of the object and of the goal `(6,)`, metres: training targets, never an input."""
-        goal = np.asarray(self._world._target_pos, dtype=np.float64)
-        return np.concatenate((self._full_state[4:7], goal)).astype(np.float32)
+        """Positions of the object and of the goal `(6,)`, metres: training targets, never an input.
+
+        Tasks with balls of their own give the first and the last ball, those that have vanished included.
+        """
+        return self.scenario.targets(self._full_state).astype(np.float32)
 
     def fingertips(self) -> npt.NDArray[np.float64]:
-        """The point between the fingertips `(3,)`, metres; Meta-World judges a reach by it. For experts."""
+        """The point between the fingertips `(3,)`, metres; Meta-World judges a reach by it."""
         return np.asarray(self._world.tcp_center, dtype=np.float64).copy()
 
     def close(self) -> None:

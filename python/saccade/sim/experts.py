@@ -1,10 +1,7 @@
 """Scripted experts, and how demonstrations are disturbed so that a learner sees how to recover."""
 
-import warnings
 from dataclasses import dataclass
-from typing import Any
 
-import metaworld.policies
 import numpy as np
 import numpy.typing as npt
 
@@ -14,7 +11,7 @@ Float32Array = npt.NDArray[np.float32]
 
 
 class Expert:
-    """Meta-World's scripted expert of one task, told everything.
+    """The scripted expert of one task, told everything.
 
     Args:
         environment: the simulation it drives.
@@ -22,18 +19,10 @@ class Expert:
 
     def __init__(self, environment: TaskEnvironment) -> None:
         self._environment = environment
-        self._script: Any = getattr(metaworld.policies, environment.task.expert)()
 
     def action(self) -> Float32Array:
         """What it does now, `(4,)` in [-1, 1]."""
-        state = self._environment.privileged_state()
-        if self._environment.task.name == "reach":
-            # Its script brings the wrist to the goal, success is judged between the fingertips, 4.5 cm below.
-            # Aiming with the fingertips leaves the whole 5 cm for the errors of whoever learns from it.
-            state[-3:] += state[:3] - self._environment.fingertips()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it warns whenever it asks for more than full speed
-            action = self._script.get_action(state)
+        action = self._environment.scenario.expert_action(self._environment.privileged_state())
         clipped: Float32Array = np.clip(action[:ACTION_DIM], -1.0, 1.0).astype(np.float32)
         return clipped
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from saccade.sim import graphics
 from saccade.sim.cameras import Camera
+from saccade.sim.scenarios import Ball
 
 UInt8Array = npt.NDArray[np.uint8]
 
@@ -69,6 +70,19 @@ def free_camera(camera: Camera) -> mujoco.MjvCamera:
     return view
 
 
+def add_ball(scene: mujoco.MjvScene, ball: Ball) -> None:
+    """Adds a ball to what is about to be drawn."""
+    mujoco.mjv_initGeom(
+        scene.geoms[scene.ngeom],
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=np.full(3, ball.radius),
+        pos=ball.position,
+        mat=np.eye(3).ravel(),
+        rgba=np.array(ball.rgba, dtype=np.float32),
+    )
+    scene.ngeom += 1
+
+
 class Renderer:
     """Draws one simulation through several cameras.
 
@@ -90,16 +104,14 @@ class Renderer:
         self._options.geomgroup[HIDDEN_GROUP] = 1 if for_video else 0
         self._renderer: mujoco.Renderer | None = mujoco.Renderer(model, drawn, drawn)
 
-    def draw(self, data: mujoco.MjData, camera: Camera) -> UInt8Array:
-        """The picture `(size, size, 3)`."""
+    def draw(self, data: mujoco.MjData, camera: Camera, balls: Iterable[Ball] = ()) -> UInt8Array:
+        """The picture `(size, size, 3)`, with balls that the simulation does not have."""
         if self._renderer is None:
             raise RuntimeError("this renderer is closed")
         self._renderer.update_scene(data, free_camera(camera), self._options)
+        for ball in balls:
+            add_ball(self._renderer.scene, ball)
         return average_down(self._renderer.render(), self._supersampling)
-
-    def draw_all(self, data: mujoco.MjData, cameras: Iterable[Camera]) -> dict[str, UInt8Array]:
-        """One picture per camera, by its name."""
-        return {camera.name: self.draw(data, camera) for camera in cameras}
 
     def close(self) -> None:
         """Frees the OpenGL context; may be called twice."""

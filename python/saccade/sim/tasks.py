@@ -1,8 +1,12 @@
 """The tasks: which Meta-World task, how it is told to the robot, and which seeds are used for what."""
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from saccade.errors import InputError
+from saccade.sim.scenarios import MetaWorldScenario, Scenario, StereoReach, TwoGoals, TwoStage
 
 # A seed fixes where objects and goals lie. The three uses have ranges of their own, so that no policy is
 # judged on a layout it was trained or chosen on. `check_evaluation_seeds` and `demos.py` hold to them.
@@ -18,7 +22,7 @@ class Task:
     Attributes:
         name: How users call it.
         scene: Meta-World's name of its environment.
-        expert: Class of its scripted expert in `metaworld.policies`.
+        scenario: Makes the rules of one environment, given Meta-World's.
         objects: What stands on the table. Tasks with the same objects can all be done in the same scene.
         instructions: Wordings; an episode's seed picks one of them. The first is the plainest.
         draws_goal: Whether the goal is marked in the picture. Where the goal is an object's own state (an
@@ -29,7 +33,7 @@ class Task:
 
     name: str
     scene: str
-    expert: str
+    scenario: Callable[[Any], Scenario]
     objects: str
     instructions: tuple[str, ...]
     draws_goal: bool = False
@@ -40,12 +44,15 @@ class Task:
         return self.instructions[seed % len(self.instructions)]
 
 
-# reach and push show the same scene, hand, puck and green ball alike: only the instruction tells them apart.
-ALL_TASKS = (
+# The tasks of the demo, on which the shipped policy was trained. reach and push show the same scene, hand,
+# puck and green ball alike: only the instruction tells them apart.
+DEMO_TASKS = (
     Task(
         name="reach",
         scene="reach-v3",
-        expert="SawyerReachV3Policy",
+        scenario=functools.partial(
+            MetaWorldScenario, expert="SawyerReachV3Policy", aims_with_fingertips=True
+        ),
         objects="puck and ball",
         draws_goal=True,
         instructions=(
@@ -59,7 +66,7 @@ ALL_TASKS = (
     Task(
         name="push",
         scene="push-v3",
-        expert="SawyerPushV3Policy",
+        scenario=functools.partial(MetaWorldScenario, expert="SawyerPushV3Policy"),
         objects="puck and ball",
         draws_goal=True,
         instructions=(
@@ -73,7 +80,7 @@ ALL_TASKS = (
     Task(
         name="drawer-open",
         scene="drawer-open-v3",
-        expert="SawyerDrawerOpenV3Policy",
+        scenario=functools.partial(MetaWorldScenario, expert="SawyerDrawerOpenV3Policy"),
         objects="drawer",
         instructions=(
             "open the drawer",
@@ -86,7 +93,7 @@ ALL_TASKS = (
     Task(
         name="button-press-topdown",
         scene="button-press-topdown-v3",
-        expert="SawyerButtonPressTopdownV3Policy",
+        scenario=functools.partial(MetaWorldScenario, expert="SawyerButtonPressTopdownV3Policy"),
         objects="button",
         instructions=(
             "press the button",
@@ -99,7 +106,7 @@ ALL_TASKS = (
     Task(
         name="window-open",
         scene="window-open-v3",
-        expert="SawyerWindowOpenV3Policy",
+        scenario=functools.partial(MetaWorldScenario, expert="SawyerWindowOpenV3Policy"),
         objects="window",
         instructions=(
             "open the window",
@@ -110,7 +117,54 @@ ALL_TASKS = (
         ),
     ),
 )
-TASKS = {task.name: task for task in ALL_TASKS}
+# Harder ones, for studies: two answers that are equally good, a place that one picture does not tell, and two
+# things to be done in turn.
+STUDY_TASKS = (
+    Task(
+        name="two-goals",
+        scene="reach-v3",
+        scenario=TwoGoals,
+        objects="two yellow balls",
+        instructions=(
+            "reach a yellow ball",
+            "touch one of the yellow balls",
+            "go to either yellow ball",
+            "move the hand to one yellow ball",
+            "bring the gripper to either yellow ball",
+        ),
+        max_steps=100,
+    ),
+    Task(
+        name="stereo-reach",
+        scene="reach-v3",
+        scenario=StereoReach,
+        objects="blue ball",
+        instructions=(
+            "reach the blue ball",
+            "move the hand to the blue ball",
+            "go to the blue ball",
+            "touch the blue ball with the gripper",
+            "bring the gripper to the blue ball",
+        ),
+        max_steps=100,
+    ),
+    Task(
+        name="two-stage",
+        scene="reach-v3",
+        scenario=TwoStage,
+        objects="blue ball and green ball",
+        instructions=(
+            "touch the blue ball and then the green ball",
+            "reach the blue ball, then the green one",
+            "first the blue ball, then the green one",
+            "go to the blue ball before the green ball",
+            "touch both balls, the blue one first",
+        ),
+        max_steps=200,
+    ),
+)
+# A task's number in this order seeds its noise: new ones come last.
+TASKS = {task.name: task for task in (*DEMO_TASKS, *STUDY_TASKS)}
 
 
 def find_task(name: str) -> Task:
