@@ -1,0 +1,58 @@
+"""What a worker process keeps between cells, so that neighbours do not load the same things again."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+from pathlib import Path
+from typing import Any
+
+from saccade.config import HeadConfig
+from saccade.head import ActionHead
+from saccade.sim.environment import TaskEnvironment
+from saccade.sim.policy import Policy
+from saccade.sim.rollout import environment_for
+
+
+@functools.lru_cache(maxsize=1)
+def policy_of(checkpoint: str, engine: str = "rust") -> Policy:
+    """The policy in a directory; its head on one thread, for studies spread out over processes."""
+    return Policy.load(checkpoint, engine=engine, num_threads=1)
+
+
+@functools.lru_cache(maxsize=1)
+def head_of(checkpoint: str) -> ActionHead:
+    """The head alone, on one thread."""
+    return ActionHead.load(Path(checkpoint), num_threads=1)
+
+
+def describe_checkpoint(checkpoint: str) -> dict[str, Any]:
+    """What a study's settings say of a policy: its folder's name, its hash and the sizes that matter here."""
+    policy = policy_of(checkpoint)
+    head = HeadConfig.from_dict(policy.config.head)
+    return {
+        "name": Path(checkpoint).resolve().name,
+        "sha256": policy.checkpoint_sha256(),
+        "num_future_tokens": head.num_future_tokens,
+        "num_layers": head.num_layers,
+        "num_steps": head.num_steps,
+        "num_vl_tokens": policy.config.backbone.num_tokens,
+    }
+
+
+_open: dict[tuple[str, str], TaskEnvironment] = {}
+
+
+def environment_of(checkpoint: str, task: str) -> TaskEnvironment:
+    """The task as the policy in that directory sees it. One is open at a time."""
+    if (checkpoint, task) not in _open:
+        close_environments()
+        _open[checkpoint, task] = environment_for(policy_of(checkpoint), task)
+    return _open[checkpoint, task]
+
+
+@atexit.register
+def close_environments() -> None:
+    """Frees the OpenGL contexts, which must not be left to the end of the interpreter."""
+    while _open:
+        _open.popitem()[1].close()

@@ -1,0 +1,239 @@
+"""Intervals for rates, paired differences and means over episodes, and what a number of them can detect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+from scipy.stats import binomtest, norm
+
+from saccade.errors import InputError
+
+CONFIDENCE = 0.95
+POWER = 0.8
+Statistic = Callable[..., float]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """Success of two arms on the same episodes.
+
+    Attributes:
+        difference: Rate of the first less rate of the second, with Tango's score interval.
+        pairs: Episodes that both have.
+        both, only_first, only_second, neither: In how many of them which arm succeeded. Only the two middle
+            ones, the discordant pairs, tell the arms apart.
+        p_value: McNemar's exact test.
+    """
+
+    difference: Estimate
+    pairs: int
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+    p_value: float
+
+
+def wilson(successes: int, trials: int) -> Estimate:
+    """A success rate with Wilson's score interval; without a trial the rate is NaN and may be anything.
+
+    Example:
+        >>> rate = wilson(18, 20)
+        >>> rate.value, round(rate.low, 3), round(rate.high, 3)
+        (0.9, 0.699, 0.972)
+    """
+    if not 0 <= successes <= trials:
+        raise InputError(f"successes: given {successes} of {trials}, expected between 0 and all of them")
+    if trials == 0:
+        return Estimate(math.nan, 0.0, 1.0)
+    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(successes / trials, float(interval.low), float(interval.high))
+
+
+def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> PairedDifference:
+    """Compares two arms on the same episodes, in the same order.
+
+    The interval is Tango's score interval (Statistics in Medicine 17, 1998). Unlike those of Wald and
+    Newcombe it keeps its width where no pair is discordant, so equal results are not taken for equality.
+
+    Raises:
+        InputError: lengths differ, or there is no pair.
+
+    Example:
+        >>> found = paired_difference([True] * 9 + [False], [True] * 5 + [False] * 5)
+        >>> found.difference.value, found.only_first, found.only_second
+        (0.4, 4, 0)
+        >>> round(found.difference.low, 2), round(found.difference.high, 2)
+        (0.01, 0.69)
+    """
+    one, two = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
+    if one.shape != two.shape or one.ndim != 1 or not one.size:
+        raise InputError(
+            f"paired_difference: given {one.size} and {two.size} results, expected pairs, at least one"
+        )
+    only_first, only_second = int((one & ~two).sum()), int((~one & two).sum())
+    discordant = only_first + only_second
+    return PairedDifference(
+        difference=tango(only_first, only_second, one.size),
+        pairs=one.size,
+        both=int((one & two).sum()),
+        only_first=only_first,
+        only_second=only_second,
+        neither=int((~one & ~two).sum()),
+        p_value=float(binomtest(only_first, discordant).pvalue) if discordant else 1.0,
+    )
+
+
+def tango(only_first: int, only_second: int, pairs: int) -> Estimate:
+    """The difference of two paired rates with Tango's score interval, from the discordant pairs.
+
+    Example:
+        Response to a therapy, before and after (Cavo and others, Blood 120, 2012):
+
+        >>> found = tango(6, 16, 161)
+        >>> [round(number, 4) for number in (found.value, found.low, found.high)]
+        [-0.0621, -0.124, -0.0054]
+    """
+    quantile = float(norm.ppf((1 + CONFIDENCE) / 2))
+    value = (only_first - only_second) / pairs
+
+    def score(difference: float) -> float:
+        """The observed less the supposed difference, in standard deviations under the latter."""
+        # The likeliest share of pairs that only the second won, given the difference (a quadratic's root).
+        linear = (2 * pairs - only_first + only_second) * difference - only_first - only_second
+        constant = -only_second * difference * (1 - difference)
+        share = (math.sqrt(max(linear**2 - 8 * pairs * constant, 0.0)) - linear) / (4 * pairs)
+        variance = pairs * (2 * share + difference * (1 - difference))
+        return (only_first - only_second - pairs * difference) / math.sqrt(variance)
+
+    # At -1 and 1 the variance may vanish; there the limit is the bound itself.
+    edge = 1 - 1e-12
+    low, high = -1.0, 1.0
+    if score(-edge) > quantile:
+        low = float(brentq(lambda difference: score(difference) - quantile, -edge, min(value, edge)))
+    if score(edge) < -quantile:
+        high = float(brentq(lambda difference: score(difference) + quantile, max(value, -edge), edge))
+    return Estimate(value, low, high)
+
+
+def bootstrap(
+    values: npt.ArrayLike,
+    clusters: Sequence[Any] | npt.NDArray[Any],
+    statistic: Statistic = np.mean,
+    *,
+    draws: int = 2000,
+    seed: int = 0,
+) -> Estimate:
+    """A statistic with its percentile interval, drawing whole clusters with replacement.
+
+    Chunks of one episode are alike, so episodes are drawn and not chunks. With fewer than about ten clusters
+    the interval is too narrow; with one there is none (NaN).
+
+    Args:
+        values: `(observations, ...)`; the statistic gets the rows of the clusters drawn.
+        clusters: of each observation, such as its episode; text or numbers, or tuples of them.
+        statistic: a function of such rows; must not depend on their order.
+        draws, seed: of the bootstrap.
+
+    Example:
+        >>> mean = bootstrap([1.0, 1.0, 3.0, 3.0], ["a", "a", "b", "b"])
+        >>> mean.value, mean.low, mean.high
+        (2.0, 1.0, 3.0)
+    """
+    rows = np.asarray(values)
+    names = [tuple(name) if isinstance(name, (tuple, list)) else name for name in clusters]
+    if len(names) != len(rows) or not names:
+        raise InputError(
+            f"clusters: given {len(names)} for {len(rows)} values, expected one for each, at least one"
+        )
+    value = float(statistic(rows))
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    if len(numbers) < 2:
+        return Estimate(value, math.nan, math.nan)
+    number_of = np.array([numbers[name] for name in names])
+    members = [np.flatnonzero(number_of == number) for number in range(len(numbers))]
+    rng = np.random.default_rng(seed)
+    drawn = []
+    for _ in range(draws):
+        chosen = rng.integers(len(members), size=len(members))
+        drawn.append(float(statistic(rows[np.concatenate([members[one] for one in chosen])])))
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(value, float(low), float(high))
+
+
+def detectable_difference(pairs: int, discordant: float) -> float:
+    """The smallest difference of two paired rates that McNemar's test finds with 80 % power at the 5 % level.
+
+    From Connor's sample size (Biometrics 43, 1987), solved for the difference.
+
+    Args:
+        pairs: episodes that both arms have.
+        discordant: share of pairs in which one succeeds and the other fails. Two arms that have nothing in
+            common but a rate p have 2 p (1 - p).
+
+    Returns:
+        The difference of the rates; NaN if not even one as large as `discordant`, the largest there can be,
+        would be found.
+
+    Example:
+        75 episodes an arm, of which a quarter go one way in one arm and the other way in the other:
+
+        >>> round(detectable_difference(75, 0.25), 3)
+        0.159
+    """
+    if pairs < 1 or not 0 < discordant <= 1:
+        raise InputError(
+            f"pairs, discordant: given {pairs} and {discordant}, expected at least 1, and a share above 0"
+        )
+    level, power = norm.ppf((1 + CONFIDENCE) / 2), norm.ppf(POWER)
+
+    def shortfall(difference: float) -> float:
+        needed = level * math.sqrt(discordant) + power * math.sqrt(discordant - difference**2)
+        return float(needed - difference * math.sqrt(pairs))
+
+    largest = min(discordant, math.sqrt(discordant))
+    if shortfall(largest) > 0:
+        return math.nan
+    return float(brentq(shortfall, 0.0, largest))
+
+
+def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation: float) -> float:
+    """The smallest difference between two arms of trained policies found with 80 % power at the 5 % level.
+
+    Normal approximation: a run's measured rate varies by the episodes drawn and by the training itself. With
+    few runs `run_deviation` is itself hardly known, so this is the least one can hope for.
+
+    Args:
+        rate: success expected of both arms.
+        episodes: of each run.
+        runs: trained policies of each arm.
+        run_deviation: standard deviation of the true rate between training seeds.
+
+    Example:
+        Two runs of 100 episodes each, at a rate of 70 % that varies by 4 points between training seeds:
+
+        >>> round(detectable_between_runs(0.7, 100, 2, 0.04), 3)
+        0.17
+    """
+    if not 0 <= rate <= 1 or episodes < 1 or runs < 1 or run_deviation < 0:
+        raise InputError(
+            f"rate, episodes, runs, run_deviation: given {rate}, {episodes}, {runs}, {run_deviation}; "
+            "expected a share, two numbers of at least 1, and a number of at least 0"
+        )
+    variance = (run_deviation**2 + rate * (1 - rate) / episodes) / runs
+    return float((norm.ppf((1 + CONFIDENCE) / 2) + norm.ppf(POWER)) * math.sqrt(2 * variance))
