@@ -7,6 +7,7 @@ from saccade.environment import show_config
 from saccade.errors import CheckpointError, DtypeError, InputError, SaccadeError, ShapeError
 from saccade.head import ActionHead, Context
 from saccade.intervention import Intervention
+from saccade.trace import Trace
 
 __all__ = [
     "ActionHead",
@@ -20,6 +21,7 @@ __all__ = [
     "KeyValues",
     "SaccadeError",
     "ShapeError",
+    "Trace",
     "__version__",
     "show_config",
 ]

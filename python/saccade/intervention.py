@@ -112,7 +112,9 @@ def _cuts(cut: Any) -> tuple[tuple[Chosen, Chosen], ...]:
             raise InputError(f"cut: expected pairs (reader, source), got {pair!r} among them")
         reader, source = _chosen("cut", pair[0]), _chosen("cut", pair[1])
         if reader[0] == "vl":
-            raise InputError("cut: 'vl' is read, it does not read; expected a reader among state, future, action")
+            raise InputError(
+                "cut: 'vl' is read, it does not read; expected a reader among state, future, action"
+            )
         pairs.append((reader, source))
     return tuple(pairs)
 

@@ -16,6 +16,7 @@ COMMANDS: dict[str, str] = {
     "rollout": "drive the simulated robot with a policy and report how often it succeeds",
     "demos": "record demonstrations of the tasks with scripted experts",
     "train": "train the policy on recorded demonstrations",
+    "study": "measure what the future tokens do, in closed loop and inside the head",
     "parity": "compare the Rust head with the reference in torch",
 }
 
@@ -27,11 +28,17 @@ EXTRAS: dict[str, str] = {
     "gymnasium": "sim",
     "imageio": "sim",
     "imageio_ffmpeg": "sim",
+    "jinja2": "study",
+    "joblib": "study",
     "matplotlib": "sim",
     "metaworld": "sim",
     "mujoco": "sim",
     "packaging": "sim",
+    "pandas": "study",
     "PIL": "sim",
+    "ray": "ray",
+    "scipy": "study",
+    "sklearn": "study",
     "threadpoolctl": "sim",
 }
 
