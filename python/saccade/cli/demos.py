@@ -11,12 +11,16 @@ from saccade.cli import EXIT_OK, UsageError
 HELP = "record demonstrations of the tasks with scripted experts"
 
 EPILOG = """\
+Tasks of the demo: reach, push, drawer-open, button-press-topdown, window-open. Harder ones, for studies:
+two-goals, stereo-reach, two-stage.
+
 Writes OUT/TASK/SEED.npz. Stopped at any time, the same command goes on where it was. Two processes may record
 into the same directory, each with tasks of its own.
 
 examples:
   saccade demos --out out/demos                               what the shipped policy was trained on
   saccade demos --out out/demos --tasks reach --count 50
+  saccade demos --out out/study --tasks two-goals,stereo-reach,two-stage
 """
 
 
@@ -24,8 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     parser.epilog = EPILOG
     parser.add_argument("--out", type=Path, required=True, help="directory of the recording")
-    parser.add_argument("--tasks", metavar="NAME,...", help="tasks, separated by commas (default: all)")
-    parser.add_argument("--count", type=int, help="demonstrations per task (default: 100, and 300 of reach)")
+    parser.add_argument(
+        "--tasks", metavar="NAME,...", help="tasks, separated by commas (default: the five of the demo)"
+    )
+    parser.add_argument(
+        "--count",
+        type=int,
+        help="demonstrations per task (default: 100; 300 of reach, 200 of each of the harder tasks)",
+    )
     parser.add_argument("--image-size", type=int, default=64, help="pixels along each side (default: 64)")
     parser.add_argument(
         "--frame-stride", type=int, default=3, help="control steps between recorded observations (default: 3)"

@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 HELP = "drive the simulated robot with a policy and report how often it succeeds"
 
 EPILOG = """\
-Tasks: reach, push, drawer-open, button-press-topdown, window-open. The same seed gives the same layout,
-wording and noise, whichever engine runs. Seeds from 1000000 on are kept for training and are refused.
+Tasks of the demo, which the shipped policy knows: reach, push, drawer-open, button-press-topdown,
+window-open. Harder ones, for policies of your own: two-goals, stereo-reach, two-stage.
+
+The same seed gives the same layout, wording and noise, whichever engine runs. Seeds from 1000000 on are kept
+for training and are refused.
 
 OUT receives results.json (after every episode), contact-sheet.png and, with --video, videos/TASK-SEED.mp4.
 Ctrl-C stops; the episodes that are done are kept.

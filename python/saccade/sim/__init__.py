@@ -1,6 +1,6 @@
 """Simulated robot tasks seen through cameras, and the small policy that solves them.
 
-Importing this package registers five gymnasium environments, one for each task of `saccade.sim.tasks`:
+Importing this package registers a gymnasium environment for each task of `saccade.sim.tasks`:
 
     >>> import gymnasium, saccade.sim
     >>> env = gymnasium.make("saccade/drawer-open-v0")
@@ -9,10 +9,10 @@ Importing this package registers five gymnasium environments, one for each task 
     ((64, 64, 3), (4,), 'open the drawer')
     >>> env.close()
 
-Where to read what: `tasks` (instructions, seeds), `cameras`, `environment` (what the robot sees and does),
-`experts` and `demos` (demonstrations), `backbone` and `policy` (numpy at run time), `learner` and `train`
-(torch), `rollout`, `report` and `video` (closed loop). Needs `pip install 'saccade[sim]'`; nothing here opens
-a window.
+Where to read what: `tasks` (instructions, seeds), `scenarios` (layouts, success, what experts do), `cameras`,
+`environment` (what the robot sees and does), `experts` and `demos` (demonstrations), `backbone` and `policy`
+(numpy at run time), `learner` and `train` (torch), `rollout`, `report` and `video` (closed loop). Needs
+`pip install 'saccade[sim]'`; nothing here opens a window.
 """
 
 from saccade.sim import graphics
