@@ -1,19 +1,28 @@
 """Demonstrations and training on tiny settings: resumable, and the same as if never stopped."""
 
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
 from __future__ import annotations
 
+import dataclasses
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from saccade import CheckpointError, InputError
+from saccade.config import HeadConfig
 from saccade.sim import demos, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
-from saccade.sim.dataset import chunks, load_samples
+from saccade.sim.dataset import chunks, describe, later_frames, load_samples, statistics
+from saccade.sim.learner import Learner, pool_tokens
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.tasks import DEMONSTRATION_SEEDS
 
@@ -28,6 +37,7 @@ TINY = train.TrainingSettings(
     num_future_tokens=3,
     patch_size=8,
 )
+ALIGNED = dataclasses.replace(TINY, alignment_weight=0.2)
 TASKS = ["reach", "button-press-topdown"]
 
 
@@ -119,23 +129,29 @@ def test_held_out_samples_come_from_demonstrations_of_their_own(
     assert set(training.tasks) == set(held_out.tasks)
 
 
-def test_training_resumes_to_the_same_weights(recording: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("settings", [TINY, ALIGNED], ids=["plain", "aligned"])
+def test_training_resumes_to_the_same_weights(
+    recording: Path, tmp_path: Path, settings: train.TrainingSettings
+) -> None:
     def interrupt(progress: train.Progress) -> None:
         if progress.step == 3:
             raise KeyboardInterrupt
 
     torch.set_num_threads(1)
-    train.train(recording, tmp_path / "whole", TINY, ignore)
+    train.train(recording, tmp_path / "whole", settings, ignore)
     with pytest.raises(KeyboardInterrupt):
-        train.train(recording, tmp_path / "parts", TINY, interrupt)
+        train.train(recording, tmp_path / "parts", settings, interrupt)
     stopped = load_file(tmp_path / "parts" / "model.safetensors")
-    train.train(recording, tmp_path / "parts", TINY, ignore)
+    train.train(recording, tmp_path / "parts", settings, ignore)
     whole, parts = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "parts"))
     assert whole.keys() == parts.keys()
     for name, tensor in whole.items():
         assert tensor.dtype == torch.bfloat16
         assert torch.equal(tensor, parts[name]), name
     assert any(not torch.equal(stopped[name], whole[name]) for name in whole)
+    ends = [torch.load(tmp_path / name / "training.pt", weights_only=True) for name in ("whole", "parts")]
+    for name, tensor in ends[0]["learner"].items():  # what is trained beside the policy, too
+        assert torch.equal(tensor, ends[1]["learner"][name]), name
 
 
 def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Path) -> None:
@@ -145,11 +161,15 @@ def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Pa
         "config.json",
         "model.safetensors",
         "training.pt",
+        "settings.json",
         "history.json",
         "loss.png",
     }
     history = json.loads((tmp_path / "history.json").read_text())
     assert history[-1]["step"] == TINY.steps
+    settings = json.loads((tmp_path / "settings.json").read_text())
+    assert settings.pop("demonstrations")["tasks"] == dict.fromkeys(TASKS, 2)
+    assert train.TrainingSettings(**settings) == TINY
     rust, other = (Policy.load(tmp_path, engine=engine, num_threads=1) for engine in ("rust", "torch"))
     assert rust.config.tasks == tuple(TASKS)
     images = {
@@ -207,3 +227,197 @@ def test_a_policy_of_other_sizes_cannot_be_started_from(recording: Path, tmp_pat
     with pytest.raises(FileNotFoundError):
         train.train(recording, tmp_path / "out", TINY, ignore, start=tmp_path / "nowhere")
     assert not (tmp_path / "out").exists()
+
+
+def make_batches(
+    recording: Path, settings: train.TrainingSettings, *, with_later: bool = True
+) -> tuple[train.Run, train.Batches]:
+    """A run before its first step, and what it draws from."""
+    samples, _ = load_samples(recording, TASKS, settings.horizon)
+    found = statistics(samples)
+    config = train.policy_config(settings, RECORDING, TASKS, found)
+    run = train.new_run(settings, config, describe(recording, TASKS))
+    batches = train.Batches(
+        samples, config, found["targets"], settings.batch_size, settings.absent_share, with_later
+    )
+    return run, batches
+
+
+def test_later_frames_are_the_next_ones_recorded_a_horizon_on() -> None:
+    steps = np.array([0, 3, 6, 9, 12, 15], np.int32)
+    demonstration = demos.Demonstration(
+        images=np.zeros((len(steps), 1, 8, 8, 3), np.uint8),
+        proprio=np.zeros((len(steps), 4), np.float32),
+        targets=np.zeros((len(steps), 6), np.float32),
+        frame_steps=steps,
+        actions=np.zeros((17, 4), np.float32),
+        disturbed=np.zeros(17, np.bool_),
+    )
+    assert later_frames(demonstration, 6).tolist() == [2, 3, 4, 5, 5, 5]  # exactly there, then the last one
+    assert later_frames(demonstration, 7).tolist() == [3, 4, 5, 5, 5, 5]  # the first one after
+    assert later_frames(demonstration, 40).tolist() == [5, 5, 5, 5, 5, 5]
+
+
+def test_samples_point_at_their_own_demonstrations_pictures(recording: Path) -> None:
+    horizon = 16
+    samples, _ = load_samples(recording, TASKS, horizon)
+    row, first = 0, 0
+    for task in TASKS:
+        for _, demonstration in demos.episodes(recording, task):
+            valid = chunks(demonstration, horizon)[1].sum(axis=(1, 2))
+            for frame, step in enumerate(demonstration.frame_steps):
+                if valid[frame] < 4:
+                    continue  # no sample, but its picture is kept: it may be what another one leads to
+                np.testing.assert_array_equal(samples.images[samples.now[row]], demonstration.images[frame])
+                after = [n for n, other in enumerate(demonstration.frame_steps) if other >= step + horizon]
+                expected = after[0] if after else len(demonstration.images) - 1
+                assert samples.later[row] == first + expected
+                np.testing.assert_array_equal(
+                    samples.images[samples.later[row]], demonstration.images[expected]
+                )
+                row += 1
+            first += len(demonstration.images)
+    assert row == len(samples)
+    assert first == len(samples.images)
+
+
+def test_who_is_told_to_stand_still_sees_the_same_later(recording: Path) -> None:
+    _, batches = make_batches(recording, dataclasses.replace(ALIGNED, absent_share=1.0))
+    batch = batches.draw(0)
+    assert torch.equal(batch["later_images"], batch["images"])
+    _, batches = make_batches(recording, dataclasses.replace(ALIGNED, batch_size=8))
+    batch = batches.draw(0)
+    assert not torch.equal(batch["later_images"], batch["images"])
+
+
+def test_pooling_means_runs_of_neighbours() -> None:
+    tokens = torch.randn(2, 7, 5, generator=torch.Generator().manual_seed(0))
+    for count in (1, 3, 7):
+        runs = [
+            tokens[:, i * 7 // count : -(-(i + 1) * 7 // count)].mean(dim=1) for i in range(count)
+        ]  # the bounds that torch documents
+        torch.testing.assert_close(pool_tokens(tokens, count), torch.stack(runs, dim=1))
+    assert pool_tokens(tokens, 9).shape == (2, 9, 5)
+
+
+def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Path) -> None:
+    run, batches = make_batches(recording, dataclasses.replace(ALIGNED, batch_size=3))
+    with torch.no_grad():
+        for tensor in run.average.values():  # so that the averaged backbone is not the current one
+            tensor.add_(0.05 * torch.randn(tensor.shape, generator=torch.Generator().manual_seed(1)))
+    batch = batches.draw(0)
+    rows: list[torch.Tensor] = []
+    handle = run.learner.action_head.model.transformer_blocks[0].register_forward_hook(
+        lambda module, inputs, output: rows.append(output)
+    )
+    losses = run.learner.losses(batch, torch.Generator().manual_seed(0), run.average)
+    handle.remove()
+    losses["alignment_loss"].backward()
+
+    other = Learner(run.config.backbone, HeadConfig.from_dict(run.config.head))
+    other.load_state_dict(run.average, strict=False)
+    with torch.no_grad():
+        seen = other.backbone(batch["later_images"], batch["words"])
+        projected = run.learner.projector(rows[0][:, 1:4])
+        targets = F.adaptive_avg_pool1d(seen.mT, 3).mT
+        cosines = (projected * targets).sum(-1) / (projected.norm(dim=-1) * targets.norm(dim=-1))
+    assert cosines.shape == (3, 3)
+    torch.testing.assert_close(losses["alignment_loss"].detach(), 1 - cosines.mean())
+
+    tokens = run.learner.action_head.future_tokens.weight
+    assert tokens.grad is not None
+    assert bool((tokens.grad.abs().sum(dim=1) > 0).all())
+    # Only the first block lies before the rows, and the targets' side must not move.
+    assert all(parameter.grad is None for parameter in run.learner.action_head.action_decoder.parameters())
+    assert all(tensor.grad is None and not tensor.requires_grad for tensor in run.average.values())
+
+
+def test_alignment_loss_falls_and_is_reported(recording: Path, tmp_path: Path) -> None:
+    settings = dataclasses.replace(ALIGNED, steps=40, batch_size=4, learning_rate=5e-3)
+    torch.set_num_threads(1)
+    run, batches = make_batches(recording, settings)
+    first = train.validation_losses(run, batches)["alignment_loss"]
+    train.train(recording, tmp_path, settings, ignore)
+    last = json.loads((tmp_path / "history.json").read_text())[-1]
+    assert last["validation_alignment_loss"] < 0.7 * first
+    assert last["alignment_loss"] < first
+    state = torch.load(tmp_path / "training.pt", weights_only=True)["learner"]
+    assert any(name.startswith("projector.") for name in state)
+    stored = load_file(tmp_path / "model.safetensors")
+    assert {name.split(".")[0] for name in stored} == {"backbone", "action_head"}
+
+
+def test_alignment_block_is_the_middle_one_or_as_said() -> None:
+    found = [train.TrainingSettings(num_layers=n, alignment_weight=1).aligned_block for n in (1, 2, 4, 16)]
+    assert found == [0, 0, 1, 7]
+    assert train.TrainingSettings(alignment_weight=1, alignment_block=3).aligned_block == 3
+    assert train.TrainingSettings(alignment_block=3).aligned_block is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"num_future_tokens": 0, "alignment_weight": 0.2}, "expected 0 with num_future_tokens 0"),
+        ({"alignment_weight": -0.1}, "given -0.1, expected at least 0"),
+        ({"alignment_weight": float("nan")}, "given nan"),
+        ({"alignment_weight": 0.2, "alignment_block": 4}, "given 4, expected 0 to 3"),
+    ],
+)
+def test_alignment_that_cannot_be_is_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        train.TrainingSettings(**wrong)
+
+
+def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) -> None:
+    """Bit for bit, against the steps written out here: nothing of the alignment may take part."""
+    torch.set_num_threads(1)
+    settings = dataclasses.replace(TINY, absent_share=0.5)
+    run, batches = make_batches(recording, settings, with_later=False)
+    assert not any(name.startswith("projector") for name in run.learner.state_dict())
+    other, _ = make_batches(recording, ALIGNED)  # the same start, with and without
+    for name, tensor in run.learner.state_dict().items():
+        assert torch.equal(tensor, other.learner.state_dict()[name]), name
+
+    torch.manual_seed(settings.seed)
+    learner = Learner(run.config.backbone, HeadConfig.from_dict(run.config.head))
+    optimizer = torch.optim.AdamW(
+        [
+            {"params": [p for p in learner.parameters() if p.ndim >= 2], "weight_decay": 0.01},
+            {"params": [p for p in learner.parameters() if p.ndim < 2], "weight_decay": 0.0},
+        ],
+        betas=(0.9, 0.95),
+    )
+    for step in range(3):
+        found = train.train_step(run, batches)
+        assert found.keys() == {"loss", "target_loss"}
+        batch = batches.draw(settings.seed, step)
+        assert "later_images" not in batch
+        for group in optimizer.param_groups:
+            group["lr"] = train.learning_rate(settings, step)
+        seed = np.random.default_rng((settings.seed, step, 1)).integers(2**63)
+        generator = torch.Generator().manual_seed(int(seed))
+        features = learner.backbone(batch["images"], batch["words"])
+        noise = torch.randn(batch["actions"].shape, generator=generator)
+        time = learner.action_head.sample_time(len(noise), generator)
+        flow = learner.action_head.loss(
+            features, batch["state"], 0, batch["actions"], noise=noise, time=time, action_mask=batch["mask"]
+        )
+        positions = F.mse_loss(learner.target_head(features[:, -1]), batch["targets"])
+        optimizer.zero_grad()
+        (flow + settings.target_weight * positions).backward()
+        torch.nn.utils.clip_grad_norm_(learner.parameters(), 1.0)
+        optimizer.step()
+        assert found == {"loss": flow.item(), "target_loss": positions.item()}
+    for name, tensor in learner.state_dict().items():
+        assert torch.equal(tensor, run.learner.state_dict()[name]), name
+
+
+def test_description_tells_recordings_apart(recording: Path, tmp_path: Path) -> None:
+    whole = describe(recording, TASKS)
+    assert whole["tasks"] == dict.fromkeys(TASKS, 2)
+    shutil.copytree(recording, tmp_path / "copy")
+    assert describe(tmp_path / "copy", TASKS) == whole
+    next((tmp_path / "copy" / "reach").glob("*.npz")).unlink()
+    fewer = describe(tmp_path / "copy", TASKS)
+    assert fewer["tasks"] == {"reach": 1, "button-press-topdown": 2}
+    assert fewer["sha256"] != whole["sha256"]

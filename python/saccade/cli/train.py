@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,16 +16,17 @@ if TYPE_CHECKING:
 HELP = "train the policy on recorded demonstrations"
 
 EPILOG = """\
-Writes config.json and model.safetensors (the policy, for `saccade rollout --checkpoint OUT`), loss.png,
-history.json and training.pt about once a minute. Stopped at any time, the same command goes on where it was
-and ends with the same weights as an uninterrupted run. The shipped policy was trained by the first two
-examples, one after the other.
+Writes config.json and model.safetensors (the policy, for `saccade rollout --checkpoint OUT`), settings.json,
+history.json, loss.png and training.pt about once a minute. Stopped at any time, the same command goes on
+where it was and ends with the same weights as an uninterrupted run. The shipped policy was trained by the
+first two examples, one after the other.
 
 examples:
   saccade train --demos out/demos --out out/first
   saccade train --demos out/demos --start-from out/first --absent-share 0.1 --steps 1200 \\
     --learning-rate 3e-4 --ema-decay 0.99 --seed 1 --out out/policy
   saccade train --demos out/demos --out out/n0 --num-future-tokens 0
+  saccade train --demos out/demos --out out/aligned --alignment-weight 0.2
   saccade train --demos out/demos --out out/quick --steps 2000 --threads 2
 """
 
@@ -40,11 +42,22 @@ INTEGERS = (
     ("num_layers", 1, "blocks of the head"),
 )
 
-# The same for numbers below 1.
+# Option, its smallest value, what it must be below, and what it is.
 FRACTIONS = (
-    ("learning_rate", 1e-9, "of AdamW after the warm-up"),
-    ("ema_decay", 0.0, "of the averaged weights, which are the ones that are kept"),
-    ("absent_share", 0.0, "share of frames told a task whose object is not there, and shown to stand still"),
+    ("learning_rate", 1e-9, 1, "of AdamW after the warm-up"),
+    ("ema_decay", 0.0, 1, "of the averaged weights, which are the ones that are kept"),
+    (
+        "absent_share",
+        0.0,
+        1,
+        "share of frames told a task whose object is not there, and shown to stand still",
+    ),
+    (
+        "alignment_weight",
+        0.0,
+        math.inf,
+        "of the loss that pulls the future tokens' rows towards what is seen one horizon later (FLARE: 0.2)",
+    ),
 )
 
 
@@ -56,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1)")
     for name, _, what in INTEGERS:
         parser.add_argument(f"--{name.replace('_', '-')}", type=int, help=what)
-    for name, _, what in FRACTIONS:
+    for name, *_, what in FRACTIONS:
         parser.add_argument(f"--{name.replace('_', '-')}", type=float, help=what)
     parser.add_argument(
         "--start-from", type=Path, metavar="DIR", help="policy to start from (default: random weights)"
@@ -116,12 +129,14 @@ def training_settings(args: argparse.Namespace) -> TrainingSettings:
         value = getattr(args, name)
         if value is not None and value < smallest:
             raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected at least {smallest}")
-    for name, lowest, _ in FRACTIONS:
+    for name, lowest, limit, _ in FRACTIONS:
         value = getattr(args, name)
-        if value is not None and not lowest <= value < 1:
-            raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected {lowest:g} to below 1")
+        if value is not None and not lowest <= value < limit:
+            raise UsageError(
+                f"--{name.replace('_', '-')}: given {value}, expected {lowest:g} to below {limit:g}"
+            )
     if args.start_from is not None and not (args.start_from / "model.safetensors").is_file():
         raise FileNotFoundError(f"{args.start_from}: no policy there")
-    names = [name for name, _, _ in (*INTEGERS, *FRACTIONS)]
+    names = [name for name, *_ in (*INTEGERS, *FRACTIONS)]
     chosen = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     return dataclasses.replace(TrainingSettings(), **chosen)

@@ -1,7 +1,10 @@
 """Demonstrations as training samples: one observation and the chunk of expert actions that follows it."""
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,18 +22,23 @@ MIN_VALID_ACTIONS = 4  # a frame with fewer usable actions is left out
 
 @dataclass(frozen=True)
 class Samples:
-    """`frames` observations with their chunks, as recorded (nothing is normalised).
+    """Observations with their chunks, as recorded (nothing is normalised).
 
     Attributes:
-        images: `(frames, cameras, H, W, 3)` uint8.
-        state: `(frames, 4)` float32, proprioception.
-        targets: `(frames, 6)` float32, positions of object and goal.
-        actions: `(frames, horizon, 4)` float32, zero where not valid.
-        mask: `(frames, horizon, 1)` float32, 1 where an action is valid.
-        tasks: `(frames,)` number of the task in `TASKS`.
+        images: `(frames, cameras, H, W, 3)` uint8, every recorded frame once, also those that are no sample
+            and are only what another one leads to.
+        now: `(samples,)` which frame of `images` is seen.
+        later: `(samples,)` which one is seen when the chunk has been carried out, see `later_frames`.
+        state: `(samples, 4)` float32, proprioception.
+        targets: `(samples, 6)` float32, positions of object and goal.
+        actions: `(samples, horizon, 4)` float32, zero where not valid.
+        mask: `(samples, horizon, 1)` float32, 1 where an action is valid.
+        tasks: `(samples,)` number of the task in `TASKS`.
     """
 
     images: npt.NDArray[np.uint8]
+    now: npt.NDArray[np.int64]
+    later: npt.NDArray[np.int64]
     state: Float32Array
     targets: Float32Array
     actions: Float32Array
@@ -59,6 +67,18 @@ def chunks(demonstration: demos.Demonstration, horizon: int) -> tuple[Float32Arr
     return (demonstration.actions[steps] * valid).astype(np.float32), valid.astype(np.float32)
 
 
+def later_frames(demonstration: demos.Demonstration, horizon: int) -> npt.NDArray[np.int64]:
+    """For each frame, the first one that was recorded `horizon` control steps later or after that.
+
+    Where the demonstration ends before, its last frame: nothing moves any more once the task is done.
+
+    Returns:
+        `(frames,)` indices of frames.
+    """
+    steps = demonstration.frame_steps
+    return np.minimum(np.searchsorted(steps, steps + horizon), len(steps) - 1)
+
+
 def load_samples(directory: Path, tasks: list[str], horizon: int) -> tuple[Samples, Samples]:
     """Training and validation samples, split by demonstration.
 
@@ -73,7 +93,9 @@ def load_samples(directory: Path, tasks: list[str], horizon: int) -> tuple[Sampl
             actions, mask = chunks(demonstration, horizon)
             keep = mask[..., 0].sum(axis=1) >= MIN_VALID_ACTIONS
             samples = Samples(
-                images=demonstration.images[keep],
+                images=demonstration.images,
+                now=np.flatnonzero(keep),
+                later=later_frames(demonstration, horizon)[keep],
                 state=demonstration.proprio[keep],
                 targets=demonstration.targets[keep],
                 actions=actions[keep],
@@ -88,10 +110,27 @@ def load_samples(directory: Path, tasks: list[str], horizon: int) -> tuple[Sampl
     return training, join(parts[1]) if parts[1] else training
 
 
+def describe(directory: Path, tasks: list[str]) -> dict[str, Any]:
+    """What a recording holds, for a run's settings: episodes per task, and a digest that tells others apart.
+
+    The digest is of the episodes' names and the recording's settings, on which the episodes depend and on
+    nothing else.
+    """
+    seeds = {task: sorted(int(path.stem) for path in (directory / task).glob("[0-9]*.npz")) for task in tasks}
+    recorded = {"settings": demos.read_settings(directory, tasks).to_dict(), "seeds": seeds}
+    digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
+    return {"sha256": digest, "tasks": {task: len(found) for task, found in seeds.items()}}
+
+
 def join(parts: list[Samples]) -> Samples:
     """All samples in one."""
+    firsts = np.cumsum([0, *(len(part.images) for part in parts[:-1])])  # of each part's images
+    moved = [
+        replace(part, now=part.now + first, later=part.later + first)
+        for part, first in zip(parts, firsts, strict=True)
+    ]
     fields = Samples.__dataclass_fields__
-    return Samples(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
+    return Samples(**{name: np.concatenate([getattr(part, name) for part in moved]) for name in fields})
 
 
 def statistics(samples: Samples) -> dict[str, Statistics]:

@@ -4,10 +4,13 @@
 # mypy: disable-error-code="no-any-return, no-untyped-call"
 
 import itertools
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from saccade.config import HeadConfig
 from saccade.reference import ActionHead
@@ -82,41 +85,102 @@ class Learner(nn.Module):
     """All that is trained.
 
     Besides the policy there is a linear layer that reads object and goal positions off the register token.
-    Its loss makes the backbone find them early; it is not part of the checkpoint.
+    Its loss makes the backbone find them early. With an `alignment_block` there is also a projector from the
+    hidden rows of the future tokens to what the backbone says one horizon later. Neither is part of the
+    checkpoint.
 
     Args:
         backbone_config: sizes of the backbone.
         head_config: sizes of the head.
-        target_weight: weight of the positions' loss.
+        alignment_block: block of the head after which the future rows are aligned; None for no alignment.
     """
 
     def __init__(
-        self, backbone_config: BackboneConfig, head_config: HeadConfig, target_weight: float
+        self, backbone_config: BackboneConfig, head_config: HeadConfig, alignment_block: int | None = None
     ) -> None:
         super().__init__()
         self.backbone = Backbone(backbone_config)
         self.action_head = ActionHead(head_config)
         self.target_head = nn.Linear(backbone_config.width, NUM_TARGETS)
-        self.target_weight = target_weight
+        self.alignment_block = alignment_block
+        if alignment_block is not None:
+            # Made last, so that a seed gives the other layers the same weights with and without it.
+            self.projector = nn.Sequential(
+                nn.Linear(head_config.width, backbone_config.width),
+                nn.GELU(),
+                nn.Linear(backbone_config.width, backbone_config.width),
+            )
 
-    def losses(self, batch: dict[str, Tensor], generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Flow-matching loss and the positions' loss.
+    def losses(
+        self, batch: Mapping[str, Tensor], generator: torch.Generator, average: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """All losses of a batch.
 
         Args:
             batch: `images (B, cameras, H, W, 3)` uint8, `words (B, text_length)`, `state (B, state_dim)`,
-                `actions (B, T, action_dim)`, `mask (B, T, 1)`, `targets (B, 6)`; numbers are normalised.
+                `actions (B, T, action_dim)`, `mask (B, T, 1)`, `targets (B, 6)`; numbers are normalised. With
+                alignment also `later_images`, like `images`.
             generator: for noise and times.
+            average: the averaged tensors of the policy, whose backbone sees the later images.
 
         Returns:
-            Two scalars.
+            Scalars: `loss` of flow matching, `target_loss` of the positions and, with alignment,
+            `alignment_loss`.
         """
         features = self.backbone(batch["images"], batch["words"])
         noise = torch.randn(batch["actions"].shape, generator=generator)
         time = self.action_head.sample_time(len(noise), generator)
-        flow = self.action_head.loss(
-            features, batch["state"], 0, batch["actions"], noise=noise, time=time, action_mask=batch["mask"]
-        )
-        return flow, F.mse_loss(self.target_head(features[:, -1]), batch["targets"])
+        with self.watched_rows() as rows:
+            flow = self.action_head.loss(
+                features,
+                batch["state"],
+                0,
+                batch["actions"],
+                noise=noise,
+                time=time,
+                action_mask=batch["mask"],
+            )
+        losses = {
+            "loss": flow,
+            "target_loss": F.mse_loss(self.target_head(features[:, -1]), batch["targets"]),
+        }
+        if self.alignment_block is not None:
+            future = rows[0][:, 1 : 1 + self.action_head.config.num_future_tokens]  # (B, N, width)
+            targets = self.alignment_targets(batch, average)
+            losses["alignment_loss"] = 1 - F.cosine_similarity(self.projector(future), targets, dim=-1).mean()
+        return losses
+
+    @torch.no_grad()
+    def alignment_targets(self, batch: Mapping[str, Tensor], average: Mapping[str, Tensor]) -> Tensor:
+        """What the future rows should tell: the averaged backbone's tokens of the later images.
+
+        Args:
+            batch: `later_images` and `words`, as in `losses`.
+            average: see `losses`.
+
+        Returns:
+            `(B, N, width)`: the T_vl tokens pooled to N runs of neighbours.
+        """
+        prefix = "backbone."
+        tensors = {
+            name.removeprefix(prefix): tensor for name, tensor in average.items() if name.startswith(prefix)
+        }
+        tokens = functional_call(self.backbone, tensors, (batch["later_images"], batch["words"]))
+        return pool_tokens(tokens, self.action_head.config.num_future_tokens)
+
+    @contextmanager
+    def watched_rows(self) -> Iterator[list[Tensor]]:
+        """Collects the rows `(B, R, width)` that the alignment block returns; nothing without alignment."""
+        rows: list[Tensor] = []
+        if self.alignment_block is None:
+            yield rows
+            return
+        block = self.action_head.model.transformer_blocks[self.alignment_block]
+        handle = block.register_forward_hook(lambda module, inputs, output: rows.append(output))
+        try:
+            yield rows
+        finally:
+            handle.remove()
 
     def policy_tensors(self) -> dict[str, Tensor]:
         """The tensors of a checkpoint, in the published layout."""
@@ -125,6 +189,11 @@ class Learner(nn.Module):
             for name, tensor in self.state_dict().items()
             if name.startswith(("backbone.", "action_head."))
         }
+
+
+def pool_tokens(tokens: Tensor, count: int) -> Tensor:
+    """`(B, S, width)` to `(B, count, width)`: means of runs of neighbours that cover all tokens."""
+    return F.adaptive_avg_pool1d(tokens.transpose(1, 2), count).transpose(1, 2)
 
 
 def table(*shape: int) -> nn.Parameter:

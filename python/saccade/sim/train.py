@@ -1,10 +1,10 @@
 """Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
 
 A run lives in a directory: `training.pt` (all that is needed to go on), `config.json` and `model.safetensors`
-(the policy so far), `history.json` and `loss.png`. They are written about once a minute, each under a
-temporary name that is then renamed, so a run can be stopped at any time and goes on where it was. Every step
-draws its samples and noise from the seed and its own number, so a resumed run gives what an uninterrupted one
-gives.
+(the policy so far), `settings.json` (how and on what it is trained), `history.json` and `loss.png`. They are
+written about once a minute, each under a temporary name that is then renamed, so a run can be stopped at any
+time and goes on where it was. Every step draws its samples and noise from the seed and its own number, so a
+resumed run gives what an uninterrupted one gives.
 """
 
 # Calls of torch modules are untyped.
@@ -27,7 +27,7 @@ from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.sim import demos
 from saccade.sim.backbone import BackboneConfig
-from saccade.sim.dataset import Samples, load_samples, statistics
+from saccade.sim.dataset import Samples, describe, load_samples, statistics
 from saccade.sim.environment import ACTION_DIM, PROPRIO_DIM
 from saccade.sim.files import write_atomically, write_json
 from saccade.sim.instructions import Tokenizer, build_vocabulary, words
@@ -54,6 +54,10 @@ class TrainingSettings:
         learning_rate: Of AdamW, after the warm-up.
         ema_decay: Of the averaged weights, which are the ones that are kept.
         target_weight: Weight of the loss that finds object and goal.
+        alignment_weight: Weight of the loss that pulls the hidden rows of the future tokens towards what the
+            averaged backbone says of the observation one horizon later; as in FLARE, which used 0.2.
+        alignment_block: Block of the head after which those rows are taken. Default the middle one: as many
+            blocks for the rows to read the pictures as for the actions to read the rows.
         absent_share: Share of frames that are told a task whose object is not there, and shown to stand
             still. Without them the pictures alone tell most tasks apart, and their words go unread.
         start_sha256: Of the tensors that it starts from; empty for random ones. `train` sets it.
@@ -73,6 +77,8 @@ class TrainingSettings:
     learning_rate: float = 6e-4
     ema_decay: float = 0.999
     target_weight: float = 1.0
+    alignment_weight: float = 0.0
+    alignment_block: int | None = None
     absent_share: float = 0.0
     start_sha256: str = ""
     seed: int = 0
@@ -86,6 +92,26 @@ class TrainingSettings:
     execute_steps: int = 8
     num_steps: int = 4
     patch_size: int = 16
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.alignment_weight < math.inf:
+            raise InputError(f"alignment_weight: given {self.alignment_weight}, expected at least 0")
+        if self.alignment_weight and self.num_future_tokens == 0:
+            raise InputError(
+                f"alignment_weight: given {self.alignment_weight}, expected 0 with num_future_tokens 0: "
+                "there is no row to align"
+            )
+        if self.alignment_block is not None and not 0 <= self.alignment_block < self.num_layers:
+            raise InputError(
+                f"alignment_block: given {self.alignment_block}, expected 0 to {self.num_layers - 1}"
+            )
+
+    @property
+    def aligned_block(self) -> int | None:
+        """The block whose future rows are aligned; None if none are."""
+        if self.alignment_weight == 0:
+            return None
+        return (self.num_layers - 1) // 2 if self.alignment_block is None else self.alignment_block
 
 
 @dataclass
@@ -105,10 +131,10 @@ class Run:
 
     settings: TrainingSettings
     config: PolicyConfig
-    target_statistics: Statistics
     learner: Learner
     optimizer: torch.optim.Optimizer
     average: dict[str, Tensor]
+    demonstrations: dict[str, Any]
     step: int = 0
     history: list[dict[str, float]] = field(default_factory=list)
 
@@ -155,10 +181,10 @@ def policy_config(
     return config
 
 
-def new_run(settings: TrainingSettings, config: PolicyConfig, target_statistics: Statistics) -> Run:
-    """A run before its first step."""
+def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
+    """A run before its first step; `demonstrations` says what it trains on, see `dataset.describe`."""
     torch.manual_seed(settings.seed)
-    learner = Learner(config.backbone, HeadConfig.from_dict(config.head), settings.target_weight)
+    learner = Learner(config.backbone, HeadConfig.from_dict(config.head), settings.aligned_block)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
     optimizer = torch.optim.AdamW(
@@ -168,7 +194,7 @@ def new_run(settings: TrainingSettings, config: PolicyConfig, target_statistics:
         foreach=True,
     )
     average = {name: tensor.detach().clone() for name, tensor in learner.policy_tensors().items()}
-    return Run(settings, config, target_statistics, learner, optimizer, average)
+    return Run(settings, config, learner, optimizer, average, demonstrations)
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
@@ -186,6 +212,7 @@ class Batches:
         target_statistics: of the positions.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
+        with_later: whether batches have the images seen when the chunk has been carried out.
     """
 
     def __init__(
@@ -195,8 +222,10 @@ class Batches:
         target_statistics: Statistics,
         batch_size: int,
         absent_share: float = 0.0,
+        with_later: bool = False,
     ) -> None:
         self._samples = samples
+        self._with_later = with_later
         self._batch_size = batch_size
         self._absent_share = absent_share
         self._state = config.state.normalize(samples.state)
@@ -217,35 +246,41 @@ class Batches:
         """The batch that belongs to `key`, with a wording drawn anew for each frame."""
         rng = np.random.default_rng(key)
         rows = rng.integers(len(self._samples), size=self._batch_size)
-        tasks = self._samples.tasks[rows]
+        tasks, later = self._samples.tasks[rows], self._samples.later[rows]
         actions, mask = self._actions[rows], self._samples.mask[rows]
         for row in np.flatnonzero(rng.random(len(rows)) < self._absent_share):
             if self._impossible[tasks[row]]:
                 tasks[row] = rng.choice(self._impossible[tasks[row]])
                 actions[row], mask[row] = self._still, 1.0
+                later[row] = self._samples.now[rows[row]]
         said = [self._wordings[task] for task in tasks]
         arrays = {
-            "images": self._samples.images[rows],
+            "images": self._samples.images[self._samples.now[rows]],
             "words": np.stack([wordings[rng.integers(len(wordings))] for wordings in said]),
             "state": self._state[rows],
             "actions": actions,
             "mask": mask,
             "targets": self._targets[rows],
         }
+        if self._with_later:
+            arrays["later_images"] = self._samples.images[later]
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
-def train_step(run: Run, batches: Batches) -> tuple[float, float]:
-    """One optimiser step; returns the two losses."""
+def train_step(run: Run, batches: Batches) -> dict[str, float]:
+    """One optimiser step; returns the losses by name."""
     settings = run.settings
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate(settings, run.step)
     generator = torch.Generator().manual_seed(
         int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
     )
-    flow, targets = run.learner.losses(batches.draw(settings.seed, run.step), generator)
+    losses = run.learner.losses(batches.draw(settings.seed, run.step), generator, run.average)
+    total = losses["loss"] + settings.target_weight * losses["target_loss"]
+    if "alignment_loss" in losses:
+        total = total + settings.alignment_weight * losses["alignment_loss"]
     run.optimizer.zero_grad(set_to_none=True)
-    (flow + settings.target_weight * targets).backward()
+    total.backward()
     torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
     run.optimizer.step()
     # A short memory at first, so that the average is not held back by the initial weights.
@@ -254,17 +289,17 @@ def train_step(run: Run, batches: Batches) -> tuple[float, float]:
         current = run.learner.policy_tensors()
         torch._foreach_lerp_(list(run.average.values()), list(current.values()), 1.0 - decay)
     run.step += 1
-    return flow.item(), targets.item()
+    return {name: loss.item() for name, loss in losses.items()}
 
 
 @torch.no_grad()
-def validation_loss(run: Run, batches: Batches) -> tuple[float, float]:
-    """The two losses of the averaged weights on the same held-out frames and noise each time."""
+def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
+    """The losses of the averaged weights on the same held-out frames and noise each time."""
     current = {name: tensor.clone() for name, tensor in run.learner.policy_tensors().items()}
     run.learner.load_state_dict(run.average, strict=False)
-    flow, targets = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0))
+    losses = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0), run.average)
     run.learner.load_state_dict(current, strict=False)
-    return flow.item(), targets.item()
+    return {name: loss.item() for name, loss in losses.items()}
 
 
 def export(run: Run, out: Path) -> None:
@@ -295,6 +330,7 @@ def save(run: Run, out: Path) -> None:
     with write_atomically(out / STATE_FILE) as temporary:
         torch.save(state, temporary)
     export(run, out)
+    write_json(out / "settings.json", {**asdict(run.settings), "demonstrations": run.demonstrations})
     write_json(out / "history.json", run.history)
     plot_history(run.history, out / "loss.png")
 
@@ -365,13 +401,16 @@ def train(
     if start is not None:
         digest = hashlib.sha256((start / TENSOR_FILE).read_bytes()).hexdigest()
         settings = replace(settings, start_sha256=digest)
-    run = new_run(settings, config, found["targets"])
+    run = new_run(settings, config, describe(demonstrations, tasks))
     if start is not None:
         start_from(run, start)
     if (out / STATE_FILE).exists():
         resume(run, out / STATE_FILE)
-    batches = Batches(training, config, found["targets"], settings.batch_size, settings.absent_share)
-    held_out = Batches(validation, config, found["targets"], VALIDATION_FRAMES)
+    with_later = settings.aligned_block is not None
+    batches = Batches(
+        training, config, found["targets"], settings.batch_size, settings.absent_share, with_later
+    )
+    held_out = Batches(validation, config, found["targets"], VALIDATION_FRAMES, with_later=with_later)
     try:
         loop(run, batches, held_out, out, on_step)
     finally:
@@ -384,27 +423,19 @@ def loop(
     run: Run, batches: Batches, held_out: Batches, out: Path, on_step: Callable[[Progress], None]
 ) -> None:
     """Trains to the last step, saving about once a minute."""
-    saved, sums, count = time.monotonic(), np.zeros(2), 0
+    saved, steps = time.monotonic(), list[dict[str, float]]()
     latest: float | None = None
     while run.step < run.settings.steps:
-        sums += train_step(run, batches)
-        count += 1
+        steps.append(train_step(run, batches))
+        means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
         if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == run.settings.steps:
-            latest, latest_targets = validation_loss(run, held_out)
-            means = sums / count
-            run.history.append(
-                {
-                    "step": run.step,
-                    "loss": means[0].item(),
-                    "target_loss": means[1].item(),
-                    "validation_loss": latest,
-                    "validation_target_loss": latest_targets,
-                }
-            )
+            held_out_losses = validation_losses(run, held_out)
+            validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
+            run.history.append({"step": run.step, **means, **validation})
             save(run, out)
-            saved, sums, count = time.monotonic(), np.zeros(2), 0
-        shown = sums / count if count else np.array([run.history[-1]["loss"], run.history[-1]["target_loss"]])
-        on_step(Progress(run.step, run.settings.steps, float(shown[0]), float(shown[1]), latest))
+            latest = held_out_losses["loss"]
+            saved, steps = time.monotonic(), []
+        on_step(Progress(run.step, run.settings.steps, means["loss"], means["target_loss"], latest))
 
 
 def plot_history(history: list[dict[str, Any]], path: Path) -> None:
@@ -420,9 +451,12 @@ def plot_history(history: list[dict[str, Any]], path: Path) -> None:
         "validation_loss": "velocity, held out",
         "target_loss": "positions, training",
         "validation_target_loss": "positions, held out",
+        "alignment_loss": "1 - cosine of the future rows, training",
+        "validation_alignment_loss": "1 - cosine of the future rows, held out",
     }
     for key, label in names.items():
-        axes.plot([entry["step"] for entry in history], [entry[key] for entry in history], label=label)
+        if all(key in entry for entry in history):
+            axes.plot([entry["step"] for entry in history], [entry[key] for entry in history], label=label)
     axes.set(xlabel="step", ylabel="mean squared error", yscale="log")
     axes.legend()
     with write_atomically(path) as temporary:
