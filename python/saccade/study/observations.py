@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from saccade.intervention import Intervention
+from saccade.sim import graphics
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import HeadEngine, Policy
+from saccade.sim.policy import DEMO_CHECKPOINT, HeadEngine, Policy, check_trained_on
 from saccade.sim.rollout import Episode, run_episode
+from saccade.sim.tasks import check_evaluation_seeds, find_task
+from saccade.study.arguments import names
+from saccade.study.loaded import policy_of
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -82,3 +88,66 @@ def record_looks(environment: TaskEnvironment, policy: Policy, seed: int) -> tup
     recorder = Recorder(policy.engine, environment)
     watched = Policy(policy.config, policy.backbone, recorder, policy.checkpoint)
     return run_episode(environment, watched, seed), recorder.looks
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Which episodes of which policy.
+
+    Attributes:
+        checkpoint: Directory of the policy.
+        tasks: Their names.
+        seeds: One episode of each task for each seed.
+    """
+
+    checkpoint: str
+    tasks: tuple[str, ...]
+    seeds: range
+
+    @property
+    def episodes(self) -> list[tuple[str, int]]:
+        """Task and seed of each."""
+        return [(task, seed) for task in self.tasks for seed in self.seeds]
+
+
+def add_rollout_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
+    """Declares policy, tasks and seeds; `episodes` is the default number of each task."""
+    parser.add_argument(
+        "--checkpoint", type=Path, metavar="DIR", help="policy to look into (default: the one shipped)"
+    )
+    parser.add_argument(
+        "--tasks", metavar="NAME,...", help="tasks, separated by commas (default: all that it knows)"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=episodes, help=f"episodes per task (default: {episodes})"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="first seed; the next episodes count up (default: 0)"
+    )
+
+
+def rollouts_of(args: argparse.Namespace) -> Rollouts:
+    """The episodes that the arguments ask for, all checked; needs a working OpenGL.
+
+    Raises:
+        InputError: an unknown task, seeds kept for training, no episode.
+        FileNotFoundError, CheckpointError: no policy, or one that was not trained on a task.
+        GraphicsError: nothing can be drawn here.
+    """
+    seeds = check_evaluation_seeds(args.seed, args.episodes)
+    named = None if args.tasks is None else task_names(args.tasks)
+    graphics.check()
+    checkpoint = str(args.checkpoint or DEMO_CHECKPOINT)
+    policy = policy_of(checkpoint)
+    tasks = named or policy.config.tasks
+    check_trained_on(policy, list(tasks))
+    return Rollouts(checkpoint, tasks, seeds)
+
+
+def task_names(text: str) -> tuple[str, ...]:
+    """Tasks out of a list with commas.
+
+    Raises:
+        InputError: a name is unknown, or there is none.
+    """
+    return tuple(find_task(name).name for name in names("--tasks", text))
