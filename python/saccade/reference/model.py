@@ -9,7 +9,7 @@ vision-language tokens.
 # mypy: disable-error-code="no-any-return, no-untyped-call"
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -20,12 +20,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade.config import HeadConfig
-from saccade.errors import InputError, ShapeError
+from saccade.errors import InputError
+from saccade.intervention import Intervention, Tokens
 from saccade.reference import loading, tables
+from saccade.reference.checks import check_shape
+from saccade.reference.intervene import BlockChange, Run, is_cross, removal_bias, removed_tokens
+from saccade.trace import Trace
 
 NORM_EPS = 1e-5  # every LayerNorm but the last
 OUTPUT_NORM_EPS = 1e-6  # the last one
 TABLE_STD = 0.02  # initial scale of learned tokens, positions and category-specific weights
+UNCHANGED = BlockChange()
 
 
 class Attention(nn.Module):
@@ -42,7 +47,13 @@ class Attention(nn.Module):
         self.to_out = nn.ModuleList([nn.Linear(inner, width)])
 
     def forward(
-        self, x: Tensor, context: Tensor, *, logit_bias: Tensor | None = None, return_weights: bool = False
+        self,
+        x: Tensor,
+        context: Tensor,
+        *,
+        logit_bias: Tensor | None = None,
+        stop_gradient: Tensor | None = None,
+        return_weights: bool = False,
     ) -> tuple[Tensor, Tensor | None]:
         """Lets the rows of `x` read those of `context`.
 
@@ -51,6 +62,8 @@ class Attention(nn.Module):
             context: `(B, S, context_dim)`.
             logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a
                 key. A query with no key left gets zeros from the attention.
+            stop_gradient: `(Q, S)` bool; where true, the query takes this key and its value as constants in
+                the backward pass.
             return_weights: also return the probabilities.
 
         Returns:
@@ -59,11 +72,11 @@ class Attention(nn.Module):
         q = self.split_heads(self.to_q(x))  # (B, heads, Q, head_dim)
         k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
         v = self.split_heads(self.to_v(context))  # (B, heads, S, head_dim)
-        if logit_bias is None and not return_weights:
+        if logit_bias is None and stop_gradient is None and not return_weights:
             weights, values = None, F.scaled_dot_product_attention(q, k, v)  # the same sums, faster to train
         else:
-            weights = attention_weights(q, k, logit_bias)  # (B, heads, Q, S)
-            values = weights @ v  # (B, heads, Q, head_dim)
+            weights = attention_weights(q, k, logit_bias, stop_gradient)  # (B, heads, Q, S)
+            values = attention_values(weights, v, stop_gradient)  # (B, heads, Q, head_dim)
         return self.to_out[0](values.transpose(1, 2).flatten(2)), weights  # (B, Q, width)
 
     def split_heads(self, x: Tensor) -> Tensor:
@@ -71,24 +84,48 @@ class Attention(nn.Module):
         return x.unflatten(-1, (self.num_heads, self.head_dim)).transpose(1, 2)
 
 
-def attention_weights(q: Tensor, k: Tensor, logit_bias: Tensor | None) -> Tensor:
+def attention_weights(
+    q: Tensor, k: Tensor, logit_bias: Tensor | None, stop_gradient: Tensor | None = None
+) -> Tensor:
     """softmax(q k^T / sqrt(head_dim) + bias), and zeros where no key is left.
 
     Args:
         q: `(B, heads, Q, head_dim)`.
         k: `(B, heads, S, head_dim)`.
         logit_bias: broadcast to `(B, heads, Q, S)`, or None.
+        stop_gradient: `(Q, S)` bool, True where the key is a constant; or None.
 
     Returns:
         `(B, heads, Q, S)`.
     """
-    logits = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])  # (B, heads, Q, S)
+    logits = q @ k.transpose(-1, -2)  # (B, heads, Q, S)
+    if stop_gradient is not None:
+        logits = torch.where(stop_gradient, q @ k.detach().transpose(-1, -2), logits)
+    logits = logits / math.sqrt(q.shape[-1])
     if logit_bias is None:
         return torch.softmax(logits, dim=-1)
     logits = logits + logit_bias.to(logits.dtype)
     nothing_left = torch.isneginf(logits).all(dim=-1, keepdim=True)  # (B, heads, Q, 1)
     # Filled before the softmax too: a row of nan would poison the gradient even where its value is replaced.
     return torch.softmax(logits.masked_fill(nothing_left, 0.0), dim=-1).masked_fill(nothing_left, 0.0)
+
+
+def attention_values(weights: Tensor, v: Tensor, stop_gradient: Tensor | None) -> Tensor:
+    """The probabilities' mean of the values.
+
+    Args:
+        weights: `(B, heads, Q, S)`.
+        v: `(B, heads, S, head_dim)`.
+        stop_gradient: `(Q, S)` bool, True where the value is a constant; or None.
+
+    Returns:
+        `(B, heads, Q, head_dim)`.
+    """
+    if stop_gradient is None:
+        return weights @ v
+    constant = v.detach()
+    # The second product is zero. It carries the gradient to `v`, and the first one that to the weights.
+    return weights @ constant + weights.masked_fill(stop_gradient, 0.0) @ (v - constant)
 
 
 class GeluLinear(nn.Module):
@@ -128,10 +165,10 @@ class VlBlock(nn.Module):
         self.norm3 = nn.LayerNorm(width, eps=NORM_EPS)
         self.ff = FeedForward(width)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """`(B, S, context_dim)` to the same shape."""
+    def forward(self, x: Tensor, logit_bias: Tensor | None = None) -> Tensor:
+        """`x (B, S, context_dim)`, a bias as in `Attention`; returns `(B, S, context_dim)`."""
         y = self.norm1(x)
-        attended, _ = self.attn1(y, y)
+        attended, _ = self.attn1(y, y, logit_bias=logit_bias)
         x = x + attended
         return x + self.ff(self.norm3(x))
 
@@ -143,10 +180,10 @@ class VlSelfAttention(nn.Module):
         super().__init__()
         self.transformer_blocks = nn.ModuleList(VlBlock(config) for _ in range(config.vl_num_layers))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """`(B, S, context_dim)` to the same shape."""
+    def forward(self, x: Tensor, logit_bias: Tensor | None = None) -> Tensor:
+        """`x (B, S, context_dim)`, a bias as in `Attention`; returns `(B, S, context_dim)`."""
         for block in self.transformer_blocks:
-            x = block(x)
+            x = block(x, logit_bias)
         return x
 
 
@@ -179,10 +216,21 @@ class DiTBlock(nn.Module):
         self.attn1 = Attention(config.width, context_dim, config.num_heads, config.head_dim)
         self.ff = FeedForward(config.width)
 
-    def forward(self, rows: Tensor, vl_embs: Tensor, temb: Tensor) -> Tensor:
-        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `temb (B, width)`; returns `(B, R, width)`."""
+    def forward(self, rows: Tensor, vl_embs: Tensor, temb: Tensor, change: BlockChange = UNCHANGED) -> Tensor:
+        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `temb (B, width)`; returns `(B, R, width)`.
+
+        What `change` does after the block is left to the caller.
+        """
         y = self.norm1(rows, temb)
-        attended, _ = self.attn1(y, vl_embs if self.is_cross else y)
+        attended, weights = self.attn1(
+            y,
+            vl_embs if self.is_cross else y,
+            logit_bias=change.logit_bias,
+            stop_gradient=change.stop_gradient,
+            return_weights=change.keep_attention is not None,
+        )
+        if change.keep_attention is not None:
+            change.keep_attention(weights)
         rows = rows + attended
         return rows + self.ff(plain_norm(rows, NORM_EPS))  # this norm does not see the time
 
@@ -220,17 +268,21 @@ class DiffusionTransformer(nn.Module):
         super().__init__()
         self.timestep_encoder = TimestepEncoder(config.width)
         self.transformer_blocks = nn.ModuleList(
-            DiTBlock(config, is_cross=index % 2 == 0 or not config.interleave_self_attention)
-            for index in range(config.num_layers)
+            DiTBlock(config, is_cross=is_cross(config, block)) for block in range(config.num_layers)
         )
         self.proj_out_1 = nn.Linear(config.width, 2 * config.width)
         self.proj_out_2 = nn.Linear(config.width, config.hidden_dim)
 
-    def forward(self, rows: Tensor, vl_embs: Tensor, timestep: Tensor) -> Tensor:
-        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; to `(B, R, hidden_dim)`."""
+    def forward(
+        self, rows: Tensor, vl_embs: Tensor, timestep: Tensor, changes: Iterable[BlockChange]
+    ) -> Tensor:
+        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; to `(B, R, hidden_dim)`.
+
+        `changes` has one entry a block.
+        """
         temb = self.timestep_encoder(timestep)  # (B, width)
-        for block in self.transformer_blocks:
-            rows = block(rows, vl_embs, temb)
+        for block, change in zip(self.transformer_blocks, changes, strict=True):
+            rows = change.after(block(rows, vl_embs, temb, change))
         return self.output(rows, temb)
 
     def output(self, rows: Tensor, temb: Tensor) -> Tensor:
@@ -383,20 +435,26 @@ class ActionHead(nn.Module):
         """Where the parameters are."""
         return self.future_tokens.weight.device
 
-    def encode(self, backbone_features: Tensor | np.ndarray) -> Tensor:
+    def encode(
+        self, backbone_features: Tensor | np.ndarray, *, drop_vl: Tensor | np.ndarray | None = None
+    ) -> Tensor:
         """Normalises and mixes the backbone's features, once per observation.
 
         Args:
             backbone_features: `(B, S, context_dim)`.
+            drop_vl: bool `(B, S)`, True where a token is removed, as if it had not been there. Its place is
+                kept, with zeros, so `velocity`, `sample` and `trace` must be given `drop_vl` too.
 
         Returns:
             `vl_embs (B, S, context_dim)`; the features themselves if the config has `use_vlln` false.
         """
         features = self.as_input(backbone_features)
         check_shape("backbone_features", features, (None, None, self.config.context_dim))
-        if not self.config.use_vlln:
-            return features
-        return self.vl_self_attention(self.vlln(features))
+        removed = removed_tokens(drop_vl, features)
+        if self.config.use_vlln:
+            bias = None if removed is None else removal_bias(removed, self.dtype)
+            features = self.vl_self_attention(self.vlln(features), bias)
+        return features if removed is None else features.masked_fill(removed[..., None], 0.0)
 
     def velocity(
         self,
@@ -405,6 +463,10 @@ class ActionHead(nn.Module):
         embodiment_id: int | Tensor | np.ndarray,
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
+        *,
+        drop_vl: Tensor | np.ndarray | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
         """The flow's velocity at noisy actions.
 
@@ -414,17 +476,40 @@ class ActionHead(nn.Module):
             embodiment_id: an int, or `(B,)`.
             actions: `(B, T, encoder_action_dim)`.
             timestep: time bucket, an int or `(B,)`.
+            drop_vl, intervention, stop_gradient: as in `trace`; this is step 0 of 1.
 
         Returns:
             `(B, T, action_dim)`.
 
         Raises:
             ShapeError: an array of another shape.
-            InputError: an embodiment that the head does not have.
+            InputError: an embodiment, or a place of an intervention, that the head does not have.
         """
+        vl_embs = self.as_input(vl_embs)
+        check_shape("vl_embs", vl_embs, (None, None, self.config.context_dim))
+        run = Run(
+            self.config,
+            vl_embs,
+            num_steps=1,
+            intervention=intervention,
+            drop_vl=drop_vl,
+            stop_gradient=stop_gradient,
+        )
+        return self.velocity_in(run, 0, vl_embs, state, embodiment_id, actions, timestep)
+
+    def velocity_in(
+        self,
+        run: Run,
+        step: int,
+        vl_embs: Tensor,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        timestep: int | Tensor | np.ndarray,
+    ) -> Tensor:
+        """`velocity` at one Euler step of a run."""
         config, horizon = self.config, self.config.action_horizon
-        vl_embs, actions, state = self.as_input(vl_embs), self.as_input(actions), self.as_input(state)
-        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
+        actions, state = self.as_input(actions), self.as_input(state)
         batch = vl_embs.shape[0]
         check_shape("actions", actions, (batch, horizon, config.encoder_action_dim))
         state = state[:, None] if state.ndim == 2 else state
@@ -434,13 +519,15 @@ class ActionHead(nn.Module):
         timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
 
         state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
-        future_rows = self.future_tokens.weight.expand(batch, -1, -1)  # (B, N, width)
+        tokens = self.future_tokens.weight if run.future_tokens is None else run.future_tokens
+        future_rows = tokens.expand(batch, -1, -1)  # (B, N, width)
         action_rows = self.action_encoder(actions, timestep, embodiment_id)  # (B, T, width)
         if config.add_pos_embed:
             action_rows = action_rows + self.position_embedding.weight[:horizon]
         rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
 
-        hidden = self.model(rows, vl_embs, timestep)  # (B, R, hidden_dim)
+        changes = [run.change(step, block) for block in range(config.num_layers)]
+        hidden = self.model(rows, vl_embs, timestep, changes)  # (B, R, hidden_dim)
         return self.action_decoder(hidden[:, -horizon:], embodiment_id)  # (B, T, action_dim)
 
     def sample(
@@ -451,6 +538,9 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
+        drop_vl: Tensor | np.ndarray | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
         """Follows the flow from noise (time 0) to actions (time 1) in equal Euler steps.
 
@@ -458,18 +548,84 @@ class ActionHead(nn.Module):
             vl_embs, state, embodiment_id: as in `velocity`.
             noise: `(B, T, encoder_action_dim)`, standard normal.
             num_steps: default as the config says.
+            drop_vl, intervention, stop_gradient: as in `trace`.
 
         Returns:
             Actions `(B, T, action_dim)`, normalised.
         """
-        num_steps = self.config.num_steps if num_steps is None else num_steps
-        if not 1 <= num_steps <= self.config.num_timestep_buckets:
-            raise InputError(f"num_steps: {num_steps}, expected 1 to {self.config.num_timestep_buckets}")
+        return self.trace(
+            vl_embs,
+            state,
+            embodiment_id,
+            noise=noise,
+            num_steps=num_steps,
+            drop_vl=drop_vl,
+            intervention=intervention,
+            stop_gradient=stop_gradient,
+            record=(),
+        ).actions
+
+    def trace(
+        self,
+        vl_embs: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        num_steps: int | None = None,
+        drop_vl: Tensor | np.ndarray | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
+        record: str | Iterable[str] = ("attention",),
+        blocks: Sequence[int] | int | None = None,
+        steps: Sequence[int] | int | None = None,
+    ) -> Trace[Tensor]:
+        """`sample`, and what happened inside; all of it is part of the graph of gradients.
+
+        The gradient with some edges stopped is the sum over all paths from the result back to an input that
+        use none of them. With `[("state", "future"), ("action", "future")]` it is what does not pass through
+        future rows, and the total less that is what does.
+
+        Args:
+            vl_embs, state, embodiment_id, noise, num_steps: as in `sample`.
+            drop_vl: bool `(B, S)`, as given to `encode`: no row reads these tokens.
+            intervention: one or several :class:`saccade.Intervention`.
+            stop_gradient: pairs (reader, source) as in `Intervention.cut`, in all blocks, steps and heads.
+                The result stays as it is (to rounding), but in the backward pass the reader's rows take the
+                source's keys and values as constants.
+            record: what is kept, any of "attention" and "hidden".
+            blocks: where it is kept; default in all blocks.
+            steps: when it is kept; default at all Euler steps.
+
+        Returns:
+            Attention probabilities, rows after the blocks, and the actions: those of `sample`, to rounding.
+
+        Raises:
+            ShapeError, DtypeError: an array that does not fit.
+            InputError: a value out of range, an intervention that does not fit the head.
+        """
+        config = self.config
+        num_steps = config.num_steps if num_steps is None else num_steps
+        if not 1 <= num_steps <= config.num_timestep_buckets:
+            raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
         vl_embs, actions = self.as_input(vl_embs), self.as_input(noise)
+        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
+        run = Run(
+            config,
+            vl_embs,
+            num_steps=num_steps,
+            intervention=intervention,
+            drop_vl=drop_vl,
+            stop_gradient=stop_gradient,
+            record=record,
+            blocks=blocks,
+            steps=steps,
+        )
         for step in range(num_steps):
-            bucket = int(step / num_steps * self.config.num_timestep_buckets)
-            actions = actions + self.velocity(vl_embs, state, embodiment_id, actions, bucket) / num_steps
-        return actions
+            bucket = int(step / num_steps * config.num_timestep_buckets)
+            velocity = self.velocity_in(run, step, vl_embs, state, embodiment_id, actions, bucket)
+            actions = actions + velocity / num_steps
+        return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
 
     def forward(
         self,
@@ -479,10 +635,21 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
+        drop_vl: Tensor | np.ndarray | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
         """`encode`, then `sample`."""
-        vl_embs = self.encode(backbone_features)
-        return self.sample(vl_embs, state, embodiment_id, noise=noise, num_steps=num_steps)
+        return self.sample(
+            self.encode(backbone_features, drop_vl=drop_vl),
+            state,
+            embodiment_id,
+            noise=noise,
+            num_steps=num_steps,
+            drop_vl=drop_vl,
+            intervention=intervention,
+            stop_gradient=stop_gradient,
+        )
 
     def sample_time(self, batch: int, generator: torch.Generator | None = None) -> Tensor:
         """Draws flow times for training.
@@ -553,17 +720,6 @@ class ActionHead(nn.Module):
                 f"embodiment_id: {ids.tolist()}, expected 0 to {self.config.num_embodiments - 1}"
             )
         return int(ids) if ids.ndim == 0 else ids.to(dtype=torch.long, device=self.device)
-
-
-def check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
-    """Refuses a tensor of another shape; None stands for any size."""
-    given = tuple(tensor.shape)
-    if len(given) == len(expected) and all(
-        want in (None, have) for have, want in zip(given, expected, strict=True)
-    ):
-        return
-    wanted = ", ".join("any" if size is None else str(size) for size in expected)
-    raise ShapeError(f"{name}: shape {given}, expected ({wanted})")
 
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:

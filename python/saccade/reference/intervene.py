@@ -1,0 +1,282 @@
+"""What is changed and what is kept in one run of the torch reference, block by block.
+
+Written from the definition of `Intervention`, apart from the Rust head, so that each can check the other.
+Shapes in comments as in `model.py`; Q are the rows that read, K the keys they read: the vision-language
+tokens in a cross-attention block, the rows themselves in a self-attention block.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from saccade._arrays import boolean
+from saccade.config import HeadConfig
+from saccade.errors import InputError
+from saccade.intervention import ROW_GROUPS, Chosen, Intervention, Tokens, as_interventions
+from saccade.reference.checks import check_indices, check_shape
+from saccade.trace import check_record
+
+
+@dataclass(frozen=True)
+class BlockChange:
+    """What one block of one Euler step does differently, and who is shown what; by default nothing, nobody.
+
+    Attributes:
+        logit_bias: added to the attention's scaled scores, broadcast to `(B, heads, Q, K)`; minus infinity
+            removes a key.
+        stop_gradient: `(Q, K)` bool, True where the reader takes key and value as constants.
+        patches: pairs of row indices `(n,)` and what replaces these rows after the block, `(n, width)` or
+            `(B, n, width)`; the last one counts.
+        keep_attention: is given the probabilities `(B, heads, Q, K)`.
+        keep_hidden: is given the rows after the block and its patches, `(B, R, width)`.
+    """
+
+    logit_bias: Tensor | None = None
+    stop_gradient: Tensor | None = None
+    patches: Sequence[tuple[Tensor, Tensor]] = ()
+    keep_attention: Callable[[Tensor], None] | None = None
+    keep_hidden: Callable[[Tensor], None] | None = None
+
+    def after(self, rows: Tensor) -> Tensor:
+        """The rows that the next block reads: `(B, R, width)` to the same shape."""
+        for index, values in self.patches:
+            rows = rows.index_copy(1, index, values.expand(len(rows), -1, -1))
+        if self.keep_hidden is not None:
+            self.keep_hidden(rows)
+        return rows
+
+
+@dataclass(frozen=True)
+class Edit:
+    """An `Intervention` in the types of its normal form, with tensors in the run's dtype.
+
+    Its fields are those of `Intervention`, without the future tokens.
+    """
+
+    cut: tuple[tuple[Chosen, Chosen], ...]
+    key_bias: dict[Chosen, Tensor]
+    patch: dict[tuple[int, int], dict[Chosen, Tensor]]
+    blocks: tuple[int, ...] | None
+    steps: tuple[int, ...] | None
+    heads: tuple[int, ...] | None
+
+    @classmethod
+    def of(cls, one: Any, like: Tensor) -> "Edit":
+        """Reads an `Intervention`, whose fields are declared as all that may be given."""
+
+        def tensors(arrays: Mapping[Chosen, np.ndarray] | None) -> dict[Chosen, Tensor]:
+            found = (arrays or {}).items()
+            return {tokens: torch.as_tensor(a, dtype=like.dtype, device=like.device) for tokens, a in found}
+
+        patch = {place: tensors(rows) for place, rows in (one.patch or {}).items()}
+        return cls(one.cut, tensors(one.key_bias), patch, one.blocks, one.steps, one.heads)
+
+    def acts(self, step: int, block: int) -> bool:
+        """Whether its limits include this block of this Euler step."""
+        return (self.blocks is None or block in self.blocks) and (self.steps is None or step in self.steps)
+
+
+class Run:
+    """One run of a head, over all of its Euler steps: what is changed, and what is kept.
+
+    Args:
+        config: the head's.
+        vl_embs: `(B, S, context_dim)`; its dtype and device are those of the run.
+        num_steps: Euler steps.
+        intervention: one, several or none.
+        drop_vl: bool `(B, S)`, True where a vision-language token is removed.
+        stop_gradient: pairs as in `Intervention.cut`, cut in the backward pass only.
+        record: any of "attention" and "hidden".
+        blocks, steps: where it is recorded; default everywhere.
+
+    Attributes:
+        rows: where each group of rows lies.
+        future_tokens: `(N', width)` to use in place of the learned ones, or None.
+        attention, hidden: what was kept so far, by `(step, block)`.
+
+    Raises:
+        InputError, ShapeError, DtypeError: an argument does not fit the head or the inputs.
+    """
+
+    def __init__(
+        self,
+        config: HeadConfig,
+        vl_embs: Tensor,
+        *,
+        num_steps: int,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        drop_vl: Tensor | np.ndarray | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
+        record: str | Iterable[str] = (),
+        blocks: Sequence[int] | int | None = None,
+        steps: Sequence[int] | int | None = None,
+    ) -> None:
+        self.config = config
+        self.num_steps = num_steps
+        self.batch, num_vl_tokens, _ = vl_embs.shape
+        self.dtype, self.device = vl_embs.dtype, vl_embs.device
+        interventions = as_interventions(intervention)
+        self.future_tokens = self.replaced_tokens(interventions)
+        self.edits = [Edit.of(one, vl_embs) for one in interventions]
+        self.stopped = Edit.of(stopped_edges(stop_gradient), vl_embs)
+        self.kept = Edit.of(Intervention(blocks=blocks, steps=steps), vl_embs)  # for its limits alone
+
+        num_future = config.num_future_tokens if self.future_tokens is None else len(self.future_tokens)
+        self.sizes = {
+            "state": 1,
+            "future": num_future,
+            "action": config.action_horizon,
+            "vl": num_vl_tokens,
+        }
+        ends = np.cumsum([self.sizes[group] for group in ROW_GROUPS]).tolist()
+        self.rows = {
+            group: slice(end - self.sizes[group], end) for group, end in zip(ROW_GROUPS, ends, strict=True)
+        }
+        self.num_rows = ends[-1]
+
+        removed = removed_tokens(drop_vl, vl_embs)
+        self.removed_bias = None if removed is None else removal_bias(removed, vl_embs.dtype)
+        self.keep_attention, self.keep_hidden = check_record(record)
+        self.attention: dict[tuple[int, int], Tensor] = {}
+        self.hidden: dict[tuple[int, int], Tensor] = {}
+        for edit in (*self.edits, self.stopped, self.kept):
+            self.check(edit)
+
+    def change(self, step: int, block: int) -> BlockChange:
+        """What happens in this block of this Euler step."""
+        place, cross = (step, block), is_cross(self.config, block)
+        shown = self.kept.acts(step, block)
+        return BlockChange(
+            logit_bias=self.logit_bias(step, block, cross),
+            stop_gradient=self.cut_keys(self.stopped, cross) if self.stopped.cut else None,
+            patches=self.patches(place),
+            keep_attention=partial(self.attention.__setitem__, place)
+            if shown and self.keep_attention
+            else None,
+            keep_hidden=partial(self.hidden.__setitem__, place) if shown and self.keep_hidden else None,
+        )
+
+    def logit_bias(self, step: int, block: int, cross: bool) -> Tensor | None:
+        """The sum of all biases, broadcast to `(B, heads, Q, K)`; None where nothing is changed."""
+        biases = [] if self.removed_bias is None or not cross else [self.removed_bias]  # (B, 1, 1, S)
+        for edit in self.edits:
+            if not edit.acts(step, block):
+                continue
+            bias = self.key_bias(edit, cross).masked_fill(self.cut_keys(edit, cross), -torch.inf)
+            if not bias.any():
+                continue  # its keys are not in this block
+            in_heads = bias.new_zeros(self.config.num_heads, *bias.shape)  # (heads, Q, K)
+            in_heads[slice(None) if edit.heads is None else list(edit.heads)] = bias
+            biases.append(in_heads[None])  # (1, heads, Q, K)
+        return sum(biases[1:], biases[0]) if biases else None
+
+    def key_bias(self, edit: Edit, cross: bool) -> Tensor:
+        """The biases on the keys of such a block, `(Q, K)`, the same for every reader."""
+        bias = torch.zeros(self.num_keys(cross), dtype=self.dtype, device=self.device)
+        for chosen, values in edit.key_bias.items():
+            if (chosen[0] == "vl") == cross:
+                bias[self.places(chosen)] += values
+        return bias.expand(self.num_rows, -1)
+
+    def cut_keys(self, edit: Edit, cross: bool) -> Tensor:
+        """Which row reads which key of such a block no longer, `(Q, K)` bool."""
+        hidden = torch.zeros(self.num_rows, self.num_keys(cross), dtype=torch.bool, device=self.device)
+        for reader, source in edit.cut:
+            if (source[0] == "vl") == cross:
+                hidden[self.places(reader)[:, None], self.places(source)] = True
+        return hidden
+
+    def patches(self, place: tuple[int, int]) -> list[tuple[Tensor, Tensor]]:
+        """Row indices `(n,)` and their new values, `(n, width)` or `(B, n, width)`, in the order given."""
+        return [
+            (self.places(chosen), values)
+            for edit in self.edits
+            for chosen, values in edit.patch.get(place, {}).items()
+        ]
+
+    def places(self, chosen: Chosen) -> Tensor:
+        """Where these tokens lie among the rows, or among the vision-language tokens; `(n,)` long."""
+        group, indices = chosen
+        first = 0 if group == "vl" else self.rows[group].start
+        numbers = range(self.sizes[group]) if indices is None else indices
+        return torch.tensor([first + index for index in numbers], dtype=torch.long, device=self.device)
+
+    def num_keys(self, cross: bool) -> int:
+        """K of such a block."""
+        return self.sizes["vl"] if cross else self.num_rows
+
+    def replaced_tokens(self, interventions: Sequence[Intervention]) -> Tensor | None:
+        """The future tokens of the one intervention that has some, `(N', width)`."""
+        given = [one.future_tokens for one in interventions if one.future_tokens is not None]
+        if len(given) > 1:
+            raise InputError(f"future_tokens: in {len(given)} interventions, expected in at most one")
+        if not given:
+            return None
+        tokens = torch.as_tensor(given[0], dtype=self.dtype, device=self.device)
+        check_shape("future_tokens", tokens, (None, self.config.width))
+        return tokens
+
+    def check(self, edit: Edit) -> None:
+        """Refuses what the sizes of this run do not have."""
+        check_indices("blocks", edit.blocks, self.config.num_layers)
+        check_indices("steps", edit.steps, self.num_steps)
+        check_indices("heads", edit.heads, self.config.num_heads)
+        for pair in edit.cut:
+            for chosen in pair:
+                self.count("cut", chosen)
+        for chosen, biases in edit.key_bias.items():
+            size = self.count("key_bias", chosen)
+            check_shape(f"key_bias: {chosen[0]}", biases, (size,) if biases.ndim == 1 else ())
+        for (step, block), groups in edit.patch.items():
+            check_indices("patch: step", [step], self.num_steps)
+            check_indices("patch: block", [block], self.config.num_layers)
+            for chosen, rows in groups.items():
+                name = f"patch[({step}, {block})]"
+                batch = (self.batch,) if rows.ndim == 3 else ()
+                expected = (*batch, self.count(name, chosen), self.config.width)
+                check_shape(f"{name}: {chosen[0]}", rows, expected)
+
+    def count(self, name: str, chosen: Chosen) -> int:
+        """How many tokens these are; refuses those that the group does not have."""
+        group, indices = chosen
+        check_indices(f"{name}: {group}", indices, self.sizes[group])
+        return self.sizes[group] if indices is None else len(indices)
+
+
+def is_cross(config: HeadConfig, block: int) -> bool:
+    """Whether this block reads the vision-language tokens; the others read the rows themselves."""
+    return block % 2 == 0 or not config.interleave_self_attention
+
+
+def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
+    """Pairs (reader, source) in the normal form of a cut."""
+    try:
+        return Intervention(cut=pairs)
+    except InputError as error:
+        raise InputError(f"stop_gradient: {error}") from None
+
+
+def removed_tokens(drop_vl: Tensor | np.ndarray | None, tokens: Tensor) -> Tensor | None:
+    """`drop_vl` as a bool tensor `(B, S)` for `tokens (B, S, context_dim)`, or None.
+
+    Raises:
+        DtypeError: it is not boolean.
+        ShapeError: it is of another shape.
+    """
+    mask = boolean("drop_vl", drop_vl)
+    if mask is None:
+        return None
+    removed = torch.tensor(mask, device=tokens.device)
+    check_shape("drop_vl", removed, tuple(tokens.shape[:2]))
+    return removed
+
+
+def removal_bias(removed: Tensor, dtype: torch.dtype) -> Tensor:
+    """Minus infinity on the keys that are removed: `(B, S)` bool to `(B, 1, 1, S)`."""
+    bias = torch.zeros(removed.shape, dtype=dtype, device=removed.device).masked_fill(removed, -torch.inf)
+    return bias[:, None, None]
