@@ -7,10 +7,13 @@ import functools
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from saccade.checkpoints import read_tensors
 from saccade.config import HeadConfig
 from saccade.head import ActionHead
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import Policy
+from saccade.sim.policy import Float32Array, Policy
 from saccade.sim.rollout import environment_for
 
 
@@ -24,6 +27,14 @@ def policy_of(checkpoint: str, engine: str = "rust") -> Policy:
 def head_of(checkpoint: str) -> ActionHead:
     """The head alone, on one thread."""
     return ActionHead.load(Path(checkpoint), num_threads=1)
+
+
+@functools.lru_cache(maxsize=1)
+def learned_tokens(checkpoint: str) -> Float32Array:
+    """The future tokens of a policy, `(N, width)`; N is 0 where it has none."""
+    head = HeadConfig.from_dict(policy_of(checkpoint).config.head)
+    found = read_tensors(checkpoint, "action_head.future_tokens.")
+    return found.get("weight", np.zeros((0, head.width), np.float32))
 
 
 def describe_checkpoint(checkpoint: str) -> dict[str, Any]:

@@ -119,7 +119,8 @@ def tango(only_first: int, only_second: int, pairs: int) -> Estimate:
         constant = -only_second * difference * (1 - difference)
         share = (math.sqrt(max(linear**2 - 8 * pairs * constant, 0.0)) - linear) / (4 * pairs)
         variance = pairs * (2 * share + difference * (1 - difference))
-        return (only_first - only_second - pairs * difference) / math.sqrt(variance)
+        excess = only_first - only_second - pairs * difference
+        return excess / math.sqrt(variance) if excess else 0.0  # both vanish where no pair is discordant
 
     # At -1 and 1 the variance may vanish; there the limit is the bound itself.
     edge = 1 - 1e-12

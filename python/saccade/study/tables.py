@@ -53,7 +53,7 @@ def write_table(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Reads what `write_table` wrote: the same numbers to the last bit, empty fields as NaN.
+    """Reads what `write_table` wrote; empty fields are NaN.
 
     Raises:
         FileNotFoundError: there is none.
@@ -63,7 +63,7 @@ def read_table(path: Path) -> pd.DataFrame:
         return pd.DataFrame()
     try:
         # Words like "none" or "NA" are names here, not missing values.
-        return pd.read_csv(path, keep_default_na=False, na_values=[""], float_precision="round_trip")
+        return pd.read_csv(path, keep_default_na=False, na_values=[""])
     except (pd.errors.ParserError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a table: {error}") from None
 

@@ -1,0 +1,346 @@
+"""`saccade study cuts`: closed loop with parts of the head cut or replaced, on equal seeds and noise."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from saccade.intervention import Intervention
+from saccade.sim import graphics
+from saccade.sim.policy import ENGINES, Float32Array, Policy
+from saccade.sim.rollout import Episode, run_episode
+from saccade.study import figures
+from saccade.study.arguments import check_known, names
+from saccade.study.arms import ARMS, BASELINE, SHUFFLED, episode_rng
+from saccade.study.cells import Cell, OnDone, Rows, run_cells
+from saccade.study.loaded import describe_checkpoint, environment_of, learned_tokens, policy_of
+from saccade.study.observations import Look, Rollouts, add_rollout_arguments, record_looks, rollouts_of
+from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate
+from saccade.study.statistics import (
+    Estimate,
+    PairedDifference,
+    bootstrap,
+    detectable_difference,
+    paired_difference,
+    wilson,
+)
+from saccade.study.tables import Provenance
+
+STUDY = "cuts"
+ROUNDING = 1e-3  # a change of a chunk, in action units, that shuffled tokens may make
+
+EPILOG = """\
+Every arm runs the same episodes: the same layouts, words and noise. Success is compared in pairs with the
+arm "none", which is always run. The change of the chunk is measured on what "none" saw, look by look.
+
+arms:
+{arms}
+
+examples:
+  saccade study cuts --episodes 15 --out out/study
+  saccade study cuts --arms future-unread,future-blind --tasks push --jobs 2 --out out/study
+"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Attributes:
+        rollouts: The episodes, which each arm runs.
+        arms: Names, of `saccade.study.arms.ARMS`.
+        engine: Computes the head.
+    """
+
+    rollouts: Rollouts
+    arms: tuple[str, ...] = tuple(ARMS)
+    engine: str = "rust"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the arguments."""
+    width = max(len(name) for name in ARMS)
+    parser.epilog = EPILOG.format(
+        arms="\n".join(f"  {arm.name:{width}}  {arm.label}" for arm in ARMS.values())
+    )
+    add_rollout_arguments(parser, episodes=15)
+    parser.add_argument("--arms", metavar="NAME,...", help="arms, separated by commas (default: all)")
+    parser.add_argument("--engine", choices=ENGINES, default="rust", help="what computes the action head")
+
+
+def settings(args: argparse.Namespace) -> Settings:
+    """From the arguments; raises what is wrong with them."""
+    arms = tuple(ARMS) if args.arms is None else names("--arms", args.arms)
+    check_known("arms", arms, ARMS)
+    rollouts = rollouts_of(args)
+    graphics.check()
+    return Settings(rollouts, arms, args.engine)
+
+
+def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+    """A cell is an episode of one arm. Arms of one episode lie side by side, for they share what it saw."""
+    arms = dict.fromkeys((BASELINE, *settings.arms))
+    checkpoint = settings.rollouts.checkpoint
+    run_cells(
+        STUDY,
+        [Cell((*episode, arm)) for episode in settings.rollouts.episodes for arm in arms],
+        Work(checkpoint, settings.engine),
+        out,
+        settings={"checkpoint": describe_checkpoint(checkpoint), "engine": settings.engine},
+        backend=backend,
+        jobs=jobs,
+        on_done=on_done,
+    )
+
+
+@dataclass(frozen=True)
+class Work:
+    """Runs one episode with one arm, and measures the arm's chunks on what the unchanged policy saw."""
+
+    checkpoint: str
+    engine: str
+
+    def __call__(self, cell: Cell) -> Rows:
+        """A row with what came of it, or with a note why it cannot be measured."""
+        task, seed, name = str(cell.key[0]), int(cell.key[1]), str(cell.key[2])
+        row = {"task": task, "seed": seed, "arm": name}
+        arm = ARMS[name]
+        policy = policy_of(self.checkpoint, self.engine)
+        tokens = learned_tokens(self.checkpoint)
+        reason = arm.why_not(len(tokens))
+        if reason is not None:
+            return [{**row, "success": None, "note": reason}]
+        intervention = arm.intervention(tokens, episode_rng(task, seed))
+        episode, looks = unchanged_episode(self.checkpoint, self.engine, task, seed)
+        changes = [chunk_change(policy, look, intervention) for look in looks]
+        if intervention is not None:
+            environment = environment_of(self.checkpoint, task)
+            episode = run_episode(environment, policy, seed, intervention=intervention)
+        return [
+            {
+                **row,
+                "success": episode.success,
+                "steps": episode.steps,
+                "chunks": episode.chunks,
+                "looks": len(looks),
+                "chunk_change": float(np.mean(changes)),
+                "chunk_change_max": float(max(change.max() for change in changes)),
+                "note": None,
+            }
+        ]
+
+
+@functools.lru_cache(maxsize=1)
+def unchanged_episode(checkpoint: str, engine: str, task: str, seed: int) -> tuple[Episode, Sequence[Look]]:
+    """The episode of the arm "none" and what the head was given in it; kept for the next arm."""
+    return record_looks(environment_of(checkpoint, task), policy_of(checkpoint, engine), seed)
+
+
+def chunk_change(policy: Policy, look: Look, intervention: Intervention | None) -> Float32Array:
+    """By how much each action of a chunk changes, `(horizon, action_dim)`, all else being equal."""
+    context = policy.engine.encode(look.features)
+
+    def actions(change: Intervention | None) -> Float32Array:
+        chunk = policy.engine.sample(context, look.state, look.noise, change)[0]
+        return np.clip(policy.config.action.restore(chunk), -1.0, 1.0)
+
+    change: Float32Array = np.abs(actions(intervention) - actions(None))
+    return change
+
+
+@dataclass(frozen=True)
+class ArmResult:
+    """What the table says of one arm; `None` or no number where it was not measured."""
+
+    name: str
+    rate: Estimate
+    episodes: int
+    pairs: PairedDifference | None
+    change: Estimate | None
+    note: str | None
+
+
+def arm_results(table: pd.DataFrame) -> list[ArmResult]:
+    """One for each arm of the table, in the order of `ARMS`."""
+    by_arm = {str(name): rows.set_index(["task", "seed"]) for name, rows in table.groupby("arm")}
+    baseline = by_arm.get(BASELINE, pd.DataFrame(columns=["success"]))["success"].dropna()
+    results = []
+    for name in [name for name in ARMS if name in by_arm]:
+        rows = by_arm[name]
+        measured = rows[rows["success"].notna()]
+        note = None if len(measured) else str(rows["note"].iloc[0])
+        success = measured["success"].astype(bool)
+        shared = success.index.intersection(baseline.index)
+        pairs = None
+        if name != BASELINE and len(shared):
+            pairs = paired_difference(
+                success.loc[shared].tolist(), baseline.loc[shared].astype(bool).tolist()
+            )
+        change = None
+        if name != BASELINE and len(measured):
+            change = bootstrap(measured["chunk_change"].to_numpy(), list(measured.index))
+        results.append(
+            ArmResult(name, wilson(int(success.sum()), len(success)), len(success), pairs, change, note)
+        )
+    return results
+
+
+def section(table: pd.DataFrame, provenance: Provenance) -> Section:
+    """See `Study`."""
+    results = arm_results(table)
+    measured = [result for result in results if result.episodes]
+    compared = [result for result in measured if result.pairs is not None]
+    return Section(
+        title="Cuts: success in closed loop with parts of the head cut or replaced",
+        summary=summary(table, results, provenance),
+        figures=pictures(measured, compared),
+        grids=[arm_grid(results), task_grid(table, measured)],
+        concluded=conclusions(table, results, compared),
+        not_shown=(
+            "A cut head is one that was never trained. A loss can come from numbers it never met and need "
+            "not mean that the information was needed; future-averaged and future-redrawn differ from the "
+            "learned tokens in what later blocks meet, too.",
+            "No loss after a cut does not mean that the path is unused: the other paths may carry the same. "
+            "It says nothing of a policy trained without the path (see the study n).",
+            "Success is one bit an episode. An arm can move the actions (see the change of the chunk) "
+            "without moving success on tasks that forgive it.",
+            "Intervals are for these tasks and for layouts like these, with one set of weights; another "
+            "training run may use its future tokens otherwise. They hold for each arm by itself: of twenty "
+            "arms without an effect one is expected to show one.",
+        ),
+    )
+
+
+def summary(table: pd.DataFrame, results: Sequence[ArmResult], provenance: Provenance) -> list[str]:
+    """What was run."""
+    checkpoint = provenance.settings["checkpoint"]
+    tasks = list(dict.fromkeys(table["task"]))
+    episodes = max(result.episodes for result in results)
+    lines = [
+        f"Policy {checkpoint['name']} (SHA-256 {checkpoint['sha256'][:12]}), N = "
+        f"{checkpoint['num_future_tokens']} future tokens, {checkpoint['num_layers']} blocks, "
+        f"{checkpoint['num_steps']} Euler steps, {provenance.settings['engine']} engine. {episodes} "
+        f"episodes an arm over the tasks {', '.join(tasks)}. Every arm has the same layouts, words and "
+        "noise, and is compared with the unchanged policy on the same episodes.",
+        "Success: Wilson's 95 % interval. Difference of success: Tango's 95 % score interval for paired "
+        "proportions, and McNemar's exact test. Change of the chunk: mean over the actions of a chunk of "
+        "|change|, actions in [-1, 1], on the observations and with the noise of the unchanged policy's "
+        "episodes; 95 % bootstrap interval over episodes.",
+    ]
+    lines += [f"{ARMS[result.name].label}: {ARMS[result.name].about}" for result in results]
+    return lines
+
+
+def pictures(measured: Sequence[ArmResult], compared: Sequence[ArmResult]) -> list[Figure]:
+    """Success, difference and change by arm."""
+    found = []
+    if measured:
+        labels = [ARMS[result.name].label for result in measured]
+        picture = figures.estimates(labels, [scaled(result.rate) for result in measured], "success, %")
+        found.append(Figure("success", "Success by arm, with Wilson's 95 % interval.", picture))
+    if compared:
+        labels = [ARMS[result.name].label for result in compared]
+        differences = [scaled(result.pairs.difference) for result in compared if result.pairs]
+        picture = figures.estimates(
+            labels, differences, "difference of success from the unchanged policy, points", reference=0.0
+        )
+        found.append(
+            Figure("difference", "Paired difference of success, with Tango's 95 % interval.", picture)
+        )
+        changes = [result.change for result in compared if result.change]
+        picture = figures.estimates(labels, changes, "mean |change of an action|", reference=0.0)
+        caption = "Change of the chunk on equal observations and noise, with a 95 % bootstrap interval."
+        found.append(Figure("change", caption, picture))
+    return found
+
+
+def scaled(value: Estimate) -> Estimate:
+    """A share in percent."""
+    return Estimate(100 * value.value, 100 * value.low, 100 * value.high)
+
+
+def arm_grid(results: Sequence[ArmResult]) -> Grid:
+    """All numbers by arm."""
+    rows = []
+    for result in results:
+        cells = [ARMS[result.name].label]
+        if result.note is not None:
+            cells += [not_measured(result.note)] + [""] * 5
+        else:
+            pairs = result.pairs
+            cells += [
+                f"{round(result.rate.value * result.episodes)}/{result.episodes}",
+                rate(result.rate),
+                "" if pairs is None else number(scaled(pairs.difference), digits=1),
+                "" if pairs is None else f"{pairs.only_second} / {pairs.only_first}",
+                "" if pairs is None else f"{pairs.p_value:.2g}",
+                "" if result.change is None else number(result.change, digits=4),
+            ]
+        rows.append(cells)
+    columns = (
+        "arm",
+        "successes",
+        "success, %",
+        "difference, points",
+        "lost / won",
+        "p",
+        "change of the chunk",
+    )
+    caption = (
+        "By arm, with 95 % intervals. Lost and won: episodes in which only the unchanged policy, or only "
+        "this arm, succeeded; p: McNemar's exact test, for each arm by itself."
+    )
+    return Grid(caption, columns, rows)
+
+
+def task_grid(table: pd.DataFrame, measured: Sequence[ArmResult]) -> Grid:
+    """Successes by arm and task."""
+    tasks = list(dict.fromkeys(table["task"]))
+    rows = []
+    for result in measured:
+        of_arm = table[(table["arm"] == result.name) & table["success"].notna()]
+        counts = [of_arm.loc[of_arm["task"] == task, "success"].astype(bool) for task in tasks]
+        rows.append([ARMS[result.name].label, *(f"{int(found.sum())}/{len(found)}" for found in counts)])
+    return Grid("Successes by arm and task.", ("arm", *tasks), rows)
+
+
+def conclusions(
+    table: pd.DataFrame, results: Sequence[ArmResult], compared: Sequence[ArmResult]
+) -> list[str]:
+    """What the intervals allow to be said."""
+    lines = []
+    for result in results:
+        label = ARMS[result.name].label
+        if result.note is not None:
+            lines.append(f"{label}: {not_measured(result.note)}.")
+        elif result.name == SHUFFLED:
+            lines.append(control_line(table))
+        elif result.pairs is not None:
+            lines.append(f"{label}: {effect('success', result.pairs.difference)}.")
+    if compared:
+        pairs = min(result.pairs.pairs for result in compared if result.pairs)
+        found = {share: detectable_difference(pairs, share) for share in (0.1, 0.25)}
+        known = [
+            f"{100 * value:.0f} points if {100 * share:.0f} % of the episodes go one way in one arm and the "
+            "other way in the other"
+            for share, value in found.items()
+            if np.isfinite(value)
+        ]
+        if known:
+            lines.append(
+                f"{pairs} paired episodes find, with 80 % power, a difference of {'; '.join(known)}."
+            )
+    return lines
+
+
+def control_line(table: pd.DataFrame) -> str:
+    """Whether shuffling the tokens changed anything but rounding, which it must not."""
+    largest = float(table.loc[table["arm"] == SHUFFLED, "chunk_change_max"].max())
+    verdict = "as it must be" if largest < ROUNDING else "WHICH IT MUST NOT: do not trust the other arms"
+    return f"Control, {ARMS[SHUFFLED].label}: the chunk changed by {largest:.1g} at most, {verdict}."

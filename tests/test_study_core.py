@@ -1,0 +1,320 @@
+"""Cells that are resumed, tables that come back as they were, and intervals against published values."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from saccade.errors import InputError
+from saccade.study import STUDIES, load_study, statistics, tables
+from saccade.study.cells import BACKENDS, Cell, Rows, StudyError, digest, run_cells
+from saccade.study.statistics import Estimate
+
+SETTINGS = {"checkpoint": "abc", "width": 0.1}
+
+
+@dataclass(frozen=True)
+class Square:
+    """Squares a cell's number, writes down that it did, and fails or dies where it is told to."""
+
+    log: Path
+    fails: tuple[int, ...] = ()
+    dies: tuple[int, ...] = ()
+
+    def __call__(self, cell: Cell) -> Rows:
+        number = int(cell.key[1])
+        with self.log.open("a") as log:
+            log.write(f"{number}\n")
+        if number in self.dies:
+            os._exit(9)
+        if number in self.fails:
+            raise ValueError(f"cannot square {number}")
+        return [
+            {"arm": cell.key[0], "number": number, "square": np.float64(number**2), "odd": number % 2 == 1}
+        ]
+
+    @property
+    def worked(self) -> list[int]:
+        """The numbers it was given so far, in order, and forgets them."""
+        numbers = [int(line) for line in self.log.read_text().split()]
+        self.log.unlink()
+        return numbers
+
+
+def cells(*numbers: int) -> list[Cell]:
+    return [Cell(("square", number)) for number in numbers]
+
+
+def test_a_second_run_does_only_what_is_missing(tmp_path: Path) -> None:
+    work, out = Square(tmp_path / "log"), tmp_path / "out"
+    seen: list[tuple[str, int, int]] = []
+    run_cells("demo", cells(10, 9), work, out, settings=SETTINGS)
+    assert work.worked == [10, 9]
+    table = run_cells(
+        "demo",
+        cells(10, 9, 2),
+        work,
+        out,
+        settings=SETTINGS,
+        on_done=lambda finished, done, total: seen.append((finished.cell.name, done, total)),
+    )
+    assert work.worked == [2]
+    assert seen == [("square 2", 3, 3)]
+    assert table["number"].tolist() == [2, 9, 10]  # sorted as numbers
+    assert set(table["settings_sha256"]) == {digest(SETTINGS)}
+    assert table["cpu"].notna().all()
+
+    provenance = tables.read_provenance(out / "demo.json")
+    assert provenance.complete
+    assert (provenance.done, provenance.total, provenance.settings) == (3, 3, SETTINGS)
+    assert provenance.packages.keys() >= {"saccade", "numpy"}
+    assert provenance.machine.keys() == {"cpu", "system", "python"}
+    assert json.loads((out / "demo.json").read_text())["complete"] is True
+
+
+def test_a_killed_run_keeps_what_was_done(tmp_path: Path) -> None:
+    """The process dies in the middle of a cell, as if killed; the next one goes on."""
+    script = (
+        "from test_study_core import *\n"
+        f"work = Square(Path({str(tmp_path / 'log')!r}), dies=(3,))\n"
+        f"run_cells('demo', cells(1, 2, 3, 4), work, Path({str(tmp_path / 'out')!r}), settings=SETTINGS)\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent, check=False)
+    assert killed.returncode == 9
+    half = tables.read_provenance(tmp_path / "out" / "demo.json")
+    assert (half.done, half.total, half.complete) == (2, 4, False)
+    assert tables.read_table(tmp_path / "out" / "demo.csv")["number"].tolist() == [1, 2]
+
+    work = Square(tmp_path / "log")
+    assert work.worked == [1, 2, 3]
+    table = run_cells("demo", cells(1, 2, 3, 4), work, tmp_path / "out", settings=SETTINGS)
+    assert work.worked == [3, 4]
+    assert table["square"].tolist() == [1.0, 4.0, 9.0, 16.0]
+    left = [path.name for path in (tmp_path / "out").rglob("*") if path.name.startswith(".")]
+    assert left == []
+
+
+def test_a_failing_cell_is_named_after_the_others_are_done(tmp_path: Path) -> None:
+    work = Square(tmp_path / "log", fails=(1,))
+    with pytest.raises(StudyError, match=r"1 of 3 cells failed: square 1: ValueError: cannot square 1"):
+        run_cells("demo", cells(1, 2, 3), work, tmp_path, settings=SETTINGS)
+    assert work.worked == [1, 2, 3]
+    half = tables.read_provenance(tmp_path / "demo.json")
+    assert (half.done, half.complete) == (2, False)
+    assert half.failed == [{"key": ["square", 1], "error": "ValueError: cannot square 1"}]
+
+    run_cells("demo", cells(1, 2, 3), Square(tmp_path / "log"), tmp_path, settings=SETTINGS)
+    assert work.worked == [1]
+    assert tables.read_provenance(tmp_path / "demo.json").failed == []
+
+
+def test_two_processes_give_the_same_table(tmp_path: Path) -> None:
+    work = Square(tmp_path / "log")
+    one = run_cells("demo", cells(*range(6)), work, tmp_path / "one", settings=SETTINGS)
+    two = run_cells("demo", cells(*range(6)), work, tmp_path / "two", settings=SETTINGS, jobs=2)
+    pd.testing.assert_frame_equal(one, two)
+    assert (tmp_path / "one" / "demo.csv").read_bytes() == (tmp_path / "two" / "demo.csv").read_bytes()
+
+
+def test_a_worker_that_dies_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match="a worker process died"):
+        run_cells(
+            "demo", cells(1, 2), Square(tmp_path / "log", dies=(1, 2)), tmp_path, settings=SETTINGS, jobs=2
+        )
+
+
+def test_other_settings_are_refused(tmp_path: Path) -> None:
+    work = Square(tmp_path / "log")
+    run_cells("demo", cells(1), work, tmp_path, settings=SETTINGS)
+    with pytest.raises(InputError, match=r"other settings \(width 0.1, now 0.2\)"):
+        run_cells("demo", cells(1), work, tmp_path, settings={**SETTINGS, "width": 0.2})
+    run_cells("other", cells(1), work, tmp_path, settings={"width": 0.2})  # another study may have its own
+
+
+def test_a_cell_with_other_settings_takes_the_place_of_its_predecessor(tmp_path: Path) -> None:
+    work = Square(tmp_path / "log")
+    first = [Cell(("square", 1), {"steps": 1}), Cell(("square", 2), {"steps": 1})]
+    run_cells("demo", first, work, tmp_path, settings=SETTINGS)
+    table = run_cells("demo", [Cell(("square", 1), {"steps": 2})], work, tmp_path, settings=SETTINGS)
+    assert work.worked == [1, 2, 1]
+    assert table["number"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"backend": "dask"}, "backend: unknown name 'dask', expected one of loky, ray"),
+        ({"jobs": 0}, "jobs: given 0"),
+        ({"cells": cells(1, 1)}, "keys that occur twice"),
+    ],
+)
+def test_bad_input(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
+    given = {"cells": cells(1), "backend": "loky", "jobs": 1, **arguments}
+    with pytest.raises(InputError, match=message):
+        run_cells("demo", given.pop("cells"), Square(tmp_path / "log"), tmp_path, settings=SETTINGS, **given)  # type: ignore[arg-type]
+    assert BACKENDS == ("loky", "ray")
+
+
+def test_a_table_comes_back_as_it_was(tmp_path: Path) -> None:
+    rows = [
+        {"arm": "none", "task": "NA", "value": 0.1 + 0.2, "count": 3, "note": None},
+        {"arm": "None", "task": 'a,b\n"c" ü', "value": -1e-300, "count": -4, "note": "not measured"},
+        {"arm": "nan", "task": " x", "value": math.nan, "count": 5, "later": True},
+    ]
+    tables.write_table(rows, tmp_path / "t.csv")
+    table = tables.read_table(tmp_path / "t.csv")
+    assert list(table.columns) == ["arm", "task", "value", "count", "note", "later"]
+    assert table["arm"].tolist() == ["none", "None", "nan"]
+    assert table["task"].tolist() == [row["task"] for row in rows]
+    assert table["value"].tolist()[:2] == pytest.approx([0.1 + 0.2, -1e-300], rel=1e-15)
+    assert table["count"].tolist() == [3, -4, 5]
+    assert table[["note", "later"]].isna().to_numpy().tolist() == [[True, True], [False, True], [True, False]]
+    assert math.isnan(table["value"].iloc[2])
+
+
+def test_tables_that_are_none(tmp_path: Path) -> None:
+    tables.write_table([], tmp_path / "empty.csv")
+    assert tables.read_table(tmp_path / "empty.csv").empty
+    (tmp_path / "broken.csv").write_text('a,b\n1,"2\n')
+    with pytest.raises(InputError, match=r"broken\.csv: not a table"):
+        tables.read_table(tmp_path / "broken.csv")
+    for text in ("{", "[]", '{"study": "x"}', '{"complete": true, "other": 1}'):
+        (tmp_path / "broken.json").write_text(text)
+        with pytest.raises(InputError, match=r"broken\.json: not written by a study"):
+            tables.read_provenance(tmp_path / "broken.json")
+
+
+def near(estimate: Estimate, value: float, low: float, high: float, digits: int) -> bool:
+    return [round(number, digits) for number in (estimate.value, estimate.low, estimate.high)] == [
+        value,
+        low,
+        high,
+    ]
+
+
+def test_wilson_as_published() -> None:
+    """Newcombe, Two-sided confidence intervals for the single proportion (1998), table I, method 3."""
+    assert near(statistics.wilson(81, 263), round(81 / 263, 4), 0.2553, 0.3662, 4)
+    assert near(statistics.wilson(15, 148), round(15 / 148, 4), 0.0624, 0.1605, 4)
+    assert near(statistics.wilson(0, 20), 0.0, 0.0, 0.1611, 4)
+    assert near(statistics.wilson(1, 29), round(1 / 29, 4), 0.0061, 0.1718, 4)
+    nothing = statistics.wilson(0, 0)
+    assert math.isnan(nothing.value)
+    assert (nothing.low, nothing.high) == (0.0, 1.0)
+    with pytest.raises(InputError, match="given 3 of 2"):
+        statistics.wilson(3, 2)
+
+
+def test_paired_difference_as_published() -> None:
+    """The examples of chapter 8 of Fagerland, Lydersen, Laake, Statistical Analysis of Contingency Tables, in
+    the digits that the R package contingencytables prints.
+    """
+    cavo = statistics.paired_difference(
+        [True] * 65 + [False] * 96, [True] * 59 + [False] * 6 + [True] * 16 + [False] * 80
+    )
+    assert (cavo.both, cavo.only_first, cavo.only_second, cavo.neither, cavo.pairs) == (59, 6, 16, 80, 161)
+    assert near(cavo.difference, -0.0621, -0.1240, -0.0054, 4)
+    assert round(cavo.p_value, 6) == 0.052479
+    assert near(statistics.tango(1, 7, 21), round(-6 / 21, 3), -0.517, -0.026, 3)
+
+
+def test_paired_difference_without_a_discordant_pair_is_still_uncertain() -> None:
+    same = statistics.paired_difference([True, False] * 30, [True, False] * 30)
+    # Where no pair is discordant Tango's limits are z^2 / (n + z^2).
+    reach = 1.959964**2 / (60 + 1.959964**2)
+    assert same.difference.value == 0.0
+    assert same.difference.low == pytest.approx(-reach, abs=1e-6)
+    assert same.difference.high == pytest.approx(reach, abs=1e-6)
+    assert same.p_value == 1.0
+
+
+def test_paired_difference_holds_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    truth, held = 0.1, 0
+    for _ in range(1000):
+        only_first, only_second, _ = rng.multinomial(60, [0.2, 0.1, 0.7])
+        found = statistics.tango(int(only_first), int(only_second), 60)
+        held += found.low <= truth <= found.high
+    assert 0.93 <= held / 1000 <= 0.975
+
+
+@pytest.mark.parametrize("only_first", [0, 5, 10])
+@pytest.mark.parametrize("only_second", [0, 5])
+def test_paired_difference_at_the_edges(only_first: int, only_second: int) -> None:
+    pairs = 10 + only_second
+    found = statistics.tango(only_first, only_second, pairs)
+    assert -1 <= found.low <= found.value <= found.high <= 1
+    turned = statistics.tango(only_second, only_first, pairs)
+    assert [turned.low, turned.high] == pytest.approx([-found.high, -found.low], abs=1e-9)
+
+
+def test_paired_difference_needs_pairs() -> None:
+    with pytest.raises(InputError, match="given 2 and 1 results"):
+        statistics.paired_difference([True, False], [True])
+    with pytest.raises(InputError, match="given 0 and 0 results"):
+        statistics.paired_difference([], [])
+
+
+def test_bootstrap_draws_clusters_and_not_observations() -> None:
+    """Forty copies of each of ten numbers are ten observations, whose mean has a known error."""
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=10)
+    found = statistics.bootstrap(np.repeat(numbers, 40), np.repeat(np.arange(10), 40).tolist())
+    expected = numbers.std() / math.sqrt(10) * stats.norm.ppf(0.975)
+    assert found.value == pytest.approx(numbers.mean())
+    assert (found.high - found.low) / 2 == pytest.approx(expected, rel=0.1)
+
+    ratio = statistics.bootstrap(
+        np.array([[1.0, 2.0], [3.0, 4.0]]),
+        [("a", 1), ("a", 2)],
+        lambda rows: rows[:, 0].sum() / rows[:, 1].sum(),
+    )
+    assert (ratio.value, ratio.low, ratio.high) == (4 / 6, 0.5, 0.75)
+    assert math.isnan(statistics.bootstrap([1.0, 2.0], ["a", "a"]).low)
+    with pytest.raises(InputError, match="given 1 for 2 values"):
+        statistics.bootstrap([1.0, 2.0], ["a"])
+
+
+def test_detectable_difference_is_found_with_the_power_that_is_promised() -> None:
+    pairs, discordant = 400, 0.2
+    difference = statistics.detectable_difference(pairs, discordant)
+    rng = np.random.default_rng(0)
+    shares = [(discordant + difference) / 2, (discordant - difference) / 2, 1 - discordant]
+    only_first, only_second, _ = rng.multinomial(pairs, shares, size=20_000).T
+    significant = np.abs(only_first - only_second) > stats.norm.ppf(0.975) * np.sqrt(only_first + only_second)
+    assert significant.mean() == pytest.approx(0.8, abs=0.02)
+    assert math.isnan(statistics.detectable_difference(10, 0.05))
+    with pytest.raises(InputError, match=r"given 0 and 0\.5"):
+        statistics.detectable_difference(0, 0.5)
+
+
+def test_detectable_between_runs_is_found_with_the_power_that_is_promised() -> None:
+    rate, episodes, runs, deviation = 0.6, 100, 4, 0.03
+    difference = statistics.detectable_between_runs(rate, episodes, runs, deviation)
+    rng = np.random.default_rng(0)
+
+    def arm(true: float) -> np.ndarray:
+        rates = np.clip(rng.normal(true, deviation, (20_000, runs)), 0, 1)
+        return np.asarray(rng.binomial(episodes, rates).mean(axis=1) / episodes)
+
+    error = math.sqrt(2 * (deviation**2 + rate * (1 - rate) / episodes) / runs)
+    apart = np.abs(arm(rate + difference / 2) - arm(rate - difference / 2)) > stats.norm.ppf(0.975) * error
+    assert apart.mean() == pytest.approx(0.8, abs=0.02)
+    with pytest.raises(InputError, match="rate, episodes, runs, run_deviation: given"):
+        statistics.detectable_between_runs(1.2, 100, 2, 0.0)
+
+
+def test_studies_are_found_by_name() -> None:
+    with pytest.raises(InputError, match=f"unknown name 'cut', expected one of {', '.join(STUDIES)}"):
+        load_study("cut")
+    assert load_study("cuts").STUDY == "cuts"
