@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use half::bf16;
-use saccade::{ActionHead, Array, Features, LoadOptions};
+use saccade::{ActionHead, Array, Features, LoadOptions, Sampling};
 use saccade_benches::random::Random;
 use serde_json::{Map, Value, json};
 
@@ -108,8 +108,10 @@ fn head(criterion: &mut Criterion) {
                     Array::new(&state, &[1, 64]),
                     Array::new(&[0], &[]),
                     Array::new(&noise[..samples * CHUNK], &[1, samples, 16, 32]),
-                    None,
-                    Some(samples),
+                    &Sampling {
+                        num_samples: Some(samples),
+                        ..Sampling::default()
+                    },
                     &mut out,
                 )
             });

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -104,6 +105,26 @@ def integer(name: str, value: int, least: int = 1) -> int:
     if number >= 2**63:
         raise InputError(f"{name}: expected a number below 2**63, got {number}")
     return number
+
+
+def indices(name: str, value: Any) -> tuple[int, ...] | None:
+    """One index or several, distinct, in the order given; None stays None.
+
+    Raises:
+        InputError: ``value`` is not made of distinct integers of at least 0.
+    """
+    if value is None:
+        return None
+    if isinstance(value, (range, set, frozenset)):
+        value = sorted(value)
+    if isinstance(value, Sequence) and len(value) == 0:
+        return ()
+    found = [int(index) for index in np.atleast_1d(int64(name, value)).ravel()]
+    if min(found, default=0) < 0:
+        raise InputError(f"{name}: expected indices of at least 0, got {min(found)}")
+    if len(set(found)) != len(found):
+        raise InputError(f"{name}: expected distinct indices, got some twice")
+    return tuple(found)
 
 
 def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:

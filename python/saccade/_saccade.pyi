@@ -9,6 +9,9 @@ _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
 
+_Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
+_Intervention = dict[str, Any]  # the fields of saccade.Intervention, mappings as lists of their items
+
 __all__ = [
     "ActionHead",
     "Context",
@@ -57,7 +60,9 @@ class ActionHead:
         attention_mask: _Bool | None,
         image_mask: _Bool | None,
         drop_vl: _Bool | None,
-    ) -> Context: ...
+        attention: bool,
+        hidden: bool,
+    ) -> tuple[Context, _Recorded]: ...
     def sample(
         self,
         context: Context,
@@ -66,8 +71,23 @@ class ActionHead:
         noise: _Float32,
         num_steps: int | None,
         num_samples: int | None,
+        intervention: list[_Intervention],
         out: _Float32,
     ) -> None: ...
+    def trace(
+        self,
+        context: Context,
+        state: _Float32,
+        embodiment_id: _Int64,
+        noise: _Float32,
+        num_steps: int | None,
+        intervention: list[_Intervention],
+        attention: bool,
+        hidden: bool,
+        blocks: tuple[int, ...] | None,
+        steps: tuple[int, ...] | None,
+        max_bytes: int,
+    ) -> tuple[_Recorded, dict[str, tuple[int, int]], _Float32]: ...
     def velocity(
         self,
         context: Context,
@@ -75,6 +95,7 @@ class ActionHead:
         embodiment_id: _Int64,
         actions: _Float32,
         timestep: _Int64,
+        intervention: list[_Intervention],
         out: _Float32,
     ) -> None: ...
 

@@ -18,6 +18,7 @@ from saccade._arrays import (
     apart,
     boolean,
     float32,
+    indices,
     int64,
     integer,
     is_torch,
@@ -27,6 +28,8 @@ from saccade._arrays import (
 from saccade.attention import check_precision
 from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError
+from saccade.intervention import Intervention, as_interventions
+from saccade.trace import Record, Trace, check_record
 
 
 class Context:
@@ -34,9 +37,10 @@ class Context:
     :meth:`ActionHead.encode`.
     """
 
-    def __init__(self, held: _saccade.Context, use_torch: bool) -> None:
+    def __init__(self, held: _saccade.Context, use_torch: bool, record: Record | None) -> None:
         self._held = held
         self._torch = use_torch
+        self._record = record
 
     @property
     def batch(self) -> int:
@@ -51,7 +55,12 @@ class Context:
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return self._held.nbytes
+        return self._held.nbytes + (0 if self._record is None else self._record.nbytes)
+
+    @property
+    def record(self) -> Record | None:
+        """What ``encode`` was asked to record of the VL self-attention; None if nothing."""
+        return self._record
 
     @property
     def vl_embs(self) -> Array:
@@ -188,6 +197,7 @@ class ActionHead:
         attention_mask: ArrayLike | None = None,
         image_mask: ArrayLike | None = None,
         drop_vl: ArrayLike | None = None,
+        record: Sequence[str] = (),
     ) -> Context:
         """Runs what depends on the observation alone: ``vlln``, the VL self-attention, every cross block's
         keys and values.
@@ -199,17 +209,25 @@ class ActionHead:
             image_mask: bool ``(batch, T_vl)``, True = image token; kept in the context for maps.
             drop_vl: bool ``(batch, T_vl)``, True = removed before the VL self-attention and everywhere
                 after, as if it had not been there.
+            record: What to keep in ``context.record``, ``"attention"`` and ``"hidden"``: the probabilities of
+                each block of the VL self-attention, and the tokens after it. At most 2 GiB.
 
         Raises:
-            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity.
+            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; more than can be
+            recorded.
         """
-        held = self._head.encode(
+        use_torch = is_torch(backbone_features)
+        attention, hidden = check_record(record)
+        held, recorded = self._head.encode(
             float32("backbone_features", backbone_features),
             boolean("attention_mask", attention_mask),
             boolean("image_mask", image_mask),
             boolean("drop_vl", drop_vl),
+            attention,
+            hidden,
         )
-        return Context(held, is_torch(backbone_features))
+        kept = [_converted(arrays, use_torch) for arrays in recorded]
+        return Context(held, use_torch, Record(*kept) if attention or hidden else None)
 
     def sample(
         self,
@@ -221,6 +239,7 @@ class ActionHead:
         seed: Any = None,
         num_steps: int | None = None,
         num_samples: int | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
         """Samples a chunk of actions: Euler steps from noise.
@@ -238,6 +257,7 @@ class ActionHead:
             num_steps: Euler steps, 1 to ``num_timestep_buckets``. Default the config's.
             num_samples: Chunks for each observation, from one context. None adds no axis to noise and
                 result; any integer adds one.
+            intervention: What to change inside the head; one, or several that act together.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
 
         Returns:
@@ -250,7 +270,6 @@ class ActionHead:
         """
         held = _held(context)
         samples = None if num_samples is None else integer("num_samples", num_samples)
-        steps = None if num_steps is None else integer("num_steps", num_steps)
         config = self._config
         leading = (held.batch,) if samples is None else (held.batch, samples)
         output = result((*leading, config.action_horizon, config.action_dim), out)
@@ -260,8 +279,9 @@ class ActionHead:
             apart(float32("state", state), output),
             int64("embodiment_id", embodiment_id),
             apart(start, output),
-            steps,
+            _num_steps(num_steps),
             samples,
+            _plain(intervention),
             output,
         )
         return like_features(output, context._torch) if out is None else out  # type: ignore[return-value]
@@ -279,6 +299,7 @@ class ActionHead:
         seed: Any = None,
         num_steps: int | None = None,
         num_samples: int | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
         """:meth:`encode`, then :meth:`sample`."""
@@ -293,6 +314,7 @@ class ActionHead:
             seed=seed,
             num_steps=num_steps,
             num_samples=num_samples,
+            intervention=intervention,
             out=out,
         )
 
@@ -303,6 +325,8 @@ class ActionHead:
         embodiment_id: int | ArrayLike,
         actions: ArrayLike,
         timestep: int | ArrayLike,
+        *,
+        intervention: Intervention | Sequence[Intervention] | None = None,
     ) -> Array:
         """The velocity that the head predicts for noisy actions.
 
@@ -312,6 +336,7 @@ class ActionHead:
             embodiment_id: An integer, or ``(batch,)`` integers.
             actions: Noisy actions, ``(batch, action_horizon, encoder_action_dim)``.
             timestep: The bucket, 0 to ``num_timestep_buckets - 1``: an integer, or ``(batch,)`` integers.
+            intervention: As in :meth:`sample`; this is step 0.
 
         Returns:
             ``(batch, action_horizon, action_dim)`` float32, torch if the features were torch.
@@ -327,9 +352,83 @@ class ActionHead:
             int64("embodiment_id", embodiment_id),
             float32("actions", actions),
             int64("timestep", timestep),
+            _plain(intervention),
             output,
         )
         return like_features(output, context._torch)
+
+    def trace(
+        self,
+        context: Context,
+        state: ArrayLike,
+        embodiment_id: int | ArrayLike,
+        *,
+        noise: ArrayLike | None = None,
+        seed: Any = None,
+        num_steps: int | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        record: Sequence[str] = ("attention",),
+        blocks: int | Sequence[int] | None = None,
+        steps: int | Sequence[int] | None = None,
+        max_bytes: int = 2**31,
+    ) -> Trace[Array]:
+        """Samples like :meth:`sample` and keeps what goes on inside.
+
+        All rows are computed in every block, the last included, where ``sample`` needs those of the actions
+        only.
+
+        Args:
+            context, state, embodiment_id, noise, seed, num_steps, intervention: As in :meth:`sample`.
+            record: What to keep: ``"attention"``, the probabilities of every block and step, and
+                ``"hidden"``, the rows after it.
+            blocks: Of which blocks; default all.
+            steps: Of which Euler steps; default all.
+            max_bytes: A trace that holds more is refused before anything is allocated.
+
+        Raises:
+            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; both ``noise`` and
+            ``seed``; more than ``max_bytes``.
+
+        Example:
+            How much of the future rows' attention in the first block each vision-language token gets, in the
+            mean over heads:
+
+            >>> import importlib.resources
+            >>> import numpy as np, saccade
+            >>> head = saccade.ActionHead.load(importlib.resources.files("saccade") / "sim" / "demo")
+            >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
+            >>> state = np.zeros((1, head.config.state_dim), np.float32)
+            >>> trace = head.trace(context, state, 0, seed=7, blocks=0, steps=0)
+            >>> trace.attention[0, 0][:, :, trace.rows["future"]].mean(1).shape == (
+            ...     1,
+            ...     head.config.num_future_tokens,
+            ...     60,
+            ... )
+            True
+        """
+        held = _held(context)
+        config = self._config
+        start = _noise(noise, seed, (held.batch, config.action_horizon, config.encoder_action_dim))
+        attention, hidden = check_record(record)
+        (probabilities, kept_rows), rows, actions = self._head.trace(
+            held,
+            float32("state", state),
+            int64("embodiment_id", embodiment_id),
+            start,
+            _num_steps(num_steps),
+            _plain(intervention),
+            attention,
+            hidden,
+            indices("blocks", blocks),
+            indices("steps", steps),
+            integer("max_bytes", max_bytes, least=0),
+        )
+        return Trace(
+            attention=_converted(probabilities, context._torch),
+            hidden=_converted(kept_rows, context._torch),
+            rows={group: slice(*span) for group, span in rows.items()},
+            actions=like_features(actions, context._torch),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _load, (self._source, self._options)
@@ -364,6 +463,25 @@ def _held(context: Context) -> _saccade.Context:
     if not isinstance(context, Context):
         raise InputError(f"context: expected what encode returns, got {type(context).__name__}")
     return context._held
+
+
+def _num_steps(num_steps: int | None) -> int | None:
+    return None if num_steps is None else integer("num_steps", num_steps)
+
+
+def _plain(given: Intervention | Sequence[Intervention] | None) -> list[dict[str, Any]]:
+    """Interventions in the form that the engine takes: mappings as lists of their items."""
+
+    def plain(one: Any) -> dict[str, Any]:
+        patches = [(place, *item) for place, groups in (one.patch or {}).items() for item in groups.items()]
+        return {**vars(one), "key_bias": list((one.key_bias or {}).items()), "patch": patches}
+
+    return [plain(one) for one in as_interventions(given)]
+
+
+def _converted(arrays: dict[Any, Float32Array], use_torch: bool) -> dict[Any, Array]:
+    """Arrays by place, as :func:`like_features` gives them."""
+    return {place: like_features(array, use_torch) for place, array in arrays.items()}
 
 
 def _noise(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float32Array:

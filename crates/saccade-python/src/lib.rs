@@ -3,6 +3,7 @@
 
 #![deny(unsafe_code)]
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -14,7 +15,10 @@ use pyo3::exceptions::PyFileNotFoundError;
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyType};
-use saccade::{Array, Checkpoint, Elements, Error, Features, Isa, LoadOptions};
+use saccade::{
+    Array, Checkpoint, Elements, Error, Features, Group, Isa, LoadOptions, OwnedArray, Patch, Record,
+    Recorded, Sampling, Tokens, TraceOptions,
+};
 
 /// The exception class of `saccade.errors` with this name.
 fn exception<'py>(
@@ -58,6 +62,78 @@ fn to_numpy<'py, T: Element>(
     shape: &[usize],
 ) -> PyResult<Bound<'py, PyArrayDyn<T>>> {
     data.into_pyarray(py).reshape(shape.to_vec())
+}
+
+/// A group's name and indices.
+type PyTokens = (String, Option<Vec<usize>>);
+
+/// The fields of a `saccade.Intervention` by name, as its constructor normalised them; mappings are lists of their items.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct PyIntervention<'py> {
+    cut: Vec<(PyTokens, PyTokens)>,
+    key_bias: Vec<(PyTokens, PyReadonlyArrayDyn<'py, f32>)>,
+    patch: Vec<((usize, usize), PyTokens, PyReadonlyArrayDyn<'py, f32>)>,
+    future_tokens: Option<PyReadonlyArrayDyn<'py, f32>>,
+    blocks: Option<Vec<usize>>,
+    steps: Option<Vec<usize>>,
+    heads: Option<Vec<usize>>,
+}
+
+fn tokens((name, indices): PyTokens) -> PyResult<Tokens> {
+    let group = Group::from_name(&name).map_err(raise)?;
+    Ok(Tokens { group, indices })
+}
+
+fn owned(array: &PyReadonlyArrayDyn<'_, f32>) -> PyResult<OwnedArray> {
+    Ok(OwnedArray::new(array.as_slice()?.to_vec(), array.shape()))
+}
+
+fn intervention(given: PyIntervention<'_>) -> PyResult<saccade::Intervention> {
+    let cut = |(reader, source)| Ok((tokens(reader)?, tokens(source)?));
+    let key_bias = |(keys, bias)| Ok((tokens(keys)?, owned(&bias)?));
+    let patch = |((step, block), patched, rows)| {
+        Ok(Patch {
+            step,
+            block,
+            tokens: tokens(patched)?,
+            rows: owned(&rows)?,
+        })
+    };
+    Ok(saccade::Intervention {
+        cut: given.cut.into_iter().map(cut).collect::<PyResult<_>>()?,
+        key_bias: given
+            .key_bias
+            .into_iter()
+            .map(key_bias)
+            .collect::<PyResult<_>>()?,
+        patch: given.patch.into_iter().map(patch).collect::<PyResult<_>>()?,
+        future_tokens: given.future_tokens.as_ref().map(owned).transpose()?,
+        blocks: given.blocks,
+        steps: given.steps,
+        heads: given.heads,
+    })
+}
+
+fn interventions(given: Vec<PyIntervention<'_>>) -> PyResult<Vec<saccade::Intervention>> {
+    given.into_iter().map(intervention).collect()
+}
+
+/// Attention and hidden rows, each by place.
+type PyRecorded<'py> = (Bound<'py, PyDict>, Bound<'py, PyDict>);
+
+fn recorded<'py, Place: IntoPyObject<'py>>(
+    py: Python<'py>,
+    recorded: Recorded<Place>,
+) -> PyResult<PyRecorded<'py>> {
+    let to_dict = |arrays: BTreeMap<Place, OwnedArray>| {
+        let dict = PyDict::new(py);
+        for (place, array) in arrays {
+            dict.set_item(place, to_numpy(py, array.data, &array.shape)?)?;
+        }
+        Ok::<_, PyErr>(dict)
+    };
+    Ok((to_dict(recorded.attention)?, to_dict(recorded.hidden)?))
 }
 
 fn config_dict<'py>(py: Python<'py>, config: &saccade::HeadConfig) -> PyResult<Bound<'py, PyDict>> {
@@ -193,22 +269,27 @@ impl ActionHead {
             .map_err(raise)
     }
 
-    fn encode(
+    #[allow(clippy::too_many_arguments)]
+    fn encode<'py>(
         &self,
-        py: Python<'_>,
+        py: Python<'py>,
         backbone_features: PyReadonlyArrayDyn<'_, f32>,
         attention_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
         image_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
         drop_vl: Option<PyReadonlyArrayDyn<'_, bool>>,
-    ) -> PyResult<Context> {
+        attention: bool,
+        hidden: bool,
+    ) -> PyResult<(Context, PyRecorded<'py>)> {
         let features = Features {
             backbone_features: view(&backbone_features)?,
             attention_mask: optional_view(&attention_mask)?,
             image_mask: optional_view(&image_mask)?,
             drop_vl: optional_view(&drop_vl)?,
+            record: Record { attention, hidden },
         };
-        let context = py.detach(|| self.0.encode(&features)).map_err(raise)?;
-        Ok(Context(Arc::new(context)))
+        let mut context = py.detach(|| self.0.encode(&features)).map_err(raise)?;
+        let kept = recorded(py, context.take_recorded())?;
+        Ok((Context(Arc::new(context)), kept))
     }
 
     #[allow(clippy::too_many_arguments)]
@@ -221,15 +302,68 @@ impl ActionHead {
         noise: PyReadonlyArrayDyn<'_, f32>,
         num_steps: Option<usize>,
         num_samples: Option<usize>,
+        intervention: Vec<PyIntervention<'_>>,
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
         let (context, out) = (&context.0, out.as_slice_mut()?);
+        let sampling = Sampling {
+            num_steps,
+            num_samples,
+            interventions: &interventions(intervention)?,
+        };
         py.detach(|| {
             self.0
-                .sample(context, state, embodiment_id, noise, num_steps, num_samples, out)
+                .sample(context, state, embodiment_id, noise, &sampling, out)
         })
         .map_err(raise)
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn trace<'py>(
+        &self,
+        py: Python<'py>,
+        context: &Context,
+        state: PyReadonlyArrayDyn<'_, f32>,
+        embodiment_id: PyReadonlyArrayDyn<'_, i64>,
+        noise: PyReadonlyArrayDyn<'_, f32>,
+        num_steps: Option<usize>,
+        intervention: Vec<PyIntervention<'_>>,
+        attention: bool,
+        hidden: bool,
+        blocks: Option<Vec<usize>>,
+        steps: Option<Vec<usize>>,
+        max_bytes: u64,
+    ) -> PyResult<(PyRecorded<'py>, Bound<'py, PyDict>, Bound<'py, PyArrayDyn<f32>>)> {
+        let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
+        let context = &context.0;
+        let interventions = interventions(intervention)?;
+        let options = TraceOptions {
+            record: Record { attention, hidden },
+            blocks,
+            steps,
+            max_bytes,
+        };
+        let trace = py
+            .detach(|| {
+                self.0.trace(
+                    context,
+                    state,
+                    embodiment_id,
+                    noise,
+                    num_steps,
+                    &interventions,
+                    &options,
+                )
+            })
+            .map_err(raise)?;
+        let rows = PyDict::new(py);
+        for group in [Group::State, Group::Future, Group::Action] {
+            let range = trace.groups.range(group);
+            rows.set_item(group.name(), (range.start, range.end))?;
+        }
+        let actions = to_numpy(py, trace.actions.data, &trace.actions.shape)?;
+        Ok((recorded(py, trace.recorded)?, rows, actions))
     }
 
     #[allow(clippy::too_many_arguments)]
@@ -241,14 +375,23 @@ impl ActionHead {
         embodiment_id: PyReadonlyArrayDyn<'_, i64>,
         actions: PyReadonlyArrayDyn<'_, f32>,
         timestep: PyReadonlyArrayDyn<'_, i64>,
+        intervention: Vec<PyIntervention<'_>>,
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let (state, embodiment_id) = (view(&state)?, view(&embodiment_id)?);
         let (actions, timestep) = (view(&actions)?, view(&timestep)?);
         let (context, out) = (&context.0, out.as_slice_mut()?);
+        let interventions = interventions(intervention)?;
         py.detach(|| {
-            self.0
-                .velocity(context, state, embodiment_id, actions, timestep, out)
+            self.0.velocity(
+                context,
+                state,
+                embodiment_id,
+                actions,
+                timestep,
+                &interventions,
+                out,
+            )
         })
         .map_err(raise)
     }

@@ -59,6 +59,33 @@ impl Array<'_, f32> {
     }
 }
 
+/// An array that owns its elements: what is kept, or given for keeps.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct OwnedArray {
+    /// The elements, last axis fastest.
+    pub data: Vec<f32>,
+    /// The size of each axis; their product is `data.len()`.
+    pub shape: Vec<usize>,
+}
+
+impl OwnedArray {
+    /// `data` with `shape`.
+    ///
+    /// # Panics
+    /// If `shape` does not multiply to the length of `data`.
+    #[must_use]
+    pub fn new(data: Vec<f32>, shape: &[usize]) -> Self {
+        let shape = Array::new(&data, shape).shape.to_vec();
+        Self { data, shape }
+    }
+
+    /// The array, borrowed.
+    #[must_use]
+    pub fn view(&self) -> Array<'_> {
+        Array::new(&self.data, &self.shape)
+    }
+}
+
 /// The index on every axis of the element at `position`.
 fn unravel(mut position: usize, shape: &[usize]) -> Vec<usize> {
     let mut index: Vec<usize> = shape

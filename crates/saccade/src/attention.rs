@@ -20,6 +20,7 @@ pub(crate) struct AttentionBuffers {
     q: Vec<f32>,
     kv: Vec<f32>,
     mix: Vec<f32>,
+    bias: Vec<f32>,
     packed: Option<PackedKeyValues>,
 }
 
@@ -29,8 +30,52 @@ impl AttentionBuffers {
             q: Vec::new(),
             kv: Vec::new(),
             mix: Vec::new(),
+            bias: Vec::new(),
             packed: None,
         }
+    }
+}
+
+/// What is added to the logits of an attention over several sequences.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Bias<'a> {
+    /// `(sequences, keys)`: each sequence's own, for all of its heads and queries.
+    pub keys: Option<&'a [f32]>,
+    /// The same for all sequences.
+    pub shared: Option<LogitBias<'a>>,
+}
+
+impl Bias<'_> {
+    /// The bias of one sequence with `[heads, queries, keys]` logits; `sum` is memory for the sum of both kinds.
+    fn of<'s>(
+        &'s self,
+        sequence: usize,
+        [heads, queries, keys]: [usize; 3],
+        sum: &'s mut Vec<f32>,
+    ) -> Option<LogitBias<'s>> {
+        let own = self.keys.map(|all| &all[sequence * keys..(sequence + 1) * keys]);
+        let (own, shared) = match (own, self.shared) {
+            (Some(own), Some(shared)) => (own, shared),
+            (Some(values), None) => {
+                return Some(LogitBias {
+                    values,
+                    head_stride: 0,
+                    query_stride: 0,
+                });
+            }
+            (None, shared) => return shared,
+        };
+        let heads = if shared.head_stride == 0 { 1 } else { heads };
+        sum.clear();
+        for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
+            let row = &shared.values[head * shared.head_stride + query * shared.query_stride..][..keys];
+            sum.extend(row.iter().zip(own).map(|(shared, own)| shared + own));
+        }
+        Some(LogitBias {
+            values: sum,
+            head_stride: if heads == 1 { 0 } else { queries * keys },
+            query_stride: keys,
+        })
     }
 }
 
@@ -99,15 +144,15 @@ impl Attention {
     }
 
     /// `x += out(attention(y, held keys and values))`; `y` and `x` have equally many rows for each of `kv`.
-    /// `bias` gives the logit bias of a group, and `weights`, where asked for, is `(groups, heads, queries, keys)`.
+    /// `weights`, where asked for, is `(groups, heads, queries, keys)`.
     #[allow(clippy::too_many_arguments)] // Buffers and views of one equation; a struct would only rename them.
-    pub(crate) fn add_cross<'b>(
+    pub(crate) fn add_cross(
         &self,
         engine: Engine,
         y: &[f32],
         kv: &[PackedKeyValues],
-        bias: impl Fn(usize) -> Option<LogitBias<'b>>,
-        weights: Option<&mut [f32]>,
+        bias: Bias<'_>,
+        mut weights: Option<&mut [f32]>,
         epilogue: Epilogue,
         buffers: &mut AttentionBuffers,
         x: &mut [f32],
@@ -116,20 +161,16 @@ impl Attention {
         self.queries(engine, y, buffers);
         let count = buffers.q.len() / width / kv.len(); // query rows of a group
         let mix = sized(&mut buffers.mix, buffers.q.len());
-        let mut weights = weights;
         for (group, kv) in kv.iter().enumerate() {
             let range = group * count * width..(group + 1) * count * width;
-            let group_weights = weights.as_mut().map(|all| {
-                let size = self.num_heads * count * kv.len();
-                &mut all[group * size..(group + 1) * size]
-            });
+            let logits = [self.num_heads, count, kv.len()];
             attention(
                 engine.threads,
                 rows(&buffers.q[range.clone()], width),
                 kv,
                 self.scale(),
-                bias(group),
-                group_weights,
+                bias.of(group, logits, &mut buffers.bias),
+                weights_of(&mut weights, group, logits),
                 rows_mut(&mut mix[range], width),
             );
         }
@@ -137,15 +178,16 @@ impl Attention {
             .apply(engine.threads, rows(mix, width), epilogue, rows_mut(x, width));
     }
 
-    /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences.
+    /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences; `weights` as above.
     #[allow(clippy::too_many_arguments)] // As above.
-    pub(crate) fn add_self<'b>(
+    pub(crate) fn add_self(
         &self,
         engine: Engine,
         y: &[f32],
         source: &[f32],
         groups: usize,
-        bias: impl Fn(usize) -> Option<LogitBias<'b>>,
+        bias: Bias<'_>,
+        mut weights: Option<&mut [f32]>,
         buffers: &mut AttentionBuffers,
         x: &mut [f32],
     ) {
@@ -155,6 +197,7 @@ impl Attention {
         let mix = sized(&mut buffers.mix, buffers.q.len());
         let (keys, values) = self.keys_values(engine, source, &mut buffers.kv);
         let len = keys.nrows() / groups; // rows of a sequence
+        let logits = [self.num_heads, count, len];
         let packed = buffers
             .packed
             .get_or_insert_with(|| PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim()));
@@ -170,8 +213,8 @@ impl Attention {
                 rows(&buffers.q[range.clone()], width),
                 packed,
                 self.scale(),
-                bias(group),
-                None,
+                bias.of(group, logits, &mut buffers.bias),
+                weights_of(&mut weights, group, logits),
                 rows_mut(&mut mix[range], width),
             );
         }
@@ -197,6 +240,17 @@ impl Attention {
     fn scale(&self) -> f32 {
         1.0 / (self.head_dim() as f32).sqrt()
     }
+}
+
+/// The probabilities of one group among those of all groups.
+fn weights_of<'a>(
+    all: &'a mut Option<&mut [f32]>,
+    group: usize,
+    logits: [usize; 3],
+) -> Option<&'a mut [f32]> {
+    let size: usize = logits.iter().product();
+    all.as_deref_mut()
+        .map(|all| &mut all[group * size..(group + 1) * size])
 }
 
 /// `Linear(GELU_tanh(Linear(y)))`.

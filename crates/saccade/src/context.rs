@@ -1,12 +1,15 @@
 //! What is computed once per observation and held: the vision-language tokens, and the keys and values of every cross-attention block.
 
-use saccade_kernels::{LogitBias, PackedKeyValues};
+use std::ops::Range;
 
-use crate::attention::{Attention, AttentionBuffers, FeedForward};
+use saccade_kernels::PackedKeyValues;
+
+use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward};
 use crate::config::HeadConfig;
 use crate::error::Result;
 use crate::layers::{Engine, HeadTensors, Norm, sized};
 use crate::layout::{HeadNames, VlBlockNames};
+use crate::trace::{Record, Recorded, Shapes};
 
 /// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate
 /// activations small. At 1024 rows the weights are read once per 3 to 4 camera views and the largest buffer is 32 MB at N1.5's size.
@@ -20,8 +23,10 @@ pub struct Context {
     pub(crate) vl_embs: Vec<f32>,
     /// By block, empty for self-attention; within it by batch element.
     pub(crate) keys_values: Vec<Vec<PackedKeyValues>>,
-    pub(crate) removed: Option<RemovedKeys>,
+    /// Logit biases that take away what `drop_vl` named, `(batch, num_vl_tokens)`.
+    pub(crate) removed: Option<Vec<f32>>,
     pub(crate) image_mask: Option<Vec<bool>>,
+    pub(crate) recorded: Recorded<usize>,
 }
 
 impl Context {
@@ -49,7 +54,13 @@ impl Context {
         self.image_mask.as_deref()
     }
 
-    /// Bytes held.
+    /// Hands over what `encode` recorded of the VL self-attention, by block.
+    #[must_use]
+    pub fn take_recorded(&mut self) -> Recorded<usize> {
+        std::mem::take(&mut self.recorded)
+    }
+
+    /// Bytes held, without what was recorded.
     #[must_use]
     pub fn nbytes(&self) -> usize {
         let keys_values: usize = self
@@ -60,39 +71,14 @@ impl Context {
             .sum();
         4 * self.vl_embs.len() + keys_values
     }
-
-    /// The logit bias that takes the removed positions of batch element `element` away.
-    pub(crate) fn bias(&self, element: usize) -> Option<LogitBias<'_>> {
-        self.removed.as_ref().map(|removed| removed.bias(element))
-    }
 }
 
-/// Positions that are not there, as logit biases: 0 or minus infinity.
-pub(crate) struct RemovedKeys {
-    values: Vec<f32>,
-    num_vl_tokens: usize,
-}
-
-impl RemovedKeys {
-    pub(crate) fn new(removed: &[bool], num_vl_tokens: usize) -> Self {
-        let values = removed
-            .iter()
-            .map(|&removed| if removed { f32::NEG_INFINITY } else { 0.0 })
-            .collect();
-        Self {
-            values,
-            num_vl_tokens,
-        }
-    }
-
-    fn bias(&self, element: usize) -> LogitBias<'_> {
-        let range = element * self.num_vl_tokens..(element + 1) * self.num_vl_tokens;
-        LogitBias {
-            values: &self.values[range],
-            head_stride: 0,
-            query_stride: 0,
-        }
-    }
+/// The logit biases, 0 or minus infinity, that take these positions away.
+pub(crate) fn removed_keys(removed: &[bool]) -> Vec<f32> {
+    removed
+        .iter()
+        .map(|&removed| if removed { f32::NEG_INFINITY } else { 0.0 })
+        .collect()
 }
 
 /// `vlln` and the VL self-attention (spec 1.5).
@@ -100,6 +86,7 @@ pub(crate) struct VlEncoder {
     vlln: Option<Norm>,
     blocks: Vec<VlBlock>,
     context_dim: usize,
+    num_heads: usize,
 }
 
 struct VlBlock {
@@ -128,6 +115,9 @@ impl EncodeBuffers {
 
 const EPS: f32 = 1e-5;
 
+/// As much as a trace holds by default: the probabilities of N1.5's four blocks over three cameras for six observations.
+const MAX_RECORDED_BYTES: u64 = 1 << 31;
+
 impl VlEncoder {
     pub(crate) fn load(
         tensors: &HeadTensors<'_>,
@@ -151,6 +141,7 @@ impl VlEncoder {
                 .transpose()?,
             blocks: names.vl_blocks.iter().map(block).collect::<Result<_>>()?,
             context_dim: config.context_dim,
+            num_heads: config.vl_num_heads,
         })
     }
 
@@ -164,16 +155,35 @@ impl VlEncoder {
         self.vlln.as_ref().map_or(0, Norm::nbytes) + self.blocks.iter().map(block).sum::<usize>()
     }
 
+    /// Memory for what is to be recorded of `batch` observations.
+    pub(crate) fn recorded(
+        &self,
+        record: Record,
+        batch: usize,
+        num_vl_tokens: usize,
+    ) -> Result<Recorded<usize>> {
+        let shapes = |block| {
+            let attention = [batch, self.num_heads, num_vl_tokens, num_vl_tokens];
+            let hidden = [batch, num_vl_tokens, self.context_dim];
+            (block, Shapes { attention, hidden })
+        };
+        let places: Vec<_> = (0..self.blocks.len()).map(shapes).collect();
+        Recorded::claim(record, &places, MAX_RECORDED_BYTES)
+    }
+
     /// The tokens that the cross-attention blocks see, and their keys and values in each of `cross` blocks.
     ///
-    /// `features` is `(batch, num_vl_tokens, context_dim)`.
+    /// `features` is `(batch, num_vl_tokens, context_dim)`, `removed` what is added to the logits of its tokens. What `recorded` has places
+    /// for is kept.
+    #[allow(clippy::too_many_arguments)] // An observation, what is wanted of it, and memory.
     pub(crate) fn encode(
         &self,
         engine: Engine,
         cross: &[Option<&Attention>],
         features: &[f32],
         num_vl_tokens: usize,
-        removed: Option<&RemovedKeys>,
+        removed: Option<&[f32]>,
+        recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,
     ) -> (Vec<f32>, Vec<Vec<PackedKeyValues>>) {
         let mut vl_embs = vec![0.0; features.len()];
@@ -182,8 +192,17 @@ impl VlEncoder {
         let chunk = together * num_vl_tokens * self.context_dim;
         for (index, (features, vl)) in features.chunks(chunk).zip(vl_embs.chunks_mut(chunk)).enumerate() {
             let groups = features.len() / (num_vl_tokens * self.context_dim);
-            let bias = |group: usize| removed.map(|removed| removed.bias(index * together + group));
-            self.tokens(engine, features, groups, bias, buffers, vl);
+            let elements = index * together..index * together + groups;
+            self.tokens(
+                engine,
+                features,
+                num_vl_tokens,
+                elements,
+                removed,
+                recorded,
+                buffers,
+                vl,
+            );
             for (attention, keys_values) in cross.iter().zip(&mut keys_values) {
                 if let Some(attention) = attention {
                     keys_values.extend(attention.project(engine, vl, groups, &mut buffers.hidden));
@@ -191,7 +210,7 @@ impl VlEncoder {
             }
         }
         if let Some(removed) = removed {
-            for (row, &bias) in vl_embs.chunks_exact_mut(self.context_dim).zip(&removed.values) {
+            for (row, &bias) in vl_embs.chunks_exact_mut(self.context_dim).zip(removed) {
                 if bias != 0.0 {
                     row.fill(0.0);
                 }
@@ -200,27 +219,44 @@ impl VlEncoder {
         (vl_embs, keys_values)
     }
 
-    fn tokens<'b>(
+    /// The batch elements `elements`, whose features are given.
+    #[allow(clippy::too_many_arguments)] // As above.
+    fn tokens(
         &self,
         engine: Engine,
         features: &[f32],
-        groups: usize,
-        bias: impl Fn(usize) -> Option<LogitBias<'b>>,
+        num_vl_tokens: usize,
+        elements: Range<usize>,
+        removed: Option<&[f32]>,
+        recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,
         vl: &mut [f32],
     ) {
+        // The part of `(batch, ...)` that belongs to the elements.
+        let part = |size: usize| elements.start * size..elements.end * size;
+        let bias = Bias {
+            keys: removed.map(|removed| &removed[part(num_vl_tokens)]),
+            shared: None,
+        };
         match &self.vlln {
             Some(vlln) => vlln.apply(engine, features, vl),
             None => vl.copy_from_slice(features),
         }
-        for block in &self.blocks {
+        for (index, block) in self.blocks.iter().enumerate() {
             let y = sized(&mut buffers.y, vl.len());
             block.norm1.apply(engine, vl, y);
+            let weights = recorded
+                .attention(index)
+                .map(|all| &mut all[part(self.num_heads * num_vl_tokens * num_vl_tokens)]);
+            let attention = &mut buffers.attention;
             block
                 .attention
-                .add_self(engine, y, y, groups, &bias, &mut buffers.attention, vl);
+                .add_self(engine, y, y, elements.len(), bias, weights, attention, vl);
             block.norm3.apply(engine, vl, y);
             block.feed_forward.add(engine, y, &mut buffers.hidden, vl);
+            if let Some(kept) = recorded.hidden(index) {
+                kept[part(num_vl_tokens * self.context_dim)].copy_from_slice(vl);
+            }
         }
     }
 }

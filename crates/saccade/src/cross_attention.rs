@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
-use saccade_kernels::{Epilogue, LogitBias, PackedKeyValues};
+use saccade_kernels::{Epilogue, PackedKeyValues};
 
 use crate::array::Array;
-use crate::attention::{Attention, AttentionBuffers};
+use crate::attention::{Attention, AttentionBuffers, Bias};
 use crate::checkpoint::Elements;
 use crate::error::{Error, Result, show_shape};
 use crate::head::engine;
@@ -171,14 +171,10 @@ impl CrossAttention {
                 kv.batch
             )));
         }
-        let keys = [kv.batch, kv.num_vl_tokens];
-        let logit_bias = logit_bias(keys, key_mask, key_bias)?;
-        let bias = |element: usize| {
-            logit_bias.as_ref().map(|values| LogitBias {
-                values: &values[element * keys[1]..(element + 1) * keys[1]],
-                head_stride: 0,
-                query_stride: 0,
-            })
+        let logit_bias = logit_bias([kv.batch, kv.num_vl_tokens], key_mask, key_bias)?;
+        let bias = Bias {
+            keys: logit_bias.as_deref(),
+            shared: None,
         };
         let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
         let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);

@@ -4,14 +4,16 @@ use std::sync::Arc;
 
 use saccade_kernels::{Epilogue, PackedLinear, layer_norm};
 
-use crate::attention::{Attention, AttentionBuffers, FeedForward};
+use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward};
 use crate::cache::Cache;
 use crate::config::HeadConfig;
 use crate::context::Context;
 use crate::error::Result;
+use crate::intervention::Changes;
 use crate::layers::{Engine, HeadTensors, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
 use crate::tables::{TIME_CHANNELS, embedding_time};
+use crate::trace::Recorded;
 
 const BLOCK_EPS: f32 = 1e-5;
 const OUTPUT_EPS: f32 = 1e-6;
@@ -54,19 +56,17 @@ pub(crate) struct TimeModulations {
 pub(crate) struct Sequences<'a> {
     pub context: &'a Context,
     pub samples: usize,
-    /// Rows of one sequence, and how many of them, the last ones, are actions.
-    pub rows: usize,
-    pub action_rows: usize,
     /// One for each batch element.
     pub times: &'a [Arc<TimeModulations>],
+    /// Which rows there are, and what interventions change at Euler step `step`.
+    pub changes: &'a Changes<'a>,
+    pub step: usize,
 }
 
-/// In the last block only the action rows are needed (spec I4).
+/// In the last block only the action rows are needed (spec I4). A trace wants all of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LastBlock {
     ActionRows,
-    /// The plain computation, which the saving is tested against.
-    #[cfg(test)]
     AllRows,
 }
 
@@ -193,19 +193,21 @@ impl Dit {
         }
     }
 
-    /// Runs all blocks over `buffers.h` and writes the output rows of the actions, `(sequences, action_rows, hidden_dim)`.
+    /// Runs all blocks over `buffers.h` and writes the output rows of the actions, `(sequences, action_rows, hidden_dim)`. What `recorded`
+    /// has places for is kept.
     pub(crate) fn forward(
         &self,
         engine: Engine,
         sequences: &Sequences<'_>,
         last: LastBlock,
+        recorded: &mut Recorded<(usize, usize)>,
         buffers: &mut DitBuffers,
         out: &mut Vec<f32>,
     ) {
         let (final_block, blocks) = self.blocks.split_last().expect("a config has at least one block");
         let mut h = std::mem::take(&mut buffers.h); // (sequences, rows, width)
         for (index, block) in blocks.iter().enumerate() {
-            self.block(engine, sequences, index, block, &mut h, None, buffers);
+            self.block(engine, sequences, index, block, &mut h, None, recorded, buffers);
         }
         let mut action = std::mem::take(&mut buffers.action); // (sequences, action_rows, width)
         match last {
@@ -218,10 +220,10 @@ impl Dit {
                     final_block,
                     &mut action,
                     Some(&h),
+                    recorded,
                     buffers,
                 );
             }
-            #[cfg(test)]
             LastBlock::AllRows => {
                 self.block(
                     engine,
@@ -230,6 +232,7 @@ impl Dit {
                     final_block,
                     &mut h,
                     None,
+                    recorded,
                     buffers,
                 );
                 gather_action_rows(sequences, self.width, &h, &mut action);
@@ -266,6 +269,7 @@ impl Dit {
         block: &Block,
         x: &mut [f32],
         all: Option<&[f32]>,
+        recorded: &mut Recorded<(usize, usize)>,
         buffers: &mut DitBuffers,
     ) {
         let DitBuffers {
@@ -288,14 +292,25 @@ impl Dit {
         };
         let y = sized(y, x.len());
         norm(x, y);
+        let Sequences {
+            context,
+            samples,
+            changes,
+            step,
+            ..
+        } = *sequences;
+        let groups = context.batch * samples;
+        let first_row = changes.groups.num_rows() - x.len() / self.width / groups;
+        let shared = changes.bias(step, index, first_row);
+        let weights = recorded.attention((step, index));
         if block.is_cross {
-            let context = sequences.context;
-            let (kv, bias) = (&context.keys_values[index], |element| context.bias(element));
+            let (keys, kv) = (context.removed.as_deref(), &context.keys_values[index]);
+            let bias = Bias { keys, shared };
             block
                 .attention
-                .add_cross(engine, y, kv, bias, None, Epilogue::Add, attention, x);
+                .add_cross(engine, y, kv, bias, weights, Epilogue::Add, attention, x);
         } else {
-            let groups = sequences.context.batch * sequences.samples;
+            let bias = Bias { keys: None, shared };
             let source: &[f32] = match all {
                 None => y,
                 Some(h) => {
@@ -306,7 +321,7 @@ impl Dit {
             };
             block
                 .attention
-                .add_self(engine, y, source, groups, |_| None, attention, x);
+                .add_self(engine, y, source, groups, bias, weights, attention, x);
         }
         layer_norm(
             engine.isa,
@@ -317,12 +332,17 @@ impl Dit {
             rows_mut(y, self.width),
         );
         block.feed_forward.add(engine, y, hidden, x);
+        changes.patch(step, index, first_row, samples, self.width, x);
+        if let Some(kept) = recorded.hidden((step, index)) {
+            kept.copy_from_slice(x);
+        }
     }
 }
 
 /// Copies the action rows, the last of each sequence, from `h` to `action`.
 fn gather_action_rows(sequences: &Sequences<'_>, width: usize, h: &[f32], action: &mut Vec<f32>) {
-    let (sequence, actions) = (sequences.rows * width, sequences.action_rows * width);
+    let groups = &sequences.changes.groups;
+    let (sequence, actions) = (groups.num_rows() * width, groups.action * width);
     let action = sized(action, h.len() / sequence * actions);
     for (from, to) in h.chunks_exact(sequence).zip(action.chunks_exact_mut(actions)) {
         to.copy_from_slice(&from[sequence - actions..]);

@@ -6,16 +6,18 @@ use std::sync::{Arc, Mutex};
 
 use saccade_kernels::{Epilogue, Isa, silu};
 
-use crate::array::Array;
+use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
 use crate::checkpoint::Checkpoint;
 use crate::config::HeadConfig;
-use crate::context::{Context, EncodeBuffers, RemovedKeys, VlEncoder};
+use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
 use crate::dit::{Dit, DitBuffers, LastBlock, Sequences, TimeModulations};
 use crate::error::{Error, Result, show_shape};
+use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, HeadTensors, TensorSource, sized};
 use crate::layout::HeadNames;
 use crate::tables::action_time;
+use crate::trace::{Record, Recorded, Shapes, Trace, TraceOptions};
 
 /// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
 const CACHED_BRACKETS: usize = 256;
@@ -42,6 +44,8 @@ pub struct Features<'a> {
     pub image_mask: Option<Array<'a, bool>>,
     /// `(batch, num_vl_tokens)`, true = as if the position were not there.
     pub drop_vl: Option<Array<'a, bool>>,
+    /// What to keep of the VL self-attention.
+    pub record: Record,
 }
 
 impl<'a> Features<'a> {
@@ -53,8 +57,20 @@ impl<'a> Features<'a> {
             attention_mask: None,
             image_mask: None,
             drop_vl: None,
+            record: Record::default(),
         }
     }
+}
+
+/// How a chunk is sampled.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Sampling<'a> {
+    /// Euler steps, 1 to `num_timestep_buckets`; default the config's.
+    pub num_steps: Option<usize>,
+    /// Chunks for each observation; none adds no axis to noise and result.
+    pub num_samples: Option<usize>,
+    /// What to change inside the head.
+    pub interventions: &'a [Intervention],
 }
 
 /// A loaded action head. Immutable; serves any number of threads at once.
@@ -74,6 +90,17 @@ pub struct ActionHead {
     action_decoder: [CategoryLinear; 2],
     brackets: Cache<(usize, usize), Vec<f32>>,
     workspaces: Mutex<Vec<Workspace>>,
+}
+
+/// One forward pass: over what, with which changes, and how much of it.
+struct Step<'a> {
+    context: &'a Context,
+    /// Sequences for each batch element.
+    samples: usize,
+    changes: &'a Changes<'a>,
+    /// The Euler step.
+    step: usize,
+    last: LastBlock,
 }
 
 /// Memory of one call, kept for the next call.
@@ -209,7 +236,8 @@ impl ActionHead {
         let removed = features
             .drop_vl
             .filter(|mask| mask.data.contains(&true))
-            .map(|mask| RemovedKeys::new(mask.data, num_vl_tokens));
+            .map(|mask| removed_keys(mask.data));
+        let mut recorded = self.vl.recorded(features.record, batch, num_vl_tokens)?;
         let cross = self.dit.cross_attentions();
         let (vl_embs, keys_values) = self.with_workspace(|workspace| {
             let data = features.backbone_features.data;
@@ -219,7 +247,8 @@ impl ActionHead {
                 &cross,
                 data,
                 num_vl_tokens,
-                removed.as_ref(),
+                removed.as_deref(),
+                &mut recorded,
                 buffers,
             )
         });
@@ -231,10 +260,11 @@ impl ActionHead {
             keys_values,
             removed,
             image_mask: features.image_mask.map(|mask| mask.data.to_vec()),
+            recorded,
         })
     }
 
-    /// Samples a chunk of actions: `num_steps` Euler steps from `noise` (spec 1.8).
+    /// Samples a chunk of actions: Euler steps from `noise` (spec 1.8).
     ///
     /// `state` is `(batch, state_dim)` or `(batch, state_history, state_dim)`, `embodiment_id` a scalar or `(batch)`, `noise`
     /// `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with `num_samples`.
@@ -242,47 +272,111 @@ impl ActionHead {
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit; `out` is then untouched.
-    #[allow(clippy::too_many_arguments)] // The sampler's inputs, as in the paper.
     pub fn sample(
         &self,
         context: &Context,
         state: Array<'_>,
         embodiment_id: Array<'_, i64>,
         noise: Array<'_>,
-        num_steps: Option<usize>,
-        num_samples: Option<usize>,
+        sampling: &Sampling<'_>,
         out: &mut [f32],
     ) -> Result<()> {
         self.check_context(context)?;
         let state = self.check_state(state, context.batch)?;
-        let num_steps = self.check_num_steps(num_steps)?;
-        let samples = self.check_noise(noise, context.batch, num_samples)?;
+        let num_steps = self.check_num_steps(sampling.num_steps)?;
+        let samples = self.check_noise(noise, context.batch, sampling.num_samples)?;
+        let changes = self.changes(sampling.interventions, context, num_steps)?;
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, context.batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
-            let Workspace { x, .. } = workspace;
-            sized(x, noise.data.len()).copy_from_slice(noise.data);
-            let dt = 1.0 / num_steps as f32;
-            for step in 0..num_steps {
-                let bucket = self.bucket(step, num_steps);
-                workspace.times.clear();
-                workspace
-                    .times
-                    .resize(context.batch, self.dit.time(self.engine, bucket));
-                self.step_velocity(context, samples, |_| bucket, LastBlock::ActionRows, workspace);
-                for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
-                    *x += dt * v;
-                }
-            }
+            sized(&mut workspace.x, noise.data.len()).copy_from_slice(noise.data);
+            let nothing = &mut Recorded::default();
+            self.euler_steps(
+                context,
+                samples,
+                num_steps,
+                &changes,
+                LastBlock::ActionRows,
+                nothing,
+                workspace,
+            );
             out.copy_from_slice(&workspace.x);
             Ok(())
         })
     }
 
+    /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last included.
+    ///
+    /// `noise` is `(batch, action_horizon, encoder_action_dim)`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, and for a trace of more than `options.max_bytes`.
+    #[allow(clippy::too_many_arguments)] // Those of sample, and what to keep.
+    pub fn trace(
+        &self,
+        context: &Context,
+        state: Array<'_>,
+        embodiment_id: Array<'_, i64>,
+        noise: Array<'_>,
+        num_steps: Option<usize>,
+        interventions: &[Intervention],
+        options: &TraceOptions,
+    ) -> Result<Trace> {
+        self.check_context(context)?;
+        let (batch, config) = (context.batch, &self.config);
+        let state = self.check_state(state, batch)?;
+        let num_steps = self.check_num_steps(num_steps)?;
+        let samples = self.check_noise(noise, batch, None)?;
+        let changes = self.changes(interventions, context, num_steps)?;
+        let groups = changes.groups;
+        let shapes = |(step, block)| {
+            let rows = groups.num_rows();
+            let keys = if config.is_cross(block) { groups.vl } else { rows };
+            let attention = [batch, config.num_heads, rows, keys];
+            (
+                (step, block),
+                Shapes {
+                    attention,
+                    hidden: [batch, rows, config.width],
+                },
+            )
+        };
+        let places = options
+            .places(num_steps, config.num_layers)?
+            .into_iter()
+            .map(shapes);
+        self.with_workspace(|workspace| {
+            self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
+            let mut recorded =
+                Recorded::claim(options.record, &places.collect::<Vec<_>>(), options.max_bytes)?;
+            self.encode_state(state, workspace);
+            sized(&mut workspace.x, noise.data.len()).copy_from_slice(noise.data);
+            let all = LastBlock::AllRows;
+            self.euler_steps(
+                context,
+                samples,
+                num_steps,
+                &changes,
+                all,
+                &mut recorded,
+                workspace,
+            );
+            let shape = [batch, config.action_horizon, config.action_dim];
+            let actions = OwnedArray::new(workspace.x.clone(), &shape);
+            Ok(Trace {
+                recorded,
+                groups,
+                actions,
+            })
+        })
+    }
+
     /// The velocity of noisy `actions (batch, action_horizon, encoder_action_dim)` at `timestep`, a bucket: a scalar or `(batch)`.
+    /// To the interventions it is step 0 of 1.
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit; `out` is then untouched.
+    #[allow(clippy::too_many_arguments)] // The equation's variables.
     pub fn velocity(
         &self,
         context: &Context,
@@ -290,6 +384,7 @@ impl ActionHead {
         embodiment_id: Array<'_, i64>,
         actions: Array<'_>,
         timestep: Array<'_, i64>,
+        interventions: &[Intervention],
         out: &mut [f32],
     ) -> Result<()> {
         self.check_context(context)?;
@@ -304,6 +399,7 @@ impl ActionHead {
             )?
             .check_finite("actions")?;
         let timesteps = self.check_timestep(timestep, batch)?;
+        let changes = self.changes(interventions, context, 1)?;
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
@@ -312,13 +408,15 @@ impl ActionHead {
             workspace
                 .times
                 .extend(timesteps.iter().map(|&bucket| self.dit.time(self.engine, bucket)));
-            self.step_velocity(
+            let step = Step {
                 context,
-                1,
-                |element| timesteps[element],
-                LastBlock::ActionRows,
-                workspace,
-            );
+                samples: 1,
+                changes: &changes,
+                step: 0,
+                last: LastBlock::ActionRows,
+            };
+            let bucket = |element: usize| timesteps[element];
+            self.step_velocity(&step, bucket, &mut Recorded::default(), workspace);
             out.copy_from_slice(&workspace.velocity);
             Ok(())
         })
@@ -374,10 +472,61 @@ impl ActionHead {
             state,
             embodiment_id,
             Array::new(&noise, &shape),
-            None,
-            num_samples,
+            &Sampling {
+                num_samples,
+                ..Sampling::default()
+            },
             &mut out,
         )
+    }
+
+    /// What the interventions mean for a call on `context`.
+    fn changes<'a>(
+        &'a self,
+        interventions: &'a [Intervention],
+        context: &Context,
+        num_steps: usize,
+    ) -> Result<Changes<'a>> {
+        let extent = Extent {
+            config: &self.config,
+            batch: context.batch,
+            num_vl_tokens: context.num_vl_tokens,
+            num_steps,
+        };
+        Changes::new(interventions, &self.future_tokens, extent)
+    }
+
+    /// Follows the velocity from `workspace.x`, the noise, to the actions, in equal steps.
+    #[allow(clippy::too_many_arguments)] // As sample and trace.
+    fn euler_steps(
+        &self,
+        context: &Context,
+        samples: usize,
+        num_steps: usize,
+        changes: &Changes<'_>,
+        last: LastBlock,
+        recorded: &mut Recorded<(usize, usize)>,
+        workspace: &mut Workspace,
+    ) {
+        let dt = 1.0 / num_steps as f32;
+        for step in 0..num_steps {
+            let bucket = self.bucket(step, num_steps);
+            workspace.times.clear();
+            workspace
+                .times
+                .resize(context.batch, self.dit.time(self.engine, bucket));
+            let step = Step {
+                context,
+                samples,
+                changes,
+                step,
+                last,
+            };
+            self.step_velocity(&step, |_| bucket, recorded, workspace);
+            for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
+                *x += dt * v;
+            }
+        }
     }
 
     /// The bucket of Euler step `step`: float64, truncated, as the released sampler does.
@@ -409,14 +558,13 @@ impl ActionHead {
     /// One forward pass over `workspace.x (batch, samples, action_horizon, encoder_action_dim)`, to `workspace.velocity`.
     fn step_velocity(
         &self,
-        context: &Context,
-        samples: usize,
+        step: &Step<'_>,
         bucket: impl Fn(usize) -> usize,
-        last: LastBlock,
+        recorded: &mut Recorded<(usize, usize)>,
         workspace: &mut Workspace,
     ) {
-        self.encode_actions(samples, bucket, workspace);
-        self.assemble_rows(samples, workspace);
+        self.encode_actions(step.samples, bucket, workspace);
+        self.assemble_rows(step, workspace);
         let Workspace {
             dit,
             embodiment_ids,
@@ -427,13 +575,14 @@ impl ActionHead {
             ..
         } = workspace;
         let sequences = Sequences {
-            context,
-            samples,
-            rows: self.config.num_rows(),
-            action_rows: self.config.action_horizon,
+            context: step.context,
+            samples: step.samples,
             times,
+            changes: step.changes,
+            step: step.step,
         };
-        self.dit.forward(self.engine, &sequences, last, dit, output);
+        self.dit
+            .forward(self.engine, &sequences, step.last, recorded, dit, output);
         let [layer1, layer2] = &self.action_decoder;
         let hidden = sized(decoder_hidden, output.len());
         layer1.apply(self.engine, embodiment_ids, output, Epilogue::Relu, hidden);
@@ -502,24 +651,25 @@ impl ActionHead {
     }
 
     /// `[state, future, action]` for each sequence, to the transformer's residual stream.
-    fn assemble_rows(&self, samples: usize, workspace: &mut Workspace) {
+    fn assemble_rows(&self, step: &Step<'_>, workspace: &mut Workspace) {
         let Workspace {
             state, encoded, dit, ..
         } = workspace;
         let width = self.config.width;
         let actions = self.config.action_horizon * width;
-        let sequence = self.config.num_rows() * width;
+        let sequence = step.changes.groups.num_rows() * width;
+        let future_tokens = step.changes.future_tokens;
         let h = sized(&mut dit.h, encoded.len() / actions * sequence);
         for (index, (h, action)) in h
             .chunks_exact_mut(sequence)
             .zip(encoded.chunks_exact(actions))
             .enumerate()
         {
-            let element = index / samples;
+            let element = index / step.samples;
             let (h_state, rest) = h.split_at_mut(width);
-            let (h_future, h_action) = rest.split_at_mut(self.future_tokens.len());
+            let (h_future, h_action) = rest.split_at_mut(future_tokens.len());
             h_state.copy_from_slice(&state[element * width..(element + 1) * width]);
-            h_future.copy_from_slice(&self.future_tokens);
+            h_future.copy_from_slice(future_tokens);
             h_action.copy_from_slice(action);
         }
     }
@@ -789,7 +939,15 @@ mod tests {
             .times
             .resize(context.batch, head.dit.time(head.engine, bucket));
         head.encode_state(&numbers(context.batch * config.state_dim, 3), &mut workspace);
-        head.step_velocity(context, 1, |_| bucket, last, &mut workspace);
+        let changes = head.changes(&[], context, 1).unwrap();
+        let step = Step {
+            context,
+            samples: 1,
+            changes: &changes,
+            step: 0,
+            last,
+        };
+        head.step_velocity(&step, |_| bucket, &mut Recorded::default(), &mut workspace);
         workspace.velocity
     }
 

@@ -2,7 +2,7 @@
 //!
 //! An observation is encoded once ([`ActionHead::encode`]): the vision-language tokens pass their norm and self-attention, and every
 //! cross-attention block's keys and values are held in a [`Context`]. Chunks of actions are then sampled from it
-//! ([`ActionHead::sample`]) as often as wanted.
+//! ([`ActionHead::sample`]) as often as wanted. What happens inside can be changed ([`Intervention`]) and kept ([`ActionHead::trace`]).
 //!
 //! Where an equation comes from is said by its number in the GR00T action head's specification, as in "spec 1.6".
 
@@ -18,15 +18,19 @@ mod cross_attention;
 mod dit;
 mod error;
 mod head;
+mod intervention;
 mod layers;
 mod layout;
 mod tables;
+mod trace;
 
-pub use array::Array;
+pub use array::{Array, OwnedArray};
 pub use checkpoint::{Checkpoint, Elements};
 pub use config::HeadConfig;
 pub use context::Context;
 pub use cross_attention::{CrossAttention, KeyValues, NamedTensors};
 pub use error::{Error, Result};
-pub use head::{ActionHead, Features, LoadOptions};
+pub use head::{ActionHead, Features, LoadOptions, Sampling};
+pub use intervention::{Group, Groups, Intervention, Patch, Tokens};
 pub use saccade_kernels::{Isa, default_num_threads};
+pub use trace::{Record, Recorded, Trace, TraceOptions};

@@ -4,7 +4,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use saccade::{ActionHead, Array, Features, LoadOptions};
+use saccade::{ActionHead, Array, Features, LoadOptions, Sampling};
 
 struct Counting;
 
@@ -53,8 +53,10 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
                 Array::new(&state, &[2, 64]),
                 Array::new(&[1, 3], &[2]),
                 Array::new(&noise, &[2, 3, 16, 32]),
-                None,
-                Some(3),
+                &Sampling {
+                    num_samples: Some(3),
+                    ..Default::default()
+                },
                 &mut out,
             )
             .unwrap();

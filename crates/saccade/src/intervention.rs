@@ -1,0 +1,511 @@
+//! What to change inside the head while it runs, and what that means at one step, in one block.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+use std::ops::Range;
+
+use saccade_kernels::LogitBias;
+
+use crate::array::OwnedArray;
+use crate::config::HeadConfig;
+use crate::error::{Error, Result, show_shape};
+
+/// A group of tokens.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Group {
+    /// The one state row.
+    State,
+    /// The future rows.
+    Future,
+    /// The action rows.
+    Action,
+    /// The vision-language tokens, which cross-attention blocks read.
+    Vl,
+}
+
+impl Group {
+    /// From its name: `state`, `future`, `action` or `vl`.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for any other name.
+    pub fn from_name(name: &str) -> Result<Self> {
+        [Self::State, Self::Future, Self::Action, Self::Vl]
+            .into_iter()
+            .find(|group| group.name() == name)
+            .ok_or_else(|| Error::Input(format!("group: expected state, future, action or vl, got {name}")))
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::State => "state",
+            Self::Future => "future",
+            Self::Action => "action",
+            Self::Vl => "vl",
+        }
+    }
+}
+
+/// A group, or some of its tokens.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Tokens {
+    /// The group.
+    pub group: Group,
+    /// Indices within the group; none stands for all of it.
+    pub indices: Option<Vec<usize>>,
+}
+
+/// Rows that replace those of some tokens after one block of one step.
+#[derive(Clone, Debug)]
+pub struct Patch {
+    /// The Euler step.
+    pub step: usize,
+    /// The block.
+    pub block: usize,
+    /// Whose rows.
+    pub tokens: Tokens,
+    /// `(tokens, width)`, or `(batch, tokens, width)`.
+    pub rows: OwnedArray,
+}
+
+/// A change of what the head computes. Several act together: biases add up, of two patches of one row the later counts, and at most one
+/// replaces the future tokens.
+///
+/// ```
+/// use saccade::{Group, Intervention, Tokens};
+/// let all = |group| Tokens { group, indices: None };
+/// let blind = Intervention { cut: vec![(all(Group::Future), all(Group::Vl))], ..Intervention::default() };
+/// assert!(blind.blocks.is_none(), "in every block");
+/// ```
+#[derive(Clone, Debug, Default)]
+pub struct Intervention {
+    /// `(reader, source)`: the reader's rows no longer see the source's keys. A row with no key left gets zero from the attention.
+    pub cut: Vec<(Tokens, Tokens)>,
+    /// Added to the logits of these keys, for every reader: one number, or `(tokens,)`. Minus infinity removes a key.
+    pub key_bias: Vec<(Tokens, OwnedArray)>,
+    /// Replaced rows; `blocks`, `steps` and `heads` do not limit them.
+    pub patch: Vec<Patch>,
+    /// `(tokens, width)`, in place of the learned ones; any number of tokens.
+    pub future_tokens: Option<OwnedArray>,
+    /// Blocks in which cuts and biases act; default all.
+    pub blocks: Option<Vec<usize>>,
+    /// Euler steps at which they act; default all.
+    pub steps: Option<Vec<usize>>,
+    /// Attention heads in which they act; default all.
+    pub heads: Option<Vec<usize>>,
+}
+
+/// How many tokens there are. Rows lie in the order state, future, action.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Groups {
+    /// Future rows.
+    pub future: usize,
+    /// Action rows.
+    pub action: usize,
+    /// Vision-language tokens.
+    pub vl: usize,
+}
+
+impl Groups {
+    /// Rows of a sequence.
+    #[must_use]
+    pub fn num_rows(&self) -> usize {
+        1 + self.future + self.action
+    }
+
+    /// Where a group's tokens lie: among the rows, or among the vision-language tokens.
+    #[must_use]
+    pub fn range(&self, group: Group) -> Range<usize> {
+        match group {
+            Group::State => 0..1,
+            Group::Future => 1..1 + self.future,
+            Group::Action => 1 + self.future..self.num_rows(),
+            Group::Vl => 0..self.vl,
+        }
+    }
+
+    /// The positions of `tokens`, in the order given.
+    fn positions(&self, tokens: &Tokens) -> Vec<usize> {
+        let range = self.range(tokens.group);
+        match &tokens.indices {
+            None => range.collect(),
+            Some(indices) => indices.iter().map(|index| range.start + index).collect(),
+        }
+    }
+
+    /// How many `tokens` are.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for an index that is not in the group.
+    fn check(&self, name: &str, tokens: &Tokens) -> Result<usize> {
+        let count = self.range(tokens.group).len();
+        let Some(indices) = &tokens.indices else {
+            return Ok(count);
+        };
+        match indices.iter().find(|index| **index >= count) {
+            None => Ok(indices.len()),
+            Some(index) => Err(Error::Input(format!(
+                "{name}: {} token {index}, expected {}",
+                tokens.group.name(),
+                span(count)
+            ))),
+        }
+    }
+}
+
+/// What one call is over.
+#[derive(Clone, Copy)]
+pub(crate) struct Extent<'a> {
+    pub config: &'a HeadConfig,
+    pub batch: usize,
+    pub num_vl_tokens: usize,
+    pub num_steps: usize,
+}
+
+/// All interventions of one call, in the form in which blocks use them.
+pub(crate) struct Changes<'a> {
+    pub groups: Groups,
+    /// `(groups.future, width)`: the learned ones, or those in their place.
+    pub future_tokens: &'a [f32],
+    biases: Vec<DenseBias>,
+    /// Which of the biases acts, by step and block; empty if none ever does.
+    acting: Vec<Option<usize>>,
+    num_layers: usize,
+    patches: Vec<PatchedRows<'a>>,
+}
+
+/// What is added to the logits of one kind of block, `(heads, rows, keys)`; one head stands for all if it is the same for all of them.
+struct DenseBias {
+    values: Vec<f32>,
+    heads: usize,
+    rows: usize,
+    keys: usize,
+}
+
+struct PatchedRows<'a> {
+    step: usize,
+    block: usize,
+    /// Positions among all rows.
+    rows: Vec<usize>,
+    values: &'a [f32],
+    /// Elements from one batch element's values to the next one's; 0 if all have the same.
+    element_stride: usize,
+}
+
+/// Bytes of biases that one call may hold: hundreds of different ones at N1.5's size.
+const MAX_BIAS_BYTES: u128 = 1 << 30;
+
+impl<'a> Changes<'a> {
+    /// Checks the interventions and works out where each acts. With none of them nothing is allocated.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for what does not fit the call.
+    pub(crate) fn new(
+        interventions: &'a [Intervention],
+        learned: &'a [f32],
+        extent: Extent<'_>,
+    ) -> Result<Self> {
+        let config = extent.config;
+        let future_tokens = replaced_future_tokens(interventions, config.width)?.unwrap_or(learned);
+        let mut changes = Self {
+            groups: Groups {
+                future: future_tokens.len() / config.width,
+                action: config.action_horizon,
+                vl: extent.num_vl_tokens,
+            },
+            future_tokens,
+            biases: Vec::new(),
+            acting: Vec::new(),
+            num_layers: config.num_layers,
+            patches: Vec::new(),
+        };
+        for intervention in interventions {
+            intervention.check(&changes.groups, extent)?;
+            for patch in &intervention.patch {
+                changes.patches.push(patch.check(&changes.groups, extent)?);
+            }
+        }
+        if interventions
+            .iter()
+            .any(|one| !one.cut.is_empty() || !one.key_bias.is_empty())
+        {
+            changes.find_biases(interventions, extent)?;
+        }
+        Ok(changes)
+    }
+
+    /// Blocks of one kind in which the same interventions act share a bias.
+    fn find_biases(&mut self, interventions: &[Intervention], extent: Extent<'_>) -> Result<()> {
+        let mut known: BTreeMap<(bool, Vec<usize>), usize> = BTreeMap::new();
+        for step in 0..extent.num_steps {
+            for block in 0..extent.config.num_layers {
+                let is_cross = extent.config.is_cross(block);
+                let acting: Vec<usize> = (0..interventions.len())
+                    .filter(|&index| interventions[index].acts(step, block, is_cross))
+                    .collect();
+                let index = if acting.is_empty() {
+                    None
+                } else {
+                    Some(match known.entry((is_cross, acting)) {
+                        Entry::Occupied(entry) => *entry.get(),
+                        Entry::Vacant(entry) => {
+                            let acting = entry.key().1.iter().map(|&index| &interventions[index]);
+                            let bias = self.sum(&acting.collect::<Vec<_>>(), is_cross, extent.config)?;
+                            self.biases.push(bias);
+                            *entry.insert(self.biases.len() - 1)
+                        }
+                    })
+                };
+                self.acting.push(index);
+            }
+        }
+        Ok(())
+    }
+
+    /// The sum of what `acting` add in blocks of one kind.
+    fn sum(&self, acting: &[&Intervention], is_cross: bool, config: &HeadConfig) -> Result<DenseBias> {
+        let rows = self.groups.num_rows();
+        let keys = if is_cross { self.groups.vl } else { rows };
+        let heads = match acting.iter().all(|one| one.heads.is_none()) {
+            true => 1,
+            false => config.num_heads,
+        };
+        let held: usize = self.biases.iter().map(|bias| bias.values.len()).sum();
+        let bytes = 4 * (held as u128 + heads as u128 * rows as u128 * keys as u128);
+        if bytes > MAX_BIAS_BYTES {
+            return Err(Error::Input(format!(
+                "intervention: cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most {MAX_BIAS_BYTES}; \
+                 limit fewer of them to heads, blocks or steps of their own"
+            )));
+        }
+        let mut bias = DenseBias {
+            values: vec![0.0; heads * rows * keys],
+            heads,
+            rows,
+            keys,
+        };
+        for intervention in acting {
+            intervention.add(&self.groups, is_cross, &mut bias);
+        }
+        // Each is below infinity; a sum of several may still reach it.
+        if bias
+            .values
+            .iter()
+            .any(|value| value.is_nan() || *value == f32::INFINITY)
+        {
+            return Err(Error::Input(
+                "key_bias: expected biases whose sum for a key is below infinity".to_owned(),
+            ));
+        }
+        Ok(bias)
+    }
+
+    /// What is added to the logits of `block` at `step`, for the rows from `first_row` on.
+    pub(crate) fn bias(&self, step: usize, block: usize, first_row: usize) -> Option<LogitBias<'_>> {
+        let acting = self.acting.get(step * self.num_layers + block)?;
+        let bias = &self.biases[(*acting)?];
+        Some(LogitBias {
+            values: &bias.values[first_row * bias.keys..],
+            head_stride: if bias.heads == 1 { 0 } else { bias.rows * bias.keys },
+            query_stride: bias.keys,
+        })
+    }
+
+    /// Replaces rows of `x`, which holds the rows from `first_row` on of `samples` sequences for each of `batch` elements.
+    pub(crate) fn patch(
+        &self,
+        step: usize,
+        block: usize,
+        first_row: usize,
+        samples: usize,
+        width: usize,
+        x: &mut [f32],
+    ) {
+        let here = self
+            .patches
+            .iter()
+            .filter(|patch| (patch.step, patch.block) == (step, block));
+        for patch in here {
+            let sequence_len = (self.groups.num_rows() - first_row) * width;
+            for (index, sequence) in x.chunks_exact_mut(sequence_len).enumerate() {
+                let values = &patch.values[index / samples * patch.element_stride..];
+                for (row, value) in patch.rows.iter().zip(values.chunks_exact(width)) {
+                    if let Some(row) = row.checked_sub(first_row) {
+                        sequence[row * width..(row + 1) * width].copy_from_slice(value);
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn replaced_future_tokens(interventions: &[Intervention], width: usize) -> Result<Option<&[f32]>> {
+    let mut given = interventions.iter().filter_map(|one| one.future_tokens.as_ref());
+    let Some(tokens) = given.next() else {
+        return Ok(None);
+    };
+    if given.next().is_some() {
+        return Err(Error::Input(
+            "future_tokens: expected at most one intervention that replaces them, got several".to_owned(),
+        ));
+    }
+    if tokens.shape.len() != 2 || tokens.shape[1] != width {
+        return Err(Error::Shape(format!(
+            "future_tokens: expected (tokens, width) with width {width}, got {}",
+            show_shape(&tokens.shape)
+        )));
+    }
+    Ok(Some(tokens.view().check_finite("future_tokens")?.data))
+}
+
+impl Intervention {
+    /// Everything but patches and future tokens.
+    fn check(&self, groups: &Groups, extent: Extent<'_>) -> Result<()> {
+        let config = extent.config;
+        for (name, indices, count) in [
+            ("blocks", &self.blocks, config.num_layers),
+            ("steps", &self.steps, extent.num_steps),
+            ("heads", &self.heads, config.num_heads),
+        ] {
+            check_indices(name, indices.as_deref().unwrap_or(&[]), count)?;
+        }
+        for (reader, source) in &self.cut {
+            if reader.group == Group::Vl {
+                return Err(Error::Input(
+                    "cut: vl is read, it does not read; expected a reader among state, future, action"
+                        .to_owned(),
+                ));
+            }
+            groups.check("cut", reader)?;
+            groups.check("cut", source)?;
+        }
+        for (tokens, bias) in &self.key_bias {
+            let count = groups.check("key_bias", tokens)?;
+            if !bias.shape.is_empty() && bias.shape != [count] {
+                return Err(Error::Shape(format!(
+                    "key_bias: expected a number or ({count},) for {}, got {}",
+                    tokens.group.name(),
+                    show_shape(&bias.shape)
+                )));
+            }
+            if let Some(bad) = bias
+                .data
+                .iter()
+                .find(|value| value.is_nan() || **value == f32::INFINITY)
+            {
+                return Err(Error::Input(format!(
+                    "key_bias: expected numbers below infinity, got {bad}"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether it adds to the logits of this block.
+    fn acts(&self, step: usize, block: usize, is_cross: bool) -> bool {
+        let limited_to =
+            |chosen: &Option<Vec<usize>>, index| chosen.as_ref().is_none_or(|chosen| chosen.contains(&index));
+        let sources = self.cut.iter().map(|(_, source)| source);
+        let mut keys = sources.chain(self.key_bias.iter().map(|(tokens, _)| tokens));
+        limited_to(&self.steps, step)
+            && limited_to(&self.blocks, block)
+            && keys.any(|tokens| is_read(tokens, is_cross))
+    }
+
+    /// Adds its cuts and biases to those of one kind of block.
+    fn add(&self, groups: &Groups, is_cross: bool, to: &mut DenseBias) {
+        let heads: Vec<usize> = match &self.heads {
+            Some(heads) => heads.clone(),
+            None => (0..to.heads).collect(),
+        };
+        let everyone: Vec<usize> = (0..to.rows).collect();
+        let mut add = |readers: &[usize], keys: &[usize], values: &dyn Fn(usize) -> f32| {
+            for &head in &heads {
+                for &reader in readers {
+                    let row = &mut to.values[(head * to.rows + reader) * to.keys..][..to.keys];
+                    for (index, &key) in keys.iter().enumerate() {
+                        row[key] += values(index);
+                    }
+                }
+            }
+        };
+        for (reader, source) in &self.cut {
+            if is_read(source, is_cross) {
+                add(&groups.positions(reader), &groups.positions(source), &|_| {
+                    f32::NEG_INFINITY
+                });
+            }
+        }
+        for (tokens, bias) in &self.key_bias {
+            if is_read(tokens, is_cross) {
+                add(
+                    &everyone,
+                    &groups.positions(tokens),
+                    &|index| match bias.shape.as_slice() {
+                        [] => bias.data[0],
+                        _ => bias.data[index],
+                    },
+                );
+            }
+        }
+    }
+}
+
+/// Whether blocks of this kind have these keys.
+fn is_read(tokens: &Tokens, is_cross: bool) -> bool {
+    (tokens.group == Group::Vl) == is_cross
+}
+
+impl Patch {
+    fn check(&self, groups: &Groups, extent: Extent<'_>) -> Result<PatchedRows<'_>> {
+        let width = extent.config.width;
+        check_indices("patch: step", &[self.step], extent.num_steps)?;
+        check_indices("patch: block", &[self.block], extent.config.num_layers)?;
+        if self.tokens.group == Group::Vl {
+            return Err(Error::Input(
+                "patch: blocks change rows, not vl; expected state, future or action".to_owned(),
+            ));
+        }
+        let name = format!("patch[({}, {})]", self.step, self.block);
+        let count = groups.check(&name, &self.tokens)?;
+        let element_stride = match self.rows.shape.as_slice() {
+            shape if shape == [count, width] => 0,
+            shape if shape == [extent.batch, count, width] => count * width,
+            shape => {
+                return Err(Error::Shape(format!(
+                    "{name}: expected (tokens, width) = {} or (batch, tokens, width) = {} for {}, got {}",
+                    show_shape(&[count, width]),
+                    show_shape(&[extent.batch, count, width]),
+                    self.tokens.group.name(),
+                    show_shape(shape)
+                )));
+            }
+        };
+        Ok(PatchedRows {
+            step: self.step,
+            block: self.block,
+            rows: groups.positions(&self.tokens),
+            values: self.rows.view().check_finite(&name)?.data,
+            element_stride,
+        })
+    }
+}
+
+/// That all indices are below `count`.
+pub(crate) fn check_indices(name: &str, indices: &[usize], count: usize) -> Result<()> {
+    match indices.iter().find(|index| **index >= count) {
+        None => Ok(()),
+        Some(index) => Err(Error::Input(format!(
+            "{name}: expected {}, got {index}",
+            span(count)
+        ))),
+    }
+}
+
+fn span(count: usize) -> String {
+    match count {
+        0 => "none, since there is no token in that group".to_owned(),
+        _ => format!("0 to {}", count - 1),
+    }
+}

@@ -1,0 +1,137 @@
+//! What is kept of the inside of the head: attention probabilities, and the rows after a block.
+
+use std::collections::BTreeMap;
+
+use crate::array::OwnedArray;
+use crate::error::{Error, Result};
+use crate::intervention::{Groups, check_indices};
+
+/// What to keep.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Record {
+    /// Attention probabilities.
+    pub attention: bool,
+    /// The rows after a block.
+    pub hidden: bool,
+}
+
+/// What [`ActionHead::trace`](crate::ActionHead::trace) keeps, and how much of it at most.
+#[derive(Clone, Debug)]
+pub struct TraceOptions {
+    /// What to keep.
+    pub record: Record,
+    /// Of which blocks; default all.
+    pub blocks: Option<Vec<usize>>,
+    /// Of which Euler steps; default all.
+    pub steps: Option<Vec<usize>>,
+    /// More than this is refused.
+    pub max_bytes: u64,
+}
+
+/// What was kept, by place: `(step, block)` of the transformer, or the block of the VL self-attention.
+#[derive(Clone, Debug)]
+pub struct Recorded<Place> {
+    /// The probabilities used, `(batch, heads, queries, keys)`; exactly 0 for keys that were cut or dropped.
+    pub attention: BTreeMap<Place, OwnedArray>,
+    /// Rows after the block, `(batch, rows, width)`.
+    pub hidden: BTreeMap<Place, OwnedArray>,
+}
+
+impl<Place> Default for Recorded<Place> {
+    /// Keeps nothing.
+    fn default() -> Self {
+        Self {
+            attention: BTreeMap::new(),
+            hidden: BTreeMap::new(),
+        }
+    }
+}
+
+/// What a place would keep: the shapes of its probabilities and rows.
+pub(crate) struct Shapes {
+    pub attention: [usize; 4],
+    pub hidden: [usize; 3],
+}
+
+impl<Place: Ord + Copy> Recorded<Place> {
+    /// Memory for `record` of these places.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if that is more than `max_bytes`, before anything is allocated, or does not fit in memory.
+    pub(crate) fn claim(record: Record, places: &[(Place, Shapes)], max_bytes: u64) -> Result<Self> {
+        let bytes = |shape: &[usize]| 4 * shape.iter().map(|&size| size as u128).product::<u128>();
+        let of_place = |shapes: &Shapes| {
+            u128::from(record.attention) * bytes(&shapes.attention)
+                + u128::from(record.hidden) * bytes(&shapes.hidden)
+        };
+        let needed: u128 = places.iter().map(|(_, shapes)| of_place(shapes)).sum();
+        if needed > u128::from(max_bytes) {
+            return Err(Error::Input(format!(
+                "max_bytes: what is to be recorded takes {needed} bytes, more than the {max_bytes} allowed; record less at a time"
+            )));
+        }
+        let claim = |shape: &[usize]| {
+            let mut data = Vec::new();
+            let elements = shape.iter().product(); // fits: it is below needed, which is below max_bytes
+            data.try_reserve_exact(elements).map_err(|_| {
+                Error::Input(format!(
+                    "max_bytes: what is to be recorded takes {needed} bytes, which do not fit in memory; record less at a time"
+                ))
+            })?;
+            data.resize(elements, 0.0);
+            Ok(OwnedArray::new(data, shape))
+        };
+        let mut recorded = Self::default();
+        for (place, shapes) in places {
+            if record.attention {
+                recorded.attention.insert(*place, claim(&shapes.attention)?);
+            }
+            if record.hidden {
+                recorded.hidden.insert(*place, claim(&shapes.hidden)?);
+            }
+        }
+        Ok(recorded)
+    }
+
+    /// Where the probabilities at `place` go, if they are wanted.
+    pub(crate) fn attention(&mut self, place: Place) -> Option<&mut [f32]> {
+        self.attention
+            .get_mut(&place)
+            .map(|array| array.data.as_mut_slice())
+    }
+
+    /// Where the rows after `place` go, if they are wanted.
+    pub(crate) fn hidden(&mut self, place: Place) -> Option<&mut [f32]> {
+        self.hidden.get_mut(&place).map(|array| array.data.as_mut_slice())
+    }
+}
+
+/// One call of [`ActionHead::trace`](crate::ActionHead::trace).
+#[derive(Clone, Debug)]
+pub struct Trace {
+    /// By step and block.
+    pub recorded: Recorded<(usize, usize)>,
+    /// Which rows are which.
+    pub groups: Groups,
+    /// `(batch, action_horizon, action_dim)`: the bits that [`ActionHead::sample`](crate::ActionHead::sample) gives.
+    pub actions: OwnedArray,
+}
+
+impl TraceOptions {
+    /// The places that are kept, of `num_steps` steps and `num_layers` blocks.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for a step or block that is not there.
+    pub(crate) fn places(&self, num_steps: usize, num_layers: usize) -> Result<Vec<(usize, usize)>> {
+        let chosen = |name, given: &Option<Vec<usize>>, count| match given {
+            None => Ok((0..count).collect()),
+            Some(indices) => check_indices(name, indices, count).map(|()| indices.clone()),
+        };
+        let steps = chosen("steps", &self.steps, num_steps)?;
+        let blocks = chosen("blocks", &self.blocks, num_layers)?;
+        Ok(steps
+            .iter()
+            .flat_map(|&step| blocks.iter().map(move |&block| (step, block)))
+            .collect())
+    }
+}
