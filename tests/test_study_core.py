@@ -318,3 +318,19 @@ def test_studies_are_found_by_name() -> None:
     with pytest.raises(InputError, match=f"unknown name 'cut', expected one of {', '.join(STUDIES)}"):
         load_study("cut")
     assert load_study("cuts").STUDY == "cuts"
+
+
+def test_ray_gives_the_same_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray", reason="the extra ray is not installed")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # its workers import this file for `Square`
+    work = Square(tmp_path / "log")
+    one = run_cells("demo", cells(*range(9)), work, tmp_path / "one", settings=SETTINGS)
+    try:
+        two = run_cells(
+            "demo", cells(*range(9)), work, tmp_path / "two", settings=SETTINGS, backend="ray", jobs=2
+        )
+    finally:
+        ray.shutdown()
+    pd.testing.assert_frame_equal(one, two)
+    with pytest.raises(InputError, match="jobs: given -1"):
+        run_cells("demo", cells(1), work, tmp_path / "two", settings=SETTINGS, backend="ray", jobs=-1)

@@ -66,7 +66,9 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("out/study"), help="where tables go (default: out/study)"
     )
-    parser.add_argument("--jobs", type=int, default=1, help="cells at once; -1 takes all cores (default: 1)")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="cells at once; with loky -1 takes all cores (default: 1)"
+    )
     parser.add_argument(
         "--backend", default="loky", metavar="loky|ray", help="processes here, or of a Ray cluster"
     )

@@ -35,6 +35,7 @@ from saccade.study.tables import (
 )
 
 BACKENDS = ("loky", "ray")
+ROUND = 4  # cells a worker between two looks at what Ray has done
 RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld", "scikit-learn")
 Key: TypeAlias = tuple["str | int | float", ...]
 Rows: TypeAlias = list[dict[str, Any]]
@@ -116,7 +117,7 @@ def run_cells(
         settings: what all rows depend on, for JSON: hashes of checkpoints, engine, and so on. Not what only
             says which cells there are.
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
-        jobs: how many at once; -1 takes all cores.
+        jobs: how many at once; with loky -1 takes all cores.
         on_done: progress.
 
     Returns:
@@ -150,8 +151,8 @@ def check_workers(backend: str, jobs: int) -> None:
     """Raises `InputError` for an unknown backend or a number of jobs that makes no sense."""
     if backend not in BACKENDS:
         raise InputError(f"backend: unknown name {backend!r}, expected one of {', '.join(BACKENDS)}")
-    if jobs < 1 and jobs != -1:
-        raise InputError(f"jobs: given {jobs}, expected at least 1, or -1 for all cores")
+    if jobs < 1 and (backend, jobs) != ("loky", -1):
+        raise InputError(f"jobs: given {jobs}, expected at least 1, or with loky -1 for all cores")
 
 
 class Store:
@@ -263,14 +264,25 @@ def spread(
     Raises:
         StudyError: a worker process died.
     """
+    todo = [joblib.delayed(work)(cell) for cell in cells]
     if backend == "ray":
+        from ray.exceptions import RayError
         from ray.util.joblib import register_ray
 
         register_ray()
-    # One cell at a time, so that each is kept as soon as it is done.
+        # Through joblib, Ray gives no result before the last one, so it gets a few cells a worker at a time.
+        size = ROUND * jobs
+        rounds = [todo[start : start + size] for start in range(0, len(todo), size)]
+        for several in rounds:
+            try:
+                yield from joblib.Parallel(n_jobs=jobs, backend=backend, batch_size=1)(several)
+            except RayError as error:
+                reason = str(error).strip().splitlines()[-1]
+                raise StudyError(f"ray could not go on: {reason}; what is done is kept") from None
+        return
     parallel = joblib.Parallel(n_jobs=jobs, backend=backend, return_as="generator_unordered", batch_size=1)
     try:
-        yield from parallel(joblib.delayed(work)(cell) for cell in cells)
+        yield from parallel(todo)
     except BrokenProcessPool:
         raise StudyError(
             "a worker process died, perhaps for want of memory; what is done is kept, run again to go on"
