@@ -24,6 +24,8 @@ def make_batches(tasks: list[str], absent_share: float) -> tuple[train.Batches, 
     recording = demos.RecordingSettings(image_size=16)
     samples = Samples(
         images=rng.integers(256, size=(FRAMES, len(recording.cameras), 16, 16, 3), dtype=np.uint8),
+        now=np.arange(FRAMES),
+        later=np.arange(FRAMES),
         state=rng.standard_normal((FRAMES, 4), dtype=np.float32),
         targets=rng.standard_normal((FRAMES, 6), dtype=np.float32),
         actions=rng.uniform(0.2, 1.0, size=(FRAMES, HORIZON, 4)).astype(np.float32),
