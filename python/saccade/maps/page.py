@@ -1,0 +1,113 @@
+"""The HTML page: one file that holds all it needs; a person picks block, step, head, token and camera."""
+
+from __future__ import annotations
+
+import base64
+import io
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from saccade.maps.record import CAVEAT, MEAN, Maps
+from saccade.maps.sheet import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES
+from saccade.sim.files import write_atomically
+
+TEMPLATE = "page.html.j2"
+LEVELS = 65535  # probabilities are stored as shares of their row's largest, in 16 bits
+
+
+def write_page(maps: Maps, path: Path) -> None:
+    """Writes the page."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(render_page(maps), encoding="utf-8")
+
+
+def render_page(maps: Maps) -> str:
+    """The page as text. Nothing in it refers to another file or host."""
+    source = (resources.files("saccade.maps") / TEMPLATE).read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    # `tojson` escapes what would end the script element; token strings such as </img> are common here.
+    return environment.from_string(source).render(
+        title=maps.inputs.title, caveat=CAVEAT, notes=notes(maps), data=page_data(maps)
+    )
+
+
+def notes(maps: Maps) -> list[str]:
+    """What is not there and why."""
+    found = []
+    if not maps.num_future_tokens:
+        found.append(NO_FUTURE)
+    if not maps.inputs.layout.cameras:
+        found.append(NO_IMAGES)
+    elif not maps.inputs.images:
+        found.append("The file has no pictures: maps are drawn on white.")
+    if maps.occlusion is None:
+        found.append("Occlusion was not measured.")
+    if len(maps.selection.shown_heads) < len(maps.selection.heads):
+        found.append(
+            f"The mean is over {len(maps.selection.heads)} heads; {len(maps.selection.shown_heads)} of them "
+            "are in this page one by one (--heads chooses)."
+        )
+    return found
+
+
+def page_data(maps: Maps) -> dict[str, Any]:
+    """What the page's script works with."""
+    selection = maps.selection
+    return {
+        "checkpoint": maps.checkpoint,
+        "numFuture": maps.num_future_tokens,
+        "layout": maps.inputs.layout.to_dict(),
+        "rows": {name: [rows.start, rows.stop] for name, rows in maps.rows.items()},
+        "blocks": [{"block": block, "readsVl": maps.reads_vl(block)} for block in selection.blocks],
+        "steps": list(selection.steps),
+        "heads": [MEAN, *selection.shown_heads],
+        "maps": {
+            f"{step},{block}": _packed(_shown(maps, attention))
+            for (step, block), attention in maps.attention.items()
+        },
+        "images": {name: _data_url(picture) for name, picture in maps.inputs.images.items()},
+        "occlusion": None if maps.occlusion is None else maps.occlusion.to_dict(),
+        "summaries": [
+            {
+                key: entry[key]
+                for key in ("step", "block", "head", "group", "overlap", "shuffled", "redrawn", "per_head")
+                if key in entry
+            }
+            for entry in maps.summaries()
+        ],
+        "colours": {**GROUP_COLOURS, **KIND_COLOURS},
+    }
+
+
+def _shown(maps: Maps, attention: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """The mean over the chosen heads, then those that are shown one by one, `(1 + shown, rows, keys)`."""
+    places = [maps.selection.heads.index(head) for head in maps.selection.shown_heads]
+    return np.concatenate((attention.mean(axis=0, keepdims=True), attention[places]))
+
+
+def _packed(maps: npt.NDArray[np.float32]) -> dict[str, Any]:
+    """Each row's largest probability as float32, and all probabilities as shares of it, little-endian."""
+    largest = maps.max(axis=-1)
+    shares = maps / np.where(largest > 0, largest, 1.0)[..., None]
+    return {
+        "keys": maps.shape[-1],
+        "largest": _base64(largest.astype("<f4")),
+        "shares": _base64(np.rint(shares * LEVELS).astype("<u2")),
+    }
+
+
+def _base64(array: npt.NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def _data_url(picture: npt.NDArray[np.uint8]) -> str:
+    """The picture as a PNG inside an address."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

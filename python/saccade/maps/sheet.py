@@ -1,0 +1,490 @@
+"""The PNG sheet: one observation, all chosen blocks, means over the chosen heads and Euler steps."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, ListedColormap, Normalize
+from matplotlib.figure import Figure
+from PIL import Image
+
+from saccade.maps.layout import Camera
+from saccade.maps.record import BASELINES, CAVEAT, MEAN, Maps
+from saccade.sim.files import write_atomically
+
+Float32Array = npt.NDArray[np.float32]
+UInt8Array = npt.NDArray[np.uint8]
+
+# All lengths are in inches.
+WIDTH, MARGIN, GAP = 13.0, 0.3, 0.06
+INNER = WIDTH - 2 * MARGIN
+TITLE_HEIGHT = 0.36
+BAR_WIDTH = 0.75  # a colour bar with its numbers
+MASS_WIDTH = 2.3  # the bars that say where attention goes
+DOTS_PER_INCH = 100
+COLOUR_STEP = 6  # of 256: not to be seen, and the file of a sheet shrank from 740 to 440 kB
+
+GROUP_COLOURS = {"state": "#c46210", "future": "#10739e", "action": "#6b3fa0"}
+KIND_COLOURS = {"text": "#5b7083", "special": "#b3261e", "pad": "#c9ced3"}
+CAMERA_COLOURS = ("#1b7837", "#5aae61", "#a6dba0", "#00696b", "#3ba5a7", "#9bd5d6")
+MATRIX_COLOURS = "inferno"
+
+MAX_TOKENS_DRAWN = 32  # one by one
+MAX_NAMED_TOKENS = 60
+NO_FUTURE = "This checkpoint has no future tokens (N = 0): maps of state and action rows only."
+NO_IMAGES = "This layout has no image tokens: nothing to lay on a picture."
+
+
+def see_through(name: str, least: float, name_of_map: str) -> ListedColormap:
+    """A colour map from fully transparent to nearly opaque, for a grey picture below it."""
+    colours = colormaps[name](np.linspace(least, 1.0, 256))
+    colours[:, 3] = 0.88 * np.linspace(0.0, 1.0, 256) ** 0.8
+    return ListedColormap(colours, name=name_of_map)
+
+
+# Two colours for two questions: what is read, and what the actions depend on.
+HEAT = see_through("YlOrRd", 0.25, "saccade-attention")
+CHANGE = see_through("GnBu", 0.35, "saccade-occlusion")
+
+
+def write_sheet(maps: Maps, path: Path) -> None:
+    """Draws the sheet and writes it as a PNG."""
+    figure = Sheet(maps).draw()
+    figure.set_dpi(DOTS_PER_INCH)
+    canvas: Any = FigureCanvasAgg(figure)  # its methods are untyped
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3].astype(np.float32)
+    rounded = np.minimum(np.rint(pixels / COLOUR_STEP) * COLOUR_STEP, 255).astype(np.uint8)
+    with write_atomically(path) as temporary:
+        Image.fromarray(rounded).save(temporary, optimize=True)
+
+
+class Sheet:
+    """Draws one section under the other; what does not apply is left out, and the header says why.
+
+    Args:
+        maps: what to draw.
+    """
+
+    def __init__(self, maps: Maps) -> None:
+        self.maps = maps
+        self.cameras = maps.inputs.layout.cameras
+        self._drawn: list[tuple[Axes, tuple[float, float, float, float]]] = []
+        self._figure = Figure(figsize=(WIDTH, 1.0))
+        self._texts: list[tuple[float, float, str, dict[str, Any]]] = []
+        self._top = 0.15  # where the next section begins
+
+    def draw(self) -> Figure:
+        """The whole sheet."""
+        self.header()
+        cross, own = self.maps.cross_blocks(), self.maps.self_blocks()
+        if self.cameras:
+            self.pictures()
+        if cross and self.cameras:
+            self.camera_maps(cross)
+        if cross and self.maps.inputs.layout.tokens:
+            self.named_tokens(cross)
+        if cross and self.cameras and self.maps.num_future_tokens:
+            self.token_maps(cross[-1])
+        if cross:
+            self.matrices(cross, "vision-language tokens", across=2, height=2.7)
+        if own:
+            self.matrices(own, "rows", across=2 if len(own) <= 2 else 4, height=2.75)
+        self.numbers()
+        return self._placed(self._top + 0.1)
+
+    def _placed(self, height: float) -> Figure:
+        """Only now is the height known by which places are divided."""
+        self._figure.set_size_inches(WIDTH, height)
+        for axes, (left, top, wide, high) in self._drawn:
+            axes.set_position((left / WIDTH, 1 - (top + high) / height, wide / WIDTH, high / height))
+        for left, top, text, style in self._texts:
+            self._figure.text(left / WIDTH, 1 - top / height, text, va="top", **style)
+        return self._figure
+
+    def _axes(self, left: float, top: float, wide: float, high: float) -> Axes:
+        axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0), label=str(len(self._drawn)))
+        self._drawn.append((axes, (left, top, wide, high)))
+        return axes
+
+    def _text(self, left: float, top: float, text: str, **style: Any) -> None:
+        self._texts.append((left, top, text, style))
+
+    def _title(self, text: str, *, note: str = "") -> None:
+        """Begins a section."""
+        self._top += 0.18
+        self._text(MARGIN, self._top, text, fontsize=10.5, weight="bold")
+        self._top += 0.21
+        if note:
+            self._note(note)
+        self._top += 0.04
+
+    def _note(self, text: str, **style: Any) -> None:
+        lines = textwrap.wrap(text, 178)
+        self._text(MARGIN, self._top, "\n".join(lines), **{"fontsize": 8, "color": "#444444"} | style)
+        self._top += 0.155 * len(lines) + 0.02
+
+    def header(self) -> None:
+        """What was looked at, and the caveat."""
+        maps, selection = self.maps, self.maps.selection
+        self._text(MARGIN, self._top, maps.inputs.title, fontsize=13, weight="bold")
+        self._top += 0.3
+        self._note(
+            f"checkpoint {maps.checkpoint['name']} (sha256 {maps.checkpoint['sha256'][:12]}), N = "
+            f"{maps.num_future_tokens} future tokens, T_vl = {maps.inputs.layout.num_tokens}; means over "
+            f"heads {ranges(selection.heads)} and Euler steps {ranges(selection.steps)}"
+        )
+        if not maps.num_future_tokens:
+            self._note(NO_FUTURE, weight="bold", color="black")
+        if not self.cameras:
+            self._note(NO_IMAGES, weight="bold", color="black")
+        elif not maps.inputs.images:
+            self._note("The file has no pictures: maps are drawn on white.", weight="bold", color="black")
+        self._note(CAVEAT, fontsize=8.5, style="italic", color="#8c1d18")
+
+    def pictures(self) -> None:
+        """The pictures as they are, and beside them what taking away each patch changes."""
+        occlusion = self.maps.occlusion
+        if occlusion is None:
+            self._title("What the cameras see", note="Occlusion was not measured (--no-occlusion).")
+        else:
+            patches = "one patch" if occlusion.cell == 1 else f"{occlusion.cell} x {occlusion.cell} patches"
+            self._title(
+                "What the cameras see, and what the actions depend on",
+                note=f"Blue: mean |change of the chunk|, same noise, without {patches}; {occlusion.method}. "
+                f"For scale: another noise changes the chunk by {occlusion.other_noise:.2g}.",
+            )
+        self._top += 0.16
+        high = self._height_for(INNER - BAR_WIDTH - 0.4, 2, 2.2)
+        end = self._strip(MARGIN, high, None, 1.0, HEAT, names=True)
+        if occlusion is not None:
+            most = max(float(change.max()) for change in occlusion.change.values())
+            end = self._strip(end + 0.4, high, occlusion.change, most, CHANGE, names=True)
+            self._colour_bar(end + 0.08, high, most, CHANGE, "mean |change|")
+        self._top += high
+
+    def camera_maps(self, blocks: Sequence[int]) -> None:
+        """One line a block: each group's mean map on each camera, and where all its attention goes."""
+        self._title(
+            "Mean maps by group of rows, in the blocks that read vision and language",
+            note="Red: probability, on one scale in each block. Right: how a row's attention divides, in %.",
+        )
+        groups = len(self.maps.rows)
+        high = self._height_for(INNER - BAR_WIDTH - MASS_WIDTH - 0.45 - 0.15 * groups, groups, 1.5)
+        for block in blocks:
+            self._top += 0.22
+            mean = self.maps.mean(block)
+            shown = {
+                group: self._on_cameras(mean[rows].mean(axis=0)) for group, rows in self.maps.rows.items()
+            }
+            most = max(float(heat.max()) for heats in shown.values() for heat in heats.values())
+            end = MARGIN - 0.15
+            for group, heats in shown.items():
+                rows = self.maps.rows[group]
+                count = rows.stop - rows.start
+                label = f"block {block}: {group}" + (f" (mean of {count})" if count > 1 else "")
+                self._text(end + 0.15, self._top - 0.19, label, fontsize=8.5, color=GROUP_COLOURS[group])
+                end = self._strip(end + 0.15, high, heats, most, HEAT)
+            self._colour_bar(end + 0.08, high, most, HEAT, "probability")
+            self._masses(self._axes(WIDTH - MARGIN - MASS_WIDTH, self._top, MASS_WIDTH, high * 0.72), block)
+            self._top += high + 0.05
+
+    def _masses(self, axes: Axes, block: int) -> None:
+        """Stacked bars of a group's attention by camera and kind of token."""
+        mean, parts, groups = self.maps.mean(block), self.maps.parts(block), list(self.maps.rows)
+        colours = dict(zip((camera.name for camera in self.cameras), CAMERA_COLOURS * 9, strict=False))
+        colours |= KIND_COLOURS
+        left = np.zeros(len(groups))
+        for name, positions in parts.items():
+            wide = np.array([mean[rows][:, positions].sum(axis=1).mean() for rows in self.maps.rows.values()])
+            axes.barh(groups, wide, left=left, color=colours[name], label=name, height=0.8)
+            for row, (start, width) in enumerate(zip(left, wide, strict=True)):
+                if width > 0.09:
+                    style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7, "color": "white"}
+                    axes.text(start + width / 2, row, f"{100 * width:.0f}", **style)
+            left += wide
+        axes.set_xlim(0, 1)
+        axes.invert_yaxis()
+        axes.set_xticks([])
+        axes.tick_params(labelsize=7.5, length=0)
+        axes.spines[:].set_visible(False)
+        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.45, 0.02)}
+        axes.legend(ncols=3, fontsize=7, frameon=False, handlelength=0.8, columnspacing=0.9, **place)
+
+    def named_tokens(self, blocks: Sequence[int]) -> None:
+        """Probability on each token that is no patch, by block and group."""
+        tokens: Sequence[Any] = self.maps.inputs.layout.tokens
+        lines = [(block, group) for block in blocks for group in self.maps.rows]
+        positions = [token.position for token in tokens]
+        values = np.array(
+            [self.maps.mean(block)[self.maps.rows[group]].mean(axis=0)[positions] for block, group in lines]
+        )
+        left_out = ""
+        if len(tokens) > MAX_NAMED_TOKENS:
+            kept = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:MAX_NAMED_TOKENS])
+            left_out = f"; the {MAX_NAMED_TOKENS} of {len(tokens)} that are read most"
+            values, tokens = values[:, kept], [tokens[index] for index in kept]
+        self._title(
+            f"Words, special tokens (red) and padding (grey): attention in %{left_out}",
+            note="An even share would be "
+            f"{100 / self.maps.inputs.layout.num_tokens:.2g} %. Special tokens often take attention that has "
+            "no better place to go (sinks).",
+        )
+        wide, high = INNER - 1.1, 0.19 * len(lines)
+        axes = self._axes(MARGIN + 1.1, self._top, min(wide, 0.95 * len(tokens)), high)
+        axes.imshow(values, aspect="auto", cmap="Greys", vmin=0, vmax=values.max() * 1.3)
+        axes.set_yticks(
+            range(len(lines)), [f"block {block}: {group}" for block, group in lines], fontsize=7.5
+        )
+        for label, (_, group) in zip(axes.get_yticklabels(), lines, strict=True):
+            label.set_color(GROUP_COLOURS[group])
+        upright = len(tokens) > 16
+        names = [token.name for token in tokens]
+        axes.set_xticks(range(len(tokens)), names, fontsize=8, rotation=90 if upright else 0)
+        for label, token in zip(axes.get_xticklabels(), tokens, strict=True):
+            label.set_color({"special": KIND_COLOURS["special"], "pad": "#888888"}.get(token.kind, "black"))
+        if len(tokens) <= 24:
+            for (row, column), value in np.ndenumerate(values):
+                colour = "white" if value > 0.7 * values.max() else "black"
+                style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5, "color": colour}
+                axes.text(column, row, f"{100 * value:.1f}", **style)
+        axes.tick_params(length=0)
+        longest = max(len(name) for name in names)
+        self._top += high + (0.1 + 0.085 * min(longest, 24) if upright else 0.25)
+
+    def token_maps(self, block: int) -> None:
+        """Every future token's own map on all cameras, on one scale."""
+        mean = self.maps.mean(block)[self.maps.rows["future"]][:MAX_TOKENS_DRAWN]
+        shown = [self._on_cameras(one) for one in mean]
+        most = max(float(heat.max()) for heats in shown for heat in heats.values())
+        first = "" if len(mean) == self.maps.num_future_tokens else f", the first {len(mean)}"
+        self._title(
+            f"Future tokens one by one{first}: block {block}",
+            note=f"Cameras {', '.join(camera.name for camera in self.cameras)}. One scale, up to probability "
+            f"{most:.2g}.",
+        )
+        across = {1: 16, 2: 8, 3: 8}.get(len(self.cameras), 4)
+        apart = 0.1
+        high = self._height_for((INNER - apart * (across - 1)) / across, 1, 2.0)
+        pitch = (INNER + apart) / across
+        for place, heats in enumerate(shown):
+            column = place % across
+            if column == 0:
+                self._top += 0.17 + (high if place else 0.0)
+            left = MARGIN + pitch * column
+            self._text(left, self._top - 0.14, str(place), fontsize=7.5, color=GROUP_COLOURS["future"])
+            self._strip(left, high, heats, most, HEAT, gap=0.02)
+        self._top += high
+
+    def matrices(self, blocks: Sequence[int], what: str, *, across: int, height: float) -> None:
+        """Whole matrices: all rows over all keys."""
+        self._title(
+            f"All rows (down) over all keys (across): blocks that read the {what}",
+            note="Probability, on one scale in each block.",
+        )
+        pitch = INNER / across
+        for place, block in enumerate(blocks):
+            column = place % across
+            if column == 0:
+                self._top += 0.2 + (height + 0.3 if place else 0.0)
+            left = MARGIN + 0.25 + column * pitch
+            axes = self._axes(left, self._top, pitch - 0.95, height)
+            mean = self.maps.mean(block)
+            drawn = axes.imshow(mean, aspect="auto", cmap=MATRIX_COLOURS, vmin=0, interpolation="nearest")
+            axes.set_title(f"block {block}", fontsize=9, pad=3)
+            keys = self._runs() if self.maps.reads_vl(block) else list(self.maps.rows.items())
+            _borders(axes, list(self.maps.rows.items()), down=True)
+            _borders(axes, keys, down=False)
+            bar = self._axes(left + pitch - 0.9, self._top, 0.1, height)
+            self._figure.colorbar(drawn, cax=bar)
+            bar.tick_params(labelsize=6.5)
+        self._top += height + 0.25
+
+    def _runs(self) -> list[tuple[str, slice]]:
+        """Cameras, and runs of other tokens, by what stands under them in a matrix."""
+        runs = [(camera.name, camera.positions) for camera in self.cameras]
+        start: int | None = None
+        positions = {token.position for token in self.maps.inputs.layout.tokens}
+        for position in range(self.maps.inputs.layout.num_tokens + 1):
+            if position in positions:
+                start = position if start is None else start
+            elif start is not None:
+                runs.append(("other" if position - start > 4 else "", slice(start, position)))
+                start = None
+        return runs
+
+    def numbers(self) -> None:
+        """Entropy and overlap by block, with what identical, random and unrelated tokens would give."""
+        maps = self.maps
+        summaries = [entry for entry in maps.summaries() if entry["head"] == MEAN]
+        blocks = maps.selection.blocks
+        several = maps.num_future_tokens > 1
+        notes = [f"{name}: {meaning}." for name, meaning in BASELINES.items()] if several else []
+        self._title(
+            f"Do the rows look at different places? Means over Euler steps {ranges(maps.selection.steps)}",
+            note=" ".join(notes),
+        )
+        self._top += 0.22
+        wide, high = (INNER - 1.2) / 3, 2.2
+        panels = [
+            self._axes(MARGIN + 0.25 + place * (wide + 0.45), self._top, wide, high)
+            for place in range(3 if several else 1)
+        ]
+        places = list(range(len(blocks)))
+
+        def means(group: str, *keys: str) -> list[float]:
+            """By block, over the steps."""
+            values = []
+            for block in blocks:
+                found: list[Any] = [e for e in summaries if e["block"] == block and e["group"] == group]
+                for key in keys:
+                    found = [entry[key] for entry in found]
+                values.append(float(np.mean(found)))
+            return values
+
+        for group in maps.rows:
+            spread = np.exp(means(group, "per_head", "entropy"))
+            panels[0].plot(places, spread, "o-", color=GROUP_COLOURS[group], label=group, markersize=4)
+        keys = [sum(map(len, maps.parts(block).values())) for block in blocks]
+        panels[0].plot(places, keys, "_", color="#888888", markersize=14, label="all keys alike")
+        panels[0].set_title("keys that a row looks at in one head: exp(entropy)", fontsize=9)
+        panels[0].set_ylim(bottom=0)
+        future = GROUP_COLOURS["future"]
+        for axes, key, title, identical in zip(
+            panels[1:],
+            ("jensen_shannon", "distinct"),
+            (
+                "future tokens: divergence between maps (0 to 1)",
+                f"future tokens: distinct maps (1 to {maps.num_future_tokens})",
+            ),
+            (0.0, 1.0),
+            strict=False,
+        ):
+            for path, style, colour, label in (
+                (("per_head", "shuffled"), "x--", "#b79500", "shuffled maps, in one head"),
+                (("per_head", "overlap"), "o-", future, "learned tokens, in one head"),
+                (("overlap",), "s:", future, "learned tokens, mean of the heads' maps"),
+                (("per_head", "redrawn"), "^--", "#8a8a8a", "redrawn tokens, in one head"),
+            ):
+                axes.plot(places, means("future", *path, key), style, color=colour, label=label, markersize=4)
+            axes.axhline(identical, color="black", linewidth=0.7, label="identical tokens")
+            axes.set_title(title, fontsize=9)
+        for axes in panels:
+            labels = [f"{block}\n{'vl' if maps.reads_vl(block) else 'rows'}" for block in blocks]
+            axes.set_xticks(places, labels, fontsize=7)
+            axes.tick_params(axis="y", labelsize=7)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.set_ylim(top=1.5 * axes.get_ylim()[1])  # room for the legend
+            axes.legend(fontsize=7, frameon=False, loc="upper right")
+        self._top += high + 0.4
+        self._note("Below the axes: the block, and what it reads.")
+
+    def _on_cameras(self, keys: Float32Array) -> dict[str, Float32Array]:
+        """A row's map `(T_vl,)` by camera, `(rows, columns)` each."""
+        return {
+            camera.name: keys[camera.positions].reshape(camera.rows, camera.columns)
+            for camera in self.cameras
+        }
+
+    def _aspect(self, camera: Camera) -> float:
+        """Width by height."""
+        picture = self.maps.inputs.images.get(camera.name)
+        return camera.columns / camera.rows if picture is None else picture.shape[1] / picture.shape[0]
+
+    def _height_for(self, wide: float, strips: int, highest: float) -> float:
+        """Of pictures, so that so many strips of all cameras fit beside each other."""
+        aspects = sum(self._aspect(camera) for camera in self.cameras)
+        gaps = GAP * (len(self.cameras) - 1) * strips
+        return min(highest, (wide - gaps) / (aspects * strips))
+
+    def _strip(
+        self,
+        left: float,
+        high: float,
+        heats: Mapping[str, Float32Array] | None,
+        most: float,
+        colours: Colormap,
+        *,
+        names: bool = False,
+        gap: float = GAP,
+    ) -> float:
+        """All cameras beside each other, with their maps; returns where it ends on the right."""
+        for camera in self.cameras:
+            wide = high * self._aspect(camera)
+            axes = self._axes(left, self._top, wide, high)
+            heat = None if heats is None else heats[camera.name]
+            _show(axes, camera, self.maps.inputs.images.get(camera.name), heat, most, colours)
+            if names:
+                self._text(left, self._top - 0.16, camera.name, fontsize=8.5)
+            left += wide + gap
+        return left - gap
+
+    def _colour_bar(self, left: float, high: float, most: float, colours: Colormap, label: str) -> None:
+        axes = self._axes(left, self._top, 0.1, high)
+        bar = self._figure.colorbar(ScalarMappable(Normalize(0, most or 1.0), colours), cax=axes)
+        bar.set_label(label, fontsize=7.5)
+        axes.tick_params(labelsize=6.5)
+
+
+def _show(
+    axes: Axes,
+    camera: Camera,
+    picture: UInt8Array | None,
+    heat: Float32Array | None,
+    most: float,
+    colours: Colormap,
+) -> None:
+    """The picture, in grey with the map on it if there is one; patches keep their edges, since nothing finer
+    is known.
+    """
+    extent = (0.0, float(camera.columns), float(camera.rows), 0.0)
+    if picture is not None and heat is None:
+        axes.imshow(picture, extent=extent)
+    elif picture is not None:
+        grey = picture.astype(np.float32).mean(axis=2) / 255.0
+        axes.imshow(grey, extent=extent, cmap="gray", vmin=-0.4, vmax=1.0)
+    if heat is not None:
+        axes.imshow(heat, extent=extent, cmap=colours, vmin=0, vmax=most or 1.0, interpolation="nearest")
+    axes.set_aspect("auto")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set_linewidth(0.4)
+
+
+def _borders(axes: Axes, runs: Sequence[tuple[str, slice]], *, down: bool) -> None:
+    """Lines between the runs, and their names in the middle."""
+    for _, run in runs:
+        if run.start:
+            draw = axes.axhline if down else axes.axvline
+            draw(run.start - 0.5, color="white", linewidth=0.7)
+    middles, names = [(run.start + run.stop - 1) / 2 for _, run in runs], [name for name, _ in runs]
+    if down:
+        axes.set_yticks(middles, names, fontsize=7, rotation=90, va="center")
+    else:
+        axes.set_xticks(middles, names, fontsize=7)
+    axes.tick_params(length=0, pad=2)
+
+
+def ranges(numbers: Sequence[int]) -> str:
+    """Sorted numbers with runs drawn together.
+
+    Example:
+        >>> ranges((0, 1, 2, 5))
+        '0-2, 5'
+    """
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
