@@ -112,7 +112,7 @@ class Run:
         intervention: Intervention | Sequence[Intervention] | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
-        record: str | Iterable[str] = (),
+        record: Iterable[str] = (),
         blocks: Sequence[int] | int | None = None,
         steps: Sequence[int] | int | None = None,
     ) -> None:
@@ -151,14 +151,13 @@ class Run:
         """What happens in this block of this Euler step."""
         place, cross = (step, block), is_cross(self.config, block)
         shown = self.kept.acts(step, block)
+        attention, hidden = shown and self.keep_attention, shown and self.keep_hidden
         return BlockChange(
             logit_bias=self.logit_bias(step, block, cross),
             stop_gradient=self.cut_keys(self.stopped, cross) if self.stopped.cut else None,
             patches=self.patches(place),
-            keep_attention=partial(self.attention.__setitem__, place)
-            if shown and self.keep_attention
-            else None,
-            keep_hidden=partial(self.hidden.__setitem__, place) if shown and self.keep_hidden else None,
+            keep_attention=partial(self.attention.__setitem__, place) if attention else None,
+            keep_hidden=partial(self.hidden.__setitem__, place) if hidden else None,
         )
 
     def logit_bias(self, step: int, block: int, cross: bool) -> Tensor | None:
@@ -168,11 +167,10 @@ class Run:
             if not edit.acts(step, block):
                 continue
             bias = self.key_bias(edit, cross).masked_fill(self.cut_keys(edit, cross), -torch.inf)
-            if not bias.any():
-                continue  # its keys are not in this block
             in_heads = bias.new_zeros(self.config.num_heads, *bias.shape)  # (heads, Q, K)
             in_heads[slice(None) if edit.heads is None else list(edit.heads)] = bias
-            biases.append(in_heads[None])  # (1, heads, Q, K)
+            if in_heads.any():  # else its keys are in the other kind of block
+                biases.append(in_heads[None])  # (1, heads, Q, K)
         return sum(biases[1:], biases[0]) if biases else None
 
     def key_bias(self, edit: Edit, cross: bool) -> Tensor:

@@ -576,7 +576,7 @@ class ActionHead(nn.Module):
         drop_vl: Tensor | np.ndarray | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
-        record: str | Iterable[str] = ("attention",),
+        record: Iterable[str] = ("attention",),
         blocks: Sequence[int] | int | None = None,
         steps: Sequence[int] | int | None = None,
     ) -> Trace[Tensor]:
