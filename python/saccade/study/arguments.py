@@ -28,15 +28,15 @@ def check_known(what: str, given: Iterable[str], known: Iterable[str]) -> None:
             raise InputError(f"{what}: unknown name {name!r}, expected one of {', '.join(known)}")
 
 
-def numbers(option: str, text: str | None, count: int) -> tuple[int, ...] | None:
-    """Distinct numbers below `count` out of a list with commas; None stays None.
+def numbers(option: str, text: str | None, count: int) -> tuple[int, ...]:
+    """Distinct numbers below `count` out of a list with commas, in order; None gives all of them.
 
     Example:
-        >>> numbers("--blocks", "3,0", 4)
-        (0, 3)
+        >>> numbers("--blocks", "3,0", 4), numbers("--blocks", None, 4)
+        ((0, 3), (0, 1, 2, 3))
     """
     if text is None:
-        return None
+        return tuple(range(count))
     try:
         found = tuple(sorted({int(word) for word in names(option, text)}))
     except ValueError:
