@@ -7,7 +7,7 @@ from saccade.environment import show_config
 from saccade.errors import CheckpointError, DtypeError, InputError, SaccadeError, ShapeError
 from saccade.head import ActionHead, Context
 from saccade.intervention import Intervention
-from saccade.trace import Trace
+from saccade.trace import Record, Trace
 
 __all__ = [
     "ActionHead",
@@ -19,6 +19,7 @@ __all__ = [
     "InputError",
     "Intervention",
     "KeyValues",
+    "Record",
     "SaccadeError",
     "ShapeError",
     "Trace",

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from saccade._arrays import ArrayLike, Float32Array, float32, int64, integer
+from saccade._arrays import ArrayLike, Float32Array, float32, indices, integer
 from saccade.errors import InputError, ShapeError
 
 #: The rows of the head in the order in which they lie, and the tokens that cross-attention blocks read.
@@ -29,7 +29,8 @@ class Intervention:
     Groups of tokens are ``"state"``, ``"future"`` and ``"action"`` (the rows of the head) and ``"vl"`` (what
     cross-attention blocks read). Where a group stands, ``(group, indices)`` may stand for some of its tokens.
     Cross-attention blocks have the keys ``vl``, self-attention blocks those of the three others; a cut or
-    bias acts where its keys are. All batch elements and samples are treated alike.
+    bias acts where its keys are. All batch elements and samples are treated alike. Keys of a mapping must be
+    hashable: ``("future", (0, 1))``.
 
     Several interventions given in a sequence act together: biases add up, of two patches of one row the later
     one counts, and at most one replaces the future tokens.
@@ -84,7 +85,7 @@ class Intervention:
         keep("patch", _patches(self.patch))
         keep("future_tokens", _future_tokens(self.future_tokens))
         for name in ("blocks", "steps", "heads"):
-            keep(name, _indices(name, getattr(self, name)))
+            keep(name, indices(name, getattr(self, name)))
 
 
 def as_interventions(given: Intervention | Sequence[Intervention] | None) -> tuple[Intervention, ...]:
@@ -186,25 +187,9 @@ def _finite(name: str, values: Float32Array) -> Float32Array:
 
 
 def _chosen(name: str, tokens: Any) -> Chosen:
-    group, indices = tokens if isinstance(tokens, tuple) and len(tokens) == 2 else (tokens, None)
+    group, chosen = tokens if isinstance(tokens, tuple) and len(tokens) == 2 else (tokens, None)
     if not isinstance(group, str) or group not in GROUPS:
         raise InputError(
             f"{name}: expected a group ({', '.join(GROUPS)}) or (group, indices), got {tokens!r}"
         )
-    return group, _indices(f"{name}: {group}", indices)
-
-
-def _indices(name: str, value: Any) -> tuple[int, ...] | None:
-    """Distinct indices in the order given, which is that of their biases and rows; None stays None."""
-    if value is None:
-        return None
-    if isinstance(value, (range, set, frozenset)):
-        value = sorted(value)
-    if isinstance(value, Sequence) and len(value) == 0:
-        return ()
-    found = [int(index) for index in np.atleast_1d(int64(name, value)).ravel()]
-    if min(found, default=0) < 0:
-        raise InputError(f"{name}: expected indices of at least 0, got {min(found)}")
-    if len(set(found)) != len(found):
-        raise InputError(f"{name}: expected distinct indices, got some twice")
-    return tuple(found)
+    return group, indices(f"{name}: {group}", chosen)

@@ -16,6 +16,7 @@ COMMANDS: dict[str, str] = {
     "rollout": "drive the simulated robot with a policy and report how often it succeeds",
     "demos": "record demonstrations of the tasks with scripted experts",
     "train": "train the policy on recorded demonstrations",
+    "attention": "show what the rows of the action head look at",
     "study": "measure what the future tokens do, in closed loop and inside the head",
     "parity": "compare the Rust head with the reference in torch",
 }
