@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -13,12 +14,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from saccade import CheckpointError, InputError, ShapeError
+from saccade import CheckpointError, InputError, Intervention, ShapeError
 from saccade.sim import learner
 from saccade.sim.backbone import Backbone, BackboneConfig
 from saccade.sim.instructions import Tokenizer, build_vocabulary
-from saccade.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
-from saccade.sim.rollout import environment_for
+from saccade.sim.policy import DEMO_CHECKPOINT, Interventions, Policy, check_trained_on
+from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.settings import PolicyConfig, Statistics
 
 CONFIGS = [
@@ -81,6 +82,99 @@ def test_both_engines_agree_along_a_trajectory(demo: Policy) -> None:
             np.testing.assert_allclose(chunk.actions, other.act(observation, noise=noise).actions, atol=1e-4)
             for action in chunk.actions[: demo.config.execute_steps]:
                 environment.advance(action)
+
+
+INTERVENTIONS: dict[str, Interventions] = {
+    "cut": Intervention(cut=[("action", "future"), ("state", "future")]),
+    "bias": Intervention(key_bias={("vl", range(30)): -1.5, ("future", (0, 3)): 2.0}, heads=[1, 2]),
+    "tokens": Intervention(future_tokens=np.zeros((5, 128), np.float32)),
+    "two": (Intervention(cut=[("future", "vl")], steps=[0]), Intervention(key_bias={"state": 1.0})),
+}
+
+
+@pytest.mark.parametrize("name", INTERVENTIONS)
+def test_interventions_reach_both_engines(demo: Policy, name: str) -> None:
+    change = INTERVENTIONS[name]
+    other = Policy.load(engine="torch", num_threads=1)
+    rng = np.random.default_rng(3)
+    images = {
+        camera.name: rng.integers(256, size=(64, 64, 3), dtype=np.uint8) for camera in demo.config.cameras
+    }
+    observation = {"images": images, "proprio": demo.config.state.mean, "instruction": "open the drawer"}
+    noise = demo.noise(rng)
+    plain = demo.act(observation, noise=noise).actions
+    changed = demo.act(observation, noise=noise, intervention=change).actions
+    expected = other.act(observation, noise=noise, intervention=change).actions
+    np.testing.assert_allclose(changed, expected, atol=1e-4)
+    assert np.abs(changed - plain).max() > 1e-3
+    # The same by hand, from the parts that studies use.
+    context = demo.engine.encode(demo.features(observation))
+    normalised = demo.engine.sample(context, demo.state(observation), noise, change)[0]
+    np.testing.assert_array_equal(np.clip(demo.config.action.restore(normalised), -1, 1), changed)
+
+
+def test_an_intervention_that_does_not_fit_is_refused(demo: Policy) -> None:
+    images = {camera.name: np.zeros((64, 64, 3), np.uint8) for camera in demo.config.cameras}
+    observation = {"images": images, "proprio": np.zeros(4), "instruction": ""}
+    noise = demo.noise(np.random.default_rng(0))
+    for policy in (demo, Policy.load(engine="torch", num_threads=1)):
+        with pytest.raises(InputError, match="block"):
+            policy.act(
+                observation, noise=noise, intervention=Intervention(cut=[("action", "vl")], blocks=[4])
+            )
+
+
+def test_episodes_take_interventions_fixed_and_by_chunk(demo: Policy) -> None:
+    change = Intervention(cut=[("future", "vl")])
+    asked: list[tuple[int, int]] = []
+
+    def only_the_second(chunk: int, seed: int) -> Intervention | None:
+        asked.append((chunk, seed))
+        return change if chunk == 1 else None
+
+    class Remembering(Policy):
+        given: list[Any]
+
+        def act(self, observation: Any, *, noise: Any, intervention: Interventions = None) -> Any:
+            self.given.append(intervention)
+            return super().act(observation, noise=noise, intervention=intervention)
+
+    def drive(intervention: Any) -> tuple[list[Any], list[np.ndarray]]:
+        policy = Remembering(demo.config, demo.backbone, demo.engine, demo.checkpoint)
+        policy.given = []
+        hands: list[np.ndarray] = []
+        with contextlib.closing(environment_for(policy, "button-press-topdown")) as environment:
+            environment.task = dataclasses.replace(environment.task, max_steps=20)
+            episode = run_episode(
+                environment,
+                policy,
+                1,
+                intervention=intervention,
+                on_step=lambda seen, episode: hands.append(seen.privileged_state()[:4]),
+            )
+        assert episode.chunks == len(policy.given) == 3
+        return policy.given, hands
+
+    given, hands = drive(None)
+    assert set(given) == {None}
+    fixed, fixed_hands = drive(change)
+    assert set(fixed) == {change}
+    by_chunk, chunk_hands = drive(only_the_second)
+    assert asked == [(number, 1) for number in range(len(by_chunk))]
+    assert by_chunk == [change if number == 1 else None for number in range(len(by_chunk))]
+    # Nothing but the second chunk was changed: the hand moves the same until then, and not after.
+    first = demo.config.execute_steps + 1
+    np.testing.assert_array_equal(chunk_hands[:first], hands[:first])
+    assert not np.array_equal(chunk_hands[first + 1], hands[first + 1])
+    assert not np.array_equal(fixed_hands[1], hands[1])
+
+
+def test_blanked_cameras_are_black_to_the_policy(demo: Policy) -> None:
+    with contextlib.closing(environment_for(demo, "reach", blanked=["left"])) as environment:
+        environment.restart(0)
+        images = environment.observe()["images"]
+    assert not images["left"].any()
+    assert all(picture.any() for name, picture in images.items() if name != "left")
 
 
 def test_shipped_checkpoint_is_small_and_has_the_released_layout(demo: Policy) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,14 @@ import threadpoolctl  # type: ignore[import-untyped]
 import saccade
 from saccade.checkpoints import read_tensors
 from saccade.errors import CheckpointError, InputError, ShapeError
+from saccade.intervention import Intervention
 from saccade.sim.backbone import Backbone, stack_images
 from saccade.sim.instructions import Tokenizer
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
 Float32Array = npt.NDArray[np.float32]
+#: One, several that act together, or none.
+Interventions: TypeAlias = Intervention | Sequence[Intervention] | None
 
 DEMO_CHECKPOINT = Path(__file__).parent / "demo"
 EMBODIMENT_ID = 0
@@ -34,8 +37,13 @@ class HeadEngine(Protocol):
     def encode(self, features: Float32Array) -> Any:
         """Runs what depends on the observation alone: `(1, T_vl, width)` to something that `sample` takes."""
 
-    def sample(self, context: Any, state: Float32Array, noise: Float32Array) -> Float32Array:
-        """`state (1, state_dim)`, `noise (1, horizon, action_dim)`; actions like the noise, normalised."""
+    def sample(
+        self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
+    ) -> Float32Array:
+        """`state (1, state_dim)`, `noise (1, horizon, action_dim)`; actions like the noise, normalised.
+
+        An `intervention` changes what the head computes on the way, see `saccade.Intervention`.
+        """
 
     def describe(self) -> dict[str, Any]:
         """What a result file should say about it."""
@@ -56,9 +64,12 @@ class RustEngine:
         """See `HeadEngine`."""
         return self._head.encode(features)
 
-    def sample(self, context: Any, state: Float32Array, noise: Float32Array) -> Float32Array:
+    def sample(
+        self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
+    ) -> Float32Array:
         """See `HeadEngine`."""
-        return np.asarray(self._head.sample(context, state, EMBODIMENT_ID, noise=noise))
+        actions = self._head.sample(context, state, EMBODIMENT_ID, noise=noise, intervention=intervention)
+        return np.asarray(actions)
 
     def describe(self) -> dict[str, Any]:
         """See `HeadEngine`."""
@@ -93,10 +104,13 @@ class TorchEngine:
         with self._torch.no_grad():
             return self._head.encode(features)
 
-    def sample(self, context: Any, state: Float32Array, noise: Float32Array) -> Float32Array:
+    def sample(
+        self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
+    ) -> Float32Array:
         """See `HeadEngine`."""
         with self._torch.no_grad():
-            return np.asarray(self._head.sample(context, state, EMBODIMENT_ID, noise=noise).numpy())
+            actions = self._head.sample(context, state, EMBODIMENT_ID, noise=noise, intervention=intervention)
+            return np.asarray(actions.numpy())
 
     def describe(self) -> dict[str, Any]:
         """See `HeadEngine`."""
@@ -219,19 +233,22 @@ class Policy:
             raise ShapeError(f"proprio: shape {proprio.shape}, expected ({len(self.config.state.mean)},)")
         return self.config.state.normalize(proprio)[None]
 
-    def act(self, observation: Mapping[str, Any], *, noise: Float32Array) -> Chunk:
+    def act(
+        self, observation: Mapping[str, Any], *, noise: Float32Array, intervention: Interventions = None
+    ) -> Chunk:
         """Decides on a chunk of actions.
 
         Args:
             observation: `images` by camera name `(H, W, 3)` uint8, `proprio (4,)`, `instruction`.
             noise: from `noise`.
+            intervention: what to change inside the head, see `saccade.Intervention`.
         """
         times = [time.perf_counter()]
         features = self.features(observation)
         times.append(time.perf_counter())
         context = self.engine.encode(features)
         times.append(time.perf_counter())
-        normalised = self.engine.sample(context, self.state(observation), noise)[0]
+        normalised = self.engine.sample(context, self.state(observation), noise, intervention)[0]
         times.append(time.perf_counter())
         spent = {
             part: 1e3 * (after - before)

@@ -1,13 +1,13 @@
 """Closed loop: look, decide on a chunk, carry out its first actions, look again."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import Policy
+from saccade.sim.policy import Interventions, Policy
 from saccade.sim.tasks import TASKS, find_task
 
 PARTS = ("render", "backbone", "encode", "sample")
@@ -49,6 +49,7 @@ def run_episode(
     seed: int,
     *,
     instruction_from: str | None = None,
+    intervention: Interventions | Callable[[int, int], Interventions] = None,
     on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
 ) -> Episode:
     """Runs one episode to its first success or to the task's `max_steps`.
@@ -58,6 +59,8 @@ def run_episode(
         policy: decides.
         seed: of layout, wording and noise; the noise does not depend on the engine.
         instruction_from: tell the policy this task's words (a control: it should then fail).
+        intervention: what to change inside the head at every chunk. Or what says it for each chunk, called
+            with the number of the chunk, counted from 0, and the seed.
         on_step: called after the first look and after every control step, for videos.
     """
     task = environment.task
@@ -70,7 +73,8 @@ def run_episode(
         start = time.perf_counter()
         observation = environment.observe()
         total["render"] += 1e3 * (time.perf_counter() - start)
-        chunk = policy.act(observation, noise=policy.noise(rng))
+        change = intervention(episode.chunks, seed) if callable(intervention) else intervention
+        chunk = policy.act(observation, noise=policy.noise(rng), intervention=change)
         for part, spent in chunk.milliseconds.items():
             total[part] += spent
         episode.chunks += 1
@@ -86,11 +90,14 @@ def run_episode(
     return episode
 
 
-def environment_for(policy: Policy, task: str, *, render_mode: str | None = None) -> TaskEnvironment:
-    """The task as the policy was trained to see it."""
+def environment_for(
+    policy: Policy, task: str, *, render_mode: str | None = None, blanked: Collection[str] = ()
+) -> TaskEnvironment:
+    """The task as the policy was trained to see it; pictures of the cameras named in `blanked` are black."""
     return TaskEnvironment(
         task,
         image_size=policy.config.backbone.image_size,
         cameras=policy.config.cameras,
         render_mode=render_mode,
+        blanked=blanked,
     )
