@@ -289,3 +289,49 @@ impl FeedForward {
         self.proj.nbytes() + self.out.nbytes()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_kinds_of_bias_add_up() {
+        let own = [1.0, 2.0, f32::NEG_INFINITY, 4.0]; // two sequences of two keys
+        let shared = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0]; // (heads, queries, keys)
+        let mut sum = Vec::new();
+        let rows = |bias: LogitBias<'_>| {
+            [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(head, query)| {
+                let first = head * bias.head_stride + query * bias.query_stride;
+                [bias.values[first], bias.values[first + 1]]
+            })
+        };
+        let bias = |keys, head_stride| Bias {
+            keys,
+            shared: Some(LogitBias {
+                values: &shared,
+                head_stride,
+                query_stride: 2,
+            }),
+        };
+        let mut of = |bias: Bias<'_>, sequence| rows(bias.of(sequence, [2, 2, 2], &mut sum).unwrap());
+        assert_eq!(
+            of(bias(None, 4), 1),
+            [[10.0, 20.0], [30.0, 40.0], [50.0, 60.0], [70.0, 80.0]]
+        );
+        assert_eq!(
+            of(bias(Some(&own), 4), 0),
+            [[11.0, 22.0], [31.0, 42.0], [51.0, 62.0], [71.0, 82.0]]
+        );
+        let removed = f32::NEG_INFINITY;
+        assert_eq!(
+            of(bias(Some(&own), 0), 1),
+            [[removed, 24.0], [removed, 44.0], [removed, 24.0], [removed, 44.0]]
+        );
+        let keys_only = Bias {
+            keys: Some(&own),
+            shared: None,
+        };
+        assert_eq!(of(keys_only, 0), [[1.0, 2.0]; 4]);
+        assert!(Bias::default().of(0, [2, 2, 2], &mut sum).is_none());
+    }
+}

@@ -9,11 +9,11 @@ use crate::cache::Cache;
 use crate::config::HeadConfig;
 use crate::context::Context;
 use crate::error::Result;
-use crate::intervention::Changes;
+use crate::intervention::{Changes, Groups};
 use crate::layers::{Engine, HeadTensors, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
 use crate::tables::{TIME_CHANNELS, embedding_time};
-use crate::trace::Recorded;
+use crate::trace::{Recorded, StepBlock};
 
 const BLOCK_EPS: f32 = 1e-5;
 const OUTPUT_EPS: f32 = 1e-6;
@@ -52,18 +52,19 @@ pub(crate) struct TimeModulations {
     output: Modulation,
 }
 
-/// What one forward pass is over: equally many rows for each sequence, `samples` sequences for each batch element.
-pub(crate) struct Sequences<'a> {
+/// One forward pass: what it is over, and what is changed in it.
+#[derive(Clone, Copy)]
+pub(crate) struct Pass<'a> {
     pub context: &'a Context,
+    /// Sequences for each batch element, with equally many rows.
     pub samples: usize,
-    /// One for each batch element.
-    pub times: &'a [Arc<TimeModulations>],
-    /// Which rows there are, and what interventions change at Euler step `step`.
+    /// Which rows there are, and what is changed at Euler step `step`.
     pub changes: &'a Changes<'a>,
     pub step: usize,
+    pub last: LastBlock,
 }
 
-/// In the last block only the action rows are needed (spec I4). A trace wants all of them.
+/// In the last block only the action rows are needed (spec I4). A trace shows all of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LastBlock {
     ActionRows,
@@ -74,6 +75,8 @@ pub(crate) enum LastBlock {
 pub(crate) struct DitBuffers {
     /// The residual stream, `(sequences, rows, width)`: filled by the caller.
     pub h: Vec<f32>,
+    /// One for each batch element: filled by the caller.
+    pub times: Vec<Arc<TimeModulations>>,
     action: Vec<f32>,
     y: Vec<f32>,
     y_all: Vec<f32>,
@@ -85,6 +88,7 @@ impl DitBuffers {
     pub(crate) fn new() -> Self {
         Self {
             h: Vec::new(),
+            times: Vec::new(),
             action: Vec::new(),
             y: Vec::new(),
             y_all: Vec::new(),
@@ -198,24 +202,23 @@ impl Dit {
     pub(crate) fn forward(
         &self,
         engine: Engine,
-        sequences: &Sequences<'_>,
-        last: LastBlock,
-        recorded: &mut Recorded<(usize, usize)>,
+        pass: &Pass<'_>,
+        recorded: &mut Recorded<StepBlock>,
         buffers: &mut DitBuffers,
         out: &mut Vec<f32>,
     ) {
         let (final_block, blocks) = self.blocks.split_last().expect("a config has at least one block");
         let mut h = std::mem::take(&mut buffers.h); // (sequences, rows, width)
         for (index, block) in blocks.iter().enumerate() {
-            self.block(engine, sequences, index, block, &mut h, None, recorded, buffers);
+            self.block(engine, pass, index, block, &mut h, None, recorded, buffers);
         }
         let mut action = std::mem::take(&mut buffers.action); // (sequences, action_rows, width)
-        match last {
+        match pass.last {
             LastBlock::ActionRows => {
-                gather_action_rows(sequences, self.width, &h, &mut action);
+                gather_action_rows(&pass.changes.groups, self.width, &h, &mut action);
                 self.block(
                     engine,
-                    sequences,
+                    pass,
                     blocks.len(),
                     final_block,
                     &mut action,
@@ -227,7 +230,7 @@ impl Dit {
             LastBlock::AllRows => {
                 self.block(
                     engine,
-                    sequences,
+                    pass,
                     blocks.len(),
                     final_block,
                     &mut h,
@@ -235,13 +238,13 @@ impl Dit {
                     recorded,
                     buffers,
                 );
-                gather_action_rows(sequences, self.width, &h, &mut action);
+                gather_action_rows(&pass.changes.groups, self.width, &h, &mut action);
             }
         }
         let y = sized(&mut buffers.y, action.len());
         modulated_norm(
             engine,
-            sequences.times,
+            &buffers.times,
             |time| &time.output,
             self.width,
             OUTPUT_EPS,
@@ -264,12 +267,12 @@ impl Dit {
     fn block(
         &self,
         engine: Engine,
-        sequences: &Sequences<'_>,
+        pass: &Pass<'_>,
         index: usize,
         block: &Block,
         x: &mut [f32],
         all: Option<&[f32]>,
-        recorded: &mut Recorded<(usize, usize)>,
+        recorded: &mut Recorded<StepBlock>,
         buffers: &mut DitBuffers,
     ) {
         let DitBuffers {
@@ -277,12 +280,13 @@ impl Dit {
             y_all,
             hidden,
             attention,
+            times,
             ..
         } = buffers;
         let norm = |h: &[f32], y: &mut [f32]| {
             modulated_norm(
                 engine,
-                sequences.times,
+                times,
                 |time| &time.blocks[index],
                 self.width,
                 BLOCK_EPS,
@@ -292,13 +296,13 @@ impl Dit {
         };
         let y = sized(y, x.len());
         norm(x, y);
-        let Sequences {
+        let Pass {
             context,
             samples,
             changes,
             step,
             ..
-        } = *sequences;
+        } = *pass;
         let groups = context.batch * samples;
         let first_row = changes.groups.num_rows() - x.len() / self.width / groups;
         let shared = changes.bias(step, index, first_row);
@@ -332,7 +336,7 @@ impl Dit {
             rows_mut(y, self.width),
         );
         block.feed_forward.add(engine, y, hidden, x);
-        changes.patch(step, index, first_row, samples, self.width, x);
+        changes.patch(step, index, first_row, samples, x);
         if let Some(kept) = recorded.hidden((step, index)) {
             kept.copy_from_slice(x);
         }
@@ -340,8 +344,7 @@ impl Dit {
 }
 
 /// Copies the action rows, the last of each sequence, from `h` to `action`.
-fn gather_action_rows(sequences: &Sequences<'_>, width: usize, h: &[f32], action: &mut Vec<f32>) {
-    let groups = &sequences.changes.groups;
+fn gather_action_rows(groups: &Groups, width: usize, h: &[f32], action: &mut Vec<f32>) {
     let (sequence, actions) = (groups.num_rows() * width, groups.action * width);
     let action = sized(action, h.len() / sequence * actions);
     for (from, to) in h.chunks_exact(sequence).zip(action.chunks_exact_mut(actions)) {

@@ -11,13 +11,13 @@ use crate::cache::Cache;
 use crate::checkpoint::Checkpoint;
 use crate::config::HeadConfig;
 use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
-use crate::dit::{Dit, DitBuffers, LastBlock, Sequences, TimeModulations};
+use crate::dit::{Dit, DitBuffers, LastBlock, Pass};
 use crate::error::{Error, Result, show_shape};
 use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, HeadTensors, TensorSource, sized};
 use crate::layout::HeadNames;
 use crate::tables::action_time;
-use crate::trace::{Record, Recorded, Shapes, Trace, TraceOptions};
+use crate::trace::{Record, Recorded, Shapes, StepBlock, Trace, TraceOptions};
 
 /// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
 const CACHED_BRACKETS: usize = 256;
@@ -92,23 +92,11 @@ pub struct ActionHead {
     workspaces: Mutex<Vec<Workspace>>,
 }
 
-/// One forward pass: over what, with which changes, and how much of it.
-struct Step<'a> {
-    context: &'a Context,
-    /// Sequences for each batch element.
-    samples: usize,
-    changes: &'a Changes<'a>,
-    /// The Euler step.
-    step: usize,
-    last: LastBlock,
-}
-
 /// Memory of one call, kept for the next call.
 struct Workspace {
     encode: EncodeBuffers,
     dit: DitBuffers,
     embodiment_ids: Vec<usize>,
-    times: Vec<Arc<TimeModulations>>,
     state_hidden: Vec<f32>,
     state: Vec<f32>,
     x: Vec<f32>,
@@ -125,7 +113,6 @@ impl Workspace {
             encode: EncodeBuffers::new(),
             dit: DitBuffers::new(),
             embodiment_ids: Vec::new(),
-            times: Vec::new(),
             state_hidden: Vec::new(),
             state: Vec::new(),
             x: Vec::new(),
@@ -286,20 +273,18 @@ impl ActionHead {
         let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, context.batch, sampling.num_samples)?;
         let changes = self.changes(sampling.interventions, context, num_steps)?;
+        let pass = Pass {
+            context,
+            samples,
+            changes: &changes,
+            step: 0,
+            last: LastBlock::ActionRows,
+        };
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, context.batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
-            sized(&mut workspace.x, noise.data.len()).copy_from_slice(noise.data);
             let nothing = &mut Recorded::default();
-            self.euler_steps(
-                context,
-                samples,
-                num_steps,
-                &changes,
-                LastBlock::ActionRows,
-                nothing,
-                workspace,
-            );
+            self.euler_steps(&pass, noise.data, num_steps, nothing, workspace);
             out.copy_from_slice(&workspace.x);
             Ok(())
         })
@@ -329,44 +314,32 @@ impl ActionHead {
         let samples = self.check_noise(noise, batch, None)?;
         let changes = self.changes(interventions, context, num_steps)?;
         let groups = changes.groups;
-        let shapes = |(step, block)| {
+        let shapes = |place: StepBlock| {
             let rows = groups.num_rows();
-            let keys = if config.is_cross(block) { groups.vl } else { rows };
+            let keys = if config.is_cross(place.1) { groups.vl } else { rows };
             let attention = [batch, config.num_heads, rows, keys];
-            (
-                (step, block),
-                Shapes {
-                    attention,
-                    hidden: [batch, rows, config.width],
-                },
-            )
+            let hidden = [batch, rows, config.width];
+            (place, Shapes { attention, hidden })
         };
-        let places = options
-            .places(num_steps, config.num_layers)?
-            .into_iter()
-            .map(shapes);
+        let places = options.places(num_steps, config.num_layers)?;
+        let places: Vec<_> = places.into_iter().map(shapes).collect();
+        let pass = Pass {
+            context,
+            samples,
+            changes: &changes,
+            step: 0,
+            last: LastBlock::AllRows,
+        };
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
-            let mut recorded =
-                Recorded::claim(options.record, &places.collect::<Vec<_>>(), options.max_bytes)?;
+            let mut recorded = Recorded::claim(options.record, &places, options.max_bytes)?;
             self.encode_state(state, workspace);
-            sized(&mut workspace.x, noise.data.len()).copy_from_slice(noise.data);
-            let all = LastBlock::AllRows;
-            self.euler_steps(
-                context,
-                samples,
-                num_steps,
-                &changes,
-                all,
-                &mut recorded,
-                workspace,
-            );
+            self.euler_steps(&pass, noise.data, num_steps, &mut recorded, workspace);
             let shape = [batch, config.action_horizon, config.action_dim];
-            let actions = OwnedArray::new(workspace.x.clone(), &shape);
             Ok(Trace {
                 recorded,
                 groups,
-                actions,
+                actions: OwnedArray::new(workspace.x.clone(), &shape),
             })
         })
     }
@@ -404,11 +377,10 @@ impl ActionHead {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
             sized(&mut workspace.x, actions.data.len()).copy_from_slice(actions.data);
-            workspace.times.clear();
-            workspace
-                .times
-                .extend(timesteps.iter().map(|&bucket| self.dit.time(self.engine, bucket)));
-            let step = Step {
+            let times = timesteps.iter().map(|&bucket| self.dit.time(self.engine, bucket));
+            workspace.dit.times.clear();
+            workspace.dit.times.extend(times);
+            let pass = Pass {
                 context,
                 samples: 1,
                 changes: &changes,
@@ -416,7 +388,7 @@ impl ActionHead {
                 last: LastBlock::ActionRows,
             };
             let bucket = |element: usize| timesteps[element];
-            self.step_velocity(&step, bucket, &mut Recorded::default(), workspace);
+            self.step_velocity(&pass, bucket, &mut Recorded::default(), workspace);
             out.copy_from_slice(&workspace.velocity);
             Ok(())
         })
@@ -496,33 +468,23 @@ impl ActionHead {
         Changes::new(interventions, &self.future_tokens, extent)
     }
 
-    /// Follows the velocity from `workspace.x`, the noise, to the actions, in equal steps.
-    #[allow(clippy::too_many_arguments)] // As sample and trace.
+    /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`.
     fn euler_steps(
         &self,
-        context: &Context,
-        samples: usize,
+        pass: &Pass<'_>,
+        noise: &[f32],
         num_steps: usize,
-        changes: &Changes<'_>,
-        last: LastBlock,
-        recorded: &mut Recorded<(usize, usize)>,
+        recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) {
+        sized(&mut workspace.x, noise.len()).copy_from_slice(noise);
         let dt = 1.0 / num_steps as f32;
         for step in 0..num_steps {
             let bucket = self.bucket(step, num_steps);
-            workspace.times.clear();
-            workspace
-                .times
-                .resize(context.batch, self.dit.time(self.engine, bucket));
-            let step = Step {
-                context,
-                samples,
-                changes,
-                step,
-                last,
-            };
-            self.step_velocity(&step, |_| bucket, recorded, workspace);
+            let times = &mut workspace.dit.times;
+            times.clear();
+            times.resize(pass.context.batch, self.dit.time(self.engine, bucket));
+            self.step_velocity(&Pass { step, ..*pass }, |_| bucket, recorded, workspace);
             for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
                 *x += dt * v;
             }
@@ -558,31 +520,22 @@ impl ActionHead {
     /// One forward pass over `workspace.x (batch, samples, action_horizon, encoder_action_dim)`, to `workspace.velocity`.
     fn step_velocity(
         &self,
-        step: &Step<'_>,
+        pass: &Pass<'_>,
         bucket: impl Fn(usize) -> usize,
-        recorded: &mut Recorded<(usize, usize)>,
+        recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) {
-        self.encode_actions(step.samples, bucket, workspace);
-        self.assemble_rows(step, workspace);
+        self.encode_actions(pass.samples, bucket, workspace);
+        self.assemble_rows(pass, workspace);
         let Workspace {
             dit,
             embodiment_ids,
-            times,
             output,
             decoder_hidden,
             velocity,
             ..
         } = workspace;
-        let sequences = Sequences {
-            context: step.context,
-            samples: step.samples,
-            times,
-            changes: step.changes,
-            step: step.step,
-        };
-        self.dit
-            .forward(self.engine, &sequences, step.last, recorded, dit, output);
+        self.dit.forward(self.engine, pass, recorded, dit, output);
         let [layer1, layer2] = &self.action_decoder;
         let hidden = sized(decoder_hidden, output.len());
         layer1.apply(self.engine, embodiment_ids, output, Epilogue::Relu, hidden);
@@ -651,21 +604,21 @@ impl ActionHead {
     }
 
     /// `[state, future, action]` for each sequence, to the transformer's residual stream.
-    fn assemble_rows(&self, step: &Step<'_>, workspace: &mut Workspace) {
+    fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) {
         let Workspace {
             state, encoded, dit, ..
         } = workspace;
         let width = self.config.width;
         let actions = self.config.action_horizon * width;
-        let sequence = step.changes.groups.num_rows() * width;
-        let future_tokens = step.changes.future_tokens;
+        let sequence = pass.changes.groups.num_rows() * width;
+        let future_tokens = pass.changes.future_tokens;
         let h = sized(&mut dit.h, encoded.len() / actions * sequence);
         for (index, (h, action)) in h
             .chunks_exact_mut(sequence)
             .zip(encoded.chunks_exact(actions))
             .enumerate()
         {
-            let element = index / step.samples;
+            let element = index / pass.samples;
             let (h_state, rest) = h.split_at_mut(width);
             let (h_future, h_action) = rest.split_at_mut(future_tokens.len());
             h_state.copy_from_slice(&state[element * width..(element + 1) * width]);
@@ -935,19 +888,18 @@ mod tests {
             context.batch * config.action_horizon * config.encoder_action_dim,
             2,
         );
-        workspace
-            .times
-            .resize(context.batch, head.dit.time(head.engine, bucket));
+        let times = &mut workspace.dit.times;
+        times.resize(context.batch, head.dit.time(head.engine, bucket));
         head.encode_state(&numbers(context.batch * config.state_dim, 3), &mut workspace);
         let changes = head.changes(&[], context, 1).unwrap();
-        let step = Step {
+        let pass = Pass {
             context,
             samples: 1,
             changes: &changes,
             step: 0,
             last,
         };
-        head.step_velocity(&step, |_| bucket, &mut Recorded::default(), &mut workspace);
+        head.step_velocity(&pass, |_| bucket, &mut Recorded::default(), &mut workspace);
         workspace.velocity
     }
 

@@ -28,7 +28,10 @@ pub struct TraceOptions {
     pub max_bytes: u64,
 }
 
-/// What was kept, by place: `(step, block)` of the transformer, or the block of the VL self-attention.
+/// An Euler step and a block of the transformer.
+pub type StepBlock = (usize, usize);
+
+/// What was kept, by place: [`StepBlock`], or the block of the VL self-attention.
 #[derive(Clone, Debug)]
 pub struct Recorded<Place> {
     /// The probabilities used, `(batch, heads, queries, keys)`; exactly 0 for keys that were cut or dropped.
@@ -109,8 +112,8 @@ impl<Place: Ord + Copy> Recorded<Place> {
 /// One call of [`ActionHead::trace`](crate::ActionHead::trace).
 #[derive(Clone, Debug)]
 pub struct Trace {
-    /// By step and block.
-    pub recorded: Recorded<(usize, usize)>,
+    /// What was asked for.
+    pub recorded: Recorded<StepBlock>,
     /// Which rows are which.
     pub groups: Groups,
     /// `(batch, action_horizon, action_dim)`: the bits that [`ActionHead::sample`](crate::ActionHead::sample) gives.
@@ -122,7 +125,7 @@ impl TraceOptions {
     ///
     /// # Errors
     /// [`Error::Input`] for a step or block that is not there.
-    pub(crate) fn places(&self, num_steps: usize, num_layers: usize) -> Result<Vec<(usize, usize)>> {
+    pub(crate) fn places(&self, num_steps: usize, num_layers: usize) -> Result<Vec<StepBlock>> {
         let chosen = |name, given: &Option<Vec<usize>>, count| match given {
             None => Ok((0..count).collect()),
             Some(indices) => check_indices(name, indices, count).map(|()| indices.clone()),
@@ -133,5 +136,50 @@ impl TraceOptions {
             .iter()
             .flat_map(|&step| blocks.iter().map(move |&block| (step, block)))
             .collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BOTH: Record = Record {
+        attention: true,
+        hidden: true,
+    };
+
+    #[test]
+    fn one_byte_too_much_is_refused() {
+        let places = || {
+            [0, 2].map(|block| {
+                let (attention, hidden) = ([2, 3, 4, 5], [2, 4, 7]);
+                (block, Shapes { attention, hidden })
+            })
+        };
+        let bytes = 2 * 4 * (2 * 3 * 4 * 5 + 2 * 4 * 7);
+        let recorded = Recorded::claim(BOTH, &places(), bytes).unwrap();
+        assert_eq!(recorded.attention[&2].shape, [2, 3, 4, 5]);
+        assert_eq!(recorded.hidden[&0].data.len(), 2 * 4 * 7);
+        assert_eq!(
+            Recorded::claim(BOTH, &places(), bytes - 1)
+                .unwrap_err()
+                .to_string(),
+            format!(
+                "max_bytes: what is to be recorded takes {bytes} bytes, more than the {} allowed; record less at a time",
+                bytes - 1
+            )
+        );
+        let nothing = Recorded::claim(Record::default(), &places(), 0).unwrap();
+        assert!(nothing.attention.is_empty() && nothing.hidden.is_empty());
+    }
+
+    #[test]
+    fn sizes_beyond_64_bits_are_refused() {
+        let (attention, hidden) = ([1 << 20; 4], [1 << 20; 3]);
+        let error = Recorded::claim(BOTH, &[(0, Shapes { attention, hidden })], u64::MAX).unwrap_err();
+        assert!(
+            error.to_string().contains("4835703278458516698824704 bytes")
+                || error.to_string().contains("bytes")
+        );
     }
 }
