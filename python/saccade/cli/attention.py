@@ -269,8 +269,8 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
                 table.add_row(f"{block} reads {reads}", group, *cells(found, parts))
         console.print(table)
     console.print(
-        "means over heads and Euler steps; keys: exp(entropy) of a row in one head; distinct: effective "
-        "number of distinct maps in one head",
+        "attention in %, means over heads and Euler steps; keys: exp(entropy) of a row in one head; "
+        "distinct: effective number of distinct maps in one head",
         style="dim",
         soft_wrap=True,
     )
@@ -293,4 +293,4 @@ def cells(entries: Sequence[dict[str, Any]], parts: Sequence[str]) -> list[str]:
     spread = np.exp(np.mean([entry["per_head"]["entropy"] for entry in entries]))
     overlaps = [entry["per_head"]["overlap"] for entry in entries]
     distinct = "–" if overlaps[0] is None else f"{np.mean([found['distinct'] for found in overlaps]):.2f}"
-    return [*(f"{mass:.1f} %" for mass in masses), f"{spread:.1f}", distinct]
+    return [*(f"{mass:.1f}" for mass in masses), f"{spread:.1f}", distinct]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.maps.layout import Camera, Layout
-from saccade.sim.policy import Policy
+from saccade.sim.policy import EMBODIMENT_ID, Policy
 
 Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
@@ -89,7 +89,7 @@ class BlankedPixels:
         count = len(places)
         state = np.repeat(self._policy.state(self._observation), count, axis=0)
         noise = np.repeat(self._noise, count, axis=0)
-        return np.asarray(head(features, state, np.zeros(count, np.int64), noise=noise))
+        return np.asarray(head(features, state, EMBODIMENT_ID, noise=noise))
 
     def _without(self, place: Place | None) -> Mapping[str, Any]:
         if place is None:

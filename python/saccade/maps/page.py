@@ -31,6 +31,7 @@ def render_page(maps: Maps) -> str:
     """The page as text. Nothing in it refers to another file or host."""
     source = (resources.files("saccade.maps") / TEMPLATE).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # groups keep their order
     # `tojson` escapes what would end the script element; token strings such as </img> are common here.
     return environment.from_string(source).render(
         title=maps.inputs.title, caveat=CAVEAT, notes=notes(maps), data=page_data(maps)

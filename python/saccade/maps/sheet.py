@@ -31,7 +31,7 @@ TITLE_HEIGHT = 0.36
 BAR_WIDTH = 0.75  # a colour bar with its numbers
 MASS_WIDTH = 2.3  # the bars that say where attention goes
 DOTS_PER_INCH = 100
-COLOUR_STEP = 6  # of 256: not to be seen, and the file of a sheet shrank from 740 to 440 kB
+COLOUR_STEP = 5  # of 255: not to be seen, and the file of a sheet is two thirds as large
 
 GROUP_COLOURS = {"state": "#c46210", "future": "#10739e", "action": "#6b3fa0"}
 KIND_COLOURS = {"text": "#5b7083", "special": "#b3261e", "pad": "#c9ced3"}
@@ -63,7 +63,7 @@ def write_sheet(maps: Maps, path: Path) -> None:
     canvas: Any = FigureCanvasAgg(figure)  # its methods are untyped
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3].astype(np.float32)
-    rounded = np.minimum(np.rint(pixels / COLOUR_STEP) * COLOUR_STEP, 255).astype(np.uint8)
+    rounded = (np.rint(pixels / COLOUR_STEP) * COLOUR_STEP).astype(np.uint8)
     with write_atomically(path) as temporary:
         Image.fromarray(rounded).save(temporary, optimize=True)
 
@@ -179,7 +179,7 @@ class Sheet:
             note="Red: probability, on one scale in each block. Right: how a row's attention divides, in %.",
         )
         groups = len(self.maps.rows)
-        high = self._height_for(INNER - BAR_WIDTH - MASS_WIDTH - 0.45 - 0.15 * groups, groups, 1.5)
+        high = self._height_for(INNER - BAR_WIDTH - MASS_WIDTH - 0.45 - 0.15 * groups, groups, 1.9)
         for block in blocks:
             self._top += 0.22
             mean = self.maps.mean(block)
@@ -187,13 +187,14 @@ class Sheet:
                 group: self._on_cameras(mean[rows].mean(axis=0)) for group, rows in self.maps.rows.items()
             }
             most = max(float(heat.max()) for heats in shown.values() for heat in heats.values())
-            end = MARGIN - 0.15
+            left = MARGIN
             for group, heats in shown.items():
                 rows = self.maps.rows[group]
                 count = rows.stop - rows.start
                 label = f"block {block}: {group}" + (f" (mean of {count})" if count > 1 else "")
-                self._text(end + 0.15, self._top - 0.19, label, fontsize=8.5, color=GROUP_COLOURS[group])
-                end = self._strip(end + 0.15, high, heats, most, HEAT)
+                self._text(left, self._top - 0.19, label, fontsize=8.5, color=GROUP_COLOURS[group])
+                end = self._strip(left, high, heats, most, HEAT)
+                left = max(end + 0.15, left + 2.0)  # room for the label
             self._colour_bar(end + 0.08, high, most, HEAT, "probability")
             self._masses(self._axes(WIDTH - MARGIN - MASS_WIDTH, self._top, MASS_WIDTH, high * 0.72), block)
             self._top += high + 0.05
