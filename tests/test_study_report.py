@@ -148,7 +148,7 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
     # The change of the chunk: mean of 0.10 ... 0.19 by hand.
     assert "0.1450 (" in parsed.text
 
-    assert "future rows in all blocks: the chunk follows 20.0 %" in parsed.text
+    assert "future rows in all blocks: the chunk goes 20.0 %" in parsed.text
     assert "state rows in all blocks: the chunk was not found to follow" in parsed.text
     assert "Control, all rows in all blocks: a share of 1.0000, as it must be." in parsed.text
     assert "words, future rows: not measured, the policy knows no task for it." in parsed.text

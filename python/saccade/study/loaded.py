@@ -55,15 +55,29 @@ _open: dict[tuple[str, str], TaskEnvironment] = {}
 
 
 def environment_of(checkpoint: str, task: str) -> TaskEnvironment:
-    """The task as the policy in that directory sees it. One is open at a time."""
-    if (checkpoint, task) not in _open:
-        close_environments()
-        _open[checkpoint, task] = environment_for(policy_of(checkpoint), task)
+    """The task as the policy in that directory sees it. The last two that were asked for stay open."""
+    if (checkpoint, task) in _open:
+        _open[checkpoint, task] = _open.pop((checkpoint, task))  # now the last one
+    else:
+        if len(_open) == 2:
+            _open.pop(next(iter(_open))).close()
+        environment = environment_for(policy_of(checkpoint), task)
+        _open[checkpoint, task] = environment
+        # MuJoCo sets EGL up when it first draws, and has it ended at exit; what is registered later runs
+        # before that.
+        environment.restart(0)
+        environment.observe()
+        close_at_exit()
     return _open[checkpoint, task]
 
 
-@atexit.register
 def close_environments() -> None:
-    """Frees the OpenGL contexts, which must not be left to the end of the interpreter."""
+    """Frees the OpenGL contexts."""
     while _open:
         _open.popitem()[1].close()
+
+
+@functools.cache
+def close_at_exit() -> None:
+    """Has them freed before the interpreter ends, once."""
+    atexit.register(close_environments)

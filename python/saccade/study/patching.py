@@ -266,9 +266,9 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         grids=[grid(found, provenance, kinds)],
         concluded=conclusions(table, found, provenance, kinds),
         not_shown=(
-            "Rows of later steps and blocks have also read the donor's half-made actions, so patching them "
-            "brings more than what was seen. The cleanest place is block 0 of step 0: there the future rows "
-            "depend on the vision-language tokens and the time alone (--blocks 0 --steps 0).",
+            "Rows after later blocks have also read the donor's half-made actions, so patching them brings "
+            "more than what was seen. After block 0, a cross-attention block, the future rows depend on the "
+            "vision-language tokens and the time alone.",
             "Patched rows stand among rows that they never met. A share can be below what the rows carry "
             "because later cross-attention blocks read the receiver's tokens again, and above it because "
             "the mixture is one that the head never met.",
@@ -304,12 +304,17 @@ def pictures(
     kinds: Sequence[str],
 ) -> list[Figure]:
     """Shares with all blocks patched, and for each kind of donor block by block."""
-    together = {place: share for place, (share, _, _) in found.items() if place[2] == ALL}
+    # The action rows after the last block are all that the actions are made of.
+    together = {
+        f"{kind}: {group}": found[kind, group, ALL][0]
+        for kind in kinds
+        for group in GROUPS
+        if group != "action" and (kind, group, ALL) in found
+    }
     drawn = []
     if together:
-        labels = [f"{kind}: {group}" for kind, group, _ in together]
         picture = figures.estimates(
-            labels, list(together.values()), "share of the way to the donor's chunk", reference=0.0
+            list(together), list(together.values()), "share of the way to the donor's chunk", reference=0.0
         )
         caption = "All chosen blocks and steps patched at once, by kind of donor and group of rows."
         drawn.append(Figure("together", caption, picture))
@@ -353,13 +358,18 @@ def conclusions(
     """What the intervals allow to be said."""
     lines = []
     for kind in kinds:
-        for group in GROUPS:
-            if (kind, group, ALL) not in found:
-                notes = table.loc[(table["kind"] == kind) & table["note"].notna(), "note"]
-                if len(notes):
-                    lines.append(f"{kind}, {group} rows: {not_measured(str(notes.iloc[0]))}.")
-            elif group != CONTROL:
+        for group in ("future", "state"):
+            if (kind, group, ALL) in found:
                 lines.append(f"{kind}, {group} rows in all blocks: {following(found[kind, group, ALL][0])}.")
+            else:
+                of_group = table["group"].isna() | (table["group"] == group) if "group" in table else True
+                notes = table.loc[(table["kind"] == kind) & table["note"].notna() & of_group, "note"]
+                lines += [f"{kind}, {group} rows: {not_measured(note)}." for note in notes.unique()]
+        if (kind, "future", "0") in found:
+            share = found[kind, "future", "0"][0]
+            lines.append(
+                f"{kind}, future rows after block 0, where they hold vision alone: {following(share)}."
+            )
     controls = [found[kind, CONTROL, ALL][0].value for kind in kinds if (kind, CONTROL, ALL) in found]
     controls = [value for value in controls if math.isfinite(value)]
     if controls and controls_are_exact(provenance):
@@ -381,17 +391,27 @@ def following(share: Estimate) -> str:
 
     Example:
         >>> following(Estimate(0.2, 0.1, 0.3))
-        'the chunk follows 20.0 % of the way to the donor\'s (95 % interval 10.0 to 30.0)'
+        "the chunk goes 20.0 % of the way to the donor's (95 % interval 10.0 to 30.0)"
+        >>> following(Estimate(-0.2, -0.3, -0.1))
+        "the chunk goes away from the donor's, by 20.0 % of the way (95 % interval 10.0 to 30.0)"
         >>> following(Estimate(0.01, -0.02, 0.04))
-        'the chunk was not found to follow; up to 4.0 % of the way to the donor\'s is not excluded'
+        "the chunk was not found to follow; from -2.0 to 4.0 % of the way to the donor's is not excluded"
     """
     if math.isnan(share.value):
         return "donors and receivers act alike, so there is nothing to follow"
-    if share.low > 0 or share.high < 0 or math.isnan(share.low):
-        interval = f"95 % interval {100 * share.low:.1f} to {100 * share.high:.1f}"
-        known = "no interval" if math.isnan(share.low) else interval
-        return f"the chunk follows {100 * share.value:.1f} % of the way to the donor's ({known})"
+    value, low, high = 100 * share.value, 100 * share.low, 100 * share.high
+    if math.isnan(low):
+        return f"the chunk goes {value:.1f} % of the way to the donor's (one receiver, no interval)"
+    if low > 0:
+        return (
+            f"the chunk goes {value:.1f} % of the way to the donor's (95 % interval {low:.1f} to {high:.1f})"
+        )
+    if high < 0:
+        return (
+            f"the chunk goes away from the donor's, by {-value:.1f} % of the way "
+            f"(95 % interval {-high:.1f} to {-low:.1f})"
+        )
     return (
-        f"the chunk was not found to follow; up to {100 * share.high:.1f} % of the way to the donor's is not "
+        f"the chunk was not found to follow; from {low:.1f} to {high:.1f} % of the way to the donor's is not "
         "excluded"
     )
