@@ -238,7 +238,9 @@ def test_trace_keeps_what_is_asked_for_where_it_is_asked_for() -> None:
     assert trace.hidden.keys() == {(1, 0), (1, 3)}
     assert trace.attention == {}
     assert trace.hidden[1, 3].shape == (2, 10, 12)
-    assert head.trace(**inputs, record=(), blocks=()).attention == {}
+    trace = head.trace(**inputs, blocks=range(2), steps=[0])
+    assert trace.attention.keys() == {(0, 0), (0, 1)}
+    assert head.trace(**inputs, blocks=()).attention == {}
 
 
 def test_trace_changes_nothing() -> None:

@@ -378,6 +378,12 @@ class ActionHead(nn.Module):
         >>> vl_embs = head.encode(inputs["backbone_features"])
         >>> head.sample(vl_embs, inputs["state"], 2, noise=inputs["noise"]).shape
         torch.Size([2, 16, 32])
+
+        What the action rows read of the 32 future rows in block 1 of the first Euler step:
+
+        >>> trace = head.trace(vl_embs, inputs["state"], 2, noise=inputs["noise"])
+        >>> trace.attention[0, 1][:, :, trace.rows["action"], trace.rows["future"]].shape
+        torch.Size([2, 2, 16, 32])
     """
 
     def __init__(self, config: HeadConfig, *, time_distribution: TimeDistribution | None = None) -> None:
