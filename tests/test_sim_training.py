@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from saccade import CheckpointError, InputError
+from saccade.cli import main
 from saccade.config import HeadConfig
 from saccade.sim import demos, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
@@ -421,3 +422,20 @@ def test_description_tells_recordings_apart(recording: Path, tmp_path: Path) -> 
     fewer = describe(tmp_path / "copy", TASKS)
     assert fewer["tasks"] == {"reach": 1, "button-press-topdown": 2}
     assert fewer["sha256"] != whole["sha256"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--alignment-weight", "0.2", "--num-future-tokens", "0"], "there is no row to align"),
+        (["--alignment-weight", "-1"], "--alignment-weight: given -1.0, expected 0"),
+        (["--alignment-weight", "inf"], "--alignment-weight: given inf"),
+    ],
+)
+def test_the_command_refuses_alignment_that_cannot_be(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    out = tmp_path / "out"
+    assert main(["train", "--demos", str(recording), "--out", str(out), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
