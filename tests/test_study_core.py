@@ -104,6 +104,22 @@ def test_a_killed_run_keeps_what_was_done(tmp_path: Path) -> None:
     assert left == []
 
 
+def test_a_study_in_phases_is_not_complete_before_the_last(tmp_path: Path) -> None:
+    work, totals = Square(tmp_path / "log"), []
+    for several in (cells(1), cells(1, 2)):
+        run_cells(
+            "demo",
+            several,
+            work,
+            tmp_path,
+            settings=SETTINGS,
+            expected=2,
+            on_done=lambda finished, done, total: totals.append((done, total)),
+        )
+        assert tables.read_provenance(tmp_path / "demo.json").complete == (len(several) == 2)
+    assert totals == [(1, 2), (2, 2)]
+
+
 def test_a_failing_cell_is_named_after_the_others_are_done(tmp_path: Path) -> None:
     work = Square(tmp_path / "log", fails=(1,))
     with pytest.raises(StudyError, match=r"1 of 3 cells failed: square 1: ValueError: cannot square 1"):

@@ -32,6 +32,10 @@ STUDIES: dict[str, tuple[str, str]] = {
     ),
     "probes": ("saccade.study.probes", "what linear probes read from the rows after each block"),
     "n": ("saccade.study.sweeps:N", "policies with different numbers of future tokens"),
+    "n-runtime": (
+        "saccade.study.resized",
+        "a policy's number of future tokens changed at run time, without training",
+    ),
     "tvl": ("saccade.study.sweeps:TVL", "policies with different numbers of vision-language tokens"),
     "vlsa": ("saccade.study.sweeps:VLSA", "policies with different depths of VL self-attention"),
 }

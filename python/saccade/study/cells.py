@@ -100,6 +100,7 @@ def run_cells(
     backend: str = "loky",
     jobs: int = 1,
     on_done: OnDone = silent,
+    expected: int = 0,
 ) -> pd.DataFrame:
     """Works through the cells that are not done yet; a run that was killed goes on where it was.
 
@@ -119,6 +120,8 @@ def run_cells(
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
         jobs: how many at once; with loky -1 takes all cores.
         on_done: progress.
+        expected: how many cells there will be, where later calls bring more: until then the table is not
+            complete.
 
     Returns:
         The table, as `tables.read_table` gives it.
@@ -131,13 +134,13 @@ def run_cells(
     check_workers(backend, jobs)
     if len({cell.key for cell in cells}) != len(cells):
         raise InputError(f"cells: {study} has keys that occur twice")
-    store = Store(study, out, settings, cells)
+    store = Store(study, out, settings, cells, expected)
     todo = [cell for cell in cells if cell.digest not in store.finished]
     store.write()
     marks = {"settings_sha256": digest(settings), "saccade": saccade.__version__}
     for finished in spread(Guarded(work, marks), todo, backend, jobs):
         store.add(finished)
-        on_done(finished, len(cells) - len(todo) + store.added, len(cells))
+        on_done(finished, len(cells) - len(todo) + store.added, max(len(cells), expected))
     if store.failed:
         lines = [f"{finished.cell.name}: {finished.error}" for finished in store.failed[:3]]
         more = f"; and {len(store.failed) - 3} more" if len(store.failed) > 3 else ""
@@ -159,14 +162,15 @@ class Store:
     """The files of one study.
 
     Args:
-        study, out, settings: as in `run_cells`.
-        cells: those asked for.
+        study, out, settings, cells, expected: as in `run_cells`.
 
     Raises:
         InputError: `out` holds this study with other settings.
     """
 
-    def __init__(self, study: str, out: Path, settings: Mapping[str, Any], cells: Sequence[Cell]) -> None:
+    def __init__(
+        self, study: str, out: Path, settings: Mapping[str, Any], cells: Sequence[Cell], expected: int
+    ) -> None:
         self.study = study
         self.out = out
         self.settings = plain(settings)
@@ -182,7 +186,7 @@ class Store:
             # One whose settings have changed is done anew, and must not stand beside its successor.
             if asked.get(kept.key, kept.digest) == kept.digest:
                 self.finished[kept.digest] = record
-        self.total = len({*self.finished, *(cell.digest for cell in cells)})
+        self.total = max(len({*self.finished, *asked.values()}), expected)
 
     def _check_settings(self) -> None:
         path = provenance_path(self.out, self.study)
