@@ -143,14 +143,15 @@ impl Attention {
         rows(buffer, both).split_at_col(both / 2)
     }
 
-    /// `x += out(attention(y, held keys and values))`; `y` and `x` have equally many rows for each of `kv`.
-    /// `weights`, where asked for, is `(groups, heads, queries, keys)`.
+    /// `x += out(attention(y, held keys and values))`; `y` and `x` have `samples` sequences of equally many rows for each of `kv`.
+    /// `weights`, where asked for, is `(sequences, heads, queries, keys)`; it takes one sequence for each of `kv`.
     #[allow(clippy::too_many_arguments)] // Buffers and views of one equation; a struct would only rename them.
     pub(crate) fn add_cross(
         &self,
         engine: Engine,
         y: &[f32],
         kv: &[PackedKeyValues],
+        samples: usize,
         bias: Bias<'_>,
         mut weights: Option<&mut [f32]>,
         epilogue: Epilogue,
@@ -159,10 +160,17 @@ impl Attention {
     ) {
         let width = self.width();
         self.queries(engine, y, buffers);
-        let count = buffers.q.len() / width / kv.len(); // query rows of a group
+        // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that read the same keys share one.
+        let calls = if bias.shared.is_some() { samples } else { 1 };
+        let count = buffers.q.len() / width / kv.len() / calls; // query rows of a call
         let mix = sized(&mut buffers.mix, buffers.q.len());
-        for (group, kv) in kv.iter().enumerate() {
-            let range = group * count * width..(group + 1) * count * width;
+        for (call, (group, kv)) in kv
+            .iter()
+            .enumerate()
+            .flat_map(|kv| std::iter::repeat_n(kv, calls))
+            .enumerate()
+        {
+            let range = call * count * width..(call + 1) * count * width;
             let logits = [self.num_heads, count, kv.len()];
             attention(
                 engine.threads,
@@ -170,7 +178,7 @@ impl Attention {
                 kv,
                 self.scale(),
                 bias.of(group, logits, &mut buffers.bias),
-                weights_of(&mut weights, group, logits),
+                weights_of(&mut weights, call, logits),
                 rows_mut(&mut mix[range], width),
             );
         }
@@ -178,7 +186,8 @@ impl Attention {
             .apply(engine.threads, rows(mix, width), epilogue, rows_mut(x, width));
     }
 
-    /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences; `weights` as above.
+    /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences; `weights` is
+    /// `(groups, heads, queries, keys)`.
     #[allow(clippy::too_many_arguments)] // As above.
     pub(crate) fn add_self(
         &self,
@@ -242,15 +251,15 @@ impl Attention {
     }
 }
 
-/// The probabilities of one group among those of all groups.
+/// The probabilities of one sequence among those of all.
 fn weights_of<'a>(
     all: &'a mut Option<&mut [f32]>,
-    group: usize,
+    sequence: usize,
     logits: [usize; 3],
 ) -> Option<&'a mut [f32]> {
     let size: usize = logits.iter().product();
     all.as_deref_mut()
-        .map(|all| &mut all[group * size..(group + 1) * size])
+        .map(|all| &mut all[sequence * size..(sequence + 1) * size])
 }
 
 /// `Linear(GELU_tanh(Linear(y)))`.

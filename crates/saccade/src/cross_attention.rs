@@ -183,6 +183,7 @@ impl CrossAttention {
             engine,
             y,
             &kv.packed,
+            1,
             bias,
             weights,
             Epilogue::Store,

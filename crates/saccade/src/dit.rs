@@ -312,7 +312,7 @@ impl Dit {
             let bias = Bias { keys, shared };
             block
                 .attention
-                .add_cross(engine, y, kv, bias, weights, Epilogue::Add, attention, x);
+                .add_cross(engine, y, kv, samples, bias, weights, Epilogue::Add, attention, x);
         } else {
             let bias = Bias { keys: None, shared };
             let source: &[f32] = match all {

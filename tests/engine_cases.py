@@ -1,0 +1,75 @@
+"""One head twice: random weights in the Rust head and in the torch reference in float64."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from hypothesis import strategies as st
+from reference_cases import small_config
+from safetensors.torch import save_file
+from torch import Tensor
+
+import saccade
+from saccade.reference import ActionHead as Reference
+from saccade.reference.random_weights import random_head
+
+TOLERANCE = 1e-5
+TAME = (
+    TOLERANCE / 4
+)  # weights are tame if torch's own float32 is this close; others say nothing about the engine
+
+
+@st.composite
+def configs(draw: st.DrawFn) -> dict[str, Any]:
+    """Sizes from the smallest up to a little more than a kernel's tile, odd ones among them."""
+    num_heads, vl_num_heads = draw(st.integers(1, 4)), draw(st.integers(1, 3))
+    # The table beside the action tokens is half sines and half cosines, so the width is even.
+    # A LayerNorm over two or three values can blow up rounding, so norms are a little wider than that.
+    head_dims = [6, 10, 16, 48] if num_heads % 2 else [3, 4, 7, 16, 20]
+    vl_head_dims = [7, 8, 64] if vl_num_heads == 1 else [3, 8, 17]
+    head_dim, vl_head_dim = draw(st.sampled_from(head_dims)), draw(st.sampled_from(vl_head_dims))
+    return small_config(
+        num_layers=draw(st.integers(1, 5)),
+        num_heads=num_heads,
+        head_dim=head_dim,
+        interleave=draw(st.booleans()),
+        context_dim=vl_num_heads * vl_head_dim,
+        vl_num_layers=draw(st.integers(0, 2)),
+        vl_num_heads=vl_num_heads,
+        use_vlln=draw(st.booleans()),
+        num_future_tokens=draw(st.sampled_from([0, 1, 2, 5, 32])),
+        action_horizon=draw(st.integers(1, 17)),
+        action_dim=draw(st.integers(1, 33)),
+        state_dim=draw(st.integers(1, 65)),
+        hidden_dim=draw(st.integers(1, 50)),
+        num_embodiments=draw(st.integers(1, 4)),
+        num_steps=draw(st.integers(1, 6)),
+        add_pos_embed=draw(st.booleans()),
+    )
+
+
+def save(
+    folder: Path, reference: Reference, config: dict[str, Any], dtype: torch.dtype = torch.float32
+) -> None:
+    """The reference's weights in the published layout."""
+    tensors = {f"action_head.{name}": t.to(dtype).contiguous() for name, t in reference.state_dict().items()}
+    save_file(tensors, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(config))
+
+
+def both(
+    config: dict[str, Any], seed: int, dtype: torch.dtype = torch.float32
+) -> tuple[saccade.ActionHead, Reference]:
+    """The same weights, rounded to `dtype`, in the Rust head and in the reference in float64."""
+    reference = random_head(config, seed, dtype=dtype).double()
+    with tempfile.TemporaryDirectory() as folder:
+        save(Path(folder), reference, config, dtype)
+        return saccade.ActionHead.load(folder), reference
+
+
+def arrays(inputs: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: tensor.numpy() for name, tensor in inputs.items()}
