@@ -577,8 +577,8 @@ def statement_lines(rows: Iterable[Mapping[Any, Any]]) -> list[str]:
     """A sentence for each supposition."""
     lines = []
     for row in rows:
-        known = np.isfinite(row["detectable"])
-        found = f"a difference of {100 * row['detectable']:.0f} points" if known else "no difference at all"
+        least = row.get("detectable", math.nan)
+        found = f"a difference of {100 * least:.0f} points" if np.isfinite(least) else "no difference at all"
         lines.append(f"{row['comparison']}: {found}, if {row['supposed']}")
     return lines
 
