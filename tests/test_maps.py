@@ -20,6 +20,7 @@ from PIL import Image
 from released import load_released
 from safetensors.numpy import save_file
 from safetensors.torch import save_file as save_torch_file
+from scipy.stats import spearmanr
 
 import saccade
 from saccade import Intervention
@@ -419,7 +420,7 @@ def test_random_tokens_have_the_lengths_of_the_learned_ones() -> None:
 
 def test_summaries_of_maps_made_by_hand() -> None:
     maps = one_hot_maps()
-    found = {(e["block"], e["group"], e["head"]): e for e in maps.summaries() if e["step"] == 1}
+    found = {(e["block"], e["group"], e["head"]): e for e in maps.summaries if e["step"] == 1}
     assert set(found) == {
         (block, group, head)
         for block in (0, 1)
@@ -446,6 +447,19 @@ def test_summaries_of_maps_made_by_hand() -> None:
     assert found[0, "state", "mean"]["overlap"] is None
     assert found[1, "action", 0]["reads"] == "rows"
     assert found[1, "action", 0]["mass"] == pytest.approx({"state": 1 / 6, "future": 3 / 6, "action": 2 / 6})
+
+
+def test_agreement_is_the_rank_correlation_over_patches() -> None:
+    maps = one_hot_maps()  # occlusion: 0, 1, 0, 0 and 0, 0, 0.25 of the patches at positions 1 to 7
+    keys = np.array([9, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 9], np.float32)
+    expected = spearmanr(keys[1:8], [0, 1, 0, 0, 0, 0, 0.25]).statistic
+    assert maps.agreement(keys) == pytest.approx(expected)
+    assert maps.agreement(np.square(keys)) == pytest.approx(expected)
+    assert maps.agreement(np.ones(9, np.float32)) is None
+    assert one_hot_maps(occluded=False).agreement(keys) is None
+    found = {(entry["block"], entry["group"]): entry["rank_correlation"] for entry in maps.agreements()}
+    assert list(found) == [(0, "state"), (0, "future"), (0, "action")]
+    assert found[0, "state"] is None
 
 
 # The sheet.

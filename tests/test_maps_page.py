@@ -142,6 +142,13 @@ def test_the_numbers_are_those_of_the_trace(
     assert entropy == pytest.approx(-(expected * logs).sum(), abs=1e-3)
     bars, masses = page.bars("bars"), page.bars("masses")
     if block == 0:
+        agreement = maps.agreement(expected.astype(np.float32))
+        said = (
+            "one of the two is even"
+            if agreement is None
+            else f"{agreement:.2f} (rank correlation, 7 patches)"
+        )
+        assert page.text("agreement").replace("-0.00", "0.00") == said.replace("-0.00", "0.00")
         assert bars == pytest.approx({"push": expected[0], "</img><b>": expected[8]}, abs=2e-5)
         assert masses == pytest.approx(
             {

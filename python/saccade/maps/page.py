@@ -80,7 +80,7 @@ def page_data(maps: Maps) -> dict[str, Any]:
                 for key in ("step", "block", "head", "group", "overlap", "shuffled", "redrawn", "per_head")
                 if key in entry
             }
-            for entry in maps.summaries()
+            for entry in maps.summaries
         ],
         "colours": {**GROUP_COLOURS, **KIND_COLOURS},
     }

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import rankdata
 
 import saccade
 from saccade.checkpoints import read_tensors
@@ -106,9 +108,36 @@ class Maps:
         """The block's keys by what they are: cameras and kinds of tokens, or groups of rows."""
         return self.inputs.layout.parts() if self.reads_vl(block) else self._row_parts()
 
+    def agreement(self, keys: Float32Array) -> float | None:
+        """Spearman's rank correlation over all patches between a map `(T_vl,)` and the occlusion map.
+
+        None where there is no occlusion map, or where one of the two is the same everywhere.
+        """
+        if self.occlusion is None:
+            return None
+        cameras = self.inputs.layout.cameras
+        read = np.concatenate([keys[camera.positions] for camera in cameras])
+        change = np.concatenate([self.occlusion.change[camera.name].ravel() for camera in cameras])
+        if np.ptp(read) == 0 or np.ptp(change) == 0:
+            return None
+        return float(np.corrcoef(rankdata(read), rankdata(change))[0, 1])
+
+    def agreements(self) -> list[dict[str, Any]]:
+        """`agreement` of each group's mean map over heads and Euler steps, in the blocks that read vision."""
+        return [
+            {
+                "block": block,
+                "group": group,
+                "rank_correlation": self.agreement(self.mean(block)[rows].mean(axis=0)),
+            }
+            for block in self.cross_blocks()
+            for group, rows in self.rows.items()
+        ]
+
     def _row_parts(self) -> dict[str, Indices]:
         return {name: np.arange(rows.start, rows.stop) for name, rows in self.rows.items()}
 
+    @cached_property
     def summaries(self) -> list[dict[str, Any]]:
         """One entry for each step, block, group and head, the mean map of all heads first.
 
@@ -158,7 +187,8 @@ class Maps:
             "caveat": CAVEAT,
             "baselines": BASELINES,
             "occlusion": None if self.occlusion is None else self.occlusion.to_dict(),
-            "summaries": self.summaries(),
+            "agreement": self.agreements(),
+            "summaries": self.summaries,
         }
 
 

@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 from saccade.maps.layout import Camera
@@ -176,7 +177,8 @@ class Sheet:
         """One line a block: each group's mean map on each camera, and where all its attention goes."""
         self._title(
             "Mean maps by group of rows, in the blocks that read vision and language",
-            note="Red: probability, on one scale in each block. Right: how a row's attention divides, in %.",
+            note="Red: probability, on one scale in each block. r: rank correlation with the occlusion map over "
+            "all patches. Right: how a row's attention divides, in %.",
         )
         groups = len(self.maps.rows)
         high = self._height_for(INNER - BAR_WIDTH - MASS_WIDTH - 0.45 - 0.15 * groups, groups, 1.9)
@@ -192,9 +194,11 @@ class Sheet:
                 rows = self.maps.rows[group]
                 count = rows.stop - rows.start
                 label = f"block {block}: {group}" + (f" (mean of {count})" if count > 1 else "")
+                found = self.maps.agreement(mean[rows].mean(axis=0))
+                label += "" if found is None else f", r = {found:.2f}"
                 self._text(left, self._top - 0.19, label, fontsize=8.5, color=GROUP_COLOURS[group])
                 end = self._strip(left, high, heats, most, HEAT)
-                left = max(end + 0.15, left + 2.0)  # room for the label
+                left = max(end + 0.15, left + 2.3)  # room for the label
             self._colour_bar(end + 0.08, high, most, HEAT, "probability")
             self._masses(self._axes(WIDTH - MARGIN - MASS_WIDTH, self._top, MASS_WIDTH, high * 0.72), block)
             self._top += high + 0.05
@@ -300,7 +304,7 @@ class Sheet:
             left = MARGIN + 0.25 + column * pitch
             axes = self._axes(left, self._top, pitch - 0.95, height)
             mean = self.maps.mean(block)
-            drawn = axes.imshow(mean, aspect="auto", cmap=MATRIX_COLOURS, vmin=0, interpolation="nearest")
+            drawn = axes.imshow(mean, aspect="auto", cmap=MATRIX_COLOURS, vmin=0)
             axes.set_title(f"block {block}", fontsize=9, pad=3)
             keys = self._runs() if self.maps.reads_vl(block) else list(self.maps.rows.items())
             _borders(axes, list(self.maps.rows.items()), down=True)
@@ -326,7 +330,7 @@ class Sheet:
     def numbers(self) -> None:
         """Entropy and overlap by block, with what identical, random and unrelated tokens would give."""
         maps = self.maps
-        summaries = [entry for entry in maps.summaries() if entry["head"] == MEAN]
+        summaries = [entry for entry in maps.summaries if entry["head"] == MEAN]
         blocks = maps.selection.blocks
         several = maps.num_future_tokens > 1
         notes = [f"{name}: {meaning}." for name, meaning in BASELINES.items()] if several else []
@@ -419,15 +423,20 @@ class Sheet:
         gap: float = GAP,
     ) -> float:
         """All cameras beside each other, with their maps; returns where it ends on the right."""
-        for camera in self.cameras:
-            wide = high * self._aspect(camera)
-            axes = self._axes(left, self._top, wide, high)
+        wide = [high * self._aspect(camera) for camera in self.cameras]
+        total = sum(wide) + gap * (len(wide) - 1)
+        axes = self._axes(left, self._top, total, high)  # one for all of them: axes are slow to make
+        axes.set_axis_off()
+        start = 0.0
+        for camera, width in zip(self.cameras, wide, strict=True):
             heat = None if heats is None else heats[camera.name]
-            _show(axes, camera, self.maps.inputs.images.get(camera.name), heat, most, colours)
+            extent = (start, start + width, high, 0.0)
+            _show(axes, extent, self.maps.inputs.images.get(camera.name), heat, most, colours)
             if names:
-                self._text(left, self._top - 0.16, camera.name, fontsize=8.5)
-            left += wide + gap
-        return left - gap
+                self._text(left + start, self._top - 0.16, camera.name, fontsize=8.5)
+            start += width + gap
+        axes.set(xlim=(0.0, total), ylim=(high, 0.0), aspect="auto")
+        return left + total
 
     def _colour_bar(self, left: float, high: float, most: float, colours: Colormap, label: str) -> None:
         axes = self._axes(left, self._top, 0.1, high)
@@ -438,7 +447,7 @@ class Sheet:
 
 def _show(
     axes: Axes,
-    camera: Camera,
+    extent: tuple[float, float, float, float],
     picture: UInt8Array | None,
     heat: Float32Array | None,
     most: float,
@@ -447,7 +456,6 @@ def _show(
     """The picture, in grey with the map on it if there is one; patches keep their edges, since nothing finer
     is known.
     """
-    extent = (0.0, float(camera.columns), float(camera.rows), 0.0)
     if picture is not None and heat is None:
         axes.imshow(picture, extent=extent)
     elif picture is not None:
@@ -455,10 +463,9 @@ def _show(
         axes.imshow(grey, extent=extent, cmap="gray", vmin=-0.4, vmax=1.0)
     if heat is not None:
         axes.imshow(heat, extent=extent, cmap=colours, vmin=0, vmax=most or 1.0, interpolation="nearest")
-    axes.set_aspect("auto")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_linewidth(0.4)
+    left, right, bottom, _ = extent
+    frame = Rectangle((left, 0.0), right - left, bottom, fill=False, linewidth=0.5, clip_on=False)
+    axes.add_patch(frame)
 
 
 def _borders(axes: Axes, runs: Sequence[tuple[str, slice]], *, down: bool) -> None:
