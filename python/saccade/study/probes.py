@@ -177,6 +177,13 @@ def task_means(values: FloatArray, tasks: npt.NDArray[np.int64]) -> dict[int, Fl
     return {int(task): values[tasks == task].mean(axis=0) for task in np.unique(tasks)}
 
 
+def within_tasks(values: FloatArray, tasks: npt.NDArray[np.int64]) -> float:
+    """Root of the mean squared distance from the mean of the task."""
+    means = task_means(values, tasks)
+    centre = np.stack([means[int(task)] for task in tasks])
+    return float(np.sqrt(np.square(values - centre).sum(axis=1).mean()))
+
+
 def per_episode(values: FloatArray, episodes: npt.NDArray[np.int64]) -> FloatArray:
     """Sums over the looks of each episode, in the order of the episodes' numbers."""
     _, inverse = np.unique(episodes, return_inverse=True)
@@ -219,20 +226,20 @@ def probe(frames: Frames, dimensions: int) -> list[dict[str, Any]]:
     numbers, counts = np.unique(frames.episodes, return_counts=True)
     rng = np.random.default_rng(0)
     draws = rng.multinomial(len(numbers), np.full(len(numbers), 1 / len(numbers)), size=RESAMPLES)
-    shuffled = {(name, "shuffled"): values for name, values in shuffled_targets(frames, 0).items()}
-    asked = {**{(name, "true"): values for name, values in frames.targets.items()}, **shuffled}
+    spreads = {name: within_tasks(values, frames.tasks) for name, values in frames.targets.items()}
+    moving = [name for name, spread in spreads.items() if spread >= LEAST_SPREAD]
+    if not moving:
+        return []
+    shuffled = shuffled_targets(frames, 0)
+    asked = {(name, "true"): frames.targets[name] for name in moving}
+    asked |= {(name, "shuffled"): shuffled[name] for name in moving}
     found: dict[tuple[Input, Target], tuple[float, FloatArray]] = {}
-    spread: dict[str, float] = {}
     for source, values in frames.inputs.items():
-        for target, (errors, spreads) in held_out_errors(values, asked, frames, dimensions).items():
-            if target[1] == "true":
-                spread[target[0]] = float(np.sqrt(spreads.mean()))
-            sums = (per_episode(errors, frames.episodes), per_episode(spreads, frames.episodes))
+        for target, (errors, usual) in held_out_errors(values, asked, frames, dimensions).items():
+            sums = per_episode(errors, frames.episodes), per_episode(usual, frames.episodes)
             found[source, target] = explained(*sums, draws)
     rows = []
-    for name in frames.targets:
-        if spread[name] < LEAST_SPREAD:
-            continue
+    for name in moving:
         for source in frames.inputs:
             value, drawn = found[source, (name, "true")]
             estimates = {
@@ -243,7 +250,7 @@ def probe(frames: Frames, dimensions: int) -> list[dict[str, Any]]:
                 base, base_drawn = found[other, (name, "true")]
                 estimates[label] = estimate(value - base, drawn - base_drawn)
             row: dict[str, Any] = dict(zip(("rows", "block", "tokens"), source, strict=True))
-            row |= {"target": name, "spread": spread[name]}
+            row |= {"target": name, "spread": spreads[name]}
             for label, one in estimates.items():
                 row |= {label: one.value, f"{label}_low": one.low, f"{label}_high": one.high}
             rows.append({**row, "episodes": len(numbers), "frames": int(counts.sum())})
