@@ -177,8 +177,8 @@ class Sheet:
         """One line a block: each group's mean map on each camera, and where all its attention goes."""
         self._title(
             "Mean maps by group of rows, in the blocks that read vision and language",
-            note="Red: probability, on one scale in each block. r: rank correlation with the occlusion map over "
-            "all patches. Right: how a row's attention divides, in %.",
+            note="Red: probability, on one scale in each block. r: rank correlation with the occlusion map "
+            "over all patches. Right: how a row's attention divides, in %.",
         )
         groups = len(self.maps.rows)
         high = self._height_for(INNER - BAR_WIDTH - MASS_WIDTH - 0.45 - 0.15 * groups, groups, 1.9)
