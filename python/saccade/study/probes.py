@@ -105,9 +105,10 @@ def held_out_errors(
 ) -> dict[Target, tuple[FloatArray, FloatArray]]:
     """Squared errors of linear probes, each on episodes that it was not fitted to.
 
-    In each fold everything is fitted to the training episodes: inputs are standardised and reduced to their
-    first principal components, at most `dimensions`; then comes a ridge regression for each target, whose
-    penalty is the best of `PENALTIES` in a cross-validation among the training episodes.
+    In each fold everything is fitted to the training episodes. The task's mean is taken off inputs and
+    targets, so that nothing is won or lost by telling tasks apart. Inputs are then standardised and reduced
+    to their first principal components, at most `dimensions`; then comes a ridge regression for each target,
+    whose penalty is the best of `PENALTIES` in a cross-validation among the training episodes.
 
     Args:
         values: `(frames, inputs)`, what the probes read.
@@ -124,18 +125,19 @@ def held_out_errors(
     owners = np.repeat(np.arange(len(targets)), [target.shape[1] for target in targets.values()])
     splitter = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0)
     for train, test in splitter.split(values, frames.tasks, frames.episodes):
-        scaler = StandardScaler().fit(values[train])
+        inputs = values - task_means(values, frames.tasks, train)
+        wanted = asked - task_means(asked, frames.tasks, train)
+        scaler = StandardScaler().fit(inputs[train])
         reduction = PCA(min(dimensions, len(train) - 1, values.shape[1]), random_state=0)
-        known = reduction.fit_transform(scaler.transform(values[train])).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # rows that only name the task are all zeros now
+            known = reduction.fit_transform(scaler.transform(inputs[train])).astype(np.float64)
         scale = np.sqrt(np.mean(np.square(known))) or 1.0
-        new = reduction.transform(scaler.transform(values[test])).astype(np.float64) / scale
-        penalties = best_penalties(known / scale, asked[train], owners, frames.episodes[train])
-        told = Ridge(alpha=penalties[owners]).fit(known / scale, asked[train]).predict(new)
-        means = task_means(asked[train], frames.tasks[train])
-        usual = np.stack([means[int(task)] for task in frames.tasks[test]])
+        new = reduction.transform(scaler.transform(inputs[test])).astype(np.float64) / scale
+        penalties = best_penalties(known / scale, wanted[train], owners, frames.episodes[train])
+        told = Ridge(alpha=penalties[owners]).fit(known / scale, wanted[train]).predict(new)
         for owner, (errors, spreads) in enumerate(found.values()):
-            errors[test] = np.square(told - asked[test])[:, owners == owner].sum(axis=1)
-            spreads[test] = np.square(usual - asked[test])[:, owners == owner].sum(axis=1)
+            errors[test] = np.square(told - wanted[test])[:, owners == owner].sum(axis=1)
+            spreads[test] = np.square(wanted[test])[:, owners == owner].sum(axis=1)
     return found
 
 
@@ -172,16 +174,18 @@ def best_penalties(
     return best
 
 
-def task_means(values: FloatArray, tasks: npt.NDArray[np.int64]) -> dict[int, FloatArray]:
-    """The mean over each task's frames."""
-    return {int(task): values[tasks == task].mean(axis=0) for task in np.unique(tasks)}
+def task_means(values: FloatArray, tasks: npt.NDArray[np.int64], chosen: npt.NDArray[np.int64]) -> FloatArray:
+    """For every frame the mean of its task over the chosen frames, shaped like `values`."""
+    means = np.zeros_like(values)
+    for task in np.unique(tasks):
+        means[tasks == task] = values[chosen[tasks[chosen] == task]].mean(axis=0)
+    return means
 
 
 def within_tasks(values: FloatArray, tasks: npt.NDArray[np.int64]) -> float:
     """Root of the mean squared distance from the mean of the task."""
-    means = task_means(values, tasks)
-    centre = np.stack([means[int(task)] for task in tasks])
-    return float(np.sqrt(np.square(values - centre).sum(axis=1).mean()))
+    apart = values - task_means(values, tasks, np.arange(len(tasks)))
+    return float(np.sqrt(np.square(apart).sum(axis=1).mean()))
 
 
 def per_episode(values: FloatArray, episodes: npt.NDArray[np.int64]) -> FloatArray:
@@ -449,8 +453,8 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         f"{len(episodes)} episodes of {checkpoint['name']} in closed loop, {int(episodes['frames'].sum())} "
         f"looks, rows taken at Euler step {provenance.settings['step']} of {checkpoint['num_steps']}. Ridge "
         f"regressions on principal components, on episodes that they were not fitted to ({FOLDS} folds by "
-        "episode). R^2 is 1 less the squared error over that of always saying the task's mean, so what "
-        "tells tasks apart does not count. Intervals are over episodes, with the same draws for all probes.",
+        "episode). The task's mean is taken off rows and targets: R^2 is of the variance within a task. "
+        "Intervals are over episodes, with the same draws for all probes.",
         "Every probe reads the same number of components at most, whatever it reads: the mean of the "
         "tokens, or all of them side by side. Control: targets of another episode of the task, look by "
         "look; what it finds follows from the time and from the task, not from the episode.",
