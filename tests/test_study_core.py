@@ -297,6 +297,14 @@ def test_bootstrap_draws_clusters_and_not_observations() -> None:
     )
     assert (ratio.value, ratio.low, ratio.high) == (4 / 6, 0.5, 0.75)
     assert math.isnan(statistics.bootstrap([1.0, 2.0], ["a", "a"]).low)
+    # The fast way to a ratio of sums draws the same clusters as the slow one.
+    parts, wholes, clusters = numbers[:9], rng.uniform(1, 2, 9), [0, 0, 1, 2, 3, 4, 4, 4, 5]
+    slow = statistics.bootstrap(
+        np.stack([parts, wholes], axis=1), clusters, lambda rows: rows[:, 0].sum() / rows[:, 1].sum()
+    )
+    fast = statistics.bootstrap_ratio(parts, wholes, clusters)
+    assert [fast.value, fast.low, fast.high] == pytest.approx([slow.value, slow.low, slow.high], rel=1e-9)
+    assert math.isnan(statistics.bootstrap_ratio([1.0], [0.0], ["a"]).value)
     with pytest.raises(InputError, match="given 1 for 2 values"):
         statistics.bootstrap([1.0, 2.0], ["a"])
 

@@ -147,6 +147,7 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
     assert f"{ARMS['rows-blind'].label}: not measured, the checkpoint has no future tokens." in parsed.text
     # The change of the chunk: mean of 0.10 ... 0.19 by hand.
     assert "0.1450 (" in parsed.text
+    assert "actions change by 0.020 (0.020 to 0.020) on average" in parsed.text
 
     assert "future rows in all blocks: the chunk goes 20.0 %" in parsed.text
     assert "state rows in all blocks: the chunk was not found to follow" in parsed.text

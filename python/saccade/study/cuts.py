@@ -25,7 +25,7 @@ from saccade.study.report import Figure, Grid, Section, effect, not_measured, nu
 from saccade.study.statistics import (
     Estimate,
     PairedDifference,
-    bootstrap,
+    bootstrap_ratio,
     detectable_difference,
     paired_difference,
     wilson,
@@ -184,7 +184,8 @@ def arm_results(table: pd.DataFrame) -> list[ArmResult]:
             )
         change = None
         if name != BASELINE and len(measured):
-            change = bootstrap(measured["chunk_change"].to_numpy(), list(measured.index))
+            changes = measured["chunk_change"].to_numpy(dtype=float)
+            change = bootstrap_ratio(changes, np.ones_like(changes), list(measured.index))
         results.append(
             ArmResult(name, wilson(int(success.sum()), len(success)), len(success), pairs, change, note)
         )
@@ -321,8 +322,10 @@ def conclusions(
             lines.append(f"{label}: {not_measured(result.note)}.")
         elif result.name == SHUFFLED:
             lines.append(control_line(table))
-        elif result.pairs is not None:
-            lines.append(f"{label}: {effect('success', result.pairs.difference)}.")
+        elif result.pairs is not None and result.change is not None:
+            change = number(result.change, digits=3)
+            on_success = effect("success", result.pairs.difference)
+            lines.append(f"{label}: {on_success}; actions change by {change} on average.")
     if compared:
         pairs = min(result.pairs.pairs for result in compared if result.pairs)
         found = {share: detectable_difference(pairs, share) for share in (0.1, 0.25)}

@@ -25,7 +25,7 @@ from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.loaded import describe_checkpoint, environment_of, head_of, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
 from saccade.study.report import Figure, Grid, Section, not_measured, number
-from saccade.study.statistics import Estimate, bootstrap
+from saccade.study.statistics import Estimate, bootstrap_ratio
 from saccade.study.tables import Provenance
 
 STUDY = "patching"
@@ -240,15 +240,11 @@ def shares(rows: pd.DataFrame) -> tuple[Estimate, float]:
         pair weighted by the square of its way; drawn anew by receiver. And the root of the summed squared
         changes over the summed squared ways.
     """
-    columns = rows[["toward", "squared_way", "squared_change"]].to_numpy(dtype=float)
     receivers = list(zip(rows["task"], rows["seed"], strict=True))
-    share = bootstrap(columns, receivers, lambda drawn: ratio(drawn[:, 0].sum(), drawn[:, 1].sum()))
-    return share, math.sqrt(ratio(columns[:, 2].sum(), columns[:, 1].sum()))
-
-
-def ratio(part: float, whole: float) -> float:
-    """NaN where the whole is nothing: donor and receiver act alike, so there is no way to go."""
-    return float(part / whole) if whole > 0 else math.nan
+    way = rows["squared_way"].to_numpy(dtype=float)
+    share = bootstrap_ratio(rows["toward"], way, receivers)
+    size = math.sqrt(rows["squared_change"].sum() / way.sum()) if way.sum() > 0 else math.nan
+    return share, size
 
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:

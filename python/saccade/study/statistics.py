@@ -162,6 +162,8 @@ def bootstrap(
         raise InputError(
             f"clusters: given {len(names)} for {len(rows)} values, expected one for each, at least one"
         )
+    if statistic is np.mean and rows.ndim == 1:
+        return bootstrap_ratio(rows, np.ones(len(rows)), names, draws=draws, seed=seed)
     value = float(statistic(rows))
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
     if len(numbers) < 2:
@@ -173,6 +175,36 @@ def bootstrap(
     for _ in range(draws):
         chosen = rng.integers(len(members), size=len(members))
         drawn.append(float(statistic(rows[np.concatenate([members[one] for one in chosen])])))
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(value, float(low), float(high))
+
+
+def bootstrap_ratio(
+    parts: npt.ArrayLike, wholes: npt.ArrayLike, clusters: Sequence[Any], *, draws: int = 2000, seed: int = 0
+) -> Estimate:
+    """The sum of parts over the sum of wholes, with its percentile interval, drawing whole clusters.
+
+    `bootstrap` for what is made of two sums, and much faster. With wholes of 1 it is the mean. NaN where the
+    wholes add up to nothing.
+
+    Example:
+        >>> share = bootstrap_ratio([1.0, 1.0, 3.0, 3.0], [2.0, 2.0, 4.0, 4.0], ["a", "a", "b", "b"])
+        >>> round(share.value, 3), share.low, share.high
+        (0.667, 0.5, 0.75)
+    """
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(clusters))}
+    number_of = np.array([numbers[name] for name in clusters], dtype=np.int64)
+    sums = np.array(
+        [np.bincount(number_of, np.asarray(values, dtype=float), len(numbers)) for values in (parts, wholes)]
+    )
+    if sums[1].sum() <= 0:
+        return Estimate(math.nan, math.nan, math.nan)
+    value = float(sums[0].sum() / sums[1].sum())
+    if len(numbers) < 2:
+        return Estimate(value, math.nan, math.nan)
+    chosen = np.random.default_rng(seed).integers(len(numbers), size=(draws, len(numbers)))
+    part, whole = sums[:, chosen].sum(axis=2)
+    drawn = part[whole > 0] / whole[whole > 0]
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high))
 
