@@ -164,12 +164,8 @@ impl Attention {
         let calls = if bias.shared.is_some() { samples } else { 1 };
         let count = buffers.q.len() / width / kv.len() / calls; // query rows of a call
         let mix = sized(&mut buffers.mix, buffers.q.len());
-        for (call, (group, kv)) in kv
-            .iter()
-            .enumerate()
-            .flat_map(|kv| std::iter::repeat_n(kv, calls))
-            .enumerate()
-        {
+        for call in 0..kv.len() * calls {
+            let (group, kv) = (call / calls, &kv[call / calls]);
             let range = call * count * width..(call + 1) * count * width;
             let logits = [self.num_heads, count, kv.len()];
             attention(

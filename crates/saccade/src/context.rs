@@ -168,7 +168,7 @@ impl VlEncoder {
             (block, Shapes { attention, hidden })
         };
         let places: Vec<_> = (0..self.blocks.len()).map(shapes).collect();
-        Recorded::claim(record, &places, MAX_RECORDED_BYTES)
+        Recorded::claim("record", record, &places, MAX_RECORDED_BYTES)
     }
 
     /// The tokens that the cross-attention blocks see, and their keys and values in each of `cross` blocks.

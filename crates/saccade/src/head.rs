@@ -332,7 +332,7 @@ impl ActionHead {
         };
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
-            let mut recorded = Recorded::claim(options.record, &places, options.max_bytes)?;
+            let mut recorded = Recorded::claim("max_bytes", options.record, &places, options.max_bytes)?;
             self.encode_state(state, workspace);
             self.euler_steps(&pass, noise.data, num_steps, &mut recorded, workspace);
             let shape = [batch, config.action_horizon, config.action_dim];

@@ -194,7 +194,7 @@ struct PatchedRows<'a> {
     element_stride: usize,
 }
 
-/// Bytes of biases that one call may hold: hundreds of different ones at N1.5's size.
+/// Bytes of biases that one call may hold: some two hundred, each different for every head, at N1.5's size with three cameras.
 const MAX_BIAS_BYTES: u128 = 1 << 30;
 
 impl<'a> Changes<'a> {
@@ -269,16 +269,14 @@ impl<'a> Changes<'a> {
     fn sum(&self, acting: &[&Intervention], is_cross: bool, config: &HeadConfig) -> Result<DenseBias> {
         let rows = self.groups.num_rows();
         let keys = if is_cross { self.groups.vl } else { rows };
-        let heads = match acting.iter().all(|one| one.heads.is_none()) {
-            true => 1,
-            false => config.num_heads,
-        };
+        let everywhere = acting.iter().all(|one| one.heads.is_none());
+        let heads = if everywhere { 1 } else { config.num_heads };
         let held: usize = self.biases.iter().map(|bias| bias.values.len()).sum();
         let bytes = 4 * (held as u128 + heads as u128 * rows as u128 * keys as u128);
         if bytes > MAX_BIAS_BYTES {
             return Err(Error::Input(format!(
-                "intervention: cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most {MAX_BIAS_BYTES}; \
-                 limit fewer of them to heads, blocks or steps of their own"
+                "intervention: cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most \
+                 {MAX_BIAS_BYTES}; give fewer of them heads, blocks or steps of their own"
             )));
         }
         let mut bias = DenseBias {

@@ -57,11 +57,16 @@ pub(crate) struct Shapes {
 }
 
 impl<Place: Ord + Copy> Recorded<Place> {
-    /// Memory for `record` of these places.
+    /// Memory for `record` of these places. `argument` is what a caller would change to be allowed more.
     ///
     /// # Errors
     /// [`Error::Input`] if that is more than `max_bytes`, before anything is allocated, or does not fit in memory.
-    pub(crate) fn claim(record: Record, places: &[(Place, Shapes)], max_bytes: u64) -> Result<Self> {
+    pub(crate) fn claim(
+        argument: &str,
+        record: Record,
+        places: &[(Place, Shapes)],
+        max_bytes: u64,
+    ) -> Result<Self> {
         let bytes = |shape: &[usize]| 4 * shape.iter().map(|&size| size as u128).product::<u128>();
         let of_place = |shapes: &Shapes| {
             u128::from(record.attention) * bytes(&shapes.attention)
@@ -70,7 +75,7 @@ impl<Place: Ord + Copy> Recorded<Place> {
         let needed: u128 = places.iter().map(|(_, shapes)| of_place(shapes)).sum();
         if needed > u128::from(max_bytes) {
             return Err(Error::Input(format!(
-                "max_bytes: what is to be recorded takes {needed} bytes, more than the {max_bytes} allowed; record less at a time"
+                "{argument}: what is to be recorded takes {needed} bytes, expected at most {max_bytes}; record less at a time"
             )));
         }
         let claim = |shape: &[usize]| {
@@ -78,7 +83,7 @@ impl<Place: Ord + Copy> Recorded<Place> {
             let elements = shape.iter().product(); // fits: it is below needed, which is below max_bytes
             data.try_reserve_exact(elements).map_err(|_| {
                 Error::Input(format!(
-                    "max_bytes: what is to be recorded takes {needed} bytes, which do not fit in memory; record less at a time"
+                    "{argument}: what is to be recorded takes {needed} bytes, which do not fit in memory; record less at a time"
                 ))
             })?;
             data.resize(elements, 0.0);
@@ -157,31 +162,32 @@ mod tests {
             })
         };
         let bytes = 2 * 4 * (2 * 3 * 4 * 5 + 2 * 4 * 7);
-        let recorded = Recorded::claim(BOTH, &places(), bytes).unwrap();
+        let recorded = Recorded::claim("max_bytes", BOTH, &places(), bytes).unwrap();
         assert_eq!(recorded.attention[&2].shape, [2, 3, 4, 5]);
         assert_eq!(recorded.hidden[&0].data.len(), 2 * 4 * 7);
         assert_eq!(
-            Recorded::claim(BOTH, &places(), bytes - 1)
+            Recorded::claim("max_bytes", BOTH, &places(), bytes - 1)
                 .unwrap_err()
                 .to_string(),
             format!(
-                "max_bytes: what is to be recorded takes {bytes} bytes, more than the {} allowed; record less at a time",
+                "max_bytes: what is to be recorded takes {bytes} bytes, expected at most {}; record less at a time",
                 bytes - 1
             )
         );
-        let nothing = Recorded::claim(Record::default(), &places(), 0).unwrap();
+        let nothing = Recorded::claim("max_bytes", Record::default(), &places(), 0).unwrap();
         assert!(nothing.attention.is_empty() && nothing.hidden.is_empty());
     }
 
     #[test]
     fn sizes_beyond_64_bits_are_refused() {
         let (attention, hidden) = ([1 << 20; 4], [1 << 20; 3]);
-        let error = Recorded::claim(BOTH, &[(0, Shapes { attention, hidden })], u64::MAX).unwrap_err();
+        let error =
+            Recorded::claim("max_bytes", BOTH, &[(0, Shapes { attention, hidden })], u64::MAX).unwrap_err();
         let bytes = (1_u128 << 82) + (1 << 62);
         assert!(
             error
                 .to_string()
-                .contains(&format!("takes {bytes} bytes, more than"))
+                .contains(&format!("takes {bytes} bytes, expected at most"))
         );
     }
 }
