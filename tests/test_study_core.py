@@ -281,6 +281,15 @@ def test_paired_difference_needs_pairs() -> None:
         statistics.paired_difference([], [])
 
 
+def test_holm_by_hand() -> None:
+    """The first ten p values of Benjamini and Hochberg (1995)."""
+    given = [0.0001, 0.0004, 0.0019, 0.0095, 0.0201, 0.0278, 0.0298, 0.0344, 0.0459, 0.3240]
+    expected = [0.001, 0.0036, 0.0152, 0.0665, 0.1206, 0.139, 0.139, 0.139, 0.139, 0.324]
+    assert statistics.holm(given) == pytest.approx(expected)
+    assert statistics.holm(given[::-1]) == pytest.approx(expected[::-1])
+    assert statistics.holm([]) == []
+
+
 def test_bootstrap_draws_clusters_and_not_observations() -> None:
     """Forty copies of each of ten numbers are ten observations, whose mean has a known error."""
     rng = np.random.default_rng(0)

@@ -166,6 +166,20 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
         assert line.count("|") - 2 * line.count("\\|") in (len(line.split(" | ")) + 1,)
 
 
+def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_path: Path) -> None:
+    rows: list[dict[str, Any]] = []
+    for seed in range(75):
+        rows.append(cut_row("push", seed, "none", True, 0.0))
+        rows.append(cut_row("push", seed, "future-blind", seed >= 6, 0.1))
+        rows += [cut_row("push", seed, arm, True, 0.1) for arm in ("future-alone", "future-zeroed")]
+    write_study(tmp_path, "cuts", rows, {"engine": "rust"})
+    section = cuts.section(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
+    line = next(line for line in section.concluded if line.startswith(ARMS["future-blind"].label))
+    # McNemar: 2 / 2**6 = 0.031; of three arms, 0.094.
+    assert "lower by 8.0 points" in line
+    assert "but p = 0.094 when corrected for the arms compared (Holm): no finding by itself" in line
+
+
 def test_report_is_made_from_the_tables_alone_and_always_alike(tmp_path: Path) -> None:
     write_cuts(tmp_path)
     files = ["report.html", "report.md", "figures/cuts-success.png", "figures/cuts-difference.png"]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # nothing is imported before a study is chosen. The report has its sections in this order.
 STUDIES: dict[str, tuple[str, str]] = {
     "cuts": ("saccade.study.cuts", "success in closed loop with parts of the head cut or replaced"),
-    "patching": ("saccade.study.patching", "do actions follow rows taken from another observation?"),
+    "patching": ("saccade.study.patching", "actions with rows of another observation put into the run"),
     "gradients": (
         "saccade.study.gradients",
         "how much of the actions' gradient the future rows carry",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from saccade.study.statistics import (
     PairedDifference,
     bootstrap_ratio,
     detectable_difference,
+    holm,
     paired_difference,
     wilson,
 )
@@ -156,7 +157,16 @@ def chunk_change(policy: Policy, look: Look, intervention: Intervention | None) 
 
 @dataclass(frozen=True)
 class ArmResult:
-    """What the table says of one arm; `None` or no number where it was not measured."""
+    """What the table says of one arm; `None` or no number where it was not measured.
+
+    Attributes:
+        name: Of the arm.
+        rate, episodes: Success, over so many.
+        pairs: Compared with the unchanged policy.
+        change: Of the chunk.
+        note: Why it was not measured.
+        corrected_p: McNemar's, corrected by Holm for the arms that are compared; the control is not.
+    """
 
     name: str
     rate: Estimate
@@ -164,6 +174,7 @@ class ArmResult:
     pairs: PairedDifference | None
     change: Estimate | None
     note: str | None
+    corrected_p: float | None = None
 
 
 def arm_results(table: pd.DataFrame) -> list[ArmResult]:
@@ -189,7 +200,9 @@ def arm_results(table: pd.DataFrame) -> list[ArmResult]:
         results.append(
             ArmResult(name, wilson(int(success.sum()), len(success)), len(success), pairs, change, note)
         )
-    return results
+    p_values = {one.name: one.pairs.p_value for one in results if one.pairs and one.name != SHUFFLED}
+    corrected = dict(zip(p_values, holm(list(p_values.values())), strict=True))
+    return [replace(one, corrected_p=corrected.get(one.name)) for one in results]
 
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
@@ -272,7 +285,7 @@ def arm_grid(results: Sequence[ArmResult]) -> Grid:
     for result in results:
         cells = [ARMS[result.name].label]
         if result.note is not None:
-            cells += [not_measured(result.note)] + [""] * 5
+            cells += [not_measured(result.note)] + [""] * 6
         else:
             pairs = result.pairs
             cells += [
@@ -281,6 +294,7 @@ def arm_grid(results: Sequence[ArmResult]) -> Grid:
                 "" if pairs is None else number(scaled(pairs.difference), digits=1),
                 "" if pairs is None else f"{pairs.only_second} / {pairs.only_first}",
                 "" if pairs is None else f"{pairs.p_value:.2g}",
+                "" if result.corrected_p is None else f"{result.corrected_p:.2g}",
                 "" if result.change is None else number(result.change, digits=4),
             ]
         rows.append(cells)
@@ -291,11 +305,13 @@ def arm_grid(results: Sequence[ArmResult]) -> Grid:
         "difference, points",
         "lost / won",
         "p",
+        "p corrected",
         "change of the chunk",
     )
     caption = (
         "By arm, with 95 % intervals. Lost and won: episodes in which only the unchanged policy, or only "
-        "this arm, succeeded; p: McNemar's exact test, for each arm by itself."
+        "this arm, succeeded; p: McNemar's exact test, for each arm by itself and corrected for all of them "
+        "by Holm."
     )
     return Grid(caption, columns, rows)
 
@@ -325,7 +341,7 @@ def conclusions(
         elif result.pairs is not None and result.change is not None:
             change = number(result.change, digits=3)
             on_success = effect("success", result.pairs.difference)
-            lines.append(f"{label}: {on_success}; actions change by {change} on average.")
+            lines.append(f"{label}: {on_success}{doubt(result)}; actions change by {change} on average.")
     if compared:
         pairs = min(result.pairs.pairs for result in compared if result.pairs)
         found = {share: detectable_difference(pairs, share) for share in (0.1, 0.25)}
@@ -340,6 +356,15 @@ def conclusions(
                 f"{pairs} paired episodes find, with 80 % power, a difference of {'; '.join(known)}."
             )
     return lines
+
+
+def doubt(result: ArmResult) -> str:
+    """What is to be added where an interval excludes zero and the corrected test does not."""
+    assert result.pairs is not None
+    difference, p = result.pairs.difference, result.corrected_p
+    if p is None or p < 0.05 or difference.low <= 0 <= difference.high:
+        return ""
+    return f", but p = {p:.2g} when corrected for the arms compared (Holm): no finding by itself"
 
 
 def control_line(table: pd.DataFrame) -> str:
