@@ -223,14 +223,14 @@ def test_arms_without_a_partner_are_not_compared(tmp_path: Path) -> None:
 
 def test_attention_sheets_are_put_in(tmp_path: Path) -> None:
     write_cuts(tmp_path)
-    (tmp_path / "attention").mkdir()
-    Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "attention" / "sheet.png")
-    (tmp_path / "attention" / "page.html").write_text("<p>")
+    (tmp_path / "attention" / "push").mkdir(parents=True)
+    Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "attention" / "push" / "sheet.png")
+    (tmp_path / "attention" / "push" / "page.html").write_text("<p>")
     page, markdown = write_report(tmp_path)
-    data = base64.b64encode((tmp_path / "attention" / "sheet.png").read_bytes()).decode()
+    data = base64.b64encode((tmp_path / "attention" / "push" / "sheet.png").read_bytes()).decode()
     assert f"data:image/png;base64,{data}" in parse(page).found
-    assert "attention/page.html" in parse(page).text
-    assert "(attention/sheet.png)" in markdown.read_text()
+    assert "attention/push/page.html" in parse(page).text
+    assert "(attention/push/sheet.png)" in markdown.read_text()
 
 
 def test_names_are_escaped(tmp_path: Path) -> None:

@@ -220,14 +220,18 @@ def make_part(directory: Path, name: str) -> Part:
 
 
 def attention_part(directory: Path) -> Part:
-    """What `saccade attention` left in the directory: its sheets, and links to its pages."""
-    sheets = sorted((directory / ATTENTION).glob("*.png"))
-    pages = sorted((directory / ATTENTION).glob("*.html"))
+    """What `saccade attention` left in the directory: its sheets, and where its pages are."""
+    sheets = sorted((directory / ATTENTION).rglob("*.png"))
+    pages = sorted((directory / ATTENTION).rglob("*.html"))
     drawn = []
     for sheet in sheets:
         data = "data:image/png;base64," + base64.b64encode(sheet.read_bytes()).decode("ascii")
-        drawn.append(Drawn(f"Attention maps: {sheet.stem}.", f"{ATTENTION}/{sheet.name}", data))
-    lines = [f"To pick block, step, head and token: {ATTENTION}/{page.name}." for page in pages]
+        file = sheet.relative_to(directory).as_posix()
+        drawn.append(Drawn(f"Attention maps: {file}.", file, data))
+    lines = [
+        f"To pick block, step, head and token on the image: {page.relative_to(directory).as_posix()}."
+        for page in pages
+    ]
     caveat = (
         "Attention is where a row looks, not what it takes from there or what comes of it. After VL "
         "self-attention a position is not only its patch."
