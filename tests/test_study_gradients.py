@@ -93,7 +93,7 @@ def test_random_projections_estimate_the_frobenius_norms(
 ) -> None:
     head, vl_embs, state, noise = case
     outputs = head.config.action_horizon * head.config.action_dim
-    every = torch.eye(outputs, dtype=torch.float64).unflatten(1, (head.config.action_horizon, -1))
+    every = torch.eye(outputs, dtype=torch.float64).view(outputs, head.config.action_horizon, -1)
     exact = gradients.shares(gradients.path_derivatives(head, vl_embs, state, noise, every))
     drawn = cotangents(head, 64, seed=3)
     estimated = gradients.shares(gradients.path_derivatives(head, vl_embs, state, noise, drawn))

@@ -172,7 +172,7 @@ def check_comparable(runs: Sequence[Run], sweep: Sweep) -> None:
     if problems or twice:
         varied = ", ".join(sweep.varied)
         raise InputError(
-            f"policies: expected runs that differ in {varied} and seed only. {'. '.join(problems + twice)}"
+            f"policies: expected runs that differ in {varied} and seed only. {'. '.join(problems or twice)}"
         )
 
 

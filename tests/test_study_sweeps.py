@@ -1,0 +1,320 @@
+"""The sweeps over trained policies and the study of resized ones: real runs of a few steps, known numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+import torch
+from scipy import stats
+
+from saccade import ActionHead, Context, InputError, Intervention
+from saccade.cli import main
+from saccade.sim import demos, graphics, train
+from saccade.sim.cameras import DEFAULT_CAMERAS
+from saccade.sim.policy import DEMO_CHECKPOINT, Policy
+from saccade.sim.rollout import environment_for, run_episode
+from saccade.study import resized, sweeps
+from saccade.study.loaded import learned_tokens
+from saccade.study.sweeps import PLAIN, TVL, VLSA, N
+from saccade.study.tables import read_provenance, read_table
+
+TASK = "button-press-topdown"
+TINY = train.TrainingSettings(
+    steps=2, batch_size=2, width=8, num_layers=2, num_heads=1, backbone_layers=1, patch_size=8
+)
+
+
+RUNS: dict[str, dict[str, Any]] = {
+    "n2-seed0": {"num_future_tokens": 2},
+    "n2-seed1": {"num_future_tokens": 2, "seed": 1},
+    "n4-seed0": {"num_future_tokens": 4},
+    "n4-aligned-seed0": {"num_future_tokens": 4, "alignment_weight": 0.2},
+}
+
+
+@pytest.fixture(autouse=True)
+def no_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine that runs these tests draws; test_sim_environment.py has the probe."""
+    monkeypatch.setattr(graphics, "check", lambda: None)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick() -> Iterator[None]:
+    """Training without its picture, few frames held out, and few rounds of timing."""
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "plot_history", lambda history, path: None)
+        patch.setattr(train, "VALIDATION_FRAMES", 2)
+        patch.setattr(sweeps, "ROUNDS", 3)
+        yield
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two demonstrations of one task with small pictures."""
+    out = tmp_path_factory.mktemp("demos")
+    settings = demos.RecordingSettings(image_size=16, frame_stride=12, cameras=DEFAULT_CAMERAS[:1])
+    demos.record_task(TASK, 2, out, settings, lambda: None)
+    return out
+
+
+@pytest.fixture(scope="module")
+def policies(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """N = 2 and 4, the latter also aligned; two training seeds of the first."""
+    out = tmp_path_factory.mktemp("policies")
+    for name, changes in RUNS.items():
+        settings = train.TrainingSettings(**{**vars(TINY), **changes})
+        train.train(recording, out / name, settings, lambda progress: None)
+    return out
+
+
+def study(name: str, *arguments: str) -> int:
+    return main(["study", name, *arguments])
+
+
+def shipped() -> tuple[ActionHead, Context, npt.NDArray[np.float32]]:
+    """The shipped head, and a random observation and state."""
+    head = ActionHead.load(DEMO_CHECKPOINT, num_threads=1)
+    rng = np.random.default_rng(0)
+    context = head.encode(rng.standard_normal((1, 9, head.config.context_dim), dtype=np.float32))
+    return head, context, rng.standard_normal((1, head.config.state_dim), dtype=np.float32)
+
+
+def test_a_sweep_over_trained_policies(
+    policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--policies", str(policies), "--episodes", "1", "--out", str(tmp_path)]
+    assert study("n", *arguments) == 0
+    printed = capsys.readouterr()
+    assert printed.err.startswith("What these runs can detect, with 80 % power at the 5 % level:")
+    assert "N = 4 against N = 2. These policies: no effect on success was found" in printed.out
+    table: Any = read_table(tmp_path / "n.csv")
+    provenance = read_provenance(tmp_path / "n.json")
+    assert provenance.complete
+    assert set(table["kind"]) == {"before", "training", "episode", "cost"}
+
+    history = json.loads((policies / "n4-seed0" / "history.json").read_text())
+    by_policy = table[table["kind"] == "training"].set_index("policy")
+    assert by_policy.loc["n4-seed0", "validation_loss"] == history[-1]["validation_loss"]
+    assert by_policy.loc["n4-aligned-seed0", "alignment_weight"] == 0.2
+
+    episodes = table[table["kind"] == "episode"].set_index(["policy", "arm"])
+    policy = Policy.load(policies / "n2-seed1", num_threads=1)
+    environment = environment_for(policy, TASK)
+    plain = run_episode(environment, policy, 0)
+    heavier = run_episode(environment, policy, 0, intervention=sweeps.equal_mass(2, 4))
+    environment.close()
+    for arm, episode in ((PLAIN, plain), ("mass of 4", heavier)):
+        row = episodes.loc[("n2-seed1", arm)]
+        assert (row["success"], row["steps"]) == (episode.success, episode.steps)
+    assert set(episodes.loc["n4-seed0"].index) == {PLAIN, "mass of 2"}
+
+    cost = table[table["kind"] == "cost"].set_index("policy")
+    assert list(cost.index) == ["n2-seed0", "n4-seed0", "n4-aligned-seed0"]
+    assert cost.loc["n2-seed0", "sample_ratio"] == 1.0
+    head = ActionHead.load(policies / "n4-seed0")
+    assert cost.loc["n4-seed0", "head_bytes"] == head.nbytes
+    assert cost.loc["n4-seed0", "context_bytes"] == cost.loc["n2-seed0", "context_bytes"]
+
+    section = N.section(table, provenance)
+    assert [grid.caption.split(":")[0] for grid in section.grids][:1] == ["Every policy"]
+    assert len(section.grids) == 4
+    # The same command again does nothing but read.
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("n/cells/*")}
+    assert study("n", *arguments) == 0
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("n/cells/*")} == before
+
+
+def test_a_sweep_that_trains(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--demos", str(recording), "--patch-size", "8,16", "--training-seeds", "0", "--steps", "1"]
+    assert study("tvl", *arguments, "--episodes", "1", "--out", str(tmp_path)) == 0
+    assert "trained anew: not measured, with one run" in capsys.readouterr().out
+    table: Any = read_table(tmp_path / "tvl.csv")
+    assert list(table[table["kind"] == "training"]["policy"]) == [
+        "patch-size-16-seed-0",
+        "patch-size-8-seed-0",
+    ]
+    cost = table[table["kind"] == "cost"].set_index("patch_size")
+    assert cost.loc[8, "num_vl_tokens"] - cost.loc[16, "num_vl_tokens"] == 3  # 4 patches instead of 1
+    section = TVL.section(table, read_provenance(tmp_path / "tvl.json"))
+    assert "1 cameras, 16 px, patches of 8 px" in section.grids[0].rows[0][0]
+
+
+def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path) -> None:
+    runs = sweeps.find_runs([policies], N.varied)
+    sweeps.check_comparable(runs, N)
+    assert [run.name for run in runs[:2]] == ["n2-seed0", "n2-seed1"]
+    with pytest.raises(
+        InputError, match=r"alignment_weight: .*\. num_future_tokens: 2 \(n2-seed0, n2-seed1\); 4 \("
+    ):
+        sweeps.check_comparable(sweeps.find_runs([policies], VLSA.varied), VLSA)
+
+    mixed = tmp_path / "mixed"
+    shutil.copytree(policies, mixed)
+    changed = json.loads((mixed / "n4-seed0" / "settings.json").read_text())
+    changed |= {"learning_rate": 0.5, "demonstrations": {**changed["demonstrations"], "sha256": "other"}}
+    (mixed / "n4-seed0" / "settings.json").write_text(json.dumps(changed))
+    with pytest.raises(InputError, match=r"learning_rate: .* 0.5 \(n4-seed0\)\. demonstrations: .*other"):
+        sweeps.check_comparable(sweeps.find_runs([mixed], N.varied), N)
+    shutil.copytree(policies / "n2-seed0", mixed / "again")
+    shutil.rmtree(mixed / "n4-seed0")
+    with pytest.raises(InputError, match="again and n2-seed0 are the same point with the same seed"):
+        sweeps.check_comparable(sweeps.find_runs([mixed], N.varied), N)
+
+
+def test_a_run_in_training_is_not_measured(policies: Path, tmp_path: Path) -> None:
+    some = tmp_path / "policies"
+    for name in ("n2-seed0", "n4-seed0"):
+        shutil.copytree(policies / name, some / name)
+    history = json.loads((some / "n4-seed0" / "history.json").read_text())
+    (some / "n4-seed0" / "history.json").write_text(json.dumps([{**history[-1], "step": 1}]))
+    assert study("n", "--policies", str(some), "--episodes", "1", "--out", str(tmp_path)) == 0
+    table: Any = read_table(tmp_path / "n.csv")
+    provenance = read_provenance(tmp_path / "n.json")
+    assert not provenance.complete
+    assert set(table[table["kind"] == "episode"]["policy"]) == {"n2-seed0"}
+    concluded = N.section(table, provenance).concluded
+    assert "n4-seed0: not measured, in training, step 1 of 2." in concluded
+    assert "Only N = 2 was measured: nothing to compare." in concluded
+
+
+def test_equal_mass_is_repeated_tokens() -> None:
+    """Tokens with the weight of twice as many are each token twice (spec, I2)."""
+    head, context, state = shipped()
+    tokens = learned_tokens(str(DEMO_CHECKPOINT))
+    twice = resized.resized(resized.TWICE, tokens, np.random.default_rng(0))
+    plain, heavier, repeated = (
+        np.asarray(head.sample(context, state, 0, seed=1, intervention=change))
+        for change in (None, sweeps.equal_mass(len(tokens), 2 * len(tokens)), twice)
+    )
+    np.testing.assert_allclose(heavier, repeated, atol=1e-5)
+    assert np.abs(heavier - plain).max() > 1e-2
+
+
+def test_difference_between_runs_is_welch_s() -> None:
+    first, second = [0.2, 0.6], [0.5, 0.9]
+    expected = stats.ttest_ind(second, first, equal_var=False).confidence_interval()
+    found = sweeps.between_runs(first, second, episodes=1000)
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+    assert found.value == pytest.approx(0.3)
+    # Runs that happen to agree still vary by their episodes.
+    agreeing = sweeps.between_runs([0.5, 0.5], [0.5, 0.5], episodes=100)
+    half = stats.t.ppf(0.975, 2) * math.sqrt(2 * 0.25 / 100 / 2)
+    assert (agreeing.low, agreeing.high) == pytest.approx((-half, half))
+    assert math.isnan(sweeps.between_runs([0.5], [0.2, 0.3], episodes=100).low)
+    assert math.isnan(sweeps.between_runs([1.0, 1.0], [1.0, 1.0], episodes=100).low)
+
+
+def test_difference_of_these_policies_is_paired() -> None:
+    def rows(successes: list[list[bool]]) -> pd.DataFrame:
+        return pd.DataFrame(
+            [
+                {"policy": str(run), "task": "reach", "seed": seed, "success": float(success)}
+                for run, found in enumerate(successes)
+                for seed, success in enumerate(found)
+            ]
+        )
+
+    easy_and_hard = [[True, False] * 10] * 2
+    assert sweeps.same_policies(rows(easy_and_hard), rows(easy_and_hard)).high == 0.0
+    found = sweeps.same_policies(rows(easy_and_hard), rows([[True] * 20, [True, False] * 10]))
+    assert found.value == 0.25
+    assert 0.1 < found.low < 0.25 < found.high < 0.4
+
+
+def test_what_is_merged_and_drawn() -> None:
+    rng = np.random.default_rng(0)
+    two = rng.standard_normal((2, 6)).astype(np.float32)
+    tokens = two[[0, 1, 0, 0, 1]]
+    merged, counts = resized.merge(tokens, 2)
+    order = np.argsort(counts)
+    np.testing.assert_allclose(merged[order], two[[1, 0]], rtol=1e-6)
+    assert counts[order].tolist() == [2, 3]
+    whole, ones = resized.merge(tokens, 5)
+    np.testing.assert_array_equal(whole, tokens)
+    assert ones.tolist() == [1] * 5
+    drawn = resized.resized("3 drawn, equal mass", np.arange(16, dtype=np.float32).reshape(8, 2), rng)
+    assert drawn is not None
+    assert drawn.future_tokens is not None
+    assert np.asarray(drawn.future_tokens).shape == (3, 2)
+    assert drawn.key_bias is not None
+    assert float(np.exp(drawn.key_bias["future", None])) == pytest.approx(8 / 3)  # type: ignore[index]
+
+
+def test_merging_equal_tokens_changes_nothing() -> None:
+    """A head whose tokens are copies of four of them, merged to four: exact, by I2."""
+    head, context, state = shipped()
+    copies = learned_tokens(str(DEMO_CHECKPOINT))[np.random.default_rng(0).integers(4, size=11)]
+    merged, counts = resized.merge(copies, 4)
+    assert len(merged) == 4
+    whole, smaller = (
+        np.asarray(head.sample(context, state, 0, seed=3, intervention=change))
+        for change in (
+            Intervention(future_tokens=copies),
+            Intervention(future_tokens=merged, key_bias={"future": np.log(counts)}),
+        )
+    )
+    np.testing.assert_allclose(smaller, whole, atol=1e-5)
+
+
+def test_resized_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--tasks", TASK, "--episodes", "1", "--sizes", "4", "--out", str(tmp_path)]
+    assert study("n-runtime", *arguments) == 0
+    printed = capsys.readouterr().out
+    assert "Control, every token twice, equal mass: the chunk changed by" in printed
+    assert "as it must be" in printed
+    table: Any = read_table(tmp_path / "n-runtime.csv")
+    assert set(table["arm"]) == set(resized.arms_of([4]))
+    by_arm = table.groupby("arm")["chunk_change"].mean()
+    assert by_arm[resized.BASELINE] == 0.0
+    assert by_arm["4 drawn"] > 1e-3
+    section = resized.section(table, read_provenance(tmp_path / "n-runtime.json"))
+    assert [row[0] for row in section.grids[0].rows] == [
+        "4 drawn",
+        "4 drawn, equal mass",
+        "4 merged",
+        resized.TWICE,
+        resized.TWICE_EQUAL,
+    ]
+
+
+def test_resizing_a_policy_without_tokens(recording: Path, tmp_path: Path) -> None:
+    settings = train.TrainingSettings(**{**vars(TINY), "num_future_tokens": 0, "steps": 1})
+    train.train(recording, tmp_path / "policy", settings, lambda progress: None)
+    arguments = ["--checkpoint", str(tmp_path / "policy"), "--episodes", "1", "--out", str(tmp_path)]
+    assert study("n-runtime", *arguments) == 0
+    table: Any = read_table(tmp_path / "n-runtime.csv")
+    section = resized.section(table, read_provenance(tmp_path / "n-runtime.json"))
+    assert section.concluded == ["Not measured, the checkpoint has no future tokens."]
+
+
+def test_bad_input(
+    policies: Path, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(name: str, *arguments: str) -> str:
+        assert study(name, *arguments, "--out", str(tmp_path / "out")) == 2
+        return capsys.readouterr().err
+
+    runs = ("--policies", str(policies))
+    assert "expected either --policies" in refused("n")
+    assert "expected either --policies" in refused("n", *runs, "--demos", str(recording))
+    assert "no runs of `saccade train` there" in refused("n", "--policies", str(recording))
+    assert "no such directory of policies" in refused("n", "--policies", str(tmp_path / "nowhere"))
+    assert "not all policies know reach" in refused("n", *runs, "--tasks", "reach")
+    assert "differ in vl_num_layers and seed only" in refused("vlsa", *runs)
+    training = ("--demos", str(recording))
+    assert "expected one: all runs see the same" in refused("n", *training, *training)
+    assert "steps: given 0" in refused("n", *training, "--steps", "0")
+    assert "expected numbers of at least 0" in refused("n", *training, "--alignment-weights", "-1")
+    assert "expected numbers of at least 0" in refused("n", *training, "--alignment-weights", "much")
+    assert "sizes: given 40, expected 1 to 31" in refused("n-runtime", "--sizes", "40")
+    assert not (tmp_path / "out").exists()
