@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from saccade.intervention import Intervention
+from saccade.intervention import ROW_GROUPS, Intervention
 
 Float32Array = npt.NDArray[np.float32]
-ROWS = ("state", "future", "action")
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ ALL_ARMS = (
         "{state, future, action} <- vl cut",
         "No row sees the vision-language tokens. A control that must fail: it shows what these tasks are "
         "worth without sight.",
-        cut(*((row, "vl") for row in ROWS)),
+        cut(*((row, "vl") for row in ROW_GROUPS)),
         needs_future=False,
     ),
     Arm(

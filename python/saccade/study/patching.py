@@ -14,13 +14,13 @@ import pandas as pd
 
 from saccade.config import HeadConfig
 from saccade.head import ActionHead, Context
-from saccade.intervention import Intervention, Tokens
+from saccade.intervention import ROW_GROUPS, Intervention, Tokens
 from saccade.sim import graphics
 from saccade.sim.policy import EMBODIMENT_ID, Float32Array
 from saccade.sim.tasks import check_evaluation_seeds, find_task
 from saccade.study import figures
 from saccade.study.arguments import check_known, names, numbers
-from saccade.study.arms import ROWS, episode_rng
+from saccade.study.arms import episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.loaded import describe_checkpoint, environment_of, head_of, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
@@ -44,7 +44,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "future": ("future",),
     "state": ("state",),
     "action": ("action",),
-    CONTROL: ROWS,
+    CONTROL: ROW_GROUPS,
 }
 
 EPILOG = """\
@@ -172,7 +172,7 @@ class Work:
         row |= {"donor_task": donor_task, "donor_seed": donor_seed}
         found = []
         for group, members in GROUPS.items():
-            if "future" in members and head.config.num_future_tokens == 0 and members != ROWS:
+            if "future" in members and head.config.num_future_tokens == 0 and members != ROW_GROUPS:
                 found.append({**row, "group": group, "note": NO_FUTURE})
                 continue
             for block in (None, *self.blocks):
@@ -288,8 +288,9 @@ def summary(table: pd.DataFrame, provenance: Provenance, kinds: Sequence[str]) -
         f"{', '.join(map(str, blocks))}, in the Euler steps {', '.join(map(str, steps))}, take the place of "
         "the receiver's.",
         "Share: how far the chunk (the head's own, normalised actions) moves along the way from the "
-        "receiver's chunk to the donor's, 0 for not at all and 1 for all of it; all pairs together, with a "
-        "95 % bootstrap interval over receivers. Size: how far it moves at all, in the same unit.",
+        "receiver's chunk to the donor's, 0 for not at all and 1 for all of it, below 0 for away from it; "
+        "shares of groups need not add up to 1. All pairs together, with a 95 % bootstrap interval over "
+        "receivers. Size: how far it moves at all, in the same unit.",
         *(f"Donors of the kind {kind} ({pairs[kind]} pairs): {KINDS[kind]}." for kind in kinds),
     ]
 
