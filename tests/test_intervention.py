@@ -594,7 +594,7 @@ def patched(step: int, block: int, group: Any, *shape: int) -> Intervention:
         (
             [None],
             saccade.InputError,
-            "intervention: expected an Intervention or a sequence of them, got list",
+            "intervention: expected an Intervention or a sequence of them, got a sequence with NoneType",
         ),
     ],
 )
@@ -611,31 +611,49 @@ def test_what_does_not_fit_is_refused(
 
 
 @pytest.mark.parametrize(
-    "fields",
+    ("fields", "error"),
     [
-        {"cut": [("action", ("vl", True))]},
-        {"cut": [("action", ("vl", [0.0]))]},
-        {"cut": [("action", ("vl", [1, 1]))]},
-        {"cut": [("action", ("vl", [-1]))]},
-        {"cut": [("vl", "state")]},
-        {"cut": [("action", "vision")]},
-        {"cut": "action"},
-        {"key_bias": {"vl": math.nan}},
-        {"key_bias": {"vl": math.inf}},
-        {"key_bias": {"vl": True}},
-        {"key_bias": {"vl": [1, 2]}},
-        {"patch": {(0, True): {"state": np.zeros((1, 12))}}},
-        {"patch": {0: {"state": np.zeros((1, 12))}}},
-        {"patch": {(0, 0): {"state": np.full((1, 12), math.nan)}}},
-        {"patch": {(0, 0): {"vl": np.zeros((1, 12))}}},
-        {"patch": {(0, 0): {"state": np.zeros(12)}}},
-        {"future_tokens": np.zeros(12)},
-        {"future_tokens": np.full((1, 12), math.inf)},
-        {"blocks": [False]},
-        {"heads": [-1]},
-        {"steps": 1.0},
+        ({"cut": [("action", ("vl", True))]}, saccade.InputError),
+        ({"cut": [("action", ("vl", [0.0]))]}, saccade.InputError),
+        ({"cut": [("action", ("vl", [1, 1]))]}, saccade.InputError),
+        ({"cut": [("action", ("vl", [-1]))]}, saccade.InputError),
+        ({"cut": [("vl", "state")]}, saccade.InputError),
+        ({"cut": [("action", "vision")]}, saccade.InputError),
+        ({"cut": "action"}, saccade.InputError),
+        ({"key_bias": {"vl": math.nan}}, saccade.InputError),
+        ({"key_bias": {"vl": math.inf}}, saccade.InputError),
+        ({"key_bias": {"vl": True}}, saccade.DtypeError),
+        ({"key_bias": {"vl": [1, 2]}}, saccade.DtypeError),
+        ({"patch": {(0, True): {"state": np.zeros((1, 12))}}}, saccade.InputError),
+        ({"patch": {0: {"state": np.zeros((1, 12))}}}, saccade.InputError),
+        ({"patch": {(0, 0): {"state": np.full((1, 12), math.nan)}}}, saccade.InputError),
+        ({"patch": {(0, 0): {"vl": np.zeros((1, 12))}}}, saccade.InputError),
+        ({"patch": {(0, 0): {"state": np.zeros(12)}}}, saccade.ShapeError),
+        ({"future_tokens": np.zeros(12)}, saccade.ShapeError),
+        ({"future_tokens": np.full((1, 12), math.inf)}, saccade.InputError),
+        ({"blocks": [False]}, saccade.InputError),
+        ({"heads": [-1]}, saccade.InputError),
+        ({"steps": 1.0}, saccade.InputError),
+        ({"cut": np.array(1)}, saccade.InputError),
+        ({"key_bias": {"vl": 10**400}}, saccade.InputError),
+        ({"key_bias": {("vl", 0): 1.0, ("vl", (0,)): 2.0}}, saccade.InputError),
+        ({"blocks": {1, "a"}}, saccade.InputError),
+        ({"blocks": ""}, saccade.InputError),
+        ({"steps": range(2**70)}, saccade.InputError),
+        ({"steps": range(-(10**12), 0)}, saccade.InputError),
+        ({"heads": np.array([[1]])}, saccade.InputError),
     ],
 )
-def test_no_intervention_is_made_of_this(fields: dict[str, Any]) -> None:
-    with pytest.raises(saccade.SaccadeError, match=next(iter(fields))):
+def test_no_intervention_is_made_of_this(fields: dict[str, Any], error: type[Exception]) -> None:
+    with pytest.raises(error, match=next(iter(fields))) as caught:
         Intervention(**fields)
+    assert type(caught.value) is error
+
+
+def test_what_is_kept_cannot_be_changed() -> None:
+    tokens = np.ones((2, 3), np.float32)
+    kept: Any = Intervention(future_tokens=tokens, key_bias={"vl": [1.0]}).future_tokens
+    tokens[:] = 0
+    assert (kept == 1).all()
+    with pytest.raises(ValueError, match="read-only"):
+        kept[0, 0] = 2

@@ -565,7 +565,7 @@ def test_other_arguments_that_do_not_fit_are_refused() -> None:
     for stop in wrong_stops:
         with pytest.raises(saccade.InputError, match="stop_gradient"):
             head.sample(**inputs, stop_gradient=stop)
-    with pytest.raises(saccade.InputError, match="future: 4"):
+    with pytest.raises(saccade.InputError, match="stop_gradient: future: 4"):
         head.sample(**inputs, stop_gradient=[("action", ("future", 4))])
     noise = inputs.pop("noise")
     with pytest.raises(saccade.InputError, match="steps: 1, expected 0 to 0"):

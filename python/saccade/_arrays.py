@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Set
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     import torch
 
     Tensor: TypeAlias = torch.Tensor
+
+#: No head has as many tokens; a range that reaches it would only be slow to write out.
+LARGEST_RANGE = 1 << 20
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 #: What array arguments may be: NumPy arrays of any strides, torch CPU tensors, or nested sequences of floats.
@@ -108,23 +111,35 @@ def integer(name: str, value: int, least: int = 1) -> int:
 
 
 def indices(name: str, value: Any) -> tuple[int, ...] | None:
-    """One index or several, distinct, in the order given; None stays None.
+    """One index or several, distinct, in the order given (sets: ascending); None stays None.
 
     Raises:
         InputError: ``value`` is not made of distinct integers of at least 0.
     """
     if value is None:
         return None
-    if isinstance(value, (range, set, frozenset)):
-        value = sorted(value)
-    if isinstance(value, Sequence) and len(value) == 0:
-        return ()
-    found = [int(index) for index in np.atleast_1d(int64(name, value)).ravel()]
-    if min(found, default=0) < 0:
-        raise InputError(f"{name}: expected indices of at least 0, got {min(found)}")
-    if len(set(found)) != len(found):
-        raise InputError(f"{name}: expected distinct indices, got some twice")
-    return tuple(found)
+    if isinstance(value, (str, bytes)):
+        raise InputError(f"{name}: expected an index or several, got {value!r}")
+    if (
+        isinstance(value, range)
+        and value
+        and (min(value[0], value[-1]) < 0 or max(value[0], value[-1]) >= LARGEST_RANGE)
+    ):
+        raise InputError(f"{name}: expected indices of 0 to {LARGEST_RANGE - 1}, got {value!r}")
+    unordered = isinstance(value, Set)
+    if isinstance(value, Collection) and not is_torch(value) and not isinstance(value, np.ndarray):
+        value = list(value)
+        if not value:
+            return ()
+    array = np.atleast_1d(int64(name, value))
+    if array.ndim > 1:
+        raise InputError(f"{name}: expected one row of indices, got shape {array.shape}")
+    distinct, counts = np.unique(array, return_counts=True)
+    if len(distinct) and distinct[0] < 0:
+        raise InputError(f"{name}: expected indices of at least 0, got {distinct[0]}")
+    if len(distinct) < len(array):
+        raise InputError(f"{name}: expected distinct indices, got {distinct[counts > 1][0]} more than once")
+    return tuple((distinct if unordered else array).tolist())
 
 
 def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:

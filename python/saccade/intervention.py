@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from saccade._arrays import ArrayLike, Float32Array, float32, indices, integer
 from saccade.errors import InputError, ShapeError
@@ -16,7 +18,7 @@ ROW_GROUPS = ("state", "future", "action")
 GROUPS = (*ROW_GROUPS, "vl")
 
 #: A group's name, or the name and the indices of some of its tokens.
-Tokens: TypeAlias = "str | tuple[str, int | Iterable[int]]"
+Tokens: TypeAlias = "str | tuple[str, int | Collection[int]]"
 #: A group and the indices of its tokens; None stands for all of them.
 Chosen: TypeAlias = tuple[str, tuple[int, ...] | None]
 
@@ -96,20 +98,26 @@ def as_interventions(given: Intervention | Sequence[Intervention] | None) -> tup
     """
     if given is None:
         return ()
-    several = (given,) if isinstance(given, Intervention) else given
-    if not isinstance(several, Sequence) or not all(isinstance(one, Intervention) for one in several):
-        raise InputError(
-            f"intervention: expected an Intervention or a sequence of them, got {type(given).__name__}"
-        )
+    several: Any = (given,) if isinstance(given, Intervention) else given
+    expected = "intervention: expected an Intervention or a sequence of them"
+    if not isinstance(several, Sequence) or isinstance(several, (str, bytes)):
+        raise InputError(f"{expected}, got {type(given).__name__}")
+    for one in several:
+        if not isinstance(one, Intervention):
+            raise InputError(f"{expected}, got a sequence with {type(one).__name__}")
     return tuple(several)
 
 
 def _cuts(cut: Any) -> tuple[tuple[Chosen, Chosen], ...]:
-    pairs = []
-    if isinstance(cut, str) or not isinstance(cut, Iterable):
+    try:
+        given = None if isinstance(cut, (str, bytes)) else list(cut)
+    except TypeError:
+        given = None
+    if given is None:
         raise InputError(f"cut: expected pairs (reader, source), got {cut!r}")
-    for pair in cut:
-        if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
+    pairs = []
+    for pair in given:
+        if isinstance(pair, (str, bytes)) or not isinstance(pair, Sequence) or len(pair) != 2:
             raise InputError(f"cut: expected pairs (reader, source), got {pair!r} among them")
         reader, source = _chosen("cut", pair[0]), _chosen("cut", pair[1])
         if reader[0] == "vl":
@@ -125,19 +133,28 @@ def _biases(key_bias: Any) -> dict[Chosen, Float32Array] | None:
         return None
     if not isinstance(key_bias, Mapping):
         raise InputError(f"key_bias: expected a mapping of groups to biases, got {type(key_bias).__name__}")
-    biases = {}
+    biases: dict[Chosen, Float32Array] = {}
     for tokens, bias in key_bias.items():
         chosen = _chosen("key_bias", tokens)
         name = f"key_bias[{tokens!r}]"
-        # A plain number may be an integer; arrays of integers are refused like everywhere else.
-        plain = isinstance(bias, (int, float)) and not isinstance(bias, bool)
-        values = float32(name, float(bias) if plain else bias)
+        if chosen in biases:
+            raise InputError(f"{name}: expected each choice of tokens once, got it twice")
+        values = float32(name, _number(name, bias))
         if values.ndim > 1:
             raise ShapeError(f"{name}: expected a number or one per token, got shape {values.shape}")
-        if np.isnan(values).any() or np.isposinf(values).any():
-            raise InputError(f"{name}: expected numbers below infinity")
-        biases[chosen] = values.copy()
+        below_infinity = ~(np.isnan(values) | np.isposinf(values))
+        biases[chosen] = _kept(name, values, below_infinity, "numbers below infinity")
     return biases
+
+
+def _number(name: str, bias: Any) -> Any:
+    """A plain number as a float, integers too; anything else as it is."""
+    if isinstance(bias, bool) or not isinstance(bias, Real):
+        return bias  # arrays of integers are refused like everywhere else
+    try:
+        return float(bias)
+    except OverflowError:
+        raise InputError(f"{name}: expected a number below infinity, got one that no float holds") from None
 
 
 def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | None:
@@ -166,7 +183,7 @@ def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | 
                 raise ShapeError(
                     f"{name}: expected (tokens, width) or (batch, tokens, width), got shape {values.shape}"
                 )
-            patches.setdefault(key, {})[chosen] = _finite(name, values)
+            patches.setdefault(key, {})[chosen] = _kept(name, values, np.isfinite(values), "finite values")
     return patches
 
 
@@ -176,14 +193,18 @@ def _future_tokens(future_tokens: Any) -> Float32Array | None:
     values = float32("future_tokens", future_tokens)
     if values.ndim != 2:
         raise ShapeError(f"future_tokens: expected (tokens, width), got shape {values.shape}")
-    return _finite("future_tokens", values)
+    return _kept("future_tokens", values, np.isfinite(values), "finite values")
 
 
-def _finite(name: str, values: Float32Array) -> Float32Array:
-    """A copy, so that nobody can change it afterwards."""
-    if not np.isfinite(values).all():
-        raise InputError(f"{name}: expected finite values")
-    return values.copy()
+def _kept(name: str, values: Float32Array, good: npt.NDArray[np.bool_], expected: str) -> Float32Array:
+    """A copy that nobody can change; refused unless all of it is good."""
+    if not good.all():
+        index = tuple(np.argwhere(~good)[0].tolist())
+        where = f" at index {index}" if index else ""
+        raise InputError(f"{name}: expected {expected}, got {values[index]}{where}")
+    kept = values.copy()
+    kept.setflags(write=False)
+    return kept
 
 
 def _chosen(name: str, tokens: Any) -> Chosen:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from saccade._arrays import Array
 from saccade.errors import InputError
@@ -57,13 +57,16 @@ class Record:
         return sum(int(array.nbytes) for kept in (self.attention, self.hidden) for array in kept.values())
 
 
-def check_record(record: Iterable[str]) -> tuple[bool, bool]:
+def check_record(record: Any) -> tuple[bool, bool]:
     """Whether attention, and whether hidden rows, are to be recorded.
 
     Raises:
         InputError: ``record`` is not made of the names ``"attention"`` and ``"hidden"``.
     """
-    names = None if isinstance(record, str) or not isinstance(record, Iterable) else list(record)
-    if names is None or any(name not in RECORDS for name in names):
+    try:
+        names = None if isinstance(record, str) else list(record)
+    except TypeError:
+        names = None
+    if names is None or any(not isinstance(name, str) or name not in RECORDS for name in names):
         raise InputError(f"record: expected a tuple of names among {', '.join(RECORDS)}, got {record!r}")
     return "attention" in names, "hidden" in names

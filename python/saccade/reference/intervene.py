@@ -71,7 +71,7 @@ class Edit:
 
         def tensors(arrays: Mapping[Chosen, np.ndarray] | None) -> dict[Chosen, Tensor]:
             found = (arrays or {}).items()
-            return {tokens: torch.as_tensor(a, dtype=like.dtype, device=like.device) for tokens, a in found}
+            return {tokens: torch.tensor(a, dtype=like.dtype, device=like.device) for tokens, a in found}
 
         patch = {place: tensors(rows) for place, rows in (one.patch or {}).items()}
         return cls(one.cut, tensors(one.key_bias), patch, one.blocks, one.steps, one.heads)
@@ -144,8 +144,9 @@ class Run:
         self.keep_attention, self.keep_hidden = check_record(record)
         self.attention: dict[tuple[int, int], Tensor] = {}
         self.hidden: dict[tuple[int, int], Tensor] = {}
-        for edit in (*self.edits, self.stopped, self.kept):
+        for edit in (*self.edits, self.kept):
             self.check(edit)
+        self.check_edges("stop_gradient", self.stopped)
 
     def change(self, step: int, block: int) -> BlockChange:
         """What happens in this block of this Euler step."""
@@ -215,7 +216,7 @@ class Run:
             raise InputError(f"future_tokens: in {len(given)} interventions, expected in at most one")
         if not given:
             return None
-        tokens = torch.as_tensor(given[0], dtype=self.dtype, device=self.device)
+        tokens = torch.tensor(given[0], dtype=self.dtype, device=self.device)
         check_shape("future_tokens", tokens, (None, self.config.width))
         return tokens
 
@@ -224,9 +225,7 @@ class Run:
         check_indices("blocks", edit.blocks, self.config.num_layers)
         check_indices("steps", edit.steps, self.num_steps)
         check_indices("heads", edit.heads, self.config.num_heads)
-        for pair in edit.cut:
-            for chosen in pair:
-                self.count("cut", chosen)
+        self.check_edges("cut", edit)
         for chosen, biases in edit.key_bias.items():
             size = self.count("key_bias", chosen)
             check_shape(f"key_bias: {chosen[0]}", biases, (size,) if biases.ndim == 1 else ())
@@ -238,6 +237,12 @@ class Run:
                 batch = (self.batch,) if rows.ndim == 3 else ()
                 expected = (*batch, self.count(name, chosen), self.config.width)
                 check_shape(f"{name}: {chosen[0]}", rows, expected)
+
+    def check_edges(self, name: str, edit: Edit) -> None:
+        """Refuses tokens that are not there."""
+        for pair in edit.cut:
+            for chosen in pair:
+                self.count(name, chosen)
 
     def count(self, name: str, chosen: Chosen) -> int:
         """How many tokens these are; refuses those that the group does not have."""

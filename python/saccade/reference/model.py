@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from saccade._arrays import integer
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.intervention import Intervention, Tokens
@@ -611,7 +612,7 @@ class ActionHead(nn.Module):
             InputError: a value out of range, an intervention that does not fit the head.
         """
         config = self.config
-        num_steps = config.num_steps if num_steps is None else num_steps
+        num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
         if not 1 <= num_steps <= config.num_timestep_buckets:
             raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
         vl_embs, actions = self.as_input(vl_embs), self.as_input(noise)
