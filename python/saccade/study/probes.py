@@ -513,7 +513,12 @@ def block_picture(rows: pd.DataFrame) -> Any:
                 series[name] = [one_of(of_input(rows, (group, block, tokens))) for block in blocks]
     for source, name in ((VL, "vl_embs"), (PROPRIO, "proprioception")):
         series[name] = [one_of(of_input(rows, source))] * len(blocks)
-    return figures.lines(blocks, series, "after block", "R^2 on other episodes", reference=0)
+    picture = figures.lines(blocks, series, "after block", "R^2 on other episodes", reference=0)
+    legend = picture.axes[0].get_legend()
+    assert legend is not None
+    legend.remove()  # it would hide lines; below the plot there is room
+    picture.legend(loc="outside lower center", ncols=4, frameon=False, fontsize="small")
+    return picture
 
 
 def input_grid(rows: pd.DataFrame, scope: str) -> Grid:
@@ -584,11 +589,15 @@ def conclusions(rows: pd.DataFrame, checkpoint: Mapping[str, Any]) -> list[str]:
             )
             continue
         first = carrying.head(1)
+        block = int(first["block"].iloc[0])
+        state = one_of(of_input(of_target, ("state", block, "all")))
         lines.append(
-            f"Where the {target} is: the future rows carry it from block {int(first['block'].iloc[0])} on: "
-            f"R^2 {number(one_of(first), digits=2)} from their mean, "
+            f"Where the {target} is: the future rows carry it from block {block} on: R^2 "
+            f"{number(one_of(first), digits=2)} from their mean, "
             f"{number(one_of(first, 'over_proprio'), digits=2)} more than from the hand alone, "
             f"{number(one_of(first, 'over_vl'), digits=2)} compared with all tokens that the head reads; "
-            f"shuffled control {number(one_of(first, 'shuffled'), digits=2)}."
+            f"shuffled control {number(one_of(first, 'shuffled'), digits=2)}. After the same block the one "
+            f"state row has {number(state, digits=2)}; after the last block the future rows have "
+            f"{number(one_of(future.tail(1)), digits=2)}."
         )
     return lines
