@@ -21,7 +21,6 @@ def one_hot_maps(
     *,
     future_tokens: int = FUTURE,
     images: bool = True,
-    occluded: bool = True,
     steps: tuple[int, ...] = (0, 1),
 ) -> Maps:
     """Two blocks, two heads, and one state, three future and two action rows.
@@ -84,5 +83,5 @@ def one_hot_maps(
         rows=rows,
         attention=attention,
         redrawn=redrawn if future_tokens else None,
-        occlusion=Occlusion("by hand", 1, change, 0.5) if occluded else None,
+        occlusion=Occlusion("by hand", 1, change, 0.5),
     )

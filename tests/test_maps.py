@@ -31,7 +31,7 @@ from saccade.maps import occlusion, record
 from saccade.maps.inputs import Inputs, LayoutOptions, from_file, from_simulator
 from saccade.maps.layout import Camera, parse_layout
 from saccade.maps.occlusion import BlankedPixels, DroppedPositions, cell_for, measure, places_of
-from saccade.maps.sheet import DOTS_PER_INCH, NO_FUTURE, WIDTH, Sheet, ranges, write_sheet
+from saccade.maps.sheet import DOTS_PER_INCH, NO_FUTURE, NO_IMAGES, WIDTH, Sheet, ranges, write_sheet
 from saccade.maps.summary import Overlap, entropy, overlap, shuffle, summarize
 from saccade.reference import ActionHead as ReferenceHead
 from saccade.sim import graphics
@@ -220,24 +220,22 @@ def pushed(policy: Policy) -> Inputs:
     return from_simulator(policy, "push", 3, 0)
 
 
-@pytest.mark.parametrize("steps", [0, 8, 13])
-def test_the_observation_is_that_of_the_rollout(policy: Policy, steps: int) -> None:
-    found = from_simulator(policy, "button-press-topdown", 2, steps)
+def test_the_observation_is_that_of_the_rollout(policy: Policy) -> None:
+    looks = (0, 8, 13)  # at the start, after a whole chunk, within one
     seen: dict[int, Any] = {}
 
     def on_step(environment: TaskEnvironment, episode: Episode) -> None:
-        if episode.steps == steps:
-            seen[steps] = environment.observe()["images"]
+        if episode.steps in looks:
+            seen[episode.steps] = environment.observe()["images"]
 
     with contextlib.closing(environment_for(policy, "button-press-topdown")) as environment:
-        run_episode(environment, policy, 2, on_step=on_step)
-    assert found.images.keys() == seen[steps].keys()
-    for name, picture in found.images.items():
-        np.testing.assert_array_equal(picture, seen[steps][name])
-
-
-def test_an_episode_that_is_over_is_an_error(policy: Policy) -> None:
-    with pytest.raises(InputError, match=r"--after: given 190, but the episode .* ends after \d+ steps"):
+        episode = run_episode(environment, policy, 2, on_step=on_step)
+    for steps in looks:
+        found = from_simulator(policy, "button-press-topdown", 2, steps)
+        assert found.images.keys() == seen[steps].keys()
+        for name, picture in found.images.items():
+            np.testing.assert_array_equal(picture, seen[steps][name])
+    with pytest.raises(InputError, match=f"--after: given 190, but .* ends after {episode.steps} steps"):
         from_simulator(policy, "button-press-topdown", 2, 190)
 
 
@@ -286,7 +284,7 @@ def written(path: Path, arrays: dict[str, Any]) -> Path:
 
 def taken(path: Path, **options: Any) -> Inputs:
     config = saccade.HeadConfig.from_dict(load_released("n15_single_view").config)
-    return from_file(path, config, row=0, options=LayoutOptions(**options), noise_seed=5)
+    return from_file(path, config, row=0, options=LayoutOptions(**options), seed=5)
 
 
 def test_a_file_of_features(tmp_path: Path) -> None:
@@ -330,14 +328,14 @@ def test_a_row_of_a_batch(tmp_path: Path) -> None:
     }
     config = saccade.HeadConfig.from_dict(given.config)
     path = written(tmp_path / "f.npz", arrays)
-    found = from_file(path, config, row=1, options=LayoutOptions(), noise_seed=0)
+    found = from_file(path, config, row=1, options=LayoutOptions(), seed=0)
     np.testing.assert_array_equal(found.features, given.backbone_features[1:])
     np.testing.assert_array_equal(found.state, given.state[1:])
     assert found.embodiment_id == given.embodiment_id[1]
     assert found.layout.cameras == (Camera("camera 1", 2, 2, 2),)
     assert found.layout.parts()["pad"].tolist() == [0]
     with pytest.raises(InputError, match="--row: given 2"):
-        from_file(path, config, row=2, options=LayoutOptions(), noise_seed=0)
+        from_file(path, config, row=2, options=LayoutOptions(), seed=0)
 
 
 FILES: list[tuple[dict[str, Any], type[Exception], str]] = [
@@ -349,6 +347,7 @@ FILES: list[tuple[dict[str, Any], type[Exception], str]] = [
         r"expects \(batch, T_vl, 128\)",
     ),
     ({"backbone_features": np.zeros((296, 128), np.float32)}, ShapeError, "backbone_features: shape"),
+    ({"backbone_features": np.zeros((0, 296, 128), np.float32)}, InputError, "expected no empty axis"),
     ({"backbone_features": np.zeros((1, 296, 128), np.int64)}, InputError, "floating point"),
     ({"input_ids": None}, InputError, "neither input_ids nor image_mask; --layout"),
     ({"input_ids": np.zeros((1, 295), np.int64)}, ShapeError, r"input_ids: shape .* expected \(1, 296\)"),
@@ -456,7 +455,6 @@ def test_agreement_is_the_rank_correlation_over_patches() -> None:
     assert maps.agreement(keys) == pytest.approx(expected)
     assert maps.agreement(np.square(keys)) == pytest.approx(expected)
     assert maps.agreement(np.ones(9, np.float32)) is None
-    assert one_hot_maps(occluded=False).agreement(keys) is None
     found = {(entry["block"], entry["group"]): entry["rank_correlation"] for entry in maps.agreements()}
     assert list(found) == [(0, "state"), (0, "future"), (0, "action")]
     assert found[0, "state"] is None
@@ -499,12 +497,35 @@ def texts(figure: Figure) -> str:
 
 
 def test_the_sheet_says_what_is_missing() -> None:
-    assert record.CAVEAT in texts(Sheet(one_hot_maps()).draw())
-    without = texts(Sheet(one_hot_maps(future_tokens=0)).draw())
+    without = texts(Sheet(one_hot_maps(future_tokens=0, images=False)).draw())
+    assert record.CAVEAT in without
+    assert record.BESIDE in without
     assert NO_FUTURE in without
     assert "one by one" not in without
-    assert "maps are drawn on white" in texts(Sheet(one_hot_maps(images=False)).draw())
-    assert "Occlusion was not measured" in texts(Sheet(one_hot_maps(occluded=False)).draw())
+    assert "maps are drawn on white" in without
+
+
+def test_without_image_tokens_there_is_no_occlusion_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = load_released("n15_tiny")
+    (tmp_path / "config.json").write_text(json.dumps(given.config))
+    names = ("backbone_features", "state", "embodiment_id")
+    features = written(tmp_path / "f.npz", {name: getattr(given, name) for name in names})
+    arguments = [str(given.path), "--config", str(tmp_path / "config.json"), "--features", str(features)]
+    chosen = ["--layout", "text:*", "--row", "1", "--threads", "1", "--out", str(tmp_path / "out")]
+    assert main(["attention", *arguments, *chosen]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert NO_IMAGES in shown
+    assert record.CAVEAT in shown
+    assert "occlusion" not in shown
+    found = json.loads((tmp_path / "out/attention.json").read_text())
+    assert found["occlusion"] is None
+    assert found["caveat"] == record.CAVEAT
+    assert {entry["rank_correlation"] for entry in found["agreement"]} == {None}
+    page = (tmp_path / "out/page.html").read_text()
+    assert NO_IMAGES in page
+    assert record.BESIDE not in page
 
 
 def test_ranges() -> None:
@@ -537,7 +558,7 @@ def test_the_command_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[st
     }
     assert found["checkpoint"]["sha256"] == Policy.load().checkpoint_sha256()
     assert found["selection"]["blocks"] == [1, 2]
-    assert found["caveat"] == record.CAVEAT
+    assert found["caveat"] == f"{record.CAVEAT} {record.BESIDE}"
     assert {(entry["step"], entry["block"]) for entry in found["summaries"]} == {
         (0, 1),
         (0, 2),
@@ -559,16 +580,13 @@ def test_a_checkpoint_without_future_tokens(tmp_path: Path, capsys: pytest.Captu
     tensors = read_tensors(DEMO_CHECKPOINT)
     del tensors["action_head.future_tokens.weight"]
     save_file(tensors, checkpoint / "model.safetensors")
-    arguments = ["attention", str(checkpoint), "--task", "push", "--steps", "0", "--no-occlusion"]
+    arguments = ["attention", str(checkpoint), "--task", "push", "--steps", "0", "--cell", "4"]
     assert main([*arguments, "--threads", "1", "--out", str(tmp_path / "out")]) == 0
     assert NO_FUTURE in " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "out/attention.json").read_text())
     assert found["num_future_tokens"] == 0
     assert {entry["group"] for entry in found["summaries"]} == {"state", "action"}
-    assert found["occlusion"] is None
-    page = (tmp_path / "out/page.html").read_text()
-    assert "has no future tokens" in page
-    assert "Occlusion was not measured" in page
+    assert "has no future tokens" in (tmp_path / "out/page.html").read_text()
 
 
 def test_a_file_of_another_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -597,6 +615,7 @@ CASES: list[tuple[list[str], str]] = [
     (["--after", "-1"], "--after: given -1"),
     (["--threads", "0"], "--threads: given 0"),
     (["--cell", "0"], "cell: given 0"),
+    (["--out", "f.npz"], "--out: f.npz is no directory"),
     (["--layout", "text:*"], "--layout: only with --features"),
     (["--features", "f.npz", "--task", "push"], "expected one observation"),
     (["--features", "missing.npz"], "missing.npz: no such file"),
@@ -623,7 +642,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
     np.savez("fits.npz", backbone_features=np.zeros((1, 20, 128), np.float32), **others)
     shutil.copy(load_released("n15_tiny").path, "head.safetensors")
     Path("config.json").write_text(json.dumps(load_released("n15_tiny").config))
-    assert main(["attention", *arguments, "--out", "out"]) == 2
+    assert main(["attention", "--out", "out", *arguments]) == 2
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1

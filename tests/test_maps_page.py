@@ -22,7 +22,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from saccade.maps.page import render_page, write_page
-from saccade.maps.record import CAVEAT, Maps
+from saccade.maps.record import BESIDE, CAVEAT, Maps
 
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
@@ -109,7 +109,7 @@ def test_the_first_view(page: Page) -> None:
         page.text("legend")
         == "block 0 (reads vision and language), Euler step 0, mean over heads: future rows, mean of 3"
     )
-    assert page.text("caveat") == CAVEAT
+    assert page.text("caveat") == f"{CAVEAT} {BESIDE}"
     assert "by hand" in page.text("change-text")
     assert page.driver.get_log("browser") == []  # type: ignore[no-untyped-call]
 
@@ -253,7 +253,7 @@ def test_overlap_is_shown_beside_its_baselines(page: Page) -> None:
 
 @needs_browser
 def test_what_is_not_there_is_said(driver: webdriver.Chrome, tmp_path: Path) -> None:
-    write_page(one_hot_maps(future_tokens=0, images=False, occluded=False), tmp_path / "page.html")
+    write_page(one_hot_maps(future_tokens=0, images=False), tmp_path / "page.html")
     page = Page(driver, tmp_path / "page.html")
     assert "no future tokens (N = 0)" in page.text("notes")
     assert "drawn on white" in page.text("notes")
@@ -261,6 +261,5 @@ def test_what_is_not_there_is_said(driver: webdriver.Chrome, tmp_path: Path) -> 
         "state",
         "action",
     ]
-    assert page.driver.find_elements(By.ID, "occlusion-0") == []
     assert page.pixels("map-0").size > 0
     assert page.driver.get_log("browser") == []  # type: ignore[no-untyped-call]

@@ -48,6 +48,8 @@ examples:
 # full-size checkpoint would grow to tens of megabytes; beyond this only named heads are shown one by one.
 MAX_PROBABILITIES = 500_000
 
+WIDTH = 160  # letters of a table in a file or a pipe, where there is no edge to keep to
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
@@ -59,9 +61,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="directory or .safetensors file (default: the shipped policy)",
     )
     parser.add_argument("--config", type=Path, help="the head's config (default: config.json beside it)")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="of the task's layout, words and noise; of the noise, if a file has none (default: 0)",
+    )
     simulator = parser.add_argument_group("an observation of the simulator")
     simulator.add_argument("--task", metavar="NAME", help="task (default: push, if it knows it)")
-    simulator.add_argument("--seed", type=int, default=0, help="of layout, words and noise (default: 0)")
     simulator.add_argument(
         "--after", type=int, default=0, metavar="K", help="control steps before it looks (default: 0)"
     )
@@ -72,9 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     file.add_argument("--grid", metavar="RxC", help="patches of a picture (default: 16x16 with input_ids)")
     file.add_argument(
         "--image-token-index", type=int, metavar="ID", help="image token in input_ids (default: 151669)"
-    )
-    file.add_argument(
-        "--noise-seed", type=int, default=0, help="of the noise, if the file has none (default: 0)"
     )
     maps = parser.add_argument_group("maps")
     maps.add_argument("--blocks", metavar="N,...", help="blocks (default: all)")
@@ -88,7 +92,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     maps.add_argument(
         "--cell", type=int, metavar="N", help="occlude N x N patches at once (default: at most 8 x 8 cells)"
     )
-    maps.add_argument("--no-occlusion", action="store_true", help="leave the occlusion map out")
     parser.add_argument("--threads", type=int, help="threads of the action head (default: the engine's own)")
     parser.add_argument(
         "--out", type=Path, default=Path("out/attention"), help="where results go (default: out/attention)"
@@ -147,7 +150,7 @@ def look(args: argparse.Namespace) -> Maps:
         rows=rows,
         attention=attention,
         redrawn=redrawn,
-        occlusion=None if args.no_occlusion or not inputs.layout.cameras else occlude(head, inputs, cell),
+        occlusion=occlude(head, inputs, cell) if inputs.layout.cameras else None,
     )
 
 
@@ -157,8 +160,10 @@ def check(args: argparse.Namespace) -> None:
         raise UsageError(f"--threads: given {args.threads}, expected at least 1")
     if args.after < 0:
         raise UsageError(f"--after: given {args.after}, expected at least 0")
-    if args.noise_seed < 0:
-        raise UsageError(f"--noise-seed: given {args.noise_seed}, expected at least 0")
+    if args.seed < 0:
+        raise UsageError(f"--seed: given {args.seed}, expected at least 0")
+    if args.out.exists() and not args.out.is_dir():
+        raise UsageError(f"--out: {args.out} is no directory")
     if args.features is not None and (args.task is not None or args.after):
         raise UsageError("--features, --task: expected one observation, of a file or of the simulator")
     if args.features is None:
@@ -197,9 +202,7 @@ def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> Inpu
             if args.image_token_index is None
             else args.image_token_index,
         )
-        return inputs.from_file(
-            args.features, config, row=args.row, options=options, noise_seed=args.noise_seed
-        )
+        return inputs.from_file(args.features, config, row=args.row, options=options, seed=args.seed)
     from saccade.sim import graphics
     from saccade.sim.policy import Policy, check_trained_on
     from saccade.sim.tasks import check_evaluation_seeds, find_task
@@ -246,27 +249,29 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
     """Prints where attention goes, and where the files are."""
     from rich import box
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    from saccade.maps.record import CAVEAT
     from saccade.maps.sheet import NO_FUTURE, NO_IMAGES
 
     console = Console()
-    console.print(maps.inputs.title, style="bold", markup=False)
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    console.print(maps.inputs.title, style="bold", markup=False, soft_wrap=True)
     entries = [entry for entry in record["summaries"] if entry["head"] == "mean"]
     for reads, blocks in (("vl", maps.cross_blocks()), ("rows", maps.self_blocks())):
         if not blocks:
             continue
         parts = list(maps.parts(blocks[0]))
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        for heading in ("block", "rows"):
+        for heading in (f"reads {reads}", "rows"):
             table.add_column(heading, no_wrap=True)
         for heading in (*parts, "keys", "distinct"):
-            table.add_column(heading, justify="right", no_wrap=True)
+            table.add_column(escape(heading), justify="right", no_wrap=True)
         for block in blocks:
             for group in maps.rows:
                 found = [e for e in entries if e["block"] == block and e["group"] == group]
-                table.add_row(f"{block} reads {reads}", group, *cells(found, parts))
+                table.add_row(f"block {block}", group, *cells(found, parts))
         console.print(table)
     console.print(
         "attention in %, means over heads and Euler steps; keys: exp(entropy) of a row in one head; "
@@ -280,7 +285,7 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
     ):
         if missing:
             console.print(message, soft_wrap=True)
-    console.print(CAVEAT, style="italic", soft_wrap=True)
+    console.print(maps.caveat, style="italic", soft_wrap=True)
     for label, name in (("sheet", "sheet.png"), ("page", "page.html"), ("numbers", "attention.json")):
         console.print(f"{label:8} {out / name}", soft_wrap=True, highlight=False, markup=False)
 

@@ -118,7 +118,7 @@ def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> 
     )
 
 
-def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOptions, noise_seed: int) -> Inputs:
+def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOptions, seed: int) -> Inputs:
     """One observation of a file of backbone features.
 
     Args:
@@ -126,7 +126,7 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
         config: of the head that will take them.
         row: which of the file's observations.
         options: where its image tokens are.
-        noise_seed: of the noise, if the file has none.
+        seed: of the noise, if the file has none.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -141,6 +141,8 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
             f"{config.context_dim})"
         )
     batch, num_tokens, _ = features.shape
+    if not batch or not num_tokens:
+        raise InputError(f"{path}: backbone_features: shape {features.shape}, expected no empty axis")
     if not 0 <= row < batch:
         raise InputError(f"--row: given {row}, {path} has rows 0 to {batch - 1}")
 
@@ -185,7 +187,7 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
     noise = of_row("noise", (config.action_horizon, config.encoder_action_dim))
     if noise is None:
         shape = (config.action_horizon, config.encoder_action_dim)
-        noise = np.random.default_rng(noise_seed).standard_normal(shape, dtype=np.float32)
+        noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
     chosen = slice(row, row + 1)
     embodiment_id = int(embodiments.reshape(-1)[row if embodiments.size == batch else 0])
     features, state, noise = features[chosen], state[chosen], np.asarray(noise, np.float32)[None]
@@ -196,7 +198,7 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
             "file": path.name,
             "row": row,
             "embodiment_id": embodiment_id,
-            "noise": "from the file" if "noise" in arrays else f"seed {noise_seed}",
+            "noise": "from the file" if "noise" in arrays else f"seed {seed}",
         },
         features=features,
         state=state,

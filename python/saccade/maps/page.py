@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from saccade.maps.record import CAVEAT, MEAN, Maps
+from saccade.maps.record import MEAN, Maps
 from saccade.maps.sheet import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES
 from saccade.sim.files import write_atomically
 
@@ -34,7 +34,7 @@ def render_page(maps: Maps) -> str:
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # groups keep their order
     # `tojson` escapes what would end the script element; token strings such as </img> are common here.
     return environment.from_string(source).render(
-        title=maps.inputs.title, caveat=CAVEAT, notes=notes(maps), data=page_data(maps)
+        title=maps.inputs.title, caveat=maps.caveat, notes=notes(maps), data=page_data(maps)
     )
 
 
@@ -47,12 +47,10 @@ def notes(maps: Maps) -> list[str]:
         found.append(NO_IMAGES)
     elif not maps.inputs.images:
         found.append("The file has no pictures: maps are drawn on white.")
-    if maps.occlusion is None:
-        found.append("Occlusion was not measured.")
-    if len(maps.selection.shown_heads) < len(maps.selection.heads):
+    if not maps.selection.shown_heads:
         found.append(
-            f"The mean is over {len(maps.selection.heads)} heads; {len(maps.selection.shown_heads)} of them "
-            "are in this page one by one (--heads chooses)."
+            f"This page has only the mean over {len(maps.selection.heads)} heads; --heads N,... shows them "
+            "one by one."
         )
     return found
 

@@ -29,10 +29,10 @@ Indices = npt.NDArray[np.int64]
 Attention = Mapping[tuple[int, int], Float32Array]
 
 CAVEAT = (
-    "A bright patch is a position that is read, not a cause. After the VL self-attention every position "
-    "holds something of all others, so what is read there need not come from that patch of the picture. The "
-    "occlusion map beside it shows what the actions depend on."
+    "A bright patch is a position that is read, not a cause. After the backbone and the VL self-attention a "
+    "position holds more than its patch, so what is read there need not come from that patch of the picture."
 )
+BESIDE = "The occlusion map beside it shows what the actions depend on."
 FUTURE_TOKENS = "future_tokens."
 PREFIXES = ("action_head.", "_groot_model.action_head.", "")  # those that ActionHead.load knows
 MEAN = "mean"
@@ -67,7 +67,7 @@ class Maps:
         attention: By step and block, `(heads, rows, keys)`, heads in the selection's order.
         redrawn: The same with future tokens drawn at random, only the future rows; None without future
             tokens.
-        occlusion: None if it was not measured.
+        occlusion: None if there are no image tokens.
     """
 
     checkpoint: dict[str, str]
@@ -78,6 +78,11 @@ class Maps:
     attention: Attention
     redrawn: Attention | None
     occlusion: Occlusion | None
+
+    @property
+    def caveat(self) -> str:
+        """What has to be said with every map."""
+        return CAVEAT if self.occlusion is None else f"{CAVEAT} {BESIDE}"
 
     @property
     def num_future_tokens(self) -> int:
@@ -111,7 +116,7 @@ class Maps:
     def agreement(self, keys: Float32Array) -> float | None:
         """Spearman's rank correlation over all patches between a map `(T_vl,)` and the occlusion map.
 
-        None where there is no occlusion map, or where one of the two is the same everywhere.
+        None where there are no image tokens, or where one of the two is the same everywhere.
         """
         if self.occlusion is None:
             return None
@@ -184,7 +189,7 @@ class Maps:
             "rows": {name: [rows.start, rows.stop] for name, rows in self.rows.items()},
             "selection": asdict(self.selection),
             "layout": self.inputs.layout.to_dict(),
-            "caveat": CAVEAT,
+            "caveat": self.caveat,
             "baselines": BASELINES,
             "occlusion": None if self.occlusion is None else self.occlusion.to_dict(),
             "agreement": self.agreements(),

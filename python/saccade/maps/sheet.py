@@ -13,13 +13,13 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, ListedColormap, Normalize
+from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
 from saccade.maps.layout import Camera
-from saccade.maps.record import BASELINES, CAVEAT, MEAN, Maps
+from saccade.maps.record import BASELINES, MEAN, Maps
 from saccade.sim.files import write_atomically
 
 Float32Array = npt.NDArray[np.float32]
@@ -150,27 +150,24 @@ class Sheet:
             self._note(NO_IMAGES, weight="bold", color="black")
         elif not maps.inputs.images:
             self._note("The file has no pictures: maps are drawn on white.", weight="bold", color="black")
-        self._note(CAVEAT, fontsize=8.5, style="italic", color="#8c1d18")
+        self._note(maps.caveat, fontsize=8.5, style="italic", color="#8c1d18")
 
     def pictures(self) -> None:
         """The pictures as they are, and beside them what taking away each patch changes."""
         occlusion = self.maps.occlusion
-        if occlusion is None:
-            self._title("What the cameras see", note="Occlusion was not measured (--no-occlusion).")
-        else:
-            patches = "one patch" if occlusion.cell == 1 else f"{occlusion.cell} x {occlusion.cell} patches"
-            self._title(
-                "What the cameras see, and what the actions depend on",
-                note=f"Blue: mean |change of the chunk|, same noise, without {patches}; {occlusion.method}. "
-                f"For scale: another noise changes the chunk by {occlusion.other_noise:.2g}.",
-            )
+        assert occlusion is not None  # it is left out only where there are no cameras
+        patches = "one patch" if occlusion.cell == 1 else f"{occlusion.cell} x {occlusion.cell} patches"
+        self._title(
+            "What the cameras see, and what the actions depend on",
+            note=f"Blue: mean |change of the chunk|, same noise, without {patches}; {occlusion.method}. "
+            f"For scale: another noise changes the chunk by {occlusion.other_noise:.2g}.",
+        )
         self._top += 0.16
         high = self._height_for(INNER - BAR_WIDTH - 0.4, 2, 2.2)
         end = self._strip(MARGIN, high, None, 1.0, HEAT, names=True)
-        if occlusion is not None:
-            most = max(float(change.max()) for change in occlusion.change.values())
-            end = self._strip(end + 0.4, high, occlusion.change, most, CHANGE, names=True)
-            self._colour_bar(end + 0.08, high, most, CHANGE, "mean |change|")
+        most = max(float(change.max()) for change in occlusion.change.values())
+        end = self._strip(end + 0.4, high, occlusion.change, most, CHANGE, names=True)
+        self._colour_bar(end + 0.08, high, most, CHANGE, "mean |change|")
         self._top += high
 
     def camera_maps(self, blocks: Sequence[int]) -> None:
@@ -211,10 +208,11 @@ class Sheet:
         left = np.zeros(len(groups))
         for name, positions in parts.items():
             wide = np.array([mean[rows][:, positions].sum(axis=1).mean() for rows in self.maps.rows.values()])
+            ink = "white" if np.dot(to_rgb(colours[name]), (0.3, 0.6, 0.1)) < 0.6 else "black"  # as eyes see
             axes.barh(groups, wide, left=left, color=colours[name], label=name, height=0.8)
             for row, (start, width) in enumerate(zip(left, wide, strict=True)):
                 if width > 0.09:
-                    style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7, "color": "white"}
+                    style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7, "color": ink}
                     axes.text(start + width / 2, row, f"{100 * width:.0f}", **style)
             left += wide
         axes.set_xlim(0, 1)
@@ -345,6 +343,16 @@ class Sheet:
             for place in range(3 if several else 1)
         ]
         places = list(range(len(blocks)))
+        alike = [
+            [place for place in places if maps.reads_vl(blocks[place])],
+            [place for place in places if not maps.reads_vl(blocks[place])],
+        ]
+
+        def line(axes: Axes, values: Sequence[float], style: str, colour: str, label: str) -> None:
+            """By block; only blocks that read the same keys are joined."""
+            for joined in alike:
+                axes.plot(joined, [values[place] for place in joined], style, color=colour, markersize=4)
+            axes.plot([], [], style, color=colour, markersize=4, label=label)
 
         def means(group: str, *keys: str) -> list[float]:
             """By block, over the steps."""
@@ -358,7 +366,7 @@ class Sheet:
 
         for group in maps.rows:
             spread = np.exp(means(group, "per_head", "entropy"))
-            panels[0].plot(places, spread, "o-", color=GROUP_COLOURS[group], label=group, markersize=4)
+            line(panels[0], spread, "o-", GROUP_COLOURS[group], group)
         keys = [sum(map(len, maps.parts(block).values())) for block in blocks]
         panels[0].plot(places, keys, "_", color="#888888", markersize=14, label="all keys alike")
         panels[0].set_title("keys that a row looks at in one head: exp(entropy)", fontsize=9)
@@ -380,7 +388,7 @@ class Sheet:
                 (("overlap",), "s:", future, "learned tokens, mean of the heads' maps"),
                 (("per_head", "redrawn"), "^--", "#8a8a8a", "redrawn tokens, in one head"),
             ):
-                axes.plot(places, means("future", *path, key), style, color=colour, label=label, markersize=4)
+                line(axes, means("future", *path, key), style, colour, label)
             axes.axhline(identical, color="black", linewidth=0.7, label="identical tokens")
             axes.set_title(title, fontsize=9)
         for axes in panels:
@@ -388,10 +396,10 @@ class Sheet:
             axes.set_xticks(places, labels, fontsize=7)
             axes.tick_params(axis="y", labelsize=7)
             axes.spines[["top", "right"]].set_visible(False)
-            axes.set_ylim(top=1.5 * axes.get_ylim()[1])  # room for the legend
+            axes.set_ylim(top=1.7 * axes.get_ylim()[1])  # room for the legend
             axes.legend(fontsize=7, frameon=False, loc="upper right")
         self._top += high + 0.4
-        self._note("Below the axes: the block, and what it reads.")
+        self._note("Below the axes: the block, and what it reads; lines join blocks that read the same.")
 
     def _on_cameras(self, keys: Float32Array) -> dict[str, Float32Array]:
         """A row's map `(T_vl,)` by camera, `(rows, columns)` each."""
