@@ -97,6 +97,8 @@ def test_a_sweep_over_trained_policies(
     printed = capsys.readouterr()
     assert printed.err.startswith("What these runs can detect, with 80 % power at the 5 % level:")
     assert "N = 4 against N = 2. These policies: no effect on success was found" in printed.out
+    assert "N = 4, aligned (0.2) against N = 4." in printed.out
+    assert "N = 4, aligned (0.2) against N = 2." not in printed.out  # differs in two respects
     table: Any = read_table(tmp_path / "n.csv")
     provenance = read_provenance(tmp_path / "n.json")
     assert provenance.complete
@@ -137,7 +139,7 @@ def test_a_sweep_over_trained_policies(
 def test_a_sweep_that_trains(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--demos", str(recording), "--patch-size", "8,16", "--training-seeds", "0", "--steps", "1"]
     assert study("tvl", *arguments, "--episodes", "1", "--out", str(tmp_path)) == 0
-    assert "trained anew: not measured, with one run" in capsys.readouterr().out
+    assert "trained anew: no interval, with 1 and 1 runs" in capsys.readouterr().out
     table: Any = read_table(tmp_path / "tvl.csv")
     assert list(table[table["kind"] == "training"]["policy"]) == [
         "patch-size-16-seed-0",
@@ -229,6 +231,11 @@ def test_difference_of_these_policies_is_paired() -> None:
     found = sweeps.same_policies(rows(easy_and_hard), rows([[True] * 20, [True, False] * 10]))
     assert found.value == 0.25
     assert 0.1 < found.low < 0.25 < found.high < 0.4
+
+
+def test_policies_with_episodes_missing_are_left_out() -> None:
+    plain = pd.DataFrame({"policy": ["one"] * 3 + ["other"] * 2})
+    assert sweeps.whole_runs(plain) == (["one"], ["other: left out, 2 of 3 episodes are done."])
 
 
 def test_what_is_merged_and_drawn() -> None:

@@ -33,6 +33,7 @@ from saccade.sim.tasks import check_evaluation_seeds
 from saccade.study import figures
 from saccade.study.arguments import names, numbers
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
+from saccade.study.cuts import scaled
 from saccade.study.loaded import describe_checkpoint, environment_of, policy_of
 from saccade.study.observations import task_names
 from saccade.study.report import Figure, Grid, Section, effect, number, rate
@@ -611,7 +612,7 @@ def between_runs(first: Sequence[float], second: Sequence[float], episodes: int)
         return Estimate(value, math.nan, math.nan)
     freedom = sum(parts) ** 2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
     half = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * math.sqrt(sum(parts))
-    return Estimate(value, value - half, value + half)
+    return Estimate(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
 def same_policies(first: pd.DataFrame, second: pd.DataFrame) -> Estimate:
@@ -651,6 +652,8 @@ def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
         success=episodes["success"].astype(bool).astype(float),
         point=[sweep.label(row) for row in episodes.to_dict("records")],
     )
+    whole, partial = whole_runs(episodes[episodes["arm"] == PLAIN])
+    episodes = episodes[episodes["policy"].isin(whole)]
     plain = episodes[episodes["arm"] == PLAIN]
     points = point_order(plain, sweep)
     pictures = [
@@ -660,12 +663,12 @@ def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
             policy_picture(plain, points),
         )
     ]
-    grids = [policy_grid(plain, trained, points), difference_grid(plain, points)]
+    grids = [policy_grid(plain, trained, points), difference_grid(plain, sweep)]
     if (episodes["arm"] != PLAIN).any():
         grids.append(mass_grid(episodes, points))
     if "cost" in kinds:
         grids.append(cost_grid(kinds["cost"], sweep))
-    lines = conclusions(plain, points) + mass_conclusions(episodes, points) + unfinished
+    lines = conclusions(plain, sweep) + mass_conclusions(episodes, points) + partial + unfinished
     return Section(sweep.title, summary, pictures, grids, lines, NOT_SHOWN)
 
 
@@ -728,32 +731,34 @@ def policy_grid(plain: pd.DataFrame, trained: pd.DataFrame, points: Sequence[str
     return Grid("Every policy: success with Wilson's 95 % interval, then by task.", columns, lines)
 
 
-def compared(points: Sequence[str]) -> list[tuple[str, str]]:
-    """Each point with the first one, and each with the one before it."""
-    pairs = [(points[0], point) for point in points[1:]]
-    return list(dict.fromkeys([*pairs, *itertools.pairwise(points)]))
+def compared(plain: pd.DataFrame, sweep: Sweep) -> list[tuple[str, str]]:
+    """Pairs of points that differ in one respect."""
+    values = plain.drop_duplicates("point").sort_values(list(sweep.varied))
+    points = [(str(row["point"]), [row[name] for name in sweep.varied]) for row in values.to_dict("records")]
+    return [
+        (first, second)
+        for (first, one), (second, other) in itertools.combinations(points, 2)
+        if sum(a != b for a, b in zip(one, other, strict=True)) == 1
+    ]
 
 
-def differences(plain: pd.DataFrame, points: Sequence[str]) -> list[tuple[str, str, Estimate, Estimate]]:
+def differences(plain: pd.DataFrame, sweep: Sweep) -> list[tuple[str, str, Estimate, Estimate]]:
     """Pairs of points, and how the second differs: these policies, and trained anew."""
     found = []
-    for first, second in compared(points):
+    for first, second in compared(plain, sweep):
         one, other = plain[plain["point"] == first], plain[plain["point"] == second]
-        episodes = min(len(rows) // len(policies_of(rows)) for rows in (one, other))
+        episodes = len(one) // len(policies_of(one))
         anew = between_runs(run_rates(one), run_rates(other), episodes)
         found.append((first, second, same_policies(one, other), anew))
     return found
 
 
-def difference_grid(plain: pd.DataFrame, points: Sequence[str]) -> Grid:
+def difference_grid(plain: pd.DataFrame, sweep: Sweep) -> Grid:
     """Differences between points, in percentage points of success."""
-    lines = []
-    for first, second, these, anew in differences(plain, points):
-        values = [
-            number(Estimate(*(100 * part for part in (one.value, one.low, one.high))), digits=0)
-            for one in (these, anew)
-        ]
-        lines.append([second, first, *values])
+    lines = [
+        [second, first, number(scaled(these), digits=0), number(scaled(anew), digits=0)]
+        for first, second, these, anew in differences(plain, sweep)
+    ]
     return Grid(
         "Difference of success, percentage points, with 95 % intervals.",
         ("policies", "less", "these policies", "trained anew"),
@@ -762,22 +767,24 @@ def difference_grid(plain: pd.DataFrame, points: Sequence[str]) -> Grid:
 
 
 def mass_differences(episodes: pd.DataFrame, points: Sequence[str]) -> list[tuple[str, str, Estimate]]:
-    """For each point and control of equal mass, how success differs from the policies as they are."""
+    """For each point and control of equal mass, how success differs from the same policies as they are."""
+    keys = ["policy", "task", "seed"]
     found = []
     for point in points:
         of_point = episodes[episodes["point"] == point]
-        plain = of_point[of_point["arm"] == PLAIN]
-        for arm in dict.fromkeys(of_point["arm"]):
-            if arm != PLAIN:
-                found.append((point, str(arm), same_policies(plain, of_point[of_point["arm"] == arm])))
+        plain = of_point[of_point["arm"] == PLAIN].set_index(keys)["success"]
+        for arm in sorted(set(of_point["arm"]) - {PLAIN}):
+            weighed = of_point[of_point["arm"] == arm].set_index(keys)["success"]
+            change = (weighed - plain).dropna()
+            drawn = [(task, seed) for _, task, seed in change.index]
+            found.append((point, str(arm), bootstrap(change.to_numpy(), drawn)))
     return found
 
 
 def mass_grid(episodes: pd.DataFrame, points: Sequence[str]) -> Grid:
     """The controls of equal mass."""
     lines = [
-        [point, arm, number(Estimate(*(100 * part for part in (one.value, one.low, one.high))), digits=0)]
-        for point, arm, one in mass_differences(episodes, points)
+        [point, arm, number(scaled(one), digits=0)] for point, arm, one in mass_differences(episodes, points)
     ]
     return Grid(
         "Control: the future keys together weigh in the softmax as so many tokens would. Difference of "
@@ -816,20 +823,33 @@ def cost_grid(cost: pd.DataFrame, sweep: Sweep) -> Grid:
     )
 
 
-def conclusions(plain: pd.DataFrame, points: Sequence[str]) -> list[str]:
-    """What the intervals allow to be said of every pair of points."""
+def conclusions(plain: pd.DataFrame, sweep: Sweep) -> list[str]:
+    """What the intervals allow to be said of every pair of points that differ in one respect."""
+    found = differences(plain, sweep)
+    if not found:
+        points = ", ".join(point_order(plain, sweep))
+        return [f"Only {points} was measured: nothing to compare."]
     lines = []
-    if len(points) < 2:
-        lines.append(f"Only {points[0]} was measured: nothing to compare.")
-    for first, second, these, anew in differences(plain, points):
+    for first, second, these, anew in found:
         runs = [len(policies_of(plain[plain["point"] == point])) for point in (first, second)]
         trained = (
-            "trained anew: not measured, with one run"
+            f"trained anew: no interval, with {runs[0]} and {runs[1]} runs"
             if math.isnan(anew.low)
-            else f"trained anew ({runs[1]} and {runs[0]} runs): {effect('success', anew)}"
+            else f"trained anew ({runs[0]} and {runs[1]} runs): {effect('success', anew)}"
         )
         lines.append(f"{second} against {first}. These policies: {effect('success', these)}; {trained}.")
     return lines
+
+
+def whole_runs(plain: pd.DataFrame) -> tuple[list[str], list[str]]:
+    """Policies that ran all episodes, and a line for each of those that did not."""
+    counts = plain.groupby("policy", sort=False).size()
+    whole = [str(name) for name in counts.index[counts == counts.max()]]
+    partial = [
+        f"{name}: left out, {count} of {counts.max()} episodes are done."
+        for name, count in counts[counts < counts.max()].items()
+    ]
+    return whole, partial
 
 
 def mass_conclusions(episodes: pd.DataFrame, points: Sequence[str]) -> list[str]:
