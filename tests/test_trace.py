@@ -141,6 +141,13 @@ def test_max_bytes_is_what_the_arrays_hold(record: list[str], steps: list[int]) 
         head.trace(**given_arrays, record=record, steps=steps, max_bytes=held - 1)
 
 
+def test_max_bytes_comes_before_what_interventions_take() -> None:
+    head, given_arrays = one_call()
+    many = Intervention(future_tokens=np.zeros((20_000, 12)), cut=[("future", "future")])
+    with pytest.raises(saccade.InputError, match="max_bytes: what is to be recorded takes"):
+        head.trace(**given_arrays, intervention=many)
+
+
 @functools.cache
 def one_call() -> tuple[saccade.ActionHead, Inputs]:
     """A head and what its `trace` takes."""
@@ -210,7 +217,7 @@ def test_torch_in_torch_out(head: saccade.ActionHead) -> None:
     assert all(isinstance(array, torch.Tensor) and array.dtype == torch.float32 for array in kept)
 
 
-def test_a_trace_cannot_be_taken_for_another(head: saccade.ActionHead, inputs: Inputs) -> None:
+def test_a_trace_is_frozen(head: saccade.ActionHead, inputs: Inputs) -> None:
     trace = head.trace(**inputs, record=())
     with pytest.raises(dataclasses.FrozenInstanceError):
         trace.actions = np.zeros(3)  # type: ignore[misc, assignment]

@@ -385,13 +385,17 @@ class ActionHead:
             steps: Of which Euler steps; default all.
             max_bytes: A trace that holds more is refused before anything is allocated.
 
+        Returns:
+            By ``(step, block)`` the attention ``(batch, heads, queries, keys)`` and the rows ``(batch, rows,
+            width)``, and the actions, bit for bit those of ``sample``; float32, torch if the features were
+            torch.
+
         Raises:
             ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; both ``noise`` and
             ``seed``; more than ``max_bytes``.
 
         Example:
-            How much of the future rows' attention in the first block each vision-language token gets, in the
-            mean over heads:
+            What the future rows look at in the first block, in the mean over heads:
 
             >>> import importlib.resources
             >>> import numpy as np, saccade
@@ -399,11 +403,8 @@ class ActionHead:
             >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
             >>> state = np.zeros((1, head.config.state_dim), np.float32)
             >>> trace = head.trace(context, state, 0, seed=7, blocks=0, steps=0)
-            >>> trace.attention[0, 0][:, :, trace.rows["future"]].mean(1).shape == (
-            ...     1,
-            ...     head.config.num_future_tokens,
-            ...     60,
-            ... )
+            >>> looks = trace.attention[0, 0][:, :, trace.rows["future"]].mean(axis=1)
+            >>> looks.shape == (1, head.config.num_future_tokens, context.num_vl_tokens)
             True
         """
         held = _held(context)

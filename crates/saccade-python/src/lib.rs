@@ -16,8 +16,8 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyType};
 use saccade::{
-    Array, Checkpoint, Elements, Error, Features, Group, Isa, LoadOptions, OwnedArray, Patch, Record,
-    Recorded, Sampling, Tokens, TraceOptions,
+    Array, Checkpoint, Elements, Error, Features, Group, Isa, Keep, LoadOptions, OwnedArray, Patch, Recorded,
+    Sampling, Tokens, TraceOptions,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -285,7 +285,7 @@ impl ActionHead {
             attention_mask: optional_view(&attention_mask)?,
             image_mask: optional_view(&image_mask)?,
             drop_vl: optional_view(&drop_vl)?,
-            record: Record { attention, hidden },
+            record: Keep { attention, hidden },
         };
         let mut context = py.detach(|| self.0.encode(&features)).map_err(raise)?;
         let kept = recorded(py, context.take_recorded())?;
@@ -337,24 +337,21 @@ impl ActionHead {
     ) -> PyResult<(PyRecorded<'py>, Bound<'py, PyDict>, Bound<'py, PyArrayDyn<f32>>)> {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
         let context = &context.0;
-        let interventions = interventions(intervention)?;
+        let sampling = Sampling {
+            num_steps,
+            num_samples: None,
+            interventions: &interventions(intervention)?,
+        };
         let options = TraceOptions {
-            record: Record { attention, hidden },
+            record: Keep { attention, hidden },
             blocks,
             steps,
             max_bytes,
         };
         let trace = py
             .detach(|| {
-                self.0.trace(
-                    context,
-                    state,
-                    embodiment_id,
-                    noise,
-                    num_steps,
-                    &interventions,
-                    &options,
-                )
+                self.0
+                    .trace(context, state, embodiment_id, noise, &sampling, &options)
             })
             .map_err(raise)?;
         let rows = PyDict::new(py);

@@ -36,24 +36,24 @@ impl AttentionBuffers {
     }
 }
 
-/// What is added to the logits of an attention over several sequences.
+/// What is added to the logits of an attention over several groups of keys.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Bias<'a> {
-    /// `(sequences, keys)`: each sequence's own, for all of its heads and queries.
+    /// `(groups, keys)`: each group's own, for all of its heads and queries.
     pub keys: Option<&'a [f32]>,
-    /// The same for all sequences.
+    /// The same for every sequence of queries.
     pub shared: Option<LogitBias<'a>>,
 }
 
 impl Bias<'_> {
-    /// The bias of one sequence with `[heads, queries, keys]` logits; `sum` is memory for the sum of both kinds.
+    /// The bias of `[heads, queries, keys]` logits of one group; `sum` is memory for the sum of both kinds.
     fn of<'s>(
         &'s self,
-        sequence: usize,
+        group: usize,
         [heads, queries, keys]: [usize; 3],
         sum: &'s mut Vec<f32>,
     ) -> Option<LogitBias<'s>> {
-        let own = self.keys.map(|all| &all[sequence * keys..(sequence + 1) * keys]);
+        let own = self.keys.map(|all| &all[group * keys..(group + 1) * keys]);
         let (own, shared) = match (own, self.shared) {
             (Some(own), Some(shared)) => (own, shared),
             (Some(values), None) => {
@@ -301,7 +301,7 @@ mod tests {
 
     #[test]
     fn both_kinds_of_bias_add_up() {
-        let own = [1.0, 2.0, f32::NEG_INFINITY, 4.0]; // two sequences of two keys
+        let own = [1.0, 2.0, f32::NEG_INFINITY, 4.0]; // two groups of two keys
         let shared = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0]; // (heads, queries, keys)
         let mut sum = Vec::new();
         let rows = |bias: LogitBias<'_>| {
@@ -318,7 +318,7 @@ mod tests {
                 query_stride: 2,
             }),
         };
-        let mut of = |bias: Bias<'_>, sequence| rows(bias.of(sequence, [2, 2, 2], &mut sum).unwrap());
+        let mut of = |bias: Bias<'_>, group| rows(bias.of(group, [2, 2, 2], &mut sum).unwrap());
         assert_eq!(
             of(bias(None, 4), 1),
             [[10.0, 20.0], [30.0, 40.0], [50.0, 60.0], [70.0, 80.0]]

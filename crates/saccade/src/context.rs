@@ -9,7 +9,7 @@ use crate::config::HeadConfig;
 use crate::error::Result;
 use crate::layers::{Engine, HeadTensors, Norm, sized};
 use crate::layout::{HeadNames, VlBlockNames};
-use crate::trace::{Record, Recorded, Shapes};
+use crate::trace::{Keep, Recorded, Shapes};
 
 /// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate
 /// activations small. At 1024 rows the weights are read once per 3 to 4 camera views and the largest buffer is 32 MB at N1.5's size.
@@ -158,7 +158,7 @@ impl VlEncoder {
     /// Memory for what is to be recorded of `batch` observations.
     pub(crate) fn recorded(
         &self,
-        record: Record,
+        record: Keep,
         batch: usize,
         num_vl_tokens: usize,
     ) -> Result<Recorded<usize>> {

@@ -215,7 +215,7 @@ impl Dit {
         let mut action = std::mem::take(&mut buffers.action); // (sequences, action_rows, width)
         match pass.last {
             LastBlock::ActionRows => {
-                gather_action_rows(&pass.changes.groups, self.width, &h, &mut action);
+                gather_action_rows(&pass.changes.extent.groups, self.width, &h, &mut action);
                 self.block(
                     engine,
                     pass,
@@ -238,7 +238,7 @@ impl Dit {
                     recorded,
                     buffers,
                 );
-                gather_action_rows(&pass.changes.groups, self.width, &h, &mut action);
+                gather_action_rows(&pass.changes.extent.groups, self.width, &h, &mut action);
             }
         }
         let y = sized(&mut buffers.y, action.len());
@@ -304,7 +304,7 @@ impl Dit {
             ..
         } = *pass;
         let groups = context.batch * samples;
-        let first_row = changes.groups.num_rows() - x.len() / self.width / groups;
+        let first_row = changes.extent.groups.num_rows() - x.len() / self.width / groups;
         let shared = changes.bias(step, index, first_row);
         let weights = recorded.attention((step, index));
         if block.is_cross {

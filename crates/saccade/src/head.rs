@@ -17,7 +17,7 @@ use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, HeadTensors, TensorSource, sized};
 use crate::layout::HeadNames;
 use crate::tables::action_time;
-use crate::trace::{Record, Recorded, Shapes, StepBlock, Trace, TraceOptions};
+use crate::trace::{Keep, Recorded, Shapes, StepBlock, Trace, TraceOptions};
 
 /// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
 const CACHED_BRACKETS: usize = 256;
@@ -45,7 +45,7 @@ pub struct Features<'a> {
     /// `(batch, num_vl_tokens)`, true = as if the position were not there.
     pub drop_vl: Option<Array<'a, bool>>,
     /// What to keep of the VL self-attention.
-    pub record: Record,
+    pub record: Keep,
 }
 
 impl<'a> Features<'a> {
@@ -57,7 +57,7 @@ impl<'a> Features<'a> {
             attention_mask: None,
             image_mask: None,
             drop_vl: None,
-            record: Record::default(),
+            record: Keep::default(),
         }
     }
 }
@@ -272,7 +272,8 @@ impl ActionHead {
         let state = self.check_state(state, context.batch)?;
         let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, context.batch, sampling.num_samples)?;
-        let changes = self.changes(sampling.interventions, context, num_steps)?;
+        let extent = self.extent(sampling.interventions, context, num_steps)?;
+        let changes = Changes::new(sampling.interventions, extent)?;
         let pass = Pass {
             context,
             samples,
@@ -292,28 +293,31 @@ impl ActionHead {
 
     /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last included.
     ///
-    /// `noise` is `(batch, action_horizon, encoder_action_dim)`.
+    /// There is one chunk for each observation: `sampling.num_samples` must be none.
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, and for a trace of more than `options.max_bytes`.
-    #[allow(clippy::too_many_arguments)] // Those of sample, and what to keep.
     pub fn trace(
         &self,
         context: &Context,
         state: Array<'_>,
         embodiment_id: Array<'_, i64>,
         noise: Array<'_>,
-        num_steps: Option<usize>,
-        interventions: &[Intervention],
+        sampling: &Sampling<'_>,
         options: &TraceOptions,
     ) -> Result<Trace> {
         self.check_context(context)?;
+        if let Some(samples) = sampling.num_samples {
+            return Err(Error::Input(format!(
+                "num_samples: expected none, since a trace is of one chunk an observation, got {samples}"
+            )));
+        }
         let (batch, config) = (context.batch, &self.config);
         let state = self.check_state(state, batch)?;
-        let num_steps = self.check_num_steps(num_steps)?;
+        let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, batch, None)?;
-        let changes = self.changes(interventions, context, num_steps)?;
-        let groups = changes.groups;
+        let extent = self.extent(sampling.interventions, context, num_steps)?;
+        let groups = extent.groups;
         let shapes = |place: StepBlock| {
             let rows = groups.num_rows();
             let keys = if config.is_cross(place.1) { groups.vl } else { rows };
@@ -323,6 +327,9 @@ impl ActionHead {
         };
         let places = options.places(num_steps, config.num_layers)?;
         let places: Vec<_> = places.into_iter().map(shapes).collect();
+        // Before the interventions are worked out, since that takes memory too.
+        let mut recorded = Recorded::claim("max_bytes", options.record, &places, options.max_bytes)?;
+        let changes = Changes::new(sampling.interventions, extent)?;
         let pass = Pass {
             context,
             samples,
@@ -332,14 +339,14 @@ impl ActionHead {
         };
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
-            let mut recorded = Recorded::claim("max_bytes", options.record, &places, options.max_bytes)?;
             self.encode_state(state, workspace);
             self.euler_steps(&pass, noise.data, num_steps, &mut recorded, workspace);
             let shape = [batch, config.action_horizon, config.action_dim];
+            let actions = OwnedArray::new(workspace.x.clone(), &shape);
             Ok(Trace {
                 recorded,
                 groups,
-                actions: OwnedArray::new(workspace.x.clone(), &shape),
+                actions,
             })
         })
     }
@@ -372,7 +379,7 @@ impl ActionHead {
             )?
             .check_finite("actions")?;
         let timesteps = self.check_timestep(timestep, batch)?;
-        let changes = self.changes(interventions, context, 1)?;
+        let changes = Changes::new(interventions, self.extent(interventions, context, 1)?)?;
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
@@ -452,20 +459,20 @@ impl ActionHead {
         )
     }
 
-    /// What the interventions mean for a call on `context`.
-    fn changes<'a>(
+    /// What a call on `context` is over.
+    fn extent<'a>(
         &'a self,
         interventions: &'a [Intervention],
         context: &Context,
         num_steps: usize,
-    ) -> Result<Changes<'a>> {
-        let extent = Extent {
-            config: &self.config,
-            batch: context.batch,
-            num_vl_tokens: context.num_vl_tokens,
+    ) -> Result<Extent<'a>> {
+        Extent::new(
+            &self.config,
+            &self.future_tokens,
+            interventions,
+            context,
             num_steps,
-        };
-        Changes::new(interventions, &self.future_tokens, extent)
+        )
     }
 
     /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`.
@@ -610,8 +617,8 @@ impl ActionHead {
         } = workspace;
         let width = self.config.width;
         let actions = self.config.action_horizon * width;
-        let sequence = pass.changes.groups.num_rows() * width;
-        let future_tokens = pass.changes.future_tokens;
+        let sequence = pass.changes.extent.groups.num_rows() * width;
+        let future_tokens = pass.changes.extent.future_tokens;
         let h = sized(&mut dit.h, encoded.len() / actions * sequence);
         for (index, (h, action)) in h
             .chunks_exact_mut(sequence)
@@ -891,7 +898,7 @@ mod tests {
         let times = &mut workspace.dit.times;
         times.resize(context.batch, head.dit.time(head.engine, bucket));
         head.encode_state(&numbers(context.batch * config.state_dim, 3), &mut workspace);
-        let changes = head.changes(&[], context, 1).unwrap();
+        let changes = Changes::new(&[], head.extent(&[], context, 1).unwrap()).unwrap();
         let pass = Pass {
             context,
             samples: 1,

@@ -8,6 +8,7 @@ use saccade_kernels::LogitBias;
 
 use crate::array::OwnedArray;
 use crate::config::HeadConfig;
+use crate::context::Context;
 use crate::error::{Error, Result, show_shape};
 
 /// A group of tokens.
@@ -159,20 +160,43 @@ impl Groups {
 pub(crate) struct Extent<'a> {
     pub config: &'a HeadConfig,
     pub batch: usize,
-    pub num_vl_tokens: usize,
     pub num_steps: usize,
+    /// `(groups.future, width)`: the learned ones, or those in their place.
+    pub future_tokens: &'a [f32],
+    pub groups: Groups,
+}
+
+impl<'a> Extent<'a> {
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for future tokens that cannot replace the learned ones.
+    pub(crate) fn new(
+        config: &'a HeadConfig,
+        learned: &'a [f32],
+        interventions: &'a [Intervention],
+        context: &Context,
+        num_steps: usize,
+    ) -> Result<Self> {
+        let future_tokens = replaced_future_tokens(interventions, config.width)?.unwrap_or(learned);
+        Ok(Self {
+            config,
+            batch: context.batch,
+            num_steps,
+            future_tokens,
+            groups: Groups {
+                future: future_tokens.len() / config.width,
+                action: config.action_horizon,
+                vl: context.num_vl_tokens,
+            },
+        })
+    }
 }
 
 /// All interventions of one call, in the form in which blocks use them.
 pub(crate) struct Changes<'a> {
-    pub groups: Groups,
-    /// `(groups.future, width)`: the learned ones, or those in their place.
-    pub future_tokens: &'a [f32],
+    pub extent: Extent<'a>,
     biases: Vec<DenseBias>,
     /// Which of the biases acts, by step and block; empty if none ever does.
     acting: Vec<Option<usize>>,
-    num_layers: usize,
-    width: usize,
     patches: Vec<PatchedRows<'a>>,
 }
 
@@ -202,47 +226,33 @@ impl<'a> Changes<'a> {
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for what does not fit the call.
-    pub(crate) fn new(
-        interventions: &'a [Intervention],
-        learned: &'a [f32],
-        extent: Extent<'_>,
-    ) -> Result<Self> {
-        let config = extent.config;
-        let future_tokens = replaced_future_tokens(interventions, config.width)?.unwrap_or(learned);
+    pub(crate) fn new(interventions: &'a [Intervention], extent: Extent<'a>) -> Result<Self> {
         let mut changes = Self {
-            groups: Groups {
-                future: future_tokens.len() / config.width,
-                action: config.action_horizon,
-                vl: extent.num_vl_tokens,
-            },
-            future_tokens,
+            extent,
             biases: Vec::new(),
             acting: Vec::new(),
-            num_layers: config.num_layers,
-            width: config.width,
             patches: Vec::new(),
         };
         for intervention in interventions {
-            intervention.check(&changes.groups, extent)?;
+            intervention.check(&extent)?;
             for patch in &intervention.patch {
-                changes.patches.push(patch.check(&changes.groups, extent)?);
+                changes.patches.push(patch.check(&extent)?);
             }
         }
-        if interventions
-            .iter()
-            .any(|one| !one.cut.is_empty() || !one.key_bias.is_empty())
-        {
-            changes.find_biases(interventions, extent)?;
+        let adds = |one: &Intervention| !one.cut.is_empty() || !one.key_bias.is_empty();
+        if interventions.iter().any(adds) {
+            changes.find_biases(interventions)?;
         }
         Ok(changes)
     }
 
     /// Blocks of one kind in which the same interventions act share a bias.
-    fn find_biases(&mut self, interventions: &[Intervention], extent: Extent<'_>) -> Result<()> {
+    fn find_biases(&mut self, interventions: &[Intervention]) -> Result<()> {
         let mut known: BTreeMap<(bool, Vec<usize>), usize> = BTreeMap::new();
-        for step in 0..extent.num_steps {
-            for block in 0..extent.config.num_layers {
-                let is_cross = extent.config.is_cross(block);
+        let config = self.extent.config;
+        for step in 0..self.extent.num_steps {
+            for block in 0..config.num_layers {
+                let is_cross = config.is_cross(block);
                 let acting: Vec<usize> = (0..interventions.len())
                     .filter(|&index| interventions[index].acts(step, block, is_cross))
                     .collect();
@@ -253,7 +263,7 @@ impl<'a> Changes<'a> {
                         Entry::Occupied(entry) => *entry.get(),
                         Entry::Vacant(entry) => {
                             let acting = entry.key().1.iter().map(|&index| &interventions[index]);
-                            let bias = self.sum(&acting.collect::<Vec<_>>(), is_cross, extent.config)?;
+                            let bias = self.sum(&acting.collect::<Vec<_>>(), is_cross)?;
                             self.biases.push(bias);
                             *entry.insert(self.biases.len() - 1)
                         }
@@ -266,9 +276,10 @@ impl<'a> Changes<'a> {
     }
 
     /// The sum of what `acting` add in blocks of one kind.
-    fn sum(&self, acting: &[&Intervention], is_cross: bool, config: &HeadConfig) -> Result<DenseBias> {
-        let rows = self.groups.num_rows();
-        let keys = if is_cross { self.groups.vl } else { rows };
+    fn sum(&self, acting: &[&Intervention], is_cross: bool) -> Result<DenseBias> {
+        let Extent { groups, config, .. } = self.extent;
+        let rows = groups.num_rows();
+        let keys = if is_cross { groups.vl } else { rows };
         let everywhere = acting.iter().all(|one| one.heads.is_none());
         let heads = if everywhere { 1 } else { config.num_heads };
         let held: usize = self.biases.iter().map(|bias| bias.values.len()).sum();
@@ -286,7 +297,7 @@ impl<'a> Changes<'a> {
             keys,
         };
         for intervention in acting {
-            intervention.add(&self.groups, is_cross, &mut bias);
+            intervention.add(&groups, is_cross, &mut bias);
         }
         // Each is below infinity; a sum of several may still reach it.
         if bias
@@ -303,7 +314,7 @@ impl<'a> Changes<'a> {
 
     /// What is added to the logits of `block` at `step`, for the rows from `first_row` on.
     pub(crate) fn bias(&self, step: usize, block: usize, first_row: usize) -> Option<LogitBias<'_>> {
-        let acting = self.acting.get(step * self.num_layers + block)?;
+        let acting = self.acting.get(step * self.extent.config.num_layers + block)?;
         let bias = &self.biases[(*acting)?];
         Some(LogitBias {
             values: &bias.values[first_row * bias.keys..],
@@ -314,8 +325,9 @@ impl<'a> Changes<'a> {
 
     /// Replaces rows after `block` at `step`. `x` holds the rows from `first_row` on of `samples` sequences for each batch element.
     pub(crate) fn patch(&self, step: usize, block: usize, first_row: usize, samples: usize, x: &mut [f32]) {
-        let width = self.width;
-        let sequence_len = (self.groups.num_rows() - first_row) * width;
+        let Extent { groups, config, .. } = self.extent;
+        let width = config.width;
+        let sequence_len = (groups.num_rows() - first_row) * width;
         let patches = self.patches.iter();
         for patch in patches.filter(|patch| (patch.step, patch.block) == (step, block)) {
             for (index, sequence) in x.chunks_exact_mut(sequence_len).enumerate() {
@@ -351,12 +363,12 @@ fn replaced_future_tokens(interventions: &[Intervention], width: usize) -> Resul
 
 impl Intervention {
     /// Everything but patches and future tokens.
-    fn check(&self, groups: &Groups, extent: Extent<'_>) -> Result<()> {
-        let config = extent.config;
+    fn check(&self, extent: &Extent<'_>) -> Result<()> {
+        let Extent { config, groups, .. } = extent;
         for (name, indices, count) in [
-            ("blocks", &self.blocks, config.num_layers),
-            ("steps", &self.steps, extent.num_steps),
-            ("heads", &self.heads, config.num_heads),
+            ("intervention: blocks", &self.blocks, config.num_layers),
+            ("intervention: steps", &self.steps, extent.num_steps),
+            ("intervention: heads", &self.heads, config.num_heads),
         ] {
             check_indices(name, indices.as_deref().unwrap_or(&[]), count)?;
         }
@@ -448,10 +460,11 @@ fn is_read(tokens: &Tokens, is_cross: bool) -> bool {
 }
 
 impl Patch {
-    fn check(&self, groups: &Groups, extent: Extent<'_>) -> Result<PatchedRows<'_>> {
-        let width = extent.config.width;
+    fn check(&self, extent: &Extent<'_>) -> Result<PatchedRows<'_>> {
+        let Extent { config, groups, .. } = extent;
+        let width = config.width;
         check_indices("patch: step", &[self.step], extent.num_steps)?;
-        check_indices("patch: block", &[self.block], extent.config.num_layers)?;
+        check_indices("patch: block", &[self.block], config.num_layers)?;
         if self.tokens.group == Group::Vl {
             return Err(Error::Input(
                 "patch: blocks change rows, not vl; expected state, future or action".to_owned(),
@@ -503,6 +516,7 @@ fn span(count: usize) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::trace::Recorded;
 
     /// Four blocks, two heads, three future and two action rows, width 4.
     fn config() -> HeadConfig {
@@ -527,14 +541,21 @@ mod tests {
     const CUT: f32 = f32::NEG_INFINITY;
 
     /// What the interventions mean for two observations of five tokens and three steps.
-    fn changes<'a>(config: &HeadConfig, interventions: &'a [Intervention]) -> Result<Changes<'a>> {
-        let extent = Extent {
-            config,
+    fn changes<'a>(config: &'a HeadConfig, interventions: &'a [Intervention]) -> Result<Changes<'a>> {
+        let context = Context {
+            head: 0,
             batch: 2,
             num_vl_tokens: 5,
-            num_steps: 3,
+            vl_embs: Vec::new(),
+            keys_values: Vec::new(),
+            removed: None,
+            image_mask: None,
+            recorded: Recorded::default(),
         };
-        Changes::new(interventions, &LEARNED, extent)
+        Changes::new(
+            interventions,
+            Extent::new(config, &LEARNED, interventions, &context, 3)?,
+        )
     }
 
     fn message(intervention: Intervention) -> String {
@@ -650,7 +671,10 @@ mod tests {
             },
         ];
         let changes = changes(&config, &empty).unwrap();
-        assert_eq!((changes.groups.future, changes.groups.num_rows()), (0, 3));
+        assert_eq!(
+            (changes.extent.groups.future, changes.extent.groups.num_rows()),
+            (0, 3)
+        );
         assert!((0..4).all(|block| changes.bias(0, block, 0).is_none()));
     }
 
@@ -704,9 +728,18 @@ mod tests {
         };
         let state = || some(Group::State, &[0]);
         for (intervention, expected) in [
-            (limited(&[0, 4], &[], &[]), "blocks: expected 0 to 3, got 4"),
-            (limited(&[], &[3], &[]), "steps: expected 0 to 2, got 3"),
-            (limited(&[], &[], &[2]), "heads: expected 0 to 1, got 2"),
+            (
+                limited(&[0, 4], &[], &[]),
+                "intervention: blocks: expected 0 to 3, got 4",
+            ),
+            (
+                limited(&[], &[3], &[]),
+                "intervention: steps: expected 0 to 2, got 3",
+            ),
+            (
+                limited(&[], &[], &[2]),
+                "intervention: heads: expected 0 to 1, got 2",
+            ),
             (
                 cut(state(), some(Group::Future, &[40])),
                 "cut: future token 40, expected 0 to 2",

@@ -33,4 +33,4 @@ pub use error::{Error, Result};
 pub use head::{ActionHead, Features, LoadOptions, Sampling};
 pub use intervention::{Group, Groups, Intervention, Patch, Tokens};
 pub use saccade_kernels::{Isa, default_num_threads};
-pub use trace::{Record, Recorded, StepBlock, Trace, TraceOptions};
+pub use trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};

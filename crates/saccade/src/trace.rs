@@ -8,7 +8,7 @@ use crate::intervention::{Groups, check_indices};
 
 /// What to keep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Record {
+pub struct Keep {
     /// Attention probabilities.
     pub attention: bool,
     /// The rows after a block.
@@ -19,7 +19,7 @@ pub struct Record {
 #[derive(Clone, Debug)]
 pub struct TraceOptions {
     /// What to keep.
-    pub record: Record,
+    pub record: Keep,
     /// Of which blocks; default all.
     pub blocks: Option<Vec<usize>>,
     /// Of which Euler steps; default all.
@@ -63,7 +63,7 @@ impl<Place: Ord + Copy> Recorded<Place> {
     /// [`Error::Input`] if that is more than `max_bytes`, before anything is allocated, or does not fit in memory.
     pub(crate) fn claim(
         argument: &str,
-        record: Record,
+        record: Keep,
         places: &[(Place, Shapes)],
         max_bytes: u64,
     ) -> Result<Self> {
@@ -78,27 +78,34 @@ impl<Place: Ord + Copy> Recorded<Place> {
                 "{argument}: what is to be recorded takes {needed} bytes, expected at most {max_bytes}; record less at a time"
             )));
         }
-        let claim = |shape: &[usize]| {
-            let mut data = Vec::new();
-            let elements = shape.iter().product(); // fits: it is below needed, which is below max_bytes
-            data.try_reserve_exact(elements).map_err(|_| {
-                Error::Input(format!(
+        let reserve = |shape: &[usize]| {
+            let mut data: Vec<f32> = Vec::new();
+            let elements = shape.iter().product(); // fits: it is below needed, which is at most max_bytes
+            match data.try_reserve_exact(elements) {
+                Ok(()) => Ok((data, shape.to_vec())),
+                Err(_) => Err(Error::Input(format!(
                     "{argument}: what is to be recorded takes {needed} bytes, which do not fit in memory; record less at a time"
-                ))
-            })?;
-            data.resize(elements, 0.0);
-            Ok(OwnedArray::new(data, shape))
+                ))),
+            }
         };
-        let mut recorded = Self::default();
+        // All is reserved before any of it is touched: what does not fit is refused at once.
+        let (mut attention, mut hidden) = (Vec::new(), Vec::new());
         for (place, shapes) in places {
             if record.attention {
-                recorded.attention.insert(*place, claim(&shapes.attention)?);
+                attention.push((*place, reserve(&shapes.attention)?));
             }
             if record.hidden {
-                recorded.hidden.insert(*place, claim(&shapes.hidden)?);
+                hidden.push((*place, reserve(&shapes.hidden)?));
             }
         }
-        Ok(recorded)
+        let filled = |(place, (mut data, shape)): (Place, (Vec<f32>, Vec<usize>))| {
+            data.resize(shape.iter().product(), 0.0);
+            (place, OwnedArray { data, shape })
+        };
+        Ok(Self {
+            attention: attention.into_iter().map(filled).collect(),
+            hidden: hidden.into_iter().map(filled).collect(),
+        })
     }
 
     /// Where the probabilities at `place` go, if they are wanted.
@@ -148,7 +155,7 @@ impl TraceOptions {
 mod tests {
     use super::*;
 
-    const BOTH: Record = Record {
+    const BOTH: Keep = Keep {
         attention: true,
         hidden: true,
     };
@@ -174,7 +181,7 @@ mod tests {
                 bytes - 1
             )
         );
-        let nothing = Recorded::claim("max_bytes", Record::default(), &places(), 0).unwrap();
+        let nothing = Recorded::claim("max_bytes", Keep::default(), &places(), 0).unwrap();
         assert!(nothing.attention.is_empty() && nothing.hidden.is_empty());
     }
 
