@@ -108,6 +108,9 @@ def test_a_sweep_over_trained_policies(
     by_policy = table[table["kind"] == "training"].set_index("policy")
     assert by_policy.loc["n4-seed0", "validation_loss"] == history[-1]["validation_loss"]
     assert by_policy.loc["n4-aligned-seed0", "alignment_weight"] == 0.2
+    checkpoint = Policy.load(policies / "n4-seed0").checkpoint_sha256()
+    assert set(table.loc[table["policy"] == "n4-seed0", "checkpoint_sha256"]) == {checkpoint}
+    assert provenance.settings["training"]["steps"] == TINY.steps
 
     episodes = table[table["kind"] == "episode"].set_index(["policy", "arm"])
     policy = Policy.load(policies / "n2-seed1", num_threads=1)
@@ -226,16 +229,44 @@ def test_difference_of_these_policies_is_paired() -> None:
             ]
         )
 
-    easy_and_hard = [[True, False] * 10] * 2
-    assert sweeps.same_policies(rows(easy_and_hard), rows(easy_and_hard)).high == 0.0
-    found = sweeps.same_policies(rows(easy_and_hard), rows([[True] * 20, [True, False] * 10]))
+    alternating = [True, False] * 10
+    found = sweeps.same_policies(rows([alternating] * 2), rows([[True] * 20, alternating]))
     assert found.value == 0.25
-    assert 0.1 < found.low < 0.25 < found.high < 0.4
+    assert 0.1 < found.low < 0.25 < found.high < 0.42
+    # Policies that agree in all of twenty episodes may differ in the twenty-first: z^2 / (n + z^2).
+    agreeing = sweeps.same_policies(rows([alternating] * 2), rows([alternating] * 2))
+    assert agreeing.high == pytest.approx(1.959964**2 / (20 + 1.959964**2))
+    assert agreeing.low == -agreeing.high
+    few = sweeps.same_policies(rows([[True] * 9]), rows([[False] * 9]))
+    assert (few.value, math.isnan(few.low), math.isnan(few.high)) == (-1.0, True, True)
 
 
 def test_policies_with_episodes_missing_are_left_out() -> None:
-    plain = pd.DataFrame({"policy": ["one"] * 3 + ["other"] * 2})
+    plain = pd.DataFrame(
+        {"policy": ["one"] * 3 + ["other"] * 2, "task": ["a", "a", "b", "a", "b"], "seed": [0, 1, 0, 0, 0]}
+    )
     assert sweeps.whole_runs(plain) == (["one"], ["other: left out, 2 of 3 episodes are done."])
+    other_tasks = plain.assign(task=["a", "a", "a", "b", "b"])
+    assert sweeps.whole_runs(other_tasks)[0] == []
+
+
+def test_one_directory_holds_policies_that_may_be_compared(policies: Path, tmp_path: Path) -> None:
+    first = tmp_path / "first"
+    shutil.copytree(policies / "n2-seed0", first / "n2-seed0")
+    arguments = ["--episodes", "1", "--out", str(tmp_path / "out")]
+    assert study("n", "--policies", str(first), *arguments) == 0
+    second = tmp_path / "second"
+    shutil.copytree(policies / "n4-seed0", second / "n4-seed0")
+    changed = json.loads((second / "n4-seed0" / "settings.json").read_text())
+    (second / "n4-seed0" / "settings.json").write_text(json.dumps({**changed, "batch_size": 3}))
+    with pytest.raises(InputError, match="other settings"):
+        N.run(
+            sweeps.Settings((str(second),), (), (TASK,), range(1)),
+            tmp_path / "out",
+            backend="loky",
+            jobs=1,
+            on_done=lambda finished, done, total: None,
+        )
 
 
 def test_what_is_merged_and_drawn() -> None:

@@ -458,11 +458,12 @@ def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDo
     }
     cells = [Cell(("actions", task, seed)) for task, seed in rollouts.episodes]
     if settings.demonstrations is not None:
+        directory = Path(settings.demonstrations)
+        # A demonstration depends on its task, its seed, and these.
+        recording = {"recording": demos.read_settings(directory, list(rollouts.tasks)).to_dict()}
         for task in rollouts.tasks:
-            recorded = sorted(
-                int(path.stem) for path in (Path(settings.demonstrations) / task).glob("[0-9]*.npz")
-            )
-            cells += [Cell(("loss", task, seed)) for seed in recorded[: len(rollouts.seeds)]]
+            recorded = sorted(int(path.stem) for path in (directory / task).glob("[0-9]*.npz"))
+            cells += [Cell(("loss", task, seed), recording) for seed in recorded[: len(rollouts.seeds)]]
     run_cells(STUDY, cells, Work(settings), out, settings=common, backend=backend, jobs=jobs, on_done=on_done)
 
 

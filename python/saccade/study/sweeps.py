@@ -8,6 +8,7 @@ fixed. All of them run the same episodes; what they cost is measured at the end,
 from __future__ import annotations
 
 import argparse
+import hashlib
 import itertools
 import json
 import math
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
@@ -26,6 +28,7 @@ from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.sim import demos, graphics
+from saccade.sim.dataset import describe
 from saccade.sim.policy import EMBODIMENT_ID
 from saccade.sim.rollout import run_episode
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
@@ -34,7 +37,7 @@ from saccade.study import figures
 from saccade.study.arguments import names, numbers
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.cuts import scaled
-from saccade.study.loaded import describe_checkpoint, environment_of, policy_of
+from saccade.study.loaded import environment_of, policy_of
 from saccade.study.observations import task_names
 from saccade.study.report import Figure, Grid, Section, effect, number, rate
 from saccade.study.statistics import (
@@ -43,6 +46,7 @@ from saccade.study.statistics import (
     bootstrap,
     detectable_between_runs,
     detectable_difference,
+    tango,
     wilson,
 )
 from saccade.study.tables import Provenance
@@ -65,6 +69,7 @@ SETTINGS_FILE = "settings.json"
 PLAIN = "plain"
 # What the statement before the runs supposes; with few runs neither can be known beforehand.
 SUPPOSED_RATE, SUPPOSED_DEVIATIONS, SUPPOSED_DISCORDANT = 0.7, (0.04, 0.08), (0.1, 0.25)
+FEWEST_EPISODES = 10  # for an interval from drawing them
 ROUNDS = 200  # of the timing; each round times every policy once
 
 
@@ -95,6 +100,14 @@ class Run:
     def step(self) -> int:
         """How far the training came."""
         return int(self.history[-1]["step"]) if self.history else 0
+
+    @property
+    def checkpoint_sha256(self) -> str:
+        """Of config and tensors, as `Policy.checkpoint_sha256` has it."""
+        digest = hashlib.sha256()
+        for name in (CONFIG_FILE, TENSOR_FILE):
+            digest.update((self.directory / name).read_bytes())
+        return digest.hexdigest()
 
     @property
     def finished(self) -> bool:
@@ -143,25 +156,29 @@ def find_runs(directories: Iterable[Path], varied: Sequence[str]) -> list[Run]:
     return sorted(found, key=lambda run: (*run.point.values(), run.seed))
 
 
+def held_equal(training: Mapping[str, Any], sweep: Sweep) -> dict[str, Any]:
+    """What of a run's settings must be the same in all runs of a sweep."""
+    held = {name: value for name, value in training.items() if name not in ("seed", *sweep.varied)}
+    if sweep.other_pictures:
+        held["demonstrations"] = training["demonstrations"]["tasks"]
+    if not training.get("alignment_weight"):
+        held.pop("alignment_block", None)  # it means nothing there
+    return held
+
+
 def check_comparable(runs: Sequence[Run], sweep: Sweep) -> None:
     """Raises `InputError` if runs differ in anything but what the sweep varies and the training seed.
 
     Also if two of them are the same point with the same seed, or have the same name. All that differs is
     listed.
     """
-    may = {"seed", *sweep.varied}
+    held = {run.name: held_equal(run.settings, sweep) for run in runs}
     problems = []
-    for name in dict.fromkeys(itertools.chain.from_iterable(run.settings for run in runs)):
-        if name in may:
-            continue
+    for name in dict.fromkeys(itertools.chain.from_iterable(held.values())):
         values: dict[str, list[str]] = {}
-        for run in runs:
-            value = run.settings.get(name)
-            if name == "demonstrations" and sweep.other_pictures:
-                value = value["tasks"] if value else value
-            if name == "alignment_block" and not run.settings.get("alignment_weight"):
-                continue  # it means nothing there
-            values.setdefault(json.dumps(value, sort_keys=True), []).append(run.name)
+        for who, settings in held.items():
+            if name in settings:
+                values.setdefault(json.dumps(settings[name], sort_keys=True), []).append(who)
         if len(values) > 1:
             shown = "; ".join(f"{value} ({', '.join(who)})" for value, who in values.items())
             problems.append(f"{name}: {shown}")
@@ -268,7 +285,12 @@ class Work:
 
 def describe_run(run: Run) -> dict[str, Any]:
     """The columns that name a policy."""
-    return {"policy": run.name, **run.point, "training_seed": run.seed}
+    return {
+        "policy": run.name,
+        **run.point,
+        "training_seed": run.seed,
+        "checkpoint_sha256": run.checkpoint_sha256,
+    }
 
 
 def equal_mass(num_tokens: int, like: int) -> Intervention:
@@ -482,13 +504,17 @@ class Sweep:
         directories |= {plan.name: out / "policies" / plan.name for plan in settings.planned}
         work = Work(directories, {plan.name: plan for plan in settings.planned}, self.varied)
 
+        training: dict[str, Any] = {}  # one directory of tables holds policies that may be compared
+        for one in (*(run.settings for run in found), *map(planned_settings, settings.planned)):
+            training |= held_equal(one, self)
+
         def work_through(cells: Sequence[Cell], expected: int, jobs: int) -> None:
             run_cells(
                 self.STUDY,
                 cells,
                 work,
                 out,
-                settings={"varied": list(self.varied), "engine": "rust"},
+                settings={"varied": list(self.varied), "engine": "rust", "training": training},
                 backend=backend,
                 jobs=jobs,
                 on_done=on_done,
@@ -500,7 +526,7 @@ class Sweep:
         say(statement(**before))
         cells = [Cell(("before",), before)]
         cells += [Cell(("training", run.name), {"step": run.step}) for run in found]
-        cells += [Cell(("training", plan.name), asdict(plan.training)) for plan in settings.planned]
+        cells += [Cell(("training", plan.name), planned_settings(plan)) for plan in settings.planned]
         work_through(cells, len(cells) + len(directories) * episodes + 1, jobs)
         runs = [work.read(name) for name in directories]
         check_comparable(runs, self)
@@ -530,6 +556,12 @@ class Sweep:
         return sweep_section(self, table)
 
 
+def planned_settings(plan: Planned) -> dict[str, Any]:
+    """What `settings.json` of a planned run will hold."""
+    directory = Path(plan.demonstrations)
+    return {**asdict(plan.training), "demonstrations": describe(directory, demos.recorded_tasks(directory))}
+
+
 def order(run: Run) -> tuple[float, ...]:
     """By point, then by seed."""
     return (*run.point.values(), run.seed)
@@ -544,7 +576,7 @@ def episode_cells(runs: Sequence[Run], settings: Settings) -> list[Cell]:
     for (arm, mass), run in itertools.product(arms, runs):
         if mass is not None and run.point["num_future_tokens"] in (0, mass):
             continue
-        described = {"checkpoint": describe_checkpoint(str(run.directory))["sha256"], "mass": mass}
+        described = {"checkpoint": run.checkpoint_sha256, "mass": mass}
         cells += [
             Cell(("episode", run.name, arm, task, seed), described)
             for task, seed in itertools.product(settings.tasks, settings.seeds)
@@ -618,11 +650,27 @@ def between_runs(first: Sequence[float], second: Sequence[float], episodes: int)
 def same_policies(first: pd.DataFrame, second: pd.DataFrame) -> Estimate:
     """Second less first success of the policies that there are, on the same episodes.
 
-    The mean over a point's runs, episode by episode; the interval is from drawing episodes.
+    The mean over a point's runs, episode by episode; see `mean_difference`.
     """
     one, other = (rows.groupby(["task", "seed"])["success"].mean() for rows in (first, second))
     difference = (other - one).dropna()
-    return bootstrap(difference.to_numpy(), list(difference.index))
+    return mean_difference(difference.to_numpy(), list(difference.index))
+
+
+def mean_difference(differences: npt.NDArray[np.float64], episodes: Sequence[Any]) -> Estimate:
+    """The mean of differences of success, with an interval from drawing episodes.
+
+    Where few episodes differ, drawing them gives an interval that is too narrow, and none at all where all
+    agree. So it is never narrower than Tango's interval for as many pairs that all agree, and there is none
+    (NaN) with fewer than `FEWEST_EPISODES`.
+    """
+    count = len(set(episodes))
+    if count < FEWEST_EPISODES:
+        return Estimate(float(np.mean(differences)) if count else math.nan, math.nan, math.nan)
+    drawn = bootstrap(differences, episodes)
+    agreeing = tango(0, 0, count).high
+    low, high = min(drawn.low, drawn.value - agreeing), max(drawn.high, drawn.value + agreeing)
+    return Estimate(drawn.value, max(low, -1.0), min(high, 1.0))
 
 
 def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
@@ -653,6 +701,8 @@ def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
         point=[sweep.label(row) for row in episodes.to_dict("records")],
     )
     whole, partial = whole_runs(episodes[episodes["arm"] == PLAIN])
+    if not whole:
+        return Section(sweep.title, summary, concluded=partial + unfinished)
     episodes = episodes[episodes["policy"].isin(whole)]
     plain = episodes[episodes["arm"] == PLAIN]
     points = point_order(plain, sweep)
@@ -777,7 +827,7 @@ def mass_differences(episodes: pd.DataFrame, points: Sequence[str]) -> list[tupl
             weighed = of_point[of_point["arm"] == arm].set_index(keys)["success"]
             change = (weighed - plain).dropna()
             drawn = [(task, seed) for _, task, seed in change.index]
-            found.append((point, str(arm), bootstrap(change.to_numpy(), drawn)))
+            found.append((point, str(arm), mean_difference(change.to_numpy(), drawn)))
     return found
 
 
@@ -842,12 +892,17 @@ def conclusions(plain: pd.DataFrame, sweep: Sweep) -> list[str]:
 
 
 def whole_runs(plain: pd.DataFrame) -> tuple[list[str], list[str]]:
-    """Policies that ran all episodes, and a line for each of those that did not."""
-    counts = plain.groupby("policy", sort=False).size()
-    whole = [str(name) for name in counts.index[counts == counts.max()]]
+    """Policies that ran every episode that any of them ran, and a line for each of those that did not."""
+    ran = {
+        str(name): set(zip(rows["task"], rows["seed"], strict=True))
+        for name, rows in plain.groupby("policy", sort=False)
+    }
+    every = set().union(*ran.values())
+    whole = [name for name, episodes in ran.items() if episodes == every]
     partial = [
-        f"{name}: left out, {count} of {counts.max()} episodes are done."
-        for name, count in counts[counts < counts.max()].items()
+        f"{name}: left out, {len(episodes)} of {len(every)} episodes are done."
+        for name, episodes in ran.items()
+        if episodes != every
     ]
     return whole, partial
 
