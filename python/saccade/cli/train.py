@@ -42,8 +42,8 @@ INTEGERS = (
     ("num_layers", 1, "blocks of the head"),
 )
 
-# Option, its smallest value, what it must be below, and what it is.
-FRACTIONS = (
+# The same for numbers that are not whole, with what they must be below.
+NUMBERS = (
     ("learning_rate", 1e-9, 1, "of AdamW after the warm-up"),
     ("ema_decay", 0.0, 1, "of the averaged weights, which are the ones that are kept"),
     (
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1)")
     for name, _, what in INTEGERS:
         parser.add_argument(f"--{name.replace('_', '-')}", type=int, help=what)
-    for name, *_, what in FRACTIONS:
+    for name, *_, what in NUMBERS:
         parser.add_argument(f"--{name.replace('_', '-')}", type=float, help=what)
     parser.add_argument(
         "--start-from", type=Path, metavar="DIR", help="policy to start from (default: random weights)"
@@ -129,14 +129,15 @@ def training_settings(args: argparse.Namespace) -> TrainingSettings:
         value = getattr(args, name)
         if value is not None and value < smallest:
             raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected at least {smallest}")
-    for name, lowest, limit, _ in FRACTIONS:
+    for name, lowest, limit, _ in NUMBERS:
         value = getattr(args, name)
         if value is not None and not lowest <= value < limit:
-            raise UsageError(
-                f"--{name.replace('_', '-')}: given {value}, expected {lowest:g} to below {limit:g}"
+            expected = (
+                f"{lowest:g} to below {limit:g}" if limit < math.inf else f"a number from {lowest:g} on"
             )
+            raise UsageError(f"--{name.replace('_', '-')}: given {value}, expected {expected}")
     if args.start_from is not None and not (args.start_from / "model.safetensors").is_file():
         raise FileNotFoundError(f"{args.start_from}: no policy there")
-    names = [name for name, *_ in (*INTEGERS, *FRACTIONS)]
+    names = [name for name, *_ in (*INTEGERS, *NUMBERS)]
     chosen = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     return dataclasses.replace(TrainingSettings(), **chosen)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
 
 REQUIRED = ("backbone_features", "state", "embodiment_id")
-OPTIONAL = ("noise", "input_ids", "image_mask", "attention_mask", "images", "tokens")
+OPTIONAL = ("noise", "input_ids", "image_mask", "attention_mask", "images", "tokens", "drop_vl", "episode")
 
 
 @dataclass(frozen=True)
@@ -134,15 +134,8 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
         ShapeError: sizes that do not fit the head or each other.
     """
     arrays = read_arrays(path)
-    features = np.asarray(arrays["backbone_features"])
-    if features.ndim != 3 or features.shape[2] != config.context_dim:
-        raise ShapeError(
-            f"{path}: backbone_features: shape {features.shape}, the checkpoint expects (batch, T_vl, "
-            f"{config.context_dim})"
-        )
-    batch, num_tokens, _ = features.shape
-    if not batch or not num_tokens:
-        raise InputError(f"{path}: backbone_features: shape {features.shape}, expected no empty axis")
+    given = head_inputs(path, arrays, config)
+    batch, num_tokens, _ = given.features.shape
     if not 0 <= row < batch:
         raise InputError(f"--row: given {row}, {path} has rows 0 to {batch - 1}")
 
@@ -167,30 +160,25 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
         num_tokens,
         options,
         input_ids=of_row("input_ids", (num_tokens,)),
-        image_mask=_as_mask(path, "image_mask", of_row("image_mask", (num_tokens,))),
-        attention_mask=_as_mask(path, "attention_mask", of_row("attention_mask", (num_tokens,))),
+        image_mask=as_mask(path, "image_mask", of_row("image_mask", (num_tokens,))),
+        attention_mask=as_mask(path, "attention_mask", of_row("attention_mask", (num_tokens,))),
         names=None if names is None else [str(name) for name in names],
         path=path,
     )
     pictures = of_row("images", (len(layout.cameras), -1, -1, 3))
     if pictures is not None and pictures.dtype != np.uint8:
         raise InputError(f"{path}: images: expected uint8, got {pictures.dtype}")
-    embodiments = np.asarray(arrays["embodiment_id"])
-    if embodiments.dtype.kind not in "iu" or embodiments.size not in (1, batch):
-        raise InputError(f"{path}: embodiment_id: expected an integer, or one for each of {batch} rows")
-    state = np.asarray(arrays["state"])
-    if state.ndim not in (2, 3) or len(state) != batch:
-        raise ShapeError(
-            f"{path}: state: shape {state.shape}, expected ({batch}, {config.state_dim}) or "
-            f"({batch}, {config.state_history}, {config.state_dim})"
-        )
-    noise = of_row("noise", (config.action_horizon, config.encoder_action_dim))
-    if noise is None:
-        shape = (config.action_horizon, config.encoder_action_dim)
-        noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+    dropped = as_mask(path, "drop_vl", of_row("drop_vl", (num_tokens,)))
+    if dropped is not None and dropped.any():
+        raise InputError(f"{path}: drop_vl: maps are of all positions, expected none dropped in row {row}")
     chosen = slice(row, row + 1)
-    embodiment_id = int(embodiments.reshape(-1)[row if embodiments.size == batch else 0])
-    features, state, noise = features[chosen], state[chosen], np.asarray(noise, np.float32)[None]
+    embodiment_id = int(given.embodiment_ids[row])
+    features, state = given.features[chosen], given.state[chosen]
+    if given.noise is None:
+        shape = (1, config.action_horizon, config.encoder_action_dim)
+        noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+    else:
+        noise = np.asarray(given.noise[chosen], np.float32)
     return Inputs(
         title=f"{path.name}, row {row} of {batch}, embodiment {embodiment_id}",
         source={
@@ -210,6 +198,65 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
         else {camera.name: picture for camera, picture in zip(layout.cameras, pictures, strict=True)},
         occluder=DroppedPositions(features, state, embodiment_id, noise),
     )
+
+
+@dataclass(frozen=True)
+class HeadInputs:
+    """All observations of a file, as the head takes them.
+
+    Attributes:
+        features: `(batch, T_vl, context_dim)`.
+        state: `(batch, state_dim)` or `(batch, history, state_dim)`.
+        embodiment_ids: `(batch,)`.
+        noise: `(batch, horizon, encoder_action_dim)`, or None.
+    """
+
+    features: npt.NDArray[Any]
+    state: npt.NDArray[Any]
+    embodiment_ids: npt.NDArray[np.int64]
+    noise: npt.NDArray[Any] | None
+
+
+def head_inputs(path: Path, arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig) -> HeadInputs:
+    """What the head takes of a file that `read_arrays` read.
+
+    Raises:
+        InputError, ShapeError: sizes or embodiments that do not fit the head or each other.
+    """
+    features = np.asarray(arrays["backbone_features"])
+    if features.ndim != 3 or features.shape[2] != config.context_dim:
+        raise ShapeError(
+            f"{path}: backbone_features: shape {features.shape}, the checkpoint expects (batch, T_vl, "
+            f"{config.context_dim})"
+        )
+    batch = len(features)
+    if not features.size:
+        raise InputError(f"{path}: backbone_features: shape {features.shape}, expected no empty axis")
+    embodiments = np.asarray(arrays["embodiment_id"])
+    if embodiments.dtype.kind not in "iu" or embodiments.size not in (1, batch):
+        raise InputError(f"{path}: embodiment_id: expected an integer, or one for each of {batch} rows")
+    if not 0 <= int(embodiments.min()) <= int(embodiments.max()) < config.num_embodiments:
+        raise InputError(
+            f"{path}: embodiment_id: given {embodiments.min()} to {embodiments.max()}, the checkpoint has 0 "
+            f"to {config.num_embodiments - 1}"
+        )
+    state = np.asarray(arrays["state"])
+    shapes = [(batch, config.state_history, config.state_dim)]
+    if config.state_history == 1:
+        shapes.insert(0, (batch, config.state_dim))
+    if state.shape not in shapes:
+        expected = " or ".join(map(str, shapes))
+        raise ShapeError(f"{path}: state: shape {state.shape}, expected {expected}")
+    noise = None
+    if "noise" in arrays:
+        shape = (batch, config.action_horizon, config.encoder_action_dim)
+        noise = np.asarray(arrays["noise"])
+        if batch == 1 and noise.ndim == 2:
+            noise = noise[None]
+        if noise.shape != shape:
+            raise ShapeError(f"{path}: noise: shape {noise.shape}, expected {shape}")
+    embodiment_ids = np.broadcast_to(embodiments.reshape(-1).astype(np.int64), batch)
+    return HeadInputs(features, state, embodiment_ids, noise)
 
 
 def _layout(
@@ -244,7 +291,7 @@ def _layout(
     )
 
 
-def _as_mask(path: Path, name: str, array: npt.NDArray[Any] | None) -> npt.NDArray[np.bool_] | None:
+def as_mask(path: Path, name: str, array: npt.NDArray[Any] | None) -> npt.NDArray[np.bool_] | None:
     """Tokenizers write masks as integers 0 and 1."""
     if array is None:
         return None
@@ -257,10 +304,10 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Reads a file of backbone features.
 
     It holds `backbone_features (batch, T_vl, context_dim)`, `state (batch, state_dim)`, `embodiment_id`, and
-    may hold `noise (batch, horizon, action_dim)`, `input_ids`, `image_mask`, `attention_mask`
-    `(batch, T_vl)`, `images (batch, cameras, H, W, 3)` uint8 and `tokens (batch, T_vl)` strings; a file with
-    one row may leave out the batch axis of the optional ones. Names may have `_in.` before them. In a
-    safetensors file, which holds no strings, `tokens` is a JSON list in the metadata.
+    may hold `noise (batch, horizon, action_dim)`, `input_ids`, `image_mask`, `attention_mask`, `drop_vl`
+    `(batch, T_vl)`, `images (batch, cameras, H, W, 3)` uint8, `tokens (batch, T_vl)` strings and `episode
+    (batch,)`; a file with one row may leave out the batch axis of the optional ones. Names may have `_in.`
+    before them. In a safetensors file, which holds no strings, `tokens` is a JSON list in the metadata.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -277,10 +277,15 @@ def _trace(
     return {name: where for name, where in rows.items() if where.stop > where.start}, attention
 
 
+def learned_tokens(checkpoint: Path) -> Float32Array:
+    """The checkpoint's future tokens, `(N, width)`; it must have some."""
+    tables = [read_tensors(checkpoint, prefix + FUTURE_TOKENS) for prefix in PREFIXES]
+    return next(table["weight"] for table in tables if "weight" in table)
+
+
 def random_tokens(checkpoint: Path, seed: int) -> Float32Array:
     """Random directions with the lengths of the checkpoint's future tokens, `(N, width)`."""
-    tables = [read_tensors(checkpoint, prefix + FUTURE_TOKENS) for prefix in PREFIXES]
-    learned = next(table["weight"] for table in tables if "weight" in table)
+    learned = learned_tokens(checkpoint)
     drawn = np.random.default_rng(seed).standard_normal(learned.shape, dtype=np.float32)
     lengths = np.linalg.norm(learned, axis=-1, keepdims=True)
     random: Float32Array = drawn * (lengths / np.linalg.norm(drawn, axis=-1, keepdims=True))
@@ -292,9 +297,14 @@ def describe_checkpoint(checkpoint: Path) -> dict[str, str]:
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
     config = [directory / "config.json"] if (directory / "config.json").is_file() else []
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
+    return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}
+
+
+def sha256_of(*paths: Path) -> str:
+    """Hash of files, one after the other."""
     digest = hashlib.sha256()
-    for path in (*config, *tensors):
+    for path in paths:
         with path.open("rb") as file:
             while piece := file.read(1 << 24):
                 digest.update(piece)
-    return {"name": checkpoint.resolve().name, "sha256": digest.hexdigest()}
+    return digest.hexdigest()

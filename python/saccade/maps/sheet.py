@@ -365,7 +365,7 @@ class Sheet:
             return values
 
         for group in maps.rows:
-            spread = np.exp(means(group, "per_head", "entropy"))
+            spread = np.exp(means(group, "per_head", "entropy")).tolist()
             line(panels[0], spread, "o-", GROUP_COLOURS[group], group)
         keys = [sum(map(len, maps.parts(block).values())) for block in blocks]
         panels[0].plot(places, keys, "_", color="#888888", markersize=14, label="all keys alike")
