@@ -331,18 +331,22 @@ def test_detectable_difference_is_found_with_the_power_that_is_promised() -> Non
         statistics.detectable_difference(0, 0.5)
 
 
-def test_detectable_between_runs_is_found_with_the_power_that_is_promised() -> None:
-    rate, episodes, runs, deviation = 0.6, 100, 4, 0.03
+@pytest.mark.parametrize("runs", [2, 3, 8])
+def test_detectable_between_runs_is_found_with_the_power_that_is_promised(runs: int) -> None:
+    rate, episodes, deviation = 0.5, 100, 0.03
     difference = statistics.detectable_between_runs(rate, episodes, runs, deviation)
     rng = np.random.default_rng(0)
+    # Rates of runs, normal with the variance that is assumed of them, so that none leaves [0, 1].
+    spread = math.sqrt(deviation**2 + rate * (1 - rate) / episodes)
+    one, two = rng.normal(rate, spread, (2, 20_000, runs))
+    test = stats.ttest_ind(one, two + difference, axis=1)
+    assert (test.pvalue < 0.05).mean() == pytest.approx(0.8, abs=0.02)
 
-    def arm(true: float) -> np.ndarray:
-        rates = np.clip(rng.normal(true, deviation, (20_000, runs)), 0, 1)
-        return np.asarray(rng.binomial(episodes, rates).mean(axis=1) / episodes)
 
-    error = math.sqrt(2 * (deviation**2 + rate * (1 - rate) / episodes) / runs)
-    apart = np.abs(arm(rate + difference / 2) - arm(rate - difference / 2)) > stats.norm.ppf(0.975) * error
-    assert apart.mean() == pytest.approx(0.8, abs=0.02)
+def test_detectable_between_runs_at_the_edges() -> None:
+    assert math.isnan(statistics.detectable_between_runs(0.5, 100, 1, 0.0))  # one run tells no variance
+    assert math.isnan(statistics.detectable_between_runs(0.5, 2, 2, 0.2))  # more than the whole scale
+    assert statistics.detectable_between_runs(1.0, 100, 2, 0.0) == 0.0
     with pytest.raises(InputError, match="rate, episodes, runs, run_deviation: given"):
         statistics.detectable_between_runs(1.2, 100, 2, 0.0)
 

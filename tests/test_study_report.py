@@ -152,7 +152,9 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
     assert "future rows in all blocks: the chunk goes 20.0 %" in parsed.text
     assert "state rows in all blocks: the chunk was not found to follow" in parsed.text
     assert "Control, all rows in all blocks: a share of 1.0000, as it must be." in parsed.text
-    assert "words, future rows: not measured, the policy knows no task for it." in parsed.text
+    assert "words: not measured, the policy knows no task for it (8 receivers: push)." in parsed.text
+    assert "Donors of the kind words (0 pairs)" in parsed.text
+    assert "Donors of the kind layout (8 pairs)" in parsed.text
     for name in set(STUDIES) - {"cuts", "patching"}:
         assert f"{STUDIES[name][1][1:]} (not measured)" in parsed.text
 

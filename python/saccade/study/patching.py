@@ -249,7 +249,7 @@ def shares(rows: pd.DataFrame) -> tuple[Estimate, float]:
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     """See `Study`."""
-    measured = table[table["note"].isna()] if "group" in table else table.iloc[:0]
+    measured = measured_rows(table)
     found: dict[tuple[str, str, str], tuple[Estimate, float, int]] = {}
     if len(measured):
         for (kind, group, block), rows in measured.groupby(["kind", "group", "block"]):
@@ -278,9 +278,7 @@ def summary(table: pd.DataFrame, provenance: Provenance, kinds: Sequence[str]) -
     """What was run."""
     checkpoint = provenance.settings["checkpoint"]
     steps, blocks = provenance.settings["steps"], provenance.settings["blocks"]
-    pairs = {
-        kind: len(table.loc[table["kind"] == kind, ["task", "seed"]].drop_duplicates()) for kind in kinds
-    }
+    pairs = {kind: len(pairs_of(measured_rows(table), kind)) for kind in kinds}
     return [
         f"Policy {checkpoint['name']} (SHA-256 {checkpoint['sha256'][:12]}), N = "
         f"{checkpoint['num_future_tokens']} future tokens. Donor and receiver are first observations and "
@@ -293,6 +291,16 @@ def summary(table: pd.DataFrame, provenance: Provenance, kinds: Sequence[str]) -
         "receivers. Size: how far it moves at all, in the same unit.",
         *(f"Donors of the kind {kind} ({pairs[kind]} pairs): {KINDS[kind]}." for kind in kinds),
     ]
+
+
+def measured_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows that hold numbers and not a note."""
+    return table[table["note"].isna()] if "group" in table else table.iloc[:0]
+
+
+def pairs_of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
+    """Receivers that had a donor of the kind, each once."""
+    return rows.loc[rows["kind"] == kind, ["task", "seed"]].drop_duplicates()
 
 
 def pictures(
@@ -354,14 +362,14 @@ def conclusions(
 ) -> list[str]:
     """What the intervals allow to be said."""
     lines = []
+    found_kinds = {kind for kind, _, _ in found}
     for kind in kinds:
+        lines += without_donor(table, kind)
         for group in ("future", "state"):
             if (kind, group, ALL) in found:
                 lines.append(f"{kind}, {group} rows in all blocks: {following(found[kind, group, ALL][0])}.")
-            else:
-                of_group = table["group"].isna() | (table["group"] == group) if "group" in table else True
-                notes = table.loc[(table["kind"] == kind) & table["note"].notna() & of_group, "note"]
-                lines += [f"{kind}, {group} rows: {not_measured(note)}." for note in notes.unique()]
+            elif kind in found_kinds:  # pairs there were, but no such rows in the head
+                lines.append(f"{kind}, {group} rows: {not_measured(NO_FUTURE)}.")
         if (kind, "future", "0") in found:
             share = found[kind, "future", "0"][0]
             lines.append(
@@ -373,6 +381,19 @@ def conclusions(
         worst = max(controls, key=lambda value: abs(value - 1))
         verdict = "as it must be" if abs(worst - 1) < EXACT else "WHICH IT MUST NOT BE: do not trust the rest"
         lines.append(f"Control, {CONTROL} in all blocks: a share of {worst:.4f}, {verdict}.")
+    return lines
+
+
+def without_donor(table: pd.DataFrame, kind: str) -> list[str]:
+    """Which receivers had no donor of the kind, and why."""
+    of_kind = table[table["kind"] == kind]
+    noted = of_kind[of_kind["note"].notna()]
+    if "group" in table:
+        noted = noted[noted["group"].isna()]
+    lines = []
+    for note, rows in noted.groupby("note"):
+        tasks = ", ".join(dict.fromkeys(rows["task"]))
+        lines.append(f"{kind}: {not_measured(str(note))} ({len(pairs_of(rows, kind))} receivers: {tasks}).")
     return lines
 
 

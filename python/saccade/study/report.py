@@ -120,7 +120,11 @@ def effect(what: str, difference: Estimate) -> str:
         'no effect on success was found; a loss of up to 8.0 and a gain of up to 4.0 points are not excluded'
         >>> effect("success", Estimate(0.0, -0.04, 0.04))
         'no effect on success was found, and one of 5 points or more is excluded (-4.0 to 4.0 points)'
+        >>> effect("success", Estimate(0.0, math.nan, math.nan))
+        'success: too few episodes for an interval, so nothing can be said'
     """
+    if math.isnan(difference.low) or math.isnan(difference.high):
+        return f"{what}: too few episodes for an interval, so nothing can be said"
     value, low, high = (100 * part for part in (difference.value, difference.low, difference.high))
     if high < 0 or low > 0:
         direction, near, far = ("lower", -high, -low) if high < 0 else ("higher", low, high)

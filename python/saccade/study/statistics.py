@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest, nct, norm, t
 
 from saccade.errors import InputError
 
@@ -158,7 +158,8 @@ def bootstrap(
     """A statistic with its percentile interval, drawing whole clusters with replacement.
 
     Chunks of one episode are alike, so episodes are drawn and not chunks. With fewer than about ten clusters
-    the interval is too narrow; with one there is none (NaN).
+    the interval is too narrow; with one there is none (NaN). Where all values are equal it has no width,
+    which is no proof of equality: rates and their differences belong to `wilson` and `paired_difference`.
 
     Args:
         values: `(observations, ...)`; the statistic gets the rows of the clusters drawn.
@@ -263,25 +264,42 @@ def detectable_difference(pairs: int, discordant: float) -> float:
 def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation: float) -> float:
     """The smallest difference between two arms of trained policies found with 80 % power at the 5 % level.
 
-    Normal approximation: a run's measured rate varies by the episodes drawn and by the training itself. With
-    few runs `run_deviation` is itself hardly known, so this is the least one can hope for.
+    For a t test between the runs of the two arms, with as many runs in each: a run's measured rate varies by
+    the episodes drawn and by the training itself, and that variance is told from the runs alone. Few runs
+    tell it badly, which costs more than the variance does.
 
     Args:
         rate: success expected of both arms.
         episodes: of each run.
         runs: trained policies of each arm.
-        run_deviation: standard deviation of the true rate between training seeds.
+        run_deviation: standard deviation of the true rate between training seeds, a guess.
+
+    Returns:
+        The difference of the rates; NaN if none that rates can have would be found, as with a single run.
 
     Example:
-        Two runs of 100 episodes each, at a rate of 70 % that varies by 4 points between training seeds:
+        Two runs of 100 episodes each, at a rate of 50 % that varies by 4 points between training seeds, and
+        then ten runs:
 
-        >>> round(detectable_between_runs(0.7, 100, 2, 0.04), 3)
-        0.17
+        >>> round(detectable_between_runs(0.5, 100, 2, 0.04), 2)
+        0.36
+        >>> round(detectable_between_runs(0.5, 100, 10, 0.04), 2)
+        0.09
     """
     if not 0 <= rate <= 1 or episodes < 1 or runs < 1 or run_deviation < 0:
         raise InputError(
             f"rate, episodes, runs, run_deviation: given {rate}, {episodes}, {runs}, {run_deviation}; "
             "expected a share, two numbers of at least 1, and a number of at least 0"
         )
-    variance = (run_deviation**2 + rate * (1 - rate) / episodes) / runs
-    return float((norm.ppf((1 + CONFIDENCE) / 2) + norm.ppf(POWER)) * math.sqrt(2 * variance))
+    if runs == 1:
+        return math.nan
+    error = math.sqrt(2 * (run_deviation**2 + rate * (1 - rate) / episodes) / runs)
+    if error == 0:
+        return 0.0
+    freedom = 2 * (runs - 1)
+    critical = t.ppf((1 + CONFIDENCE) / 2, freedom)
+
+    def shortfall(difference: float) -> float:
+        return POWER - float(nct.sf(critical, freedom, difference / error))
+
+    return float(brentq(shortfall, 0.0, 1.0)) if shortfall(1.0) < 0 else math.nan
