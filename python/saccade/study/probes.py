@@ -447,19 +447,20 @@ def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDo
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     """The study's part of the report."""
-    episodes = table[table["kind"] == "episode"]
+    probes = table[table["kind"] == "probe"]
     checkpoint = provenance.settings["checkpoint"]
+    probed = probes if len(probes) else pd.DataFrame({"episodes": [0], "frames": [0]})
     summary = [
-        f"{len(episodes)} episodes of {checkpoint['name']} in closed loop, {int(episodes['frames'].sum())} "
-        f"looks, rows taken at Euler step {provenance.settings['step']} of {checkpoint['num_steps']}. Ridge "
-        f"regressions on principal components, on episodes that they were not fitted to ({FOLDS} folds by "
-        "episode). The task's mean is taken off rows and targets: R^2 is of the variance within a task. "
-        "Intervals are over episodes, with the same draws for all probes.",
+        f"{int(probed['episodes'].max())} episodes of {checkpoint['name']} in closed loop, "
+        f"{int(probed['frames'].max())} looks, rows taken at Euler step {provenance.settings['step']} of "
+        f"{checkpoint['num_steps']}. Ridge regressions on principal components, on episodes that they were "
+        f"not fitted to ({FOLDS} folds by episode). The task's mean is taken off rows and targets: R^2 is "
+        "of the variance within a task. Intervals are over episodes, with the same draws for all probes, "
+        "which are not fitted anew for each draw.",
         "Every probe reads the same number of components at most, whatever it reads: the mean of the "
         "tokens, or all of them side by side. Control: targets of another episode of the task, look by "
         "look; what it finds follows from the time and from the task, not from the episode.",
     ]
-    probes = table[table["kind"] == "probe"]
     if probes.empty:
         return Section(
             "Probes", summary, concluded=["Not measured: episodes were run, no probe is done yet."]
@@ -580,19 +581,21 @@ def conclusions(rows: pd.DataFrame, checkpoint: Mapping[str, Any]) -> list[str]:
         future = of_target[(of_target["rows"] == "future") & (of_target["tokens"] == "mean")].sort_values(
             "block"
         )
-        carrying = future[(future["over_proprio_low"] > 0) & (future["r2_low"] > future["shuffled_high"])]
-        if carrying.empty:
+        carries = (future["over_proprio_low"] > 0) & (future["r2_low"] > future["shuffled_high"])
+        if not carries.any():
+            most = future.sort_values("r2").tail(1)
             lines.append(
-                f"Where the {target} is: the mean of the future rows tells no more of it than the hand "
-                f"alone or the control, after any block (R^2 {number(one_of(future), digits=2)} after block "
-                f"{int(future['block'].iloc[0])})."
+                f"Where the {target} is: the mean of the future rows was not found to tell more of it than "
+                f"the hand alone and the control do; at most (after block {int(most['block'].iloc[0])}) it "
+                f"tells {number(one_of(most, 'over_proprio'), digits=2)} more than the hand."
             )
             continue
-        first = carrying.head(1)
+        first = future[carries].head(1)
+        blocks = ", ".join(str(int(block)) for block in future.loc[carries, "block"])
         block = int(first["block"].iloc[0])
         state = one_of(of_input(of_target, ("state", block, "all")))
         lines.append(
-            f"Where the {target} is: the future rows carry it from block {block} on: R^2 "
+            f"Where the {target} is: the future rows carry it after block {blocks}. After block {block}: R^2 "
             f"{number(one_of(first), digits=2)} from their mean, "
             f"{number(one_of(first, 'over_proprio'), digits=2)} more than from the hand alone, "
             f"{number(one_of(first, 'over_vl'), digits=2)} compared with all tokens that the head reads; "

@@ -723,6 +723,8 @@ def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
 
 
 NOT_SHOWN = (
+    "Intervals hold for each comparison by itself: of twenty comparisons of equal policies one is expected "
+    "to exclude zero.",
     "Policies this small, trained this shortly on these tasks, are not the released model: a number of "
     "tokens that does not matter here may matter there.",
     "The validation loss is of single velocities on the demonstrations' observations. It need not rank "
