@@ -26,6 +26,7 @@ import saccade
 from saccade import Intervention
 from saccade.checkpoints import read_tensors
 from saccade.cli import main
+from saccade.cli.attention import show
 from saccade.errors import InputError, ShapeError
 from saccade.maps import occlusion, record
 from saccade.maps.inputs import Inputs, LayoutOptions, from_file, from_simulator
@@ -602,6 +603,17 @@ def test_a_file_of_another_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixt
     assert change.shape == (16, 16)
     assert (change == np.kron(change[::8, ::8], np.ones((8, 8)))).all()
     assert "drop_vl" in found["occlusion"]["method"]
+
+
+def test_the_table_keeps_the_names_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("the camera at the left wrist [bold]", "the camera that looks down from above the table")
+    layout = parse_layout(f"text:1,image:2x2={names[0]},image:1x3={names[1]},special:1", 9)
+    maps = one_hot_maps()
+    maps = dataclasses.replace(maps, inputs=dataclasses.replace(maps.inputs, layout=layout))
+    show(maps, {"summaries": maps.summaries}, tmp_path)
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in names)  # more than 80 letters, and no markup
+    assert "…" not in shown
 
 
 CASES: list[tuple[list[str], str]] = [
