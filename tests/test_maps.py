@@ -629,6 +629,7 @@ CASES: list[tuple[list[str], str]] = [
     (["--cell", "0"], "cell: given 0"),
     (["--out", "f.npz"], "--out: f.npz is no directory"),
     (["--layout", "text:*"], "--layout: only with --features"),
+    (["--grid", "2x2", "--row", "1"], "--grid, --row: only with --features"),
     (["--features", "f.npz", "--task", "push"], "expected one observation"),
     (["--features", "missing.npz"], "missing.npz: no such file"),
     (["--features", "f.npz"], "f.npz: backbone_features: shape (1, 296, 64), the checkpoint expects"),

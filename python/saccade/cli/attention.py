@@ -171,9 +171,9 @@ def check(args: argparse.Namespace) -> None:
         raise UsageError("--features, --task: expected one observation, of a file or of the simulator")
     if args.features is None:
         given = {"--layout": args.layout, "--grid": args.grid, "--image-token-index": args.image_token_index}
-        wrong = [name for name, value in given.items() if value is not None]
+        wrong = [name for name, value in given.items() if value is not None] + ["--row"] * bool(args.row)
         if wrong:
-            raise UsageError(f"{', '.join(wrong)}: only with --features; the simulator's layout is known")
+            raise UsageError(f"{', '.join(wrong)}: only with --features")
 
 
 def numbers(name: str, text: str | None) -> tuple[int, ...] | None:
