@@ -149,6 +149,24 @@ def test_a_worker_that_dies_is_one_clear_error(tmp_path: Path) -> None:
         )
 
 
+def test_cell_files_that_are_none_are_done_anew(tmp_path: Path) -> None:
+    """Half a file under its temporary name, files of something else, and cells of other settings."""
+    work = Square(tmp_path / "log")
+    run_cells("demo", cells(1, 2), work, tmp_path, settings=SETTINGS)
+    one, _ = sorted((tmp_path / "demo" / "cells").iterdir())
+    (one.parent / f".{one.stem}.99.json").write_text('{"key": ["squ')
+    one.write_text("[1, 2]")
+    (one.parent / "other.json").write_text('{"key": ["square", 9], "rows": []}')
+    assert work.worked == [1, 2]
+    assert len(run_cells("demo", cells(1, 2), work, tmp_path, settings=SETTINGS)) == 2
+    assert len(work.worked) == 1
+
+    (tmp_path / "demo.json").unlink()  # so that nothing says what the cells were done with
+    table = run_cells("demo", cells(1, 2), work, tmp_path, settings={**SETTINGS, "width": 0.2})
+    assert work.worked == [1, 2]
+    assert set(table["settings_sha256"]) == {digest({**SETTINGS, "width": 0.2})}
+
+
 def test_other_settings_are_refused(tmp_path: Path) -> None:
     work = Square(tmp_path / "log")
     run_cells("demo", cells(1), work, tmp_path, settings=SETTINGS)

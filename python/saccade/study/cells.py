@@ -26,6 +26,7 @@ from saccade.sim.files import writable_directory, write_json
 from saccade.sim.report import cpu_name
 from saccade.study.tables import (
     Provenance,
+    file_sha256,
     provenance_path,
     read_provenance,
     read_table,
@@ -181,9 +182,15 @@ class Store:
         self.directory = writable_directory(out / study / "cells")
         asked = {cell.key: cell.digest for cell in cells}
         for path in self.directory.glob("*.json"):
-            record = json.loads(path.read_text(encoding="utf-8"))
+            if path.name.startswith("."):
+                continue  # half a file, of a run that was killed
+            record = read_record(path)
+            # One whose settings, or those of the study, have changed must not stand beside its successor.
+            if record is None or any(
+                row.get("settings_sha256") != digest(settings) for row in record["rows"]
+            ):
+                continue
             kept = Cell(tuple(record["key"]), record["settings"])
-            # One whose settings have changed is done anew, and must not stand beside its successor.
             if asked.get(kept.key, kept.digest) == kept.digest:
                 self.finished[kept.digest] = record
         self.total = max(len({*self.finished, *asked.values()}), expected)
@@ -226,6 +233,7 @@ class Store:
         write_table([row for record in records for row in record["rows"]], table_path(self.out, self.study))
         provenance = Provenance(
             study=self.study,
+            table_sha256=file_sha256(table_path(self.out, self.study)),
             settings=self.settings,
             done=len(records),
             total=self.total,
@@ -241,6 +249,18 @@ class Store:
         write_provenance(provenance, provenance_path(self.out, self.study))
 
 
+def read_record(path: Path) -> dict[str, Any] | None:
+    """A cell's file; None if it holds something else, so that the cell is done anew."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        hash(tuple(record["key"]))
+        settings, rows, seconds = (record[name] for name in ("settings", "rows", "seconds"))
+    except (ValueError, KeyError, TypeError):
+        return None
+    fits = isinstance(settings, dict) and isinstance(rows, list) and isinstance(seconds, (int, float))
+    return dict(record) if fits and all(isinstance(row, dict) for row in rows) else None
+
+
 @dataclass(frozen=True)
 class Guarded:
     """`work` that returns its exceptions, with what is written into every row."""
@@ -252,7 +272,7 @@ class Guarded:
         """What came of the cell."""
         start = time.perf_counter()
         try:
-            rows = self.work(cell)
+            rows = plain(self.work(cell))  # what has no form in JSON is this cell's error
         except Exception as error:  # one bad cell must not end the others; it is raised when they are done
             spent = time.perf_counter() - start
             return Finished(cell, [], spent, f"{type(error).__name__}: {error}")

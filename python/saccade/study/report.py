@@ -18,7 +18,7 @@ from saccade.errors import InputError
 from saccade.sim.files import writable_directory, write_atomically
 from saccade.study import STUDIES, load_study
 from saccade.study.statistics import Estimate
-from saccade.study.tables import Provenance, provenance_path, read_provenance, read_table, table_path
+from saccade.study.tables import Provenance, provenance_path, read_study, table_path
 
 TITLE = "What do the future tokens do?"
 PREAMBLE = (
@@ -28,6 +28,7 @@ PREAMBLE = (
 )
 ATTENTION = "attention"
 LOSS_THAT_MATTERS = 0.05  # of success; "no difference" is not said where an interval reaches further
+FEWEST = 10  # clusters for a bootstrap
 PNG_DOTS_PER_INCH = 130
 
 
@@ -119,7 +120,7 @@ def effect(what: str, difference: Estimate) -> str:
         >>> effect("success", Estimate(-0.02, -0.08, 0.04))
         'no effect on success was found; a loss of up to 8.0 and a gain of up to 4.0 points are not excluded'
         >>> effect("success", Estimate(0.0, -0.04, 0.04))
-        'no effect on success was found, and one of 5 points or more is excluded (-4.0 to 4.0 points)'
+        'no effect on success was found, and by itself this excludes one of 5 points or more (-4.0 to 4.0)'
         >>> effect("success", Estimate(0.0, math.nan, math.nan))
         'success: too few episodes for an interval, so nothing can be said'
     """
@@ -136,9 +137,22 @@ def effect(what: str, difference: Estimate) -> str:
     matters = 100 * LOSS_THAT_MATTERS
     if max(-low, high) < matters:
         return (
-            f"{found}, and one of {matters:.0f} points or more is excluded ({low:.1f} to {high:.1f} points)"
+            f"{found}, and by itself this excludes one of {matters:.0f} points or more "
+            f"({low:.1f} to {high:.1f})"
         )
-    return f"{found}; a loss of up to {-low:.1f} and a gain of up to {high:.1f} points are not excluded"
+    return f"{found}; a loss of up to {abs(low):.1f} and a gain of up to {high:.1f} points are not excluded"
+
+
+def too_few(count: int, what: str) -> list[str]:
+    """A warning where a bootstrap interval rests on too few of something.
+
+    Example:
+        >>> too_few(3, "episodes")
+        ['Only 3 episodes: bootstrap intervals are too narrow below about 10.']
+    """
+    if count >= FEWEST:
+        return []
+    return [f"Only {count} {what}: bootstrap intervals are too narrow below about {FEWEST}."]
 
 
 @dataclass(frozen=True)
@@ -208,17 +222,20 @@ def make_part(directory: Path, name: str) -> Part:
     absent = STUDIES[name][1][0].upper() + STUDIES[name][1][1:]
     if not provenance_path(directory, name).exists():
         return Part(name, Section(absent, concluded=["Not measured."]), measured=False)
-    provenance = read_provenance(provenance_path(directory, name))
-    table = read_table(table_path(directory, name))
+    table, provenance = read_study(directory, name)
     if table.empty:
         nothing = Section(absent, concluded=["Not measured: no cell is done yet."])
         return Part(name, nothing, measured=False, unfinished=unfinished(provenance))
     try:
         section = load_study(name).section(table, provenance)
+    except InputError as error:
+        raise InputError(f"{table_path(directory, name)}: {error}") from None
     except KeyError as error:
         raise InputError(
             f"{table_path(directory, name)}: not written by this study: {error} is missing"
         ) from None
+    except ValueError as error:  # text in a column of numbers
+        raise InputError(f"{table_path(directory, name)}: not written by this study: {error}") from None
     drawn = [draw(directory, name, figure) for figure in section.figures]
     return Part(name, section, drawn, unfinished=unfinished(provenance), source=source(provenance))
 

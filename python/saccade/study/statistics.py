@@ -255,10 +255,7 @@ def detectable_difference(pairs: int, discordant: float) -> float:
         needed = level * math.sqrt(discordant) + power * math.sqrt(discordant - difference**2)
         return float(needed - difference * math.sqrt(pairs))
 
-    largest = min(discordant, math.sqrt(discordant))
-    if shortfall(largest) > 0:
-        return math.nan
-    return float(brentq(shortfall, 0.0, largest))
+    return float(brentq(shortfall, 0.0, discordant)) if shortfall(discordant) <= 0 else math.nan
 
 
 def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation: float) -> float:
@@ -284,7 +281,7 @@ def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation
         >>> round(detectable_between_runs(0.5, 100, 2, 0.04), 2)
         0.36
         >>> round(detectable_between_runs(0.5, 100, 10, 0.04), 2)
-        0.09
+        0.08
     """
     if not 0 <= rate <= 1 or episodes < 1 or runs < 1 or run_deviation < 0:
         raise InputError(

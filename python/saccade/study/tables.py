@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -26,6 +27,7 @@ class Provenance:
         cell_seconds: Time spent in the finished cells, all added up.
         packages: Versions of what computed it.
         machine: CPU, system and Python of the process that wrote the table; each row names its own CPU.
+        table_sha256: Of the table as it was written; empty if that is not known.
     """
 
     study: str
@@ -36,6 +38,7 @@ class Provenance:
     cell_seconds: float = 0.0
     packages: Mapping[str, str] = field(default_factory=dict)
     machine: Mapping[str, str] = field(default_factory=dict)
+    table_sha256: str = ""
 
     @property
     def complete(self) -> bool:
@@ -86,6 +89,42 @@ def read_provenance(path: Path) -> Provenance:
         return Provenance(**values)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not written by a study: {error}") from None
+
+
+def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
+    """A study's table and where it comes from.
+
+    Raises:
+        FileNotFoundError: one of the two is not there.
+        InputError: they do not belong together.
+    """
+    provenance = read_provenance(provenance_path(out, study))
+    path = table_path(out, study)
+    table = read_table(path)
+    if provenance.table_sha256 not in ("", file_sha256(path)):
+        raise InputError(
+            f"{path}: not as its study wrote it (edited, cut short, or the run was killed just then); "
+            "run the study again, which takes no time for what is done"
+        )
+    return table, provenance
+
+
+def file_sha256(path: Path) -> str:
+    """Hash of a file's bytes."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def truths(column: pd.Series) -> pd.Series:
+    """A column of True and False as booleans.
+
+    Raises:
+        InputError: it holds something else.
+    """
+    values = column.map({True: True, False: False, "True": True, "False": False})
+    if values.isna().any():
+        wrong = column[values.isna()].iloc[0]
+        raise InputError(f"{column.name}: expected True or False in every row, got {wrong!r}")
+    return values.astype(bool)
 
 
 def table_path(out: Path, study: str) -> Path:
