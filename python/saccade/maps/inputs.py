@@ -241,7 +241,7 @@ def head_inputs(path: Path, arrays: Mapping[str, npt.NDArray[Any]], config: Head
             f"to {config.num_embodiments - 1}"
         )
     state = np.asarray(arrays["state"])
-    shapes = [(batch, config.state_history, config.state_dim)]
+    shapes: list[tuple[int, ...]] = [(batch, config.state_history, config.state_dim)]
     if config.state_history == 1:
         shapes.insert(0, (batch, config.state_dim))
     if state.shape not in shapes:

@@ -34,6 +34,17 @@ from saccade.sim.policy import EMBODIMENT_ID
 from saccade.sim.tasks import find_task
 from saccade.study import figures
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
+from saccade.study.features import (
+    TASK,
+    Recording,
+    cautions,
+    clusters_of,
+    describe,
+    from_file,
+    observations_of,
+    recording_of,
+)
+from saccade.study.features import summary as file_summary
 from saccade.study.loaded import describe_checkpoint, environment_of, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, record_looks, rollouts_of
 from saccade.study.report import Figure, Grid, Section, not_measured, number
@@ -59,23 +70,51 @@ also the derivative of the training loss by the rows.
 examples:
   saccade study gradients --out out/study
   saccade study gradients --checkpoint out/policy --demos out/demos --tasks push --out out/study
+  saccade study gradients --checkpoint checkpoint/ --features looks.npz --out out/study
 """
 
 LEAVING_FUTURE = (("state", "future"), ("action", "future"))
 READ_BY_OTHERS = (("state", "vl"), ("action", "vl"))
 
 
+@dataclass(frozen=True)
+class Conditions:
+    """What else a chunk depends on.
+
+    Attributes:
+        embodiment_id: Of the robot.
+        drop_vl: Which tokens are removed, `(1, T_vl)`, or None.
+    """
+
+    embodiment_id: int = EMBODIMENT_ID
+    drop_vl: Tensor | None = None
+
+    def of(self, count: int) -> dict[str, Any]:
+        """Arguments of `sample` for so many copies of one observation."""
+        dropped = None if self.drop_vl is None else self.drop_vl.expand(count, -1)
+        return {"embodiment_id": self.embodiment_id, "drop_vl": dropped}
+
+
+SIMULATOR = Conditions()
+
+
 def path_derivatives(
-    head: ActionHead, vl_embs: Tensor, state: Tensor, noise: Tensor, cotangents: Tensor
+    head: ActionHead,
+    vl_embs: Tensor,
+    state: Tensor,
+    noise: Tensor,
+    cotangents: Tensor,
+    conditions: Conditions = SIMULATOR,
 ) -> dict[str, Tensor]:
     """Derivatives of projections of the actions by the vision-language tokens, path by path.
 
     Args:
         head: computes, in its dtype.
         vl_embs: of one observation, `(1, T_vl, context_dim)`.
-        state: `(1, state_dim)`.
+        state: `(1, state_dim)` or `(1, history, state_dim)`.
         noise: `(1, T, action_dim)`.
         cotangents: `(projections, T, action_dim)`; each is multiplied with the actions and summed up.
+        conditions: what else the actions depend on.
 
     Returns:
         Each path of `PATHS` and their sum `ALL_PATHS`, `(projections, T_vl, context_dim)`.
@@ -86,10 +125,10 @@ def path_derivatives(
         leaf = vl_embs.detach().repeat(count, 1, 1).requires_grad_()
         actions = head.sample(
             leaf,
-            state.expand(count, -1),
-            EMBODIMENT_ID,
+            state.expand(count, *state.shape[1:]),
             noise=noise.expand(count, -1, -1),
             stop_gradient=stopped,
+            **conditions.of(count),
         )
         # Elements of a batch do not mix: each copy of the tokens gets the derivative of its own projection.
         return torch.autograd.grad((actions * cotangents).sum(), leaf)[0]
@@ -191,7 +230,12 @@ class Nudges:
 
 
 def action_sensitivity(
-    head: ActionHead, vl_embs: Tensor, state: Tensor, noise: Tensor, cotangents: Tensor
+    head: ActionHead,
+    vl_embs: Tensor,
+    state: Tensor,
+    noise: Tensor,
+    cotangents: Tensor,
+    conditions: Conditions = SIMULATOR,
 ) -> list[tuple[Tensor, Tensor]]:
     """How the sampled actions depend on the rows before the first block and after each.
 
@@ -207,9 +251,9 @@ def action_sensitivity(
     with nudges.applied():
         actions = head.sample(
             vl_embs.expand(count, -1, -1),
-            state.expand(count, -1),
-            EMBODIMENT_ID,
+            state.expand(count, *state.shape[1:]),
             noise=noise.expand(count, -1, -1),
+            **conditions.of(count),
         )
     found = nudges.derivatives((actions * cotangents).sum())
     norms = [derivative.square().sum(dim=-1).mean(dim=0).sqrt() for derivative in found]  # (rows,) each
@@ -316,13 +360,19 @@ class Settings:
     demonstrations: str | None = None
 
 
+@dataclass(frozen=True)
+class FileSettings:
+    """What to measure on a file of features; attributes as in `Settings`."""
+
+    recording: Recording
+    projections: int
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     parser.epilog = EPILOG
     add_rollout_arguments(parser, episodes=10)
-    parser.add_argument(
-        "--looks", type=int, default=3, help="observations of each episode, evenly spaced (default: 3)"
-    )
+    parser.add_argument("--looks", type=int, help="observations of each episode, evenly spaced (default: 3)")
     parser.add_argument(
         "--projections",
         type=int,
@@ -334,16 +384,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def settings(args: argparse.Namespace) -> Settings:
+def settings(args: argparse.Namespace) -> Settings | FileSettings:
     """The settings, checked."""
-    for name in ("looks", "projections"):
-        if getattr(args, name) < 1:
-            raise InputError(f"{name}: given {getattr(args, name)}, expected at least 1")
+    looks = Settings.looks if args.looks is None else args.looks
+    for name, given in (("looks", looks), ("projections", args.projections)):
+        if given < 1:
+            raise InputError(f"{name}: given {given}, expected at least 1")
+    if args.features is not None:
+        recording = recording_of(args, "looks", "demos")
+        observations_of(recording.file, recorded_head(recording).config)
+        return FileSettings(recording, args.projections)
     rollouts = rollouts_of(args)
     if args.demos is not None:
         check_demonstrations(args.demos, rollouts)
     demonstrations = None if args.demos is None else str(args.demos)
-    return Settings(rollouts, args.looks, args.projections, demonstrations)
+    return Settings(rollouts, looks, args.projections, demonstrations)
 
 
 def check_demonstrations(directory: Path, rollouts: Rollouts) -> None:
@@ -370,6 +425,73 @@ def reference_of(checkpoint: str) -> ActionHead:
     return head
 
 
+@functools.lru_cache(maxsize=1)
+def recorded_head(recording: Recording) -> ActionHead:
+    """The same of a recording, on as many threads as it says."""
+    if recording.num_threads is not None:
+        torch.set_num_threads(recording.num_threads)
+    head = ActionHead.load(recording.checkpoint, config=recording.config)
+    head.requires_grad_(False)
+    return head
+
+
+def row_groups(head: ActionHead) -> dict[str, slice]:
+    """Where the groups of rows lie."""
+    future = head.config.num_future_tokens
+    return {"state": slice(0, 1), "future": slice(1, 1 + future), "action": slice(1 + future, None)}
+
+
+@dataclass(frozen=True)
+class FileWork:
+    """The actions on one observation of a file."""
+
+    settings: FileSettings
+
+    def __call__(self, cell: Cell) -> Rows:
+        """The rows of a cell: a kind, a task and the row of the file."""
+        kind, task, place = str(cell.key[0]), str(cell.key[1]), int(cell.key[2])
+        recording = self.settings.recording
+        head = recorded_head(recording)
+        observation = observations_of(recording.file, head.config).observation(place, recording.seed)
+        dropped = None if observation.drop_vl is None else torch.from_numpy(observation.drop_vl)
+        conditions = Conditions(observation.embodiment_id, dropped)
+        inputs = (
+            head.encode(observation.features, drop_vl=dropped),
+            head.as_input(observation.state),
+            head.as_input(observation.noise[:, 0]),
+        )
+        generator = torch.Generator().manual_seed(
+            int(np.random.default_rng((recording.seed, place)).integers(2**31))
+        )
+        shape = (self.settings.projections, head.config.action_horizon, head.config.action_dim)
+        cotangents = torch.randn(shape, generator=generator)
+        # One by one: the graph of a head of full size takes a gigabyte for each.
+        sensitivities, paths = [], []
+        for cotangent in cotangents.split(1):
+            sensitivities.append(action_sensitivity(head, *inputs, cotangent, conditions))
+            if head.config.num_future_tokens:
+                paths.append(path_derivatives(head, *inputs, cotangent, conditions))
+        rows = sensitivity_rows([pooled(sensitivities)], row_groups(head))
+        if paths:
+            rows += path_rows([shares({name: torch.cat([one[name] for one in paths]) for name in paths[0]})])
+        else:
+            rows.append({"note": NO_TOKENS})
+        episode = {"of": kind, "task": task, "seed": place, "episode": observation.episode}
+        return [{**episode, **row} for row in rows]
+
+
+def pooled(measured: Sequence[Sequence[tuple[Tensor, Tensor]]]) -> list[tuple[Tensor, Tensor]]:
+    """What `action_sensitivity` says of several projections, from what it says of each."""
+
+    def pool(values: Sequence[Tensor]) -> Tensor:
+        return torch.stack(list(values)).square().mean(dim=0).sqrt()
+
+    return [
+        (pool([norm for norm, _ in pairs]), pool([relative for _, relative in pairs]))
+        for pairs in zip(*measured, strict=True)
+    ]
+
+
 @dataclass(frozen=True)
 class Work:
     """Two kinds of cells: the actions in an episode in closed loop, and the loss on a demonstration."""
@@ -380,8 +502,7 @@ class Work:
         """The rows of a cell: a kind, a task and a seed."""
         kind, task, seed = str(cell.key[0]), str(cell.key[1]), int(cell.key[2])
         head = reference_of(self.settings.rollouts.checkpoint)
-        future = head.config.num_future_tokens
-        groups = {"state": slice(0, 1), "future": slice(1, 1 + future), "action": slice(1 + future, None)}
+        groups = row_groups(head)
         generator = torch.Generator().manual_seed(
             int(np.random.default_rng((seed, *map(ord, task))).integers(2**31))
         )
@@ -448,8 +569,11 @@ class Work:
         return sensitivity_rows(measured, groups)
 
 
-def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
     """Measures the actions in every episode, then the loss on as many demonstrations."""
+    if isinstance(settings, FileSettings):
+        run_on_file(settings, out, backend=backend, jobs=jobs, on_done=on_done)
+        return
     rollouts = settings.rollouts
     common = {
         "checkpoint": describe_checkpoint(rollouts.checkpoint),
@@ -467,24 +591,49 @@ def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDo
     run_cells(STUDY, cells, Work(settings), out, settings=common, backend=backend, jobs=jobs, on_done=on_done)
 
 
+def run_on_file(settings: FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+    """Measures the actions on every observation."""
+    config = recorded_head(settings.recording).config
+    observations = observations_of(settings.recording.file, config)
+    run_cells(
+        STUDY,
+        [Cell(("actions", TASK, row)) for row in range(len(observations))],
+        FileWork(settings),
+        out,
+        settings={**describe(settings.recording, config), "projections": settings.projections},
+        backend=backend,
+        jobs=jobs,
+        on_done=on_done,
+    )
+
+
 def mean_of(table: pd.DataFrame, column: str) -> Estimate:
     """The mean over episodes, drawing episodes."""
-    return bootstrap(table[column].to_numpy(), list(zip(table["task"], table["seed"], strict=True)))
+    return bootstrap(table[column].to_numpy(), clusters_of(table))
 
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     """The study's part of the report."""
     settings = provenance.settings
     episodes = {kind: len(rows.groupby(["task", "seed"])) for kind, rows in table.groupby("of")}
-    summary = [
-        f"{episodes.get('actions', 0)} episodes of {settings['checkpoint']['name']} in closed loop, up to "
-        f"{settings['looks']} looks of each; derivatives of the sampled chunk (all Euler steps, normalised "
-        f"actions) in torch, Frobenius norms from {settings['projections']} random projections. "
-        f"{loss_summary(episodes.get('loss', 0))} Intervals are over episodes.",
+    how = (
+        "derivatives of the sampled chunk (all Euler steps, normalised actions) in torch, Frobenius norms "
+        f"from {settings['projections']} random projections. {loss_summary(episodes.get('loss', 0))}"
+    )
+    title, warned = "Gradients", []
+    if from_file(provenance):
+        title, warned = "Gradients, from a file of features", cautions(table, provenance)
+        summary = [*file_summary(table, provenance), f"{how[0].upper()}{how[1:]}"]
+    else:
+        summary = [
+            f"{episodes.get('actions', 0)} episodes of {settings['checkpoint']['name']} in closed loop, up "
+            f"to {settings['looks']} looks of each; {how} Intervals are over episodes."
+        ]
+    summary.append(
         "The change for a row is the norm of the derivative times the row's length: to first order, how much "
         "the chunk moves if the row changes by its own length, at every Euler step. Norms alone are in the "
         "table; blocks normalise what they read, so those say as much about how long a row is.",
-    ]
+    )
     pictures = [
         Figure(f"rows-of-{kind}", caption, sensitivity_picture(table[table["of"] == kind], label))
         for kind, caption, label in (
@@ -513,10 +662,10 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         )
     if "path" not in table:
         return Section(
-            "Gradients",
+            title,
             summary,
             pictures,
-            concluded=[f"Paths: {not_measured(NO_TOKENS)}."],
+            concluded=[f"Paths: {not_measured(NO_TOKENS)}.", *warned],
             not_shown=NOT_SHOWN,
         )
     paths = table[table["path"].notna()]
@@ -531,11 +680,11 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         ),
     )
     return Section(
-        "Gradients",
+        title,
         summary,
         pictures,
         [path_grid(paths), cosine_grid(paths)],
-        conclusions(paths, share),
+        [*conclusions(paths, share), *warned],
         NOT_SHOWN,
     )
 
@@ -616,8 +765,10 @@ def cosine_grid(paths: pd.DataFrame) -> Grid:
 
 def conclusions(paths: pd.DataFrame, share: Mapping[str, Estimate]) -> list[str]:
     """What the numbers say."""
-    wide = paths.pivot_table(index=["task", "seed"], columns="path", values="share")
-    by_future = bootstrap((wide[READ] + wide[DETOUR]).to_numpy(), list(wide.index))
+    through = paths[paths["path"].isin((READ, DETOUR)) & paths["share"].notna()]
+    sums = through.groupby(["task", "seed"])["share"].sum()  # sorted, as are the clusters
+    observed = through.sort_values(["task", "seed"]).drop_duplicates(["task", "seed"])
+    by_future = bootstrap(sums.to_numpy(), clusters_of(observed))
     length = {path: number(mean_of(shares_of(paths, path), "length"), digits=2) for path in PATHS}
     return [
         "Of the derivative of the chunk by the vision-language tokens, a share of "

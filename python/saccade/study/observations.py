@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade.errors import CheckpointError, InputError
 from saccade.intervention import Intervention
 from saccade.sim import graphics
 from saccade.sim.environment import TaskEnvironment
@@ -113,32 +114,60 @@ class Rollouts:
 def add_rollout_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
     """Declares policy, tasks and seeds; `episodes` is the default number of each task."""
     parser.add_argument(
-        "--checkpoint", type=Path, metavar="DIR", help="policy to look into (default: the one shipped)"
+        "--checkpoint",
+        type=Path,
+        metavar="PATH",
+        help="policy to look into (default: the one shipped); with --features any checkpoint of a head",
     )
     parser.add_argument(
         "--tasks", metavar="NAME,...", help="tasks, separated by commas (default: all that it knows)"
     )
     parser.add_argument(
-        "--episodes", type=int, default=episodes, help=f"episodes per task (default: {episodes})"
+        "--episodes", type=int, metavar="NUMBER", help=f"episodes per task (default: {episodes})"
     )
+    parser.set_defaults(default_episodes=episodes)
     parser.add_argument(
-        "--seed", type=int, default=0, help="first seed; the next episodes count up (default: 0)"
+        "--seed",
+        type=int,
+        default=0,
+        help="first seed; the next episodes count up. With --features: of what is drawn (default: 0)",
     )
+    file = parser.add_argument_group("recorded features instead of the simulator")
+    file.add_argument(
+        "--features",
+        type=Path,
+        metavar="FILE",
+        help=".npz or .safetensors as `saccade attention` takes it, with `episode` for intervals by episode",
+    )
+    file.add_argument("--config", type=Path, help="the head's config (default: config.json beside it)")
 
 
 def rollouts_of(args: argparse.Namespace) -> Rollouts:
     """The episodes that the arguments ask for, all checked; needs a working OpenGL.
 
     Raises:
-        InputError: an unknown task, seeds kept for training, no episode.
+        InputError: an unknown task, seeds kept for training, no episode, a file of features.
         FileNotFoundError, CheckpointError: no policy, or one that was not trained on a task.
         GraphicsError: nothing can be drawn here.
     """
-    seeds = check_evaluation_seeds(args.seed, args.episodes)
+    if args.features is not None:
+        raise InputError(
+            "--features: this study asks for what only the simulator knows; cuts, patching, gradients and "
+            "n-runtime take a file of features"
+        )
+    if args.config is not None:
+        raise InputError("--config: only with --features; a policy of the simulator has its own")
+    episodes = args.default_episodes if args.episodes is None else args.episodes
+    seeds = check_evaluation_seeds(args.seed, episodes)
     named = None if args.tasks is None else task_names(args.tasks)
     graphics.check()
     checkpoint = str(args.checkpoint or DEMO_CHECKPOINT)
-    policy = policy_of(checkpoint)
+    try:
+        policy = policy_of(checkpoint)
+    except (CheckpointError, FileNotFoundError) as error:
+        if Path(checkpoint).exists():
+            raise CheckpointError(f"{error}; for a checkpoint of a head alone: --features FILE") from None
+        raise
     tasks = named or policy.config.tasks
     check_trained_on(policy, list(tasks))
     return Rollouts(checkpoint, tasks, seeds)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +23,21 @@ from saccade.study import figures
 from saccade.study.arguments import check_known, names, numbers
 from saccade.study.arms import episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
+from saccade.study.features import (
+    TASK,
+    Recording,
+    cautions,
+    clusters_of,
+    describe,
+    encode,
+    from_file,
+    head_and_observations,
+    recording_of,
+)
+from saccade.study.features import summary as file_summary
 from saccade.study.loaded import describe_checkpoint, environment_of, head_of, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
-from saccade.study.report import Figure, Grid, Section, not_measured, number
+from saccade.study.report import Figure, Grid, Section, not_measured, number, too_few
 from saccade.study.statistics import Estimate, bootstrap_ratio
 from saccade.study.tables import Provenance
 
@@ -32,6 +45,7 @@ STUDY = "patching"
 ALL = "all"  # every block at once
 CONTROL = "all rows"
 NO_FUTURE = "the checkpoint has no future tokens"
+SAME = 1e-6  # a squared way between two chunks that are equal but for rounding
 EXACT = 1e-3  # how far from 1 the control may be
 
 # What the donor's observation has that the receiver's has not.
@@ -40,6 +54,8 @@ KINDS = {
     "words": "the same picture, told another task of the same objects",
     "task": "another task: other objects, other words",
 }
+FROM_FILE = {"observation": "an observation of another episode of the file, same embodiment"}
+ABOUT = {**KINDS, **FROM_FILE}
 GROUPS: dict[str, tuple[str, ...]] = {
     "future": ("future",),
     "state": ("state",),
@@ -58,6 +74,7 @@ kinds of donors:
 examples:
   saccade study patching --episodes 15 --out out/study
   saccade study patching --kinds layout --blocks 1 --steps 0 --tasks push --out out/study
+  saccade study patching --checkpoint checkpoint/ --features looks.npz --out out/study
 """
 
 
@@ -78,6 +95,15 @@ class Settings:
     steps: tuple[int, ...]
 
 
+@dataclass(frozen=True)
+class FileSettings:
+    """What is run on a file of features; attributes as in `Settings`."""
+
+    recording: Recording
+    blocks: tuple[int, ...]
+    steps: tuple[int, ...]
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     width = max(len(name) for name in KINDS)
@@ -90,12 +116,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", metavar="K,...", help="Euler steps (default: all)")
 
 
-def settings(args: argparse.Namespace) -> Settings:
+def settings(args: argparse.Namespace) -> Settings | FileSettings:
     """From the arguments; raises what is wrong with them."""
+    if args.features is not None:
+        recording = recording_of(args, "kinds")
+        config = head_and_observations(recording)[0].config
+        return FileSettings(
+            recording,
+            numbers("--blocks", args.blocks, config.num_layers),
+            numbers("--steps", args.steps, config.num_steps),
+        )
     kinds = tuple(KINDS) if args.kinds is None else names("--kinds", args.kinds)
     check_known("kinds", kinds, KINDS)
     rollouts = rollouts_of(args)
-    check_evaluation_seeds(args.seed, 2 * args.episodes)  # donors have the later half
+    check_evaluation_seeds(args.seed, 2 * len(rollouts.seeds))  # donors have the later half
     head = HeadConfig.from_dict(policy_of(rollouts.checkpoint).config.head)
     blocks = numbers("--blocks", args.blocks, head.num_layers)
     steps = numbers("--steps", args.steps, head.num_steps)
@@ -103,8 +137,11 @@ def settings(args: argparse.Namespace) -> Settings:
     return Settings(rollouts, kinds, blocks, steps)
 
 
-def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
     """A cell is a pair of donor and receiver."""
+    if isinstance(settings, FileSettings):
+        run_on_file(settings, out, backend=backend, jobs=jobs, on_done=on_done)
+        return
     rollouts = settings.rollouts
     run_cells(
         STUDY,
@@ -126,12 +163,30 @@ def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDo
     )
 
 
+def run_on_file(settings: FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+    """A cell is a receiver; its donor follows from the file."""
+    head, observations = head_and_observations(settings.recording)
+    described = describe(settings.recording, head.config)
+    (kind,) = FROM_FILE
+    run_cells(
+        STUDY,
+        [Cell((kind, TASK, row), {}) for row in range(len(observations))],
+        FileWork(settings),
+        out,
+        settings={**described, "blocks": settings.blocks, "steps": settings.steps},
+        backend=backend,
+        jobs=jobs,
+        on_done=on_done,
+    )
+
+
 @dataclass(frozen=True)
 class Seen:
     """One observation as the head gets it."""
 
     context: Context
     state: Float32Array
+    embodiment_id: int = EMBODIMENT_ID
 
 
 @dataclass(frozen=True)
@@ -157,42 +212,8 @@ class Work:
         else:
             donor = self.see(task, donor_seed, find_task(donor_task).instruction(seed))
         noise = policy.noise(episode_rng(task, seed))
-        trace = head.trace(
-            donor.context,
-            donor.state,
-            EMBODIMENT_ID,
-            noise=noise,
-            record=("hidden",),
-            blocks=self.blocks,
-            steps=self.steps,
-        )
-        hidden = {place: np.asarray(rows)[0] for place, rows in trace.hidden.items()}
-        before = chunk(head, receiver, noise, None)
-        way = np.asarray(trace.actions)[0] - before
         row |= {"donor_task": donor_task, "donor_seed": donor_seed}
-        found = []
-        for group, members in GROUPS.items():
-            if "future" in members and head.config.num_future_tokens == 0 and members != ROW_GROUPS:
-                found.append({**row, "group": group, "note": NO_FUTURE})
-                continue
-            for block in (None, *self.blocks):
-                places = [(step, one) for step in self.steps for one in self.blocks if block in (None, one)]
-                patch: dict[tuple[int, int], dict[Tokens, Float32Array]] = {
-                    place: {name: hidden[place][trace.rows[name]] for name in members} for place in places
-                }
-                change = chunk(head, receiver, noise, Intervention(patch=patch)) - before
-                found.append(
-                    {
-                        **row,
-                        "group": group,
-                        "block": ALL if block is None else str(block),
-                        "toward": float((change * way).sum()),
-                        "squared_change": float((change * change).sum()),
-                        "squared_way": float((way * way).sum()),
-                        "note": None,
-                    }
-                )
-        return found
+        return patched(head, donor, receiver, noise, self.blocks, self.steps, row)
 
     def see(self, task: str, seed: int, instruction: str) -> Seen:
         """The first observation of an episode, told these words."""
@@ -203,6 +224,84 @@ class Work:
         observation = environment.observe()
         context = head_of(self.checkpoint).encode(policy.features(observation))
         return Seen(context, policy.state(observation))
+
+
+def patched(
+    head: ActionHead,
+    donor: Seen,
+    receiver: Seen,
+    noise: Float32Array,
+    blocks: Sequence[int],
+    steps: Sequence[int],
+    row: Mapping[str, Any],
+) -> Rows:
+    """A row for each group and block: what the donor's rows do in the receiver's run.
+
+    Args:
+        head: computes.
+        donor, receiver: two observations.
+        noise: from which both start.
+        blocks: after which rows are patched, one by one and all at once.
+        steps: in which they are patched.
+        row: what the rows have in common.
+    """
+    trace = head.trace(
+        donor.context,
+        donor.state,
+        donor.embodiment_id,
+        noise=noise,
+        record=("hidden",),
+        blocks=blocks,
+        steps=steps,
+    )
+    hidden = {place: np.asarray(rows)[0] for place, rows in trace.hidden.items()}
+    before = chunk(head, receiver, noise, None)
+    way = np.asarray(trace.actions)[0] - before
+    found: Rows = []
+    for group, members in GROUPS.items():
+        if "future" in members and head.config.num_future_tokens == 0 and members != ROW_GROUPS:
+            found.append({**row, "group": group, "note": NO_FUTURE})
+            continue
+        for block in (None, *blocks):
+            places = [(step, one) for step in steps for one in blocks if block in (None, one)]
+            patch: dict[tuple[int, int], dict[Tokens, Float32Array]] = {
+                place: {name: hidden[place][trace.rows[name]] for name in members} for place in places
+            }
+            change = chunk(head, receiver, noise, Intervention(patch=patch)) - before
+            found.append(
+                {
+                    **row,
+                    "group": group,
+                    "block": ALL if block is None else str(block),
+                    "toward": float((change * way).sum()),
+                    "squared_change": float((change * change).sum()),
+                    "squared_way": float((way * way).sum()),
+                    "note": None,
+                }
+            )
+    return found
+
+
+@dataclass(frozen=True)
+class FileWork:
+    """Patches rows of another episode's observation into the run of one of the file."""
+
+    settings: FileSettings
+
+    def __call__(self, cell: Cell) -> Rows:
+        """A row for each group and block, or a note why there is none."""
+        kind, task, place = str(cell.key[0]), str(cell.key[1]), int(cell.key[2])
+        head, observations = head_and_observations(self.settings.recording)
+        observed = observations.observation(place, self.settings.recording.seed)
+        row = {"kind": kind, "task": task, "seed": place, "episode": observed.episode}
+        number = observations.donor_of(place)
+        if number is None:
+            return [{**row, "note": f"the file has no donor for it ({ABOUT[kind]})"}]
+        other = observations.observation(number, self.settings.recording.seed)
+        receiver, donor = (Seen(encode(head, one), one.state, one.embodiment_id) for one in (observed, other))
+        noise = observed.noise[:, 0]
+        row |= {"donor_task": task, "donor_seed": number}
+        return patched(head, donor, receiver, noise, self.settings.blocks, self.settings.steps, row)
 
 
 def find_donor(kind: str, task: str, known: Sequence[str]) -> str | None:
@@ -227,7 +326,9 @@ def chunk(
     head: ActionHead, seen: Seen, noise: Float32Array, intervention: Intervention | None
 ) -> npt.NDArray[np.float64]:
     """The head's own, normalised actions, `(horizon, action_dim)`."""
-    actions = head.sample(seen.context, seen.state, EMBODIMENT_ID, noise=noise, intervention=intervention)
+    actions = head.sample(
+        seen.context, seen.state, seen.embodiment_id, noise=noise, intervention=intervention
+    )
     normalised: npt.NDArray[np.float64] = np.asarray(actions, dtype=np.float64)[0]
     return normalised
 
@@ -240,11 +341,15 @@ def shares(rows: pd.DataFrame) -> tuple[Estimate, float]:
         pair weighted by the square of its way; drawn anew by receiver. And the root of the summed squared
         changes over the summed squared ways.
     """
-    receivers = list(zip(rows["task"], rows["seed"], strict=True))
+    rows = rows[rows["squared_way"] >= SAME]
+    receivers = clusters_of(rows)
     way = rows["squared_way"].to_numpy(dtype=float)
     share = bootstrap_ratio(rows["toward"], way, receivers)
-    size = math.sqrt(rows["squared_change"].sum() / way.sum()) if way.sum() > 0 else math.nan
+    size = math.sqrt(rows["squared_change"].sum() / way.sum()) if len(way) else math.nan
     return share, size
+
+
+FIRST_ONLY = "First observations only, where the hand is at rest; what the rows carry later may differ. "
 
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
@@ -254,13 +359,18 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     if len(measured):
         for (kind, group, block), rows in measured.groupby(["kind", "group", "block"]):
             found[str(kind), str(group), str(block)] = (*shares(rows), len(rows))
-    kinds = [kind for kind in KINDS if kind in set(table["kind"])]
+    kinds = [kind for kind in ABOUT if kind in set(table["kind"])]
+    on_file = from_file(provenance)
     return Section(
-        title="Patching: do the actions follow rows taken from another observation?",
+        title="Patching: do the actions follow rows taken from another observation?"
+        + (" From a file of features" if on_file else ""),
         summary=summary(table, provenance, kinds),
         figures=pictures(found, provenance, kinds),
         grids=[grid(found, provenance, kinds)],
-        concluded=conclusions(table, found, provenance, kinds),
+        concluded=[
+            *conclusions(table, found, provenance, kinds),
+            *(cautions(table, provenance) if on_file else ()),
+        ],
         not_shown=(
             "Rows after later blocks have also read the donor's half-made actions, so patching them brings "
             "more than what was seen. After block 0, a cross-attention block, the future rows depend on the "
@@ -268,8 +378,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
             "Patched rows stand among rows that they never met. A share can be below what the rows carry "
             "because later cross-attention blocks read the receiver's tokens again, and above it because "
             "the mixture is one that the head never met.",
-            "First observations only, where the hand is at rest; what the rows carry later may differ. A "
-            "moved chunk is not yet a failed task (see the study cuts).",
+            ("" if on_file else FIRST_ONLY) + "A moved chunk is not yet a failed task (see the study cuts).",
         ),
     )
 
@@ -279,18 +388,36 @@ def summary(table: pd.DataFrame, provenance: Provenance, kinds: Sequence[str]) -
     checkpoint = provenance.settings["checkpoint"]
     steps, blocks = provenance.settings["steps"], provenance.settings["blocks"]
     pairs = {kind: len(pairs_of(measured_rows(table), kind)) for kind in kinds}
+    if from_file(provenance):
+        measured_on = file_summary(table, provenance)
+        which = "Donor and receiver are of different episodes"
+    else:
+        measured_on = []
+        which = (
+            f"Policy {checkpoint['name']} (SHA-256 {checkpoint['sha256'][:12]}), N = "
+            f"{checkpoint['num_future_tokens']} future tokens. Donor and receiver are first observations"
+        )
     return [
-        f"Policy {checkpoint['name']} (SHA-256 {checkpoint['sha256'][:12]}), N = "
-        f"{checkpoint['num_future_tokens']} future tokens. Donor and receiver are first observations and "
-        "start from the same noise. Rows of the donor's run after the blocks "
+        *measured_on,
+        f"{which} and start from the same noise. Rows of the donor's run after the blocks "
         f"{', '.join(map(str, blocks))}, in the Euler steps {', '.join(map(str, steps))}, take the place of "
         "the receiver's.",
         "Share: how far the chunk (the head's own, normalised actions) moves along the way from the "
         "receiver's chunk to the donor's, 0 for not at all and 1 for all of it, below 0 for away from it; "
         "shares of groups need not add up to 1. All pairs together, with a 95 % bootstrap interval over "
         "receivers. Size: how far it moves at all, in the same unit.",
-        *(f"Donors of the kind {kind} ({pairs[kind]} pairs): {KINDS[kind]}." for kind in kinds),
+        *(
+            f"Donors of the kind {kind} ({pairs[kind]} pairs{ways(table, kind)}): {ABOUT[kind]}."
+            for kind in kinds
+        ),
     ]
+
+
+def ways(table: pd.DataFrame, kind: str) -> str:
+    """How long the ways from receivers' to donors' chunks are, which says how much there is to follow."""
+    measured = measured_rows(table)
+    squares = measured.loc[measured["kind"] == kind, "squared_way"] if len(measured) else measured
+    return f", ways of a mean length of {float(np.sqrt(squares).mean()):.2f}" if len(squares) else ""
 
 
 def measured_rows(table: pd.DataFrame) -> pd.DataFrame:
@@ -332,7 +459,7 @@ def pictures(
         }
         if series:
             picture = figures.lines(blocks, series, "patched after block", "share of the way", reference=0.0)
-            caption = f"One block patched (in all chosen steps), donors of the kind {kind}: {KINDS[kind]}."
+            caption = f"One block patched (in all chosen steps), donors of the kind {kind}: {ABOUT[kind]}."
             drawn.append(Figure(f"blocks-{kind}", caption, picture))
     return drawn
 
@@ -375,6 +502,8 @@ def conclusions(
             lines.append(
                 f"{kind}, future rows after block 0, where they hold vision alone: {following(share)}."
             )
+        if kind in found_kinds:
+            lines += too_few(len(pairs_of(measured_rows(table), kind)), f"receivers of the kind {kind}")
     controls = [found[kind, CONTROL, ALL][0].value for kind in kinds if (kind, CONTROL, ALL) in found]
     controls = [value for value in controls if math.isfinite(value)]
     if controls and controls_are_exact(provenance):

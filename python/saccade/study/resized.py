@@ -24,6 +24,14 @@ from saccade.study.arguments import numbers
 from saccade.study.arms import episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.cuts import chunk_change, scaled, unchanged_episode
+from saccade.study.features import (
+    Changes,
+    Recording,
+    change_section,
+    from_file,
+    head_and_observations,
+    recording_of,
+)
 from saccade.study.loaded import describe_checkpoint, environment_of, learned_tokens, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
 from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate
@@ -36,6 +44,11 @@ TWICE, TWICE_EQUAL = "every token twice", "every token twice, equal mass"
 ROUNDING = 1e-3  # a change of the chunk, in action units, that an exact identity may make
 NO_TOKENS = "the checkpoint has no future tokens"
 UNLIMITED = 1 << 31
+ARMS_ARE = (
+    "Drawn: others in every episode. Merged: by the cosine between learned tokens; each counts as many "
+    "times as it stands for. Equal mass: the keys together weigh in the softmax as much as all learned "
+    "tokens would."
+)
 
 EPILOG = """\
 Arms, for each number K of --sizes: K of the tokens, drawn anew for every episode; the same with the mass of
@@ -45,6 +58,7 @@ it stands for. And every token twice, with twice the mass, and with the same (wh
 examples:
   saccade study n-runtime --out out/study
   saccade study n-runtime --checkpoint out/policy --sizes 1,4,16 --episodes 20 --out out/study
+  saccade study n-runtime --checkpoint checkpoint/ --features looks.npz --out out/study
 """
 
 
@@ -58,6 +72,14 @@ class Settings:
     """
 
     rollouts: Rollouts
+    sizes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class FileSettings:
+    """What to run on a file of features; attributes as in `Settings`."""
+
+    recording: Recording
     sizes: tuple[int, ...]
 
 
@@ -118,24 +140,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def settings(args: argparse.Namespace) -> Settings:
+def settings(args: argparse.Namespace) -> Settings | FileSettings:
     """The settings, checked."""
+    if args.features is not None:
+        recording = recording_of(args)
+        head, _ = head_and_observations(recording)
+        return FileSettings(recording, sizes_of(args, head.config.num_future_tokens))
     rollouts = rollouts_of(args)
-    count = int(describe_checkpoint(rollouts.checkpoint)["num_future_tokens"])
-    if count == 0:
-        return Settings(rollouts, ())
-    sizes = numbers("--sizes", args.sizes, UNLIMITED) or tuple(
-        sorted({count // 8, count // 4, count // 2} - {0})
+    return Settings(
+        rollouts, sizes_of(args, int(describe_checkpoint(rollouts.checkpoint)["num_future_tokens"]))
     )
+
+
+def sizes_of(args: argparse.Namespace, count: int) -> tuple[int, ...]:
+    """The numbers of tokens to go down to from `count`; none if there are no tokens."""
+    if count == 0:
+        return ()
+    if args.sizes is None:
+        return tuple(sorted({count // 8, count // 4, count // 2} - {0}))
+    sizes = numbers("--sizes", args.sizes, UNLIMITED)
     if not all(1 <= size < count for size in sizes):
         raise InputError(
             f"sizes: given {args.sizes}, expected 1 to {count - 1}; the policy has {count} tokens"
         )
-    return Settings(rollouts, sizes)
+    return sizes
 
 
-def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
     """A cell is an episode of one arm; those of one episode lie side by side, for they share what it saw."""
+    if isinstance(settings, FileSettings):
+        arms = arms_of(settings.sizes)
+        CHANGES.run(settings.recording, arms, out, backend=backend, jobs=jobs, on_done=on_done)
+        return
     rollouts = settings.rollouts
     described = describe_checkpoint(rollouts.checkpoint)
     arms = arms_of(settings.sizes) if described["num_future_tokens"] else [TWICE]
@@ -149,6 +185,14 @@ def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDo
         jobs=jobs,
         on_done=on_done,
     )
+
+
+def why_not(arm: str, num_future_tokens: int) -> str | None:
+    """Why an arm cannot be measured on a head with so many tokens, or None."""
+    return None if num_future_tokens or arm == BASELINE else NO_TOKENS
+
+
+CHANGES = Changes(STUDY, BASELINE, TWICE_EQUAL, resized, why_not)
 
 
 @dataclass(frozen=True)
@@ -216,6 +260,9 @@ def results_of(table: pd.DataFrame) -> dict[str, Result]:
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     """The study's part of the report."""
     title = "Number of future tokens changed without training"
+    if from_file(provenance):
+        names = {arm: arm for arm in sorted(dict.fromkeys(table["arm"]), key=arm_order)}
+        return change_section(CHANGES, title, names, (ARMS_ARE,), NOT_SHOWN, table, provenance)
     if table["note"].notna().any() or not (table["arm"] == BASELINE).any():
         return Section(title, concluded=[f"{not_measured(NO_TOKENS).capitalize()}."])
     checkpoint = provenance.settings["checkpoint"]
@@ -225,9 +272,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     summary = [
         f"{checkpoint['name']}, N = {checkpoint['num_future_tokens']}, {len(baseline)} episodes an arm on "
         f"equal seeds and noise; as learned it succeeds in {rate(whole)} %. The change of the chunk is "
-        "measured on what the unchanged policy saw. Drawn: others in every episode. Merged: by the cosine "
-        "between learned tokens; each counts as many times as it stands for. Equal mass: the keys together "
-        "weigh in the softmax as much as all learned tokens would.",
+        f"measured on what the unchanged policy saw. {ARMS_ARE}",
     ]
     pictures = []
     if results:
@@ -266,6 +311,8 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
 
 
 NOT_SHOWN = (
+    "Intervals hold for each arm by itself: of twenty arms without an effect one is expected to exclude "
+    "zero.",
     "A policy trained with another number of tokens would have learned other tokens; the study n trains "
     "them.",
     "With fewer tokens the later blocks meet rows that they never met in training. A loss need not mean "
