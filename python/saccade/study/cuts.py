@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,9 +19,17 @@ from saccade.study import figures
 from saccade.study.arguments import check_known, names
 from saccade.study.arms import ARMS, BASELINE, SHUFFLED, episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
+from saccade.study.features import (
+    Changes,
+    Recording,
+    change_section,
+    from_file,
+    head_and_observations,
+    recording_of,
+)
 from saccade.study.loaded import describe_checkpoint, environment_of, learned_tokens, policy_of
 from saccade.study.observations import Look, Rollouts, add_rollout_arguments, record_looks, rollouts_of
-from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate
+from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate, too_few
 from saccade.study.statistics import (
     Estimate,
     PairedDifference,
@@ -31,14 +39,16 @@ from saccade.study.statistics import (
     paired_difference,
     wilson,
 )
-from saccade.study.tables import Provenance
+from saccade.study.tables import Provenance, truths
 
 STUDY = "cuts"
 ROUNDING = 1e-3  # a change of a chunk, in action units, that shuffled tokens may make
+SHARES = (0.1, 0.25)  # of discordant pairs, for what can be detected
 
 EPILOG = """\
 Every arm runs the same episodes: the same layouts, words and noise. Success is compared in pairs with the
-arm "none", which is always run. The change of the chunk is measured on what "none" saw, look by look.
+arm "none", which is always run. The change of the chunk is measured on what "none" saw, look by look. With
+--features it is measured on the observations of a file, for any checkpoint; there is no success then.
 
 arms:
 {arms}
@@ -46,6 +56,7 @@ arms:
 examples:
   saccade study cuts --episodes 15 --out out/study
   saccade study cuts --arms future-unread,future-blind --tasks push --jobs 2 --out out/study
+  saccade study cuts --checkpoint checkpoint/ --features looks.npz --out out/study
 """
 
 
@@ -64,6 +75,14 @@ class Settings:
     engine: str = "rust"
 
 
+@dataclass(frozen=True)
+class FileSettings:
+    """What is run on a file of features; attributes as in `Settings`."""
+
+    recording: Recording
+    arms: tuple[str, ...]
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     width = max(len(name) for name in ARMS)
@@ -72,20 +91,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_rollout_arguments(parser, episodes=15)
     parser.add_argument("--arms", metavar="NAME,...", help="arms, separated by commas (default: all)")
-    parser.add_argument("--engine", choices=ENGINES, default="rust", help="what computes the action head")
+    parser.add_argument("--engine", choices=ENGINES, help="what computes the action head (default: rust)")
 
 
-def settings(args: argparse.Namespace) -> Settings:
+def settings(args: argparse.Namespace) -> Settings | FileSettings:
     """From the arguments; raises what is wrong with them."""
     arms = tuple(ARMS) if args.arms is None else names("--arms", args.arms)
     check_known("arms", arms, ARMS)
+    if args.features is not None:
+        recording = recording_of(args, "engine")
+        head_and_observations(recording)
+        return FileSettings(recording, arms)
     rollouts = rollouts_of(args)
     graphics.check()
-    return Settings(rollouts, arms, args.engine)
+    return Settings(rollouts, arms, args.engine or "rust")
 
 
-def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
+def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
     """A cell is an episode of one arm. Arms of one episode lie side by side, for they share what it saw."""
+    if isinstance(settings, FileSettings):
+        CHANGES.run(settings.recording, settings.arms, out, backend=backend, jobs=jobs, on_done=on_done)
+        return
     arms = dict.fromkeys((BASELINE, *settings.arms))
     checkpoint = settings.rollouts.checkpoint
     run_cells(
@@ -98,6 +124,19 @@ def run(settings: Settings, out: Path, *, backend: str, jobs: int, on_done: OnDo
         jobs=jobs,
         on_done=on_done,
     )
+
+
+def intervention_of(arm: str, tokens: Float32Array, rng: np.random.Generator) -> Intervention | None:
+    """What an arm does."""
+    return ARMS[arm].intervention(tokens, rng)
+
+
+def why_not(arm: str, num_future_tokens: int) -> str | None:
+    """See `Arm.why_not`."""
+    return ARMS[arm].why_not(num_future_tokens)
+
+
+CHANGES = Changes(STUDY, BASELINE, SHUFFLED, intervention_of, why_not)
 
 
 @dataclass(frozen=True)
@@ -186,13 +225,11 @@ def arm_results(table: pd.DataFrame) -> list[ArmResult]:
         rows = by_arm[name]
         measured = rows[rows["success"].notna()]
         note = None if len(measured) else str(rows["note"].iloc[0])
-        success = measured["success"].astype(bool)
+        success = truths(measured["success"])
         shared = success.index.intersection(baseline.index)
         pairs = None
         if name != BASELINE and len(shared):
-            pairs = paired_difference(
-                success.loc[shared].tolist(), baseline.loc[shared].astype(bool).tolist()
-            )
+            pairs = paired_difference(success.loc[shared].tolist(), truths(baseline.loc[shared]).tolist())
         change = None
         if name != BASELINE and len(measured):
             changes = measured["chunk_change"].to_numpy(dtype=float)
@@ -205,8 +242,22 @@ def arm_results(table: pd.DataFrame) -> list[ArmResult]:
     return [replace(one, corrected_p=corrected.get(one.name)) for one in results]
 
 
+NOT_SHOWN_OF_CUTS = (
+    "A cut head is one that was never trained. A loss can come from numbers it never met and need "
+    "not mean that the information was needed; future-averaged and future-redrawn differ from the "
+    "learned tokens in what later blocks meet, too.",
+    "No loss after a cut does not mean that the path is unused: the other paths may carry the same. "
+    "It says nothing of a policy trained without the path (see the study n).",
+)
+
+
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     """See `Study`."""
+    if from_file(provenance):
+        labels = {arm.name: arm.label for arm in ARMS.values()}
+        about = [f"{arm.label}: {arm.about}" for arm in ARMS.values() if arm.name in set(table["arm"])]
+        title = "Cuts: actions with parts of the head cut or replaced"
+        return change_section(CHANGES, title, labels, about, NOT_SHOWN_OF_CUTS, table, provenance)
     results = arm_results(table)
     measured = [result for result in results if result.episodes]
     compared = [result for result in measured if result.pairs is not None]
@@ -217,11 +268,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         grids=[arm_grid(results), task_grid(table, measured)],
         concluded=conclusions(table, results, compared),
         not_shown=(
-            "A cut head is one that was never trained. A loss can come from numbers it never met and need "
-            "not mean that the information was needed; future-averaged and future-redrawn differ from the "
-            "learned tokens in what later blocks meet, too.",
-            "No loss after a cut does not mean that the path is unused: the other paths may carry the same. "
-            "It says nothing of a policy trained without the path (see the study n).",
+            *NOT_SHOWN_OF_CUTS,
             "Success is one bit an episode. An arm can move the actions (see the change of the chunk) "
             "without moving success on tasks that forgive it.",
             "Intervals are for these tasks and for layouts like these, with one set of weights; another "
@@ -322,7 +369,7 @@ def task_grid(table: pd.DataFrame, measured: Sequence[ArmResult]) -> Grid:
     rows = []
     for result in measured:
         of_arm = table[(table["arm"] == result.name) & table["success"].notna()]
-        counts = [of_arm.loc[of_arm["task"] == task, "success"].astype(bool) for task in tasks]
+        counts = [truths(of_arm.loc[of_arm["task"] == task, "success"]) for task in tasks]
         rows.append([ARMS[result.name].label, *(f"{int(found.sum())}/{len(found)}" for found in counts)])
     return Grid("Successes by arm and task.", ("arm", *tasks), rows)
 
@@ -340,31 +387,45 @@ def conclusions(
             lines.append(control_line(table))
         elif result.pairs is not None and result.change is not None:
             change = number(result.change, digits=3)
-            on_success = effect("success", result.pairs.difference)
-            lines.append(f"{label}: {on_success}{doubt(result)}; actions change by {change} on average.")
+            on_success = effect("success", result.pairs.difference) + where_lost(table, result)
+            lines.append(f"{label}: {doubt(result)}{on_success}; actions change by {change} on average.")
     if compared:
         pairs = min(result.pairs.pairs for result in compared if result.pairs)
-        found = {share: detectable_difference(pairs, share) for share in (0.1, 0.25)}
-        known = [
-            f"{100 * value:.0f} points if {100 * share:.0f} % of the episodes go one way in one arm and the "
-            "other way in the other"
-            for share, value in found.items()
-            if np.isfinite(value)
-        ]
-        if known:
-            lines.append(
-                f"{pairs} paired episodes find, with 80 % power, a difference of {'; '.join(known)}."
-            )
+        lines.append(
+            f"What {pairs} paired episodes find with 80 % power: {'; '.join(map(found_by(pairs), SHARES))}."
+        )
+        lines += too_few(pairs, "paired episodes")
     return lines
 
 
+def found_by(pairs: int) -> Callable[[float], str]:
+    """What so many pairs find, for a share of discordant ones."""
+
+    def describe(share: float) -> str:
+        value = detectable_difference(pairs, share)
+        size = f"{100 * value:.0f} points" if np.isfinite(value) else "no difference at all"
+        return f"{size}, if {100 * share:.0f} % of the episodes go otherwise in the other arm"
+
+    return describe
+
+
+def where_lost(table: pd.DataFrame, result: ArmResult) -> str:
+    """Names the task with more than half of the lost episodes, if several are lost and there is one."""
+    success = table[table["success"].notna()].set_index(["task", "seed", "arm"])["success"]
+    both = truths(success).unstack("arm")[[BASELINE, result.name]].dropna().astype(bool)
+    lost = both.index[both[BASELINE] & ~both[result.name]].get_level_values("task").value_counts()
+    if len(both.index.unique("task")) < 2 or lost.sum() < 3 or 2 * lost.iloc[0] <= lost.sum():
+        return ""
+    return f", {lost.iloc[0]} of the {lost.sum()} lost episodes in {lost.index[0]}"
+
+
 def doubt(result: ArmResult) -> str:
-    """What is to be added where an interval excludes zero and the corrected test does not."""
+    """What is to be said first where an interval excludes zero and the corrected test does not."""
     assert result.pairs is not None
     difference, p = result.pairs.difference, result.corrected_p
     if p is None or p < 0.05 or difference.low <= 0 <= difference.high:
         return ""
-    return f", but p = {p:.2g} when corrected for the arms compared (Holm): no finding by itself"
+    return f"no finding after correction for the arms compared (Holm, p = {p:.2g}); by itself, "
 
 
 def control_line(table: pd.DataFrame) -> str:
