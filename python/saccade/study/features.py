@@ -28,13 +28,12 @@ from saccade.sim.policy import DEMO_CHECKPOINT, Float32Array
 from saccade.study import figures
 from saccade.study.arms import episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
-from saccade.study.report import Figure, Grid, Section, not_measured, number
+from saccade.study.report import Figure, Grid, Section, not_measured, number, too_few
 from saccade.study.statistics import Estimate, bootstrap_ratio
 from saccade.study.tables import Provenance
 
 TASK = "features"  # stands in the tables where the simulator's task would
 NOISES = 4  # drawn for each observation, if the file has none
-FEW = 10  # clusters; with fewer a bootstrap interval is too narrow
 ROUNDING = 1e-3  # a change of a chunk, in normalised actions, that an exact identity may make
 
 NO_LOOP = f"Success: {not_measured('a file of features has no closed loop')}."
@@ -493,7 +492,7 @@ def change_section(
         ],
         figures=pictures,
         grids=[Grid("By arm, with 95 % intervals.", columns, rows)] if rows else [],
-        concluded=[*concluded, NO_LOOP, *cautions(table, provenance)],
+        concluded=[*concluded, NO_LOOP, *cautions(table[table["chunk_change"].notna()], provenance)],
         not_shown=(*not_shown, *NOT_SHOWN),
     )
 
@@ -520,16 +519,13 @@ def summary(table: pd.DataFrame, provenance: Provenance) -> list[str]:
 
 
 def cautions(table: pd.DataFrame, provenance: Provenance) -> list[str]:
-    """What is to be known of the intervals."""
+    """What is to be known of the intervals; nothing where nothing was measured."""
+    if table.empty:
+        return []
     lines = []
     if provenance.settings["features"]["episodes"] is None:
         lines.append(
             "The file does not say of which episode an observation is, so each counts by itself. If several "
             "are of one episode, the intervals are too narrow; an array named episode mends that."
         )
-    clusters = table["episode"].nunique()
-    if clusters < FEW:
-        lines.append(
-            f"{clusters} independent observations or episodes: with so few, intervals are too narrow."
-        )
-    return lines
+    return lines + too_few(table["episode"].nunique(), "independent observations or episodes")

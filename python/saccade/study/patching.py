@@ -369,7 +369,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         grids=[grid(found, provenance, kinds)],
         concluded=[
             *conclusions(table, found, provenance, kinds),
-            *(cautions(table, provenance) if on_file else ()),
+            *(cautions(measured, provenance) if on_file else ()),
         ],
         not_shown=(
             "Rows after later blocks have also read the donor's half-made actions, so patching them brings "
@@ -502,7 +502,7 @@ def conclusions(
             lines.append(
                 f"{kind}, future rows after block 0, where they hold vision alone: {following(share)}."
             )
-        if kind in found_kinds:
+        if kind in found_kinds and not from_file(provenance):  # a file has its own cautions
             lines += too_few(len(pairs_of(measured_rows(table), kind)), f"receivers of the kind {kind}")
     controls = [found[kind, CONTROL, ALL][0].value for kind in kinds if (kind, CONTROL, ALL) in found]
     controls = [value for value in controls if math.isfinite(value)]
