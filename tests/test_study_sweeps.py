@@ -24,6 +24,7 @@ from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.study import resized, sweeps
 from saccade.study.loaded import learned_tokens
+from saccade.study.statistics import paired_difference
 from saccade.study.sweeps import PLAIN, TVL, VLSA, N
 from saccade.study.tables import read_provenance, read_table
 
@@ -96,7 +97,7 @@ def test_a_sweep_over_trained_policies(
     assert study("n", *arguments) == 0
     printed = capsys.readouterr()
     assert printed.err.startswith("What these runs can detect, with 80 % power at the 5 % level:")
-    assert "N = 4 against N = 2. These policies: no effect on success was found" in printed.out
+    assert "N = 4 against N = 2. These policies: success: too few episodes" in printed.out
     assert "N = 4, aligned (0.2) against N = 4." in printed.out
     assert "N = 4, aligned (0.2) against N = 2." not in printed.out  # differs in two respects
     table: Any = read_table(tmp_path / "n.csv")
@@ -205,12 +206,12 @@ def test_equal_mass_is_repeated_tokens() -> None:
     assert np.abs(heavier - plain).max() > 1e-2
 
 
-def test_difference_between_runs_is_welch_s() -> None:
-    first, second = [0.2, 0.6], [0.5, 0.9]
-    expected = stats.ttest_ind(second, first, equal_var=False).confidence_interval()
+def test_difference_between_runs_is_student_s() -> None:
+    first, second = [0.3, 0.4], [0.55, 0.7]
+    expected = stats.ttest_ind(second, first, equal_var=True).confidence_interval()
     found = sweeps.between_runs(first, second, episodes=1000)
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
-    assert found.value == pytest.approx(0.3)
+    assert found.value == pytest.approx(0.275)
     # Runs that happen to agree still vary by their episodes.
     agreeing = sweeps.between_runs([0.5, 0.5], [0.5, 0.5], episodes=100)
     half = stats.t.ppf(0.975, 2) * math.sqrt(2 * 0.25 / 100 / 2)
@@ -232,11 +233,16 @@ def test_difference_of_these_policies_is_paired() -> None:
     alternating = [True, False] * 10
     found = sweeps.same_policies(rows([alternating] * 2), rows([[True] * 20, alternating]))
     assert found.value == 0.25
-    assert 0.1 < found.low < 0.25 < found.high < 0.42
+    assert 0.04 < found.low < 0.25 < found.high < 0.48
     # Policies that agree in all of twenty episodes may differ in the twenty-first: z^2 / (n + z^2).
     agreeing = sweeps.same_policies(rows([alternating] * 2), rows([alternating] * 2))
     assert agreeing.high == pytest.approx(1.959964**2 / (20 + 1.959964**2))
     assert agreeing.low == -agreeing.high
+    # One run a point, one episode lost: Tango's interval, which does not exclude a loss of 5 points.
+    lost = sweeps.same_policies(rows([[True] * 100]), rows([[False] + [True] * 99]))
+    known = paired_difference([False] + [True] * 99, [True] * 100).difference
+    assert (lost.low, lost.high) == pytest.approx((known.low, known.high))
+    assert lost.low < -0.05
     few = sweeps.same_policies(rows([[True] * 9]), rows([[False] * 9]))
     assert (few.value, math.isnan(few.low), math.isnan(few.high)) == (-1.0, True, True)
 

@@ -99,7 +99,7 @@ def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> PairedDi
     )
 
 
-def tango(only_first: int, only_second: int, pairs: int) -> Estimate:
+def tango(only_first: float, only_second: float, pairs: int) -> Estimate:
     """The difference of two paired rates with Tango's score interval, from the discordant pairs.
 
     Example:

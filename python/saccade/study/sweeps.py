@@ -504,7 +504,8 @@ class Sweep:
         directories |= {plan.name: out / "policies" / plan.name for plan in settings.planned}
         work = Work(directories, {plan.name: plan for plan in settings.planned}, self.varied)
 
-        training: dict[str, Any] = {}  # one directory of tables holds policies that may be compared
+        # One directory holds policies that may be compared. Of these only aligned runs have the first.
+        training: dict[str, Any] = {"alignment_block": None}
         for one in (*(run.settings for run in found), *map(planned_settings, settings.planned)):
             training |= held_equal(one, self)
 
@@ -619,31 +620,29 @@ def statement_lines(rows: Iterable[Mapping[Any, Any]]) -> list[str]:
 def between_runs(first: Sequence[float], second: Sequence[float], episodes: int) -> Estimate:
     """Second less first mean rate of trained policies, with an interval for training them anew.
 
-    Welch's t interval over the runs. A run's rate varies at least as much as the episodes drawn make it, so
-    that two runs that happen to agree do not give a narrow interval.
+    Student's t interval over the runs, both sides with the same variance between runs. It is at least what
+    the episodes drawn make it, so that runs that happen to agree do not give a narrow interval.
 
     Args:
         first, second: success rates of the runs.
         episodes: that each rate is of.
 
     Returns:
-        With NaN bounds where a side has one run only.
+        With NaN bounds where a side has one run only, or where the variance is zero.
     """
-    means, variances, counts = [], [], []
+    value = float(np.mean(second) - np.mean(first))
+    if min(len(first), len(second)) < 2:
+        return Estimate(value, math.nan, math.nan)
+    freedom = len(first) + len(second) - 2
+    variance = 0.0
     for rates in (first, second):
         mean = float(np.mean(rates))
-        means.append(mean)
-        counts.append(len(rates))
         by_episodes = mean * (1 - mean) / episodes
-        variances.append(max(float(np.var(rates, ddof=1)), by_episodes) if len(rates) > 1 else by_episodes)
-    value = means[1] - means[0]
-    if min(counts) < 2:
+        variance += (len(rates) - 1) / freedom * max(float(np.var(rates, ddof=1)), by_episodes)
+    if variance == 0:  # all runs succeeded always, or never
         return Estimate(value, math.nan, math.nan)
-    parts = [variance / count for variance, count in zip(variances, counts, strict=True)]
-    if sum(parts) == 0:  # all runs succeeded always, or never
-        return Estimate(value, math.nan, math.nan)
-    freedom = sum(parts) ** 2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
-    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * math.sqrt(sum(parts))
+    error = math.sqrt(variance * (1 / len(first) + 1 / len(second)))
+    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
     return Estimate(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
@@ -661,16 +660,17 @@ def mean_difference(differences: npt.NDArray[np.float64], episodes: Sequence[Any
     """The mean of differences of success, with an interval from drawing episodes.
 
     Where few episodes differ, drawing them gives an interval that is too narrow, and none at all where all
-    agree. So it is never narrower than Tango's interval for as many pairs that all agree, and there is none
+    agree. So it also holds Tango's interval for as many pairs with these gains and losses, and there is none
     (NaN) with fewer than `FEWEST_EPISODES`.
     """
     count = len(set(episodes))
     if count < FEWEST_EPISODES:
         return Estimate(float(np.mean(differences)) if count else math.nan, math.nan, math.nan)
     drawn = bootstrap(differences, episodes)
-    agreeing = tango(0, 0, count).high
-    low, high = min(drawn.low, drawn.value - agreeing), max(drawn.high, drawn.value + agreeing)
-    return Estimate(drawn.value, max(low, -1.0), min(high, 1.0))
+    # An episode counts once, however many policies ran it; so gains and losses may be parts of one.
+    by_episode = pd.Series(differences).groupby([str(episode) for episode in episodes]).mean()
+    scored = tango(by_episode.clip(lower=0).sum(), -by_episode.clip(upper=0).sum(), count)
+    return Estimate(drawn.value, min(drawn.low, scored.low), max(drawn.high, scored.high))
 
 
 def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
@@ -681,7 +681,7 @@ def sweep_section(sweep: Sweep, table: pd.DataFrame) -> Section:
         "Policies that differ in what is compared and in their training seed only; all of them run the same "
         "episodes. Said before the runs: " + "; ".join(before) + ".",
         "Two intervals stand side by side. 'These policies' is about the policies that were trained, from "
-        "the episodes; 'trained anew' is about the point, from its runs (Welch's t, with no less variance "
+        "the episodes; 'trained anew' is about the point, from its runs (Student's t, with no less variance "
         "than the episodes make). With two runs a point the latter is wide, and it should be: one lucky run "
         "is not a finding.",
     ]
