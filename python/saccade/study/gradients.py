@@ -640,7 +640,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
             (
                 "actions",
                 "Change of the chunk for a change of one row by its own length, before the first block (-1) "
-                "and after each; mean over the rows of a group, 95 % intervals.",
+                "and after each; root mean square over the rows of a group, 95 % intervals.",
                 "change of the chunk (norm)",
             ),
             (
@@ -736,7 +736,9 @@ def path_grid(paths: pd.DataFrame) -> Grid:
     rows = []
     for path in PATHS:
         of_path = shares_of(paths, path)
-        by_task = [f"{values['share'].mean():.2f}" for _, values in of_path.groupby("task", sort=False)]
+        by_task = [
+            number(mean_of(values, "share"), digits=2) for _, values in of_path.groupby("task", sort=False)
+        ]
         rows.append(
             [
                 path,
@@ -775,7 +777,8 @@ def conclusions(paths: pd.DataFrame, share: Mapping[str, Estimate]) -> list[str]
         f"{number(share[DIRECT], digits=2)} runs by state and action rows alone and one of "
         f"{number(by_future, digits=2)} through future rows. Of the latter, {number(share[READ], digits=2)} "
         f"is read by future rows from the tokens; {number(share[DETOUR], digits=2)} was read by state or "
-        "action rows and passes future rows later.",
+        "action rows and passes future rows later. Shares are no proportions: one above 1 is taken back by a "
+        "negative one.",
         f"By itself, what future rows read has a length of {length[READ]} times the whole, and what runs by "
         f"state and action rows alone one of {length[DIRECT]}. Where lengths are larger than shares, paths "
         "point in other directions than the whole, or against each other.",
