@@ -19,7 +19,14 @@ from saccade.errors import InputError
 from saccade.study import STUDIES, cuts, patching
 from saccade.study.arms import ARMS
 from saccade.study.report import write_report
-from saccade.study.tables import Provenance, read_provenance, read_table, write_provenance, write_table
+from saccade.study.tables import (
+    Provenance,
+    file_sha256,
+    read_provenance,
+    read_table,
+    write_provenance,
+    write_table,
+)
 
 CHECKPOINT = {
     "name": "policy",
@@ -35,6 +42,8 @@ def write_study(
     out: Path, study: str, rows: list[dict[str, Any]], settings: Mapping[str, Any], **values: Any
 ) -> None:
     write_table(rows, out / f"{study}.csv")
+    if "table_sha256" in values:
+        values["table_sha256"] = file_sha256(out / f"{study}.csv")
     known = {"study": study, "settings": {"checkpoint": CHECKPOINT, **settings}, "done": 1, "total": 1}
     write_provenance(Provenance(**{**known, **values}), out / f"{study}.json")
 
@@ -154,7 +163,7 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
     assert "Control, all rows in all blocks: a share of 1.0000, as it must be." in parsed.text
     assert "words: not measured, the policy knows no task for it (8 receivers: push)." in parsed.text
     assert "Donors of the kind words (0 pairs)" in parsed.text
-    assert "Donors of the kind layout (8 pairs)" in parsed.text
+    assert "Donors of the kind layout (8 pairs, ways of a mean length of 2.04)" in parsed.text
     for name in set(STUDIES) - {"cuts", "patching"}:
         assert f"{STUDIES[name][1][1:]} (not measured)" in parsed.text
 
@@ -179,7 +188,9 @@ def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_p
     line = next(line for line in section.concluded if line.startswith(ARMS["future-blind"].label))
     # McNemar: 2 / 2**6 = 0.031; of three arms, 0.094.
     assert "lower by 8.0 points" in line
-    assert "but p = 0.094 when corrected for the arms compared (Holm): no finding by itself" in line
+    assert (
+        "no finding after correction for the arms compared (Holm, p = 0.094); by itself, success is" in line
+    )
 
 
 def test_report_is_made_from_the_tables_alone_and_always_alike(tmp_path: Path) -> None:
@@ -273,6 +284,22 @@ def test_bad_directories_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "holds no study; expected a table such as cuts.csv" in refused(tmp_path)
     write_study(tmp_path, "cuts", [{"task": "push", "seed": 1}], {"engine": "rust"})
     assert "cuts.csv: not written by this study: 'arm' is missing" in refused(tmp_path)
+    write_cuts(tmp_path, table_sha256=None)
+    assert main(["study", "report", str(tmp_path)]) == 0
+    capsys.readouterr()
+    with (tmp_path / "cuts.csv").open("rb+") as file:
+        file.truncate(600)
+    assert "cuts.csv: not as its study wrote it" in refused(tmp_path)
+    rows = [
+        cut_row("push", 0, "none", True, 0.0),
+        {**cut_row("push", 1, "none", True, 0.0), "success": "Fals"},
+    ]
+    write_study(tmp_path, "cuts", rows, {"engine": "rust"})
+    assert "cuts.csv: success: expected True or False in every row, got 'Fals'" in refused(tmp_path)
+    rows = [cut_row("push", 0, "none", True, 0.0), cut_row("push", 0, "future-blind", True, 0.0)]
+    rows[1]["chunk_change"] = "abc"
+    write_study(tmp_path, "cuts", rows, {"engine": "rust"})
+    assert "cuts.csv: not written by this study: could not convert" in refused(tmp_path)
     (tmp_path / "cuts.csv").unlink()
     assert "cuts.csv" in refused(tmp_path)
     (tmp_path / "cuts.json").write_text("{}")
