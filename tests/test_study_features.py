@@ -32,7 +32,7 @@ def write_case(folder: Path, *, without: tuple[str, ...] = ("noise",), **changes
     checkpoint.mkdir()
     write_checkpoint(checkpoint, config, seed=1)
     inputs = random_inputs(saccade.HeadConfig.from_dict(config), 2, batch=5, num_vl_tokens=6)
-    arrays = {name: tensor.numpy() for name, tensor in inputs.items()}
+    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in inputs.items()}
     arrays |= {"embodiment_id": np.array([0, 2, 2, 2, 0]), "episode": np.array(EPISODES)}
     for name, value in changes.items():
         arrays[name] = value(arrays) if callable(value) else value
@@ -104,7 +104,7 @@ def test_cuts_are_those_of_the_reference(tmp_path: Path, capsys: pytest.CaptureF
 
     # Intervals are drawn by episode: of five observations there are two.
     unread = features.arm_changes(table, ["future-unread"])["future-unread"]
-    values = [by_arm.loc[("future-unread", row), "chunk_change"] for row in range(5)]
+    values = table[table["arm"] == "future-unread"]["chunk_change"].to_numpy()
     assert unread.change == bootstrap_ratio(values, np.ones(5), EPISODES)
     assert "Only 2 independent observations or episodes" in printed
 
@@ -243,7 +243,7 @@ def test_a_head_without_future_tokens(name: str, tmp_path: Path, capsys: pytest.
 
 def spoiled(name: str, value: float) -> Callable[[dict[str, Any]], np.ndarray]:
     def change(arrays: dict[str, Any]) -> np.ndarray:
-        array = arrays[name].copy()
+        array: np.ndarray = arrays[name].copy()
         array[1].flat[0] = value
         return array
 
