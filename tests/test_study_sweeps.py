@@ -22,10 +22,11 @@ from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.study import resized, sweeps
+from saccade.study import resized, sweeps, sweeps_report, trained
 from saccade.study.loaded import learned_tokens
 from saccade.study.statistics import paired_difference
-from saccade.study.sweeps import PLAIN, TVL, VLSA, N
+from saccade.study.sweeps import TVL, VLSA, N
+from saccade.study.sweeps_report import PLAIN
 from saccade.study.tables import read_provenance, read_table
 
 TASK = "button-press-topdown"
@@ -156,13 +157,13 @@ def test_a_sweep_that_trains(recording: Path, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path) -> None:
-    runs = sweeps.find_runs([policies], N.varied)
+    runs = trained.find_runs([policies], N.varied)
     sweeps.check_comparable(runs, N)
     assert [run.name for run in runs[:2]] == ["n2-seed0", "n2-seed1"]
     with pytest.raises(
         InputError, match=r"alignment_weight: .*\. num_future_tokens: 2 \(n2-seed0, n2-seed1\); 4 \("
     ):
-        sweeps.check_comparable(sweeps.find_runs([policies], VLSA.varied), VLSA)
+        sweeps.check_comparable(trained.find_runs([policies], VLSA.varied), VLSA)
 
     mixed = tmp_path / "mixed"
     shutil.copytree(policies, mixed)
@@ -170,11 +171,11 @@ def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path
     changed |= {"learning_rate": 0.5, "demonstrations": {**changed["demonstrations"], "sha256": "other"}}
     (mixed / "n4-seed0" / "settings.json").write_text(json.dumps(changed))
     with pytest.raises(InputError, match=r"learning_rate: .* 0.5 \(n4-seed0\)\. demonstrations: .*other"):
-        sweeps.check_comparable(sweeps.find_runs([mixed], N.varied), N)
+        sweeps.check_comparable(trained.find_runs([mixed], N.varied), N)
     shutil.copytree(policies / "n2-seed0", mixed / "again")
     shutil.rmtree(mixed / "n4-seed0")
     with pytest.raises(InputError, match="again and n2-seed0 are the same point with the same seed"):
-        sweeps.check_comparable(sweeps.find_runs([mixed], N.varied), N)
+        sweeps.check_comparable(trained.find_runs([mixed], N.varied), N)
 
 
 def test_a_run_in_training_is_not_measured(policies: Path, tmp_path: Path) -> None:
@@ -209,15 +210,15 @@ def test_equal_mass_is_repeated_tokens() -> None:
 def test_difference_between_runs_is_student_s() -> None:
     first, second = [0.3, 0.4], [0.55, 0.7]
     expected = stats.ttest_ind(second, first, equal_var=True).confidence_interval()
-    found = sweeps.between_runs(first, second, episodes=1000)
+    found = sweeps_report.between_runs(first, second, episodes=1000)
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
     assert found.value == pytest.approx(0.275)
     # Runs that happen to agree still vary by their episodes.
-    agreeing = sweeps.between_runs([0.5, 0.5], [0.5, 0.5], episodes=100)
+    agreeing = sweeps_report.between_runs([0.5, 0.5], [0.5, 0.5], episodes=100)
     half = stats.t.ppf(0.975, 2) * math.sqrt(2 * 0.25 / 100 / 2)
     assert (agreeing.low, agreeing.high) == pytest.approx((-half, half))
-    assert math.isnan(sweeps.between_runs([0.5], [0.2, 0.3], episodes=100).low)
-    assert math.isnan(sweeps.between_runs([1.0, 1.0], [1.0, 1.0], episodes=100).low)
+    assert math.isnan(sweeps_report.between_runs([0.5], [0.2, 0.3], episodes=100).low)
+    assert math.isnan(sweeps_report.between_runs([1.0, 1.0], [1.0, 1.0], episodes=100).low)
 
 
 def test_difference_of_these_policies_is_paired() -> None:
@@ -231,19 +232,19 @@ def test_difference_of_these_policies_is_paired() -> None:
         )
 
     alternating = [True, False] * 10
-    found = sweeps.same_policies(rows([alternating] * 2), rows([[True] * 20, alternating]))
+    found = sweeps_report.same_policies(rows([alternating] * 2), rows([[True] * 20, alternating]))
     assert found.value == 0.25
     assert 0.04 < found.low < 0.25 < found.high < 0.48
     # Policies that agree in all of twenty episodes may differ in the twenty-first: z^2 / (n + z^2).
-    agreeing = sweeps.same_policies(rows([alternating] * 2), rows([alternating] * 2))
+    agreeing = sweeps_report.same_policies(rows([alternating] * 2), rows([alternating] * 2))
     assert agreeing.high == pytest.approx(1.959964**2 / (20 + 1.959964**2))
     assert agreeing.low == -agreeing.high
     # One run a point, one episode lost: Tango's interval, which does not exclude a loss of 5 points.
-    lost = sweeps.same_policies(rows([[True] * 100]), rows([[False] + [True] * 99]))
+    lost = sweeps_report.same_policies(rows([[True] * 100]), rows([[False] + [True] * 99]))
     known = paired_difference([False] + [True] * 99, [True] * 100).difference
     assert (lost.low, lost.high) == pytest.approx((known.low, known.high))
     assert lost.low < -0.05
-    few = sweeps.same_policies(rows([[True] * 9]), rows([[False] * 9]))
+    few = sweeps_report.same_policies(rows([[True] * 9]), rows([[False] * 9]))
     assert (few.value, math.isnan(few.low), math.isnan(few.high)) == (-1.0, True, True)
 
 
@@ -251,9 +252,9 @@ def test_policies_with_episodes_missing_are_left_out() -> None:
     plain = pd.DataFrame(
         {"policy": ["one"] * 3 + ["other"] * 2, "task": ["a", "a", "b", "a", "b"], "seed": [0, 1, 0, 0, 0]}
     )
-    assert sweeps.whole_runs(plain) == (["one"], ["other: left out, 2 of 3 episodes are done."])
+    assert sweeps_report.whole_runs(plain) == (["one"], ["other: left out, 2 of 3 episodes are done."])
     other_tasks = plain.assign(task=["a", "a", "a", "b", "b"])
-    assert sweeps.whole_runs(other_tasks)[0] == []
+    assert sweeps_report.whole_runs(other_tasks)[0] == []
 
 
 def test_one_directory_holds_policies_that_may_be_compared(policies: Path, tmp_path: Path) -> None:

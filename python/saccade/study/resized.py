@@ -36,7 +36,7 @@ from saccade.study.loaded import describe_checkpoint, environment_of, learned_to
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
 from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate
 from saccade.study.statistics import Estimate, bootstrap, paired_difference, wilson
-from saccade.study.tables import Provenance
+from saccade.study.tables import Provenance, truths
 
 STUDY = "n-runtime"
 BASELINE = "as learned"
@@ -241,10 +241,10 @@ class Result:
 def results_of(table: pd.DataFrame) -> dict[str, Result]:
     """Every arm but the baseline, compared with it on the same episodes."""
     by_arm = {str(arm): rows.set_index(["task", "seed"]) for arm, rows in table.groupby("arm", sort=False)}
-    baseline = by_arm[BASELINE]["success"].astype(bool)
+    baseline = truths(by_arm[BASELINE]["success"])
     found = {}
     for arm, rows in by_arm.items():
-        success = rows["success"].astype(bool)
+        success = truths(rows["success"])
         shared = success.index.intersection(baseline.index)
         if arm != BASELINE and len(shared):
             found[arm] = Result(
@@ -266,7 +266,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     if table["note"].notna().any() or not (table["arm"] == BASELINE).any():
         return Section(title, concluded=[f"{not_measured(NO_TOKENS).capitalize()}."])
     checkpoint = provenance.settings["checkpoint"]
-    baseline = table[table["arm"] == BASELINE]["success"].astype(bool)
+    baseline = truths(table[table["arm"] == BASELINE]["success"])
     whole = wilson(int(baseline.sum()), len(baseline))
     results = dict(sorted(results_of(table).items(), key=lambda item: arm_order(item[0])))
     summary = [
