@@ -22,6 +22,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "ARCHITECTURE.md",
     ROOT / "CHANGELOG.md",
+    ROOT / "studies" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 MODULES = sorted(
