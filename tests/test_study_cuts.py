@@ -17,7 +17,7 @@ from saccade.reference import ActionHead
 from saccade.sim import graphics
 from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Policy
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.study import cuts, patching
+from saccade.study import closed_loop, cuts, patching
 from saccade.study.arguments import numbers
 from saccade.study.arms import ALL_ARMS, ARMS, episode_rng
 from saccade.study.loaded import head_of, learned_tokens
@@ -90,10 +90,10 @@ def test_cuts_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_chunks_of_an_arm_are_those_of_the_reference() -> None:
     """The change of the chunk, with the head in torch and the cut of the whole group done by hand: N = 0."""
     policy = Policy.load(num_threads=1)
-    _, looks = cuts.unchanged_episode(CHECKPOINT, "rust", "button-press-topdown", 0)
+    _, looks = closed_loop.unchanged_episode(CHECKPOINT, "rust", "button-press-topdown", 0)
     look = looks[1]
     unread = ARMS["future-unread"].intervention(learned_tokens(CHECKPOINT), episode_rng("push", 0))
-    change = cuts.chunk_change(policy, look, unread)
+    change = closed_loop.chunk_change(policy, look, unread)
 
     reference = ActionHead.load(DEMO_CHECKPOINT)
     without = ActionHead.load(DEMO_CHECKPOINT)

@@ -15,6 +15,7 @@ from saccade.reference import ActionHead, random_weights
 from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.study import gradients
+from saccade.study.arms import NO_TOKENS
 from saccade.study.gradients import ALL_PATHS, DETOUR, DIRECT, PATHS, READ
 from saccade.study.tables import read_provenance, read_table
 
@@ -234,7 +235,7 @@ def test_a_policy_without_future_tokens(recording: Path, tmp_path: Path) -> None
     ]
     assert main([*arguments, "--projections", "1", "--out", str(tmp_path)]) == 0
     table = read_table(tmp_path / "gradients.csv")
-    assert gradients.NO_TOKENS in set(table["note"])
+    assert NO_TOKENS in set(table["note"])
     section = gradients.section(table, read_provenance(tmp_path / "gradients.json"))
     assert section.concluded == ["Paths: not measured, the checkpoint has no future tokens."]
 

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 
 from saccade.errors import InputError
 
+UNLIMITED = 1 << 31  # for `numbers` that have no bound of their own
+
 
 def names(option: str, text: str) -> tuple[str, ...]:
     """Names out of a list with commas, each once.

@@ -12,6 +12,9 @@ from saccade.intervention import ROW_GROUPS, Intervention
 
 Float32Array = npt.NDArray[np.float32]
 
+NO_TOKENS = "the checkpoint has no future tokens"
+ROUNDING = 1e-3  # a change of an action that an exact identity may make
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -34,7 +37,7 @@ class Arm:
     def why_not(self, num_future_tokens: int) -> str | None:
         """Why it cannot be measured on a head with so many future tokens, or None."""
         if self.needs_future and num_future_tokens == 0:
-            return "the checkpoint has no future tokens"
+            return NO_TOKENS
         return None
 
 

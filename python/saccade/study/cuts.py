@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +12,12 @@ import pandas as pd
 
 from saccade.intervention import Intervention
 from saccade.sim import graphics
-from saccade.sim.policy import ENGINES, Float32Array, Policy
-from saccade.sim.rollout import Episode, run_episode
+from saccade.sim.policy import ENGINES, Float32Array
 from saccade.study import figures
 from saccade.study.arguments import check_known, names
-from saccade.study.arms import ARMS, BASELINE, SHUFFLED, episode_rng
-from saccade.study.cells import Cell, OnDone, Rows, run_cells
+from saccade.study.arms import ARMS, BASELINE, ROUNDING, SHUFFLED
+from saccade.study.cells import Cell, OnDone, run_cells
+from saccade.study.closed_loop import ArmWork
 from saccade.study.features import (
     Changes,
     Recording,
@@ -27,8 +26,8 @@ from saccade.study.features import (
     head_and_observations,
     recording_of,
 )
-from saccade.study.loaded import describe_checkpoint, environment_of, learned_tokens, policy_of
-from saccade.study.observations import Look, Rollouts, add_rollout_arguments, record_looks, rollouts_of
+from saccade.study.loaded import describe_checkpoint
+from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
 from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate, too_few
 from saccade.study.statistics import (
     Estimate,
@@ -37,12 +36,12 @@ from saccade.study.statistics import (
     detectable_difference,
     holm,
     paired_difference,
+    scaled,
     wilson,
 )
 from saccade.study.tables import Provenance, truths
 
 STUDY = "cuts"
-ROUNDING = 1e-3  # a change of a chunk, in action units, that shuffled tokens may make
 SHARES = (0.1, 0.25)  # of discordant pairs, for what can be detected
 
 EPILOG = """\
@@ -117,7 +116,7 @@ def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int
     run_cells(
         STUDY,
         [Cell((*episode, arm)) for episode in settings.rollouts.episodes for arm in arms],
-        Work(checkpoint, settings.engine),
+        ArmWork(checkpoint, settings.engine, intervention_of, why_not),
         out,
         settings={"checkpoint": describe_checkpoint(checkpoint), "engine": settings.engine},
         backend=backend,
@@ -137,61 +136,6 @@ def why_not(arm: str, num_future_tokens: int) -> str | None:
 
 
 CHANGES = Changes(STUDY, BASELINE, SHUFFLED, intervention_of, why_not)
-
-
-@dataclass(frozen=True)
-class Work:
-    """Runs one episode with one arm, and measures the arm's chunks on what the unchanged policy saw."""
-
-    checkpoint: str
-    engine: str
-
-    def __call__(self, cell: Cell) -> Rows:
-        """A row with what came of it, or with a note why it cannot be measured."""
-        task, seed, name = str(cell.key[0]), int(cell.key[1]), str(cell.key[2])
-        row = {"task": task, "seed": seed, "arm": name}
-        arm = ARMS[name]
-        policy = policy_of(self.checkpoint, self.engine)
-        tokens = learned_tokens(self.checkpoint)
-        reason = arm.why_not(len(tokens))
-        if reason is not None:
-            return [{**row, "success": None, "note": reason}]
-        intervention = arm.intervention(tokens, episode_rng(task, seed))
-        episode, looks = unchanged_episode(self.checkpoint, self.engine, task, seed)
-        changes = [chunk_change(policy, look, intervention) for look in looks]
-        if intervention is not None:
-            environment = environment_of(self.checkpoint, task)
-            episode = run_episode(environment, policy, seed, intervention=intervention)
-        return [
-            {
-                **row,
-                "success": episode.success,
-                "steps": episode.steps,
-                "chunks": episode.chunks,
-                "looks": len(looks),
-                "chunk_change": float(np.mean(changes)),
-                "chunk_change_max": float(max(change.max() for change in changes)),
-                "note": None,
-            }
-        ]
-
-
-@functools.lru_cache(maxsize=1)
-def unchanged_episode(checkpoint: str, engine: str, task: str, seed: int) -> tuple[Episode, Sequence[Look]]:
-    """The episode of the arm "none" and what the head was given in it; kept for the next arm."""
-    return record_looks(environment_of(checkpoint, task), policy_of(checkpoint, engine), seed)
-
-
-def chunk_change(policy: Policy, look: Look, intervention: Intervention | None) -> Float32Array:
-    """By how much each action of a chunk changes, `(horizon, action_dim)`, all else being equal."""
-    context = policy.engine.encode(look.features)
-
-    def actions(change: Intervention | None) -> Float32Array:
-        chunk = policy.engine.sample(context, look.state, look.noise, change)[0]
-        return np.clip(policy.config.action.restore(chunk), -1.0, 1.0)
-
-    change: Float32Array = np.abs(actions(intervention) - actions(None))
-    return change
 
 
 @dataclass(frozen=True)
@@ -319,11 +263,6 @@ def pictures(measured: Sequence[ArmResult], compared: Sequence[ArmResult]) -> li
         caption = "Change of the chunk on equal observations and noise, with a 95 % bootstrap interval."
         found.append(Figure("change", caption, picture))
     return found
-
-
-def scaled(value: Estimate) -> Estimate:
-    """A share in percent."""
-    return Estimate(100 * value.value, 100 * value.low, 100 * value.high)
 
 
 def arm_grid(results: Sequence[ArmResult]) -> Grid:

@@ -26,7 +26,7 @@ from saccade.maps.record import describe_checkpoint, sha256_of
 from saccade.maps.record import learned_tokens as stored_tokens
 from saccade.sim.policy import DEMO_CHECKPOINT, Float32Array
 from saccade.study import figures
-from saccade.study.arms import episode_rng
+from saccade.study.arms import ROUNDING, episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.report import Figure, Grid, Section, not_measured, number, too_few
 from saccade.study.statistics import Estimate, bootstrap_ratio
@@ -34,7 +34,6 @@ from saccade.study.tables import Provenance
 
 TASK = "features"  # stands in the tables where the simulator's task would
 NOISES = 4  # drawn for each observation, if the file has none
-ROUNDING = 1e-3  # a change of a chunk, in normalised actions, that an exact identity may make
 
 NO_LOOP = f"Success: {not_measured('a file of features has no closed loop')}."
 NOT_SHOWN = (

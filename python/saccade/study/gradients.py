@@ -33,6 +33,7 @@ from saccade.sim.dataset import chunks
 from saccade.sim.policy import EMBODIMENT_ID
 from saccade.sim.tasks import find_task
 from saccade.study import figures
+from saccade.study.arms import NO_TOKENS
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.features import (
     TASK,
@@ -52,7 +53,6 @@ from saccade.study.statistics import Estimate, bootstrap
 from saccade.study.tables import Provenance
 
 STUDY = "gradients"
-NO_TOKENS = "the checkpoint has no future tokens"
 
 # Paths from the vision-language tokens to the actions, over all Euler steps. Each path is in exactly one of
 # these, so their derivatives add up to the whole.

@@ -18,12 +18,11 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from saccade.errors import InputError
 from saccade.intervention import Intervention
 from saccade.sim.policy import Float32Array
-from saccade.sim.rollout import run_episode
 from saccade.study import figures
-from saccade.study.arguments import numbers
-from saccade.study.arms import episode_rng
-from saccade.study.cells import Cell, OnDone, Rows, run_cells
-from saccade.study.cuts import chunk_change, scaled, unchanged_episode
+from saccade.study.arguments import UNLIMITED, numbers
+from saccade.study.arms import NO_TOKENS, ROUNDING
+from saccade.study.cells import Cell, OnDone, run_cells
+from saccade.study.closed_loop import ArmWork
 from saccade.study.features import (
     Changes,
     Recording,
@@ -32,18 +31,15 @@ from saccade.study.features import (
     head_and_observations,
     recording_of,
 )
-from saccade.study.loaded import describe_checkpoint, environment_of, learned_tokens, policy_of
+from saccade.study.loaded import describe_checkpoint
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
 from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate
-from saccade.study.statistics import Estimate, bootstrap, paired_difference, wilson
+from saccade.study.statistics import Estimate, bootstrap, paired_difference, scaled, wilson
 from saccade.study.tables import Provenance, truths
 
 STUDY = "n-runtime"
 BASELINE = "as learned"
 TWICE, TWICE_EQUAL = "every token twice", "every token twice, equal mass"
-ROUNDING = 1e-3  # a change of the chunk, in action units, that an exact identity may make
-NO_TOKENS = "the checkpoint has no future tokens"
-UNLIMITED = 1 << 31
 ARMS_ARE = (
     "Drawn: others in every episode. Merged: by the cosine between learned tokens; each counts as many "
     "times as it stands for. Equal mass: the keys together weigh in the softmax as much as all learned "
@@ -178,7 +174,7 @@ def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int
     run_cells(
         STUDY,
         [Cell((*episode, arm)) for episode in rollouts.episodes for arm in arms],
-        Work(rollouts.checkpoint),
+        ArmWork(rollouts.checkpoint, "rust", resized, why_not),
         out,
         settings={"checkpoint": described},
         backend=backend,
@@ -193,38 +189,6 @@ def why_not(arm: str, num_future_tokens: int) -> str | None:
 
 
 CHANGES = Changes(STUDY, BASELINE, TWICE_EQUAL, resized, why_not)
-
-
-@dataclass(frozen=True)
-class Work:
-    """Runs one episode with one arm, and measures the arm's chunks on what the unchanged policy saw."""
-
-    checkpoint: str
-
-    def __call__(self, cell: Cell) -> Rows:
-        """A row with what came of it, or with a note why it cannot be measured."""
-        task, seed, arm = str(cell.key[0]), int(cell.key[1]), str(cell.key[2])
-        row = {"task": task, "seed": seed, "arm": arm}
-        tokens = learned_tokens(self.checkpoint)
-        if not len(tokens):
-            return [{**row, "success": None, "note": NO_TOKENS}]
-        policy = policy_of(self.checkpoint)
-        intervention = resized(arm, tokens, episode_rng(task, seed))
-        episode, looks = unchanged_episode(self.checkpoint, "rust", task, seed)
-        changes = [chunk_change(policy, look, intervention) for look in looks]
-        if intervention is not None:
-            environment = environment_of(self.checkpoint, task)
-            episode = run_episode(environment, policy, seed, intervention=intervention)
-        return [
-            {
-                **row,
-                "success": episode.success,
-                "steps": episode.steps,
-                "chunk_change": float(np.mean(changes)),
-                "chunk_change_max": float(np.max(changes)),
-                "note": None,
-            }
-        ]
 
 
 @dataclass(frozen=True)

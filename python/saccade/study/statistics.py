@@ -49,6 +49,11 @@ class PairedDifference:
     p_value: float
 
 
+def scaled(value: Estimate) -> Estimate:
+    """A share in percent."""
+    return Estimate(100 * value.value, 100 * value.low, 100 * value.high)
+
+
 def wilson(successes: int, trials: int) -> Estimate:
     """A success rate with Wilson's score interval; without a trial the rate is NaN and may be anything.
 

@@ -30,7 +30,7 @@ from saccade.sim.policy import EMBODIMENT_ID
 from saccade.sim.rollout import run_episode
 from saccade.sim.settings import CONFIG_FILE, PolicyConfig
 from saccade.sim.tasks import check_evaluation_seeds
-from saccade.study.arguments import names, numbers
+from saccade.study.arguments import UNLIMITED, names, numbers
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.loaded import environment_of, policy_of
 from saccade.study.observations import task_names
@@ -52,7 +52,6 @@ examples:
   saccade study {study} --policies out/policies --out out/study
   saccade study {study} --demos out/demos {option} {values} --training-seeds 0,1 --jobs 2 --out out/study
 """
-UNLIMITED = 1 << 31
 
 # What the statement before the runs supposes; with few runs neither can be known beforehand.
 SUPPOSED_RATE, SUPPOSED_DEVIATIONS, SUPPOSED_DISCORDANT = 0.7, (0.04, 0.08), (0.1, 0.25)

@@ -13,9 +13,8 @@ import pandas as pd
 from scipy import stats
 
 from saccade.study import figures
-from saccade.study.cuts import scaled
 from saccade.study.report import Figure, Grid, Section, effect, number, rate
-from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, tango, wilson
+from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, scaled, tango, wilson
 from saccade.study.tables import truths
 
 if TYPE_CHECKING:
