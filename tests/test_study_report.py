@@ -16,12 +16,12 @@ from PIL import Image
 
 from saccade.cli import main
 from saccade.errors import InputError
+from saccade.sim.files import sha256_of
 from saccade.study import STUDIES, cuts, patching
 from saccade.study.arms import ARMS
 from saccade.study.report import write_report
 from saccade.study.tables import (
     Provenance,
-    file_sha256,
     read_provenance,
     read_table,
     write_provenance,
@@ -43,7 +43,7 @@ def write_study(
 ) -> None:
     write_table(rows, out / f"{study}.csv")
     if "table_sha256" in values:
-        values["table_sha256"] = file_sha256(out / f"{study}.csv")
+        values["table_sha256"] = sha256_of(out / f"{study}.csv")
     known = {"study": study, "settings": {"checkpoint": CHECKPOINT, **settings}, "done": 1, "total": 1}
     write_provenance(Provenance(**{**known, **values}), out / f"{study}.json")
 

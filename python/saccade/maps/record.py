@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -22,6 +21,7 @@ from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.maps.inputs import Inputs
 from saccade.maps.occlusion import Occlusion
 from saccade.maps.summary import Overlap, overlap, summarize
+from saccade.sim.files import sha256_of
 
 Float32Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
@@ -298,13 +298,3 @@ def describe_checkpoint(checkpoint: Path) -> dict[str, str]:
     config = [directory / "config.json"] if (directory / "config.json").is_file() else []
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
     return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}
-
-
-def sha256_of(*paths: Path) -> str:
-    """Hash of files, one after the other."""
-    digest = hashlib.sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            while piece := file.read(1 << 24):
-                digest.update(piece)
-    return digest.hexdigest()

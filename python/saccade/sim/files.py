@@ -1,5 +1,6 @@
 """Writing files so that a reader never finds half of one."""
 
+import hashlib
 import json
 import os
 from collections.abc import Iterator
@@ -39,3 +40,13 @@ def writable_directory(path: Path) -> Path:
     probe.touch()
     probe.unlink()
     return path
+
+
+def sha256_of(*paths: Path) -> str:
+    """Hash of files, one after the other, read in pieces."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while piece := file.read(1 << 24):
+                digest.update(piece)
+    return digest.hexdigest()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from saccade.checkpoints import read_tensors
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.intervention import Intervention
 from saccade.sim.backbone import Backbone, stack_images
+from saccade.sim.files import sha256_of
 from saccade.sim.instructions import Tokenizer
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
@@ -268,10 +268,7 @@ class Policy:
 
     def checkpoint_sha256(self) -> str:
         """Hash of config and tensors, in this order."""
-        digest = hashlib.sha256()
-        for name in (CONFIG_FILE, TENSOR_FILE):
-            digest.update((self.checkpoint / name).read_bytes())
-        return digest.hexdigest()
+        return sha256_of(self.checkpoint / CONFIG_FILE, self.checkpoint / TENSOR_FILE)
 
 
 def check_trained_on(policy: Policy, tasks: list[str]) -> None:

@@ -10,7 +10,6 @@ resumed run gives what an uninterrupted one gives.
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
-import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from saccade.sim import demos
 from saccade.sim.backbone import BackboneConfig
 from saccade.sim.dataset import Samples, describe, load_samples, statistics
 from saccade.sim.environment import ACTION_DIM, PROPRIO_DIM
-from saccade.sim.files import write_atomically, write_json
+from saccade.sim.files import sha256_of, write_atomically, write_json
 from saccade.sim.instructions import Tokenizer, build_vocabulary, words
 from saccade.sim.learner import Learner
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
@@ -399,8 +398,7 @@ def train(
     found = statistics(training)
     config = policy_config(settings, recording, tasks, found)
     if start is not None:
-        digest = hashlib.sha256((start / TENSOR_FILE).read_bytes()).hexdigest()
-        settings = replace(settings, start_sha256=digest)
+        settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
     run = new_run(settings, config, describe(demonstrations, tasks))
     if start is not None:
         start_from(run, start)

@@ -146,3 +146,9 @@ SHUFFLED = "future-shuffled"
 def episode_rng(task: str, seed: int) -> np.random.Generator:
     """What an arm draws in an episode, apart from the noise of the chunks."""
     return np.random.default_rng([seed, *task.encode()])
+
+
+def control_line(label: str, largest: float) -> str:
+    """Whether a control, which may change nothing but rounding, changed an action by more than that."""
+    verdict = "as it must be" if largest < ROUNDING else "WHICH IT MUST NOT: do not trust the other arms"
+    return f"Control, {label}: the chunk changed by {largest:.1g} at most, {verdict}."

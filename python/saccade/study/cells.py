@@ -22,11 +22,10 @@ import pandas as pd
 
 import saccade
 from saccade.errors import InputError, SaccadeError
-from saccade.sim.files import writable_directory, write_json
+from saccade.sim.files import sha256_of, writable_directory, write_json
 from saccade.sim.report import cpu_name
 from saccade.study.tables import (
     Provenance,
-    file_sha256,
     provenance_path,
     read_provenance,
     read_table,
@@ -233,7 +232,7 @@ class Store:
         write_table([row for record in records for row in record["rows"]], table_path(self.out, self.study))
         provenance = Provenance(
             study=self.study,
-            table_sha256=file_sha256(table_path(self.out, self.study)),
+            table_sha256=sha256_of(table_path(self.out, self.study)),
             settings=self.settings,
             done=len(records),
             total=self.total,

@@ -15,7 +15,7 @@ from saccade.sim import graphics
 from saccade.sim.policy import ENGINES, Float32Array
 from saccade.study import figures
 from saccade.study.arguments import check_known, names
-from saccade.study.arms import ARMS, BASELINE, ROUNDING, SHUFFLED
+from saccade.study.arms import ARMS, BASELINE, SHUFFLED, control_line
 from saccade.study.cells import Cell, OnDone, run_cells
 from saccade.study.closed_loop import ArmWork
 from saccade.study.features import (
@@ -323,7 +323,8 @@ def conclusions(
         if result.note is not None:
             lines.append(f"{label}: {not_measured(result.note)}.")
         elif result.name == SHUFFLED:
-            lines.append(control_line(table))
+            changes = table.loc[table["arm"] == SHUFFLED, "chunk_change_max"]
+            lines.append(control_line(label, float(changes.max())))
         elif result.pairs is not None and result.change is not None:
             change = number(result.change, digits=3)
             on_success = effect("success", result.pairs.difference) + where_lost(table, result)
@@ -365,10 +366,3 @@ def doubt(result: ArmResult) -> str:
     if p is None or p < 0.05 or difference.low <= 0 <= difference.high:
         return ""
     return f"no finding after correction for the arms compared (Holm, p = {p:.2g}); by itself, "
-
-
-def control_line(table: pd.DataFrame) -> str:
-    """Whether shuffling the tokens changed anything but rounding, which it must not."""
-    largest = float(table.loc[table["arm"] == SHUFFLED, "chunk_change_max"].max())
-    verdict = "as it must be" if largest < ROUNDING else "WHICH IT MUST NOT: do not trust the other arms"
-    return f"Control, {ARMS[SHUFFLED].label}: the chunk changed by {largest:.1g} at most, {verdict}."

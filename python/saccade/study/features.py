@@ -22,11 +22,12 @@ from saccade.errors import InputError, ShapeError
 from saccade.head import ActionHead, Context
 from saccade.intervention import Intervention
 from saccade.maps.inputs import as_mask, head_inputs, read_arrays
-from saccade.maps.record import describe_checkpoint, sha256_of
+from saccade.maps.record import describe_checkpoint
 from saccade.maps.record import learned_tokens as stored_tokens
+from saccade.sim.files import sha256_of
 from saccade.sim.policy import DEMO_CHECKPOINT, Float32Array
 from saccade.study import figures
-from saccade.study.arms import ROUNDING, episode_rng
+from saccade.study.arms import control_line, episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.report import Figure, Grid, Section, not_measured, number, too_few
 from saccade.study.statistics import Estimate, bootstrap_ratio
@@ -467,14 +468,7 @@ def change_section(
         ratio = "" if one.ratio is None else number(one.ratio, digits=2)
         rows.append([labels[arm], str(one.observations), number(one.change, digits=4), ratio])
         if arm == changes.control:
-            verdict = (
-                "as it must be"
-                if one.largest < ROUNDING
-                else "WHICH IT MUST NOT: do not trust the other arms"
-            )
-            concluded.append(
-                f"Control, {labels[arm]}: the chunk changed by {one.largest:.1g} at most, {verdict}."
-            )
+            concluded.append(control_line(labels[arm], one.largest))
             continue
         beside = f", {ratio} times what another noise changes" if ratio else ""
         concluded.append(

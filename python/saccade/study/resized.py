@@ -20,7 +20,7 @@ from saccade.intervention import Intervention
 from saccade.sim.policy import Float32Array
 from saccade.study import figures
 from saccade.study.arguments import UNLIMITED, numbers
-from saccade.study.arms import NO_TOKENS, ROUNDING
+from saccade.study.arms import NO_TOKENS, control_line
 from saccade.study.cells import Cell, OnDone, run_cells
 from saccade.study.closed_loop import ArmWork
 from saccade.study.features import (
@@ -295,10 +295,7 @@ def conclusions(results: Mapping[str, Result]) -> list[str]:
     lines = []
     for arm, one in results.items():
         if arm == TWICE_EQUAL:
-            verdict = (
-                "as it must be" if one.largest < ROUNDING else "WHICH IT MUST NOT: do not trust the others"
-            )
-            lines.append(f"Control, {arm}: the chunk changed by {one.largest:.1g} at most, {verdict}.")
+            lines.append(control_line(arm, one.largest))
         else:
             lines.append(f"{arm}: {effect('success', one.difference)}.")
     return lines

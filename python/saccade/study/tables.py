@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -12,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from saccade.errors import InputError
-from saccade.sim.files import write_atomically, write_json
+from saccade.sim.files import sha256_of, write_atomically, write_json
 
 
 @dataclass(frozen=True)
@@ -101,17 +100,12 @@ def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
     provenance = read_provenance(provenance_path(out, study))
     path = table_path(out, study)
     table = read_table(path)
-    if provenance.table_sha256 not in ("", file_sha256(path)):
+    if provenance.table_sha256 not in ("", sha256_of(path)):
         raise InputError(
             f"{path}: not as its study wrote it (edited, cut short, or the run was killed just then); "
             "run the study again, which takes no time for what is done"
         )
     return table, provenance
-
-
-def file_sha256(path: Path) -> str:
-    """Hash of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def truths(column: pd.Series) -> pd.Series:

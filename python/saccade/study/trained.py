@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from saccade.errors import InputError
+from saccade.sim.files import sha256_of
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
 SETTINGS_FILE = "settings.json"
@@ -46,10 +46,7 @@ class Run:
     @property
     def checkpoint_sha256(self) -> str:
         """Of config and tensors, as `Policy.checkpoint_sha256` has it."""
-        digest = hashlib.sha256()
-        for name in (CONFIG_FILE, TENSOR_FILE):
-            digest.update((self.directory / name).read_bytes())
-        return digest.hexdigest()
+        return sha256_of(self.directory / CONFIG_FILE, self.directory / TENSOR_FILE)
 
     @property
     def finished(self) -> bool:
