@@ -1,4 +1,4 @@
-"""The tasks made for studies: two goals, a place that takes two cameras, two stages."""
+"""The tasks made for studies: two goals, a place that takes two cameras, two stages, a fork."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
 from saccade.sim.environment import TaskEnvironment
 from saccade.sim.experts import Expert
 from saccade.sim.instructions import words
-from saccade.sim.scenarios import TOUCH, Ball, BallScenario, StereoReach, TwoGoals
+from saccade.sim.scenarios import TOUCH, Ball, BallScenario, Fork, StereoReach, TwoGoals
 from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS, check_evaluation_seeds
 
 Float64Array = npt.NDArray[np.float64]
 
-NAMES = ("two-goals", "stereo-reach", "two-stage")
+NAMES = ("two-goals", "stereo-reach", "two-stage", "fork")
 SHIPPED = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
 FIELD_OF_VIEW = 45.0  # degrees, MuJoCo's default for a free camera
 
@@ -225,11 +225,12 @@ def test_layouts_are_as_described() -> None:
         assert 0.039 < max(radii) <= 0.045
 
 
-def test_the_choice_cannot_be_seen_but_changes_what_the_expert_does() -> None:
-    with make("two-goals") as environment, make("two-goals") as other:
+@pytest.mark.parametrize("task", ["two-goals", "fork"])
+def test_the_choice_cannot_be_seen_but_changes_what_the_expert_does(task: str) -> None:
+    with make(task) as environment, make(task) as other:
         first, _ = environment.reset(seed=11)
         other.reset(seed=11)
-        assert isinstance(other.scenario, TwoGoals)
+        assert isinstance(other.scenario, (TwoGoals, Fork))
         other.scenario.chosen = 1 - other.scenario.chosen
         second = other.observe()
         assert first["instruction"] == second["instruction"]
@@ -248,6 +249,47 @@ def test_either_goal_counts_and_what_lies_between_does_not(goal: int) -> None:
         one, other = balls_of(environment)
         assert not go_to(environment, (one.position + other.position) / 2)
         assert go_to(environment, balls_of(environment)[goal].position)
+
+
+def test_a_fork_is_its_own_mirror_image_and_the_expert_keeps_away_from_the_middle() -> None:
+    chosen = []
+    with make("fork") as environment:
+        scenario = environment.scenario
+        assert isinstance(scenario, Fork)
+        for seed in range(60):
+            environment.restart(seed)
+            hand = environment.fingertips()
+            left, middle, right = (ball.position - hand for ball in balls_of(environment))
+            np.testing.assert_allclose(left, right * [-1.0, 1.0, 1.0], atol=1e-12)
+            np.testing.assert_allclose(middle, left * [0.0, 1.0, 1.0], atol=1e-12)
+            chosen.append(scenario.chosen)
+        assert 17 <= sum(chosen) <= 43
+        for seed in (0, 1):
+            environment.restart(seed)
+            nearest = np.inf
+            while not environment.advance(Expert(environment).action()).success:
+                nearest = min(nearest, scenario.distance(scenario.placed[1]))
+            assert nearest > TOUCH + 0.02
+            assert (environment.fingertips()[0] > hand[0]) == bool(scenario.chosen)
+
+
+def test_the_mean_of_both_ways_touches_the_blue_ball_and_then_nothing_counts() -> None:
+    """What a policy does that averages: the experts' mean action, straight ahead."""
+    with make("fork") as environment:
+        scenario = environment.scenario
+        assert isinstance(scenario, Fork)
+        for seed in range(4):
+            environment.restart(seed)
+            for _ in range(environment.task.max_steps):
+                ways = []
+                for scenario.chosen in (0, 1):
+                    ways.append(Expert(environment).action())
+                environment.advance(np.mean(ways, axis=0))
+            assert scenario.spoiled
+            assert not go_to(environment, scenario.placed[0].position)
+            environment.restart(seed)
+            assert not scenario.spoiled
+            assert go_to(environment, scenario.placed[0].position)
 
 
 def test_success_is_a_touch_of_five_centimetres() -> None:

@@ -12,7 +12,7 @@ HELP = "record demonstrations of the tasks with scripted experts"
 
 EPILOG = """\
 Tasks of the demo: reach, push, drawer-open, button-press-topdown, window-open. Harder ones, for studies:
-two-goals, stereo-reach, two-stage.
+two-goals, stereo-reach, two-stage, fork.
 
 Writes OUT/TASK/SEED.npz. Stopped at any time, the same command goes on where it was. Two processes may record
 into the same directory, each with tasks of its own.

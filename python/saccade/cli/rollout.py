@@ -25,7 +25,7 @@ HELP = "drive the simulated robot with a policy and report how often it succeeds
 
 EPILOG = """\
 Tasks of the demo, which the shipped policy knows: reach, push, drawer-open, button-press-topdown,
-window-open. Harder ones, for policies of your own: two-goals, stereo-reach, two-stage.
+window-open. Harder ones, for policies of your own: two-goals, stereo-reach, two-stage, fork.
 
 The same seed gives the same layout, wording and noise, whichever engine runs. Seeds from 1000000 on are kept
 for training and are refused.

@@ -1,6 +1,6 @@
 """Scenarios: how one task is laid out, judged and solved inside its Meta-World scene.
 
-Most tasks leave all of that to Meta-World. The three at the end put balls of our own into the scene of reach.
+Most tasks leave all of that to Meta-World. Those at the end put balls of our own into the scene of reach.
 They only exist in the pictures: the hand passes through them.
 """
 
@@ -273,3 +273,56 @@ class TwoStage(BallScenario):
         """To the ball that is next, and on to the other one if that is the first."""
         between = np.linalg.norm(self.placed[0].position - self.placed[1].position)
         return self.distance(self.placed[self.stage]) + (float(between) if self.stage == 0 else 0.0)
+
+
+class Fork(BallScenario):
+    """A blue ball straight ahead that must not be touched, and a yellow one on each side: touch either.
+
+    The hand starts on the middle line and the layout is its own mirror image, so both ways are equally good.
+    The expert takes one of them, drawn anew for each episode and not to be seen in the pictures; once the
+    hand is off the middle line the nearer ball is the one to go to. A policy that answers with the mean of
+    what it was shown goes straight ahead, to the blue ball.
+
+    Attributes:
+        chosen: Which yellow ball the expert goes to, 0 or 1.
+        spoiled: Whether the blue one was touched; the episode can then not succeed any more.
+    """
+
+    ASIDE = 0.17  # metres from the middle line to a yellow ball
+    AHEAD = 0.1  # metres from the fingertips, forwards, to all three
+    JITTER = np.array([0.015, 0.015, 0.03])  # metres by which a layout may differ: aside, ahead, height
+    HEIGHT = 0.15  # metres
+    SPEED = 6.0  # gain of the expert: full speed from 17 cm on
+
+    chosen = 0
+    spoiled = False
+
+    def place(self, rng: np.random.Generator) -> tuple[Ball, ...]:
+        """The left ball, the blue one, the right one."""
+        self.spoiled = False
+        self.chosen = int(rng.integers(2))
+        aside, ahead, up = np.array([self.ASIDE, self.AHEAD, 0.0]) + rng.uniform(-self.JITTER, self.JITTER)
+        hand = self.fingertips()
+        middle = np.array([hand[0], hand[1] + ahead, self.HEIGHT + up])
+        return tuple(
+            Ball(middle + np.array([side * aside, 0.0, 0.0]), BALL_RADIUS, colour)
+            for side, colour in ((-1, YELLOW), (0, BLUE), (1, YELLOW))
+        )
+
+    def outcome(self, reward: float, success: bool) -> StepOutcome:
+        """A touch of a yellow ball counts if the blue one was not touched before."""
+        self.spoiled = self.spoiled or self.distance(self.placed[1]) <= TOUCH
+        judged = super().outcome(reward, success)
+        return StepOutcome(judged.reward, judged.success and not self.spoiled)
+
+    def aim(self) -> Float64Array:
+        """The chosen ball."""
+        return self.placed[2 * self.chosen].position
+
+    def way_left(self) -> float:
+        """To the nearer yellow ball."""
+        return min(self.distance(ball) for ball in self.placed[::2])
+
+    def expert_action(self, state: Float64Array) -> Float64Array:
+        """Straight to where it aims, faster than in the other tasks; the gripper is left alone."""
+        return np.append(self.SPEED * (self.aim() - self.fingertips()), 0.0)

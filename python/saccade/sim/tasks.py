@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from saccade.errors import InputError
-from saccade.sim.scenarios import MetaWorldScenario, Scenario, StereoReach, TwoGoals, TwoStage
+from saccade.sim.scenarios import Fork, MetaWorldScenario, Scenario, StereoReach, TwoGoals, TwoStage
 
 # A seed fixes where objects and goals lie. The three uses have ranges of their own, so that no policy is
 # judged on a layout it was trained or chosen on. `check_evaluation_seeds` and `demos.py` hold to them.
@@ -117,8 +117,8 @@ DEMO_TASKS = (
         ),
     ),
 )
-# Harder ones, for studies: two answers that are equally good, a place that one picture does not tell, and two
-# things to be done in turn.
+# Harder ones, for studies: two answers that are equally good, a place that one picture does not tell, two
+# things to be done in turn, and two ways around an obstacle.
 STUDY_TASKS = (
     Task(
         name="two-goals",
@@ -161,6 +161,20 @@ STUDY_TASKS = (
             "touch both balls, the blue one first",
         ),
         max_steps=200,
+    ),
+    Task(
+        name="fork",
+        scene="reach-v3",
+        scenario=Fork,
+        objects="two yellow balls and a blue ball",
+        instructions=(
+            "touch a yellow ball but not the blue one",
+            "reach either yellow ball past the blue ball",
+            "go around the blue ball to a yellow one",
+            "move to one yellow ball, not the blue ball",
+            "pass the blue ball and touch a yellow ball",
+        ),
+        max_steps=40,
     ),
 )
 # A task's number in this order seeds its noise: new ones come last.
