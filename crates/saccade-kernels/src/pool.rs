@@ -3,6 +3,13 @@
 //! Nothing is started until a call wants more than one thread. A call puts a [`Job`] that lives on its own stack into one of a few slots,
 //! wakes workers, and takes tasks itself; tasks are dealt from one counter, so that whoever is free takes the next. The caller never
 //! waits for a worker that has not begun: it needs only itself to finish, then closes the slot and waits for those that are inside.
+//!
+//! On a machine with more to run than cores a worker can lose its core within a task, and then the caller waits for a scheduler's tick (4 ms
+//! here). It sleeps meanwhile, as idle workers do: on Linux a thread that sleeps keeps what is due to it, and one that is woken runs soon,
+//! so that caller and workers come to run at the same time and to pause at the same time. Measured on 2 cores with 2 busy processes, 328 tasks of
+//! 60 us in 5 loops: 2.12 times as long as alone, where 2.0 is the fair share; 2.5 with a caller that spins and yields.
+
+mod place;
 
 use std::any::Any;
 use std::cell::Cell;
@@ -11,12 +18,17 @@ use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicU32, AtomicUsize, Ordering}
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use place::Place;
+
 /// Calls that can have workers at the same time; more of them run on their own thread only.
 const SLOTS: usize = 8;
 
 /// How long a worker without work spins before it sleeps: about the longest pause between two loops of one forward pass.
 /// Waking a sleeping thread costs some 5 us of the caller's time, and as much again until it runs.
 const SPIN: Duration = Duration::from_micros(50);
+
+/// How long a caller spins at most for workers inside, whatever its tasks took: some hundredths of a scheduler's slice.
+const LONGEST_WAIT: Duration = Duration::from_micros(500);
 
 /// Upper bound of threads a call can have; a guard against nonsense, not a limit that anyone meets.
 const MAX_THREADS: usize = 1024;
@@ -26,6 +38,9 @@ struct Job<'a> {
     f: &'a (dyn Fn(usize) + Sync),
     tasks: usize,
     next: AtomicUsize,
+    threads: usize,
+    /// The caller's, when it offered the job.
+    processor: Option<usize>,
     /// Workers that may still join.
     seats: AtomicUsize,
     /// What the first panicking task threw.
@@ -33,13 +48,15 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// Takes tasks until none is left. A task that panics counts as done.
-    fn run(&self) {
+    /// Takes tasks until none is left, and counts them. A task that panics counts as done.
+    fn run(&self) -> u32 {
+        let mut taken = 0_u32;
         loop {
             let task = self.next.fetch_add(1, Ordering::Relaxed);
             if task >= self.tasks {
-                return;
+                return taken;
             }
+            taken = taken.saturating_add(1);
             if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.f)(task))) {
                 let mut first = lock(&self.panic);
                 // A later one is forgotten, not dropped: dropping runs code of its thrower, which may panic again.
@@ -65,6 +82,10 @@ struct Slot {
     taken: AtomicBool,
     /// Workers that are looking at the job, or running it.
     inside: AtomicUsize,
+    /// Whether the caller sleeps until nobody is inside.
+    caller_sleeps: AtomicBool,
+    bed: Mutex<()>,
+    wake: Condvar,
 }
 
 impl Slot {
@@ -73,11 +94,14 @@ impl Slot {
             job: AtomicPtr::new(std::ptr::null_mut()),
             taken: AtomicBool::new(false),
             inside: AtomicUsize::new(0),
+            caller_sleeps: AtomicBool::new(false),
+            bed: Mutex::new(()),
+            wake: Condvar::new(),
         }
     }
 
     /// Joins the job in this slot, if there is one with work and a seat.
-    fn help(&self) -> bool {
+    fn help(&self, place: &mut Place) -> bool {
         if self.job.load(Ordering::Relaxed).is_null() {
             return false;
         }
@@ -95,13 +119,39 @@ impl Slot {
                     .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
                     .is_ok()
             {
+                place.apart_from(job.processor, job.threads);
                 job.run();
                 helped = true;
             }
         }
-        // Everything that this thread wrote is visible to the caller that reads zero.
-        self.inside.fetch_sub(1, Ordering::Release);
+        // Everything that this thread wrote is visible to the caller that reads zero. Leaving comes before looking whether the caller sleeps,
+        // and it says so before it looks who is inside, all sequentially consistent: it sees this thread gone, or is seen asleep.
+        if self.inside.fetch_sub(1, Ordering::SeqCst) == 1 && self.caller_sleeps.load(Ordering::SeqCst) {
+            // With the lock held, a caller between its last look and its sleep is not missed. The slot is part of the pool and outlives the
+            // job; at worst this wakes the next caller, who looks and sleeps again.
+            let _bed = lock(&self.bed);
+            self.wake.notify_one();
+        }
         helped
+    }
+
+    /// Waits until nobody is inside: spins for `patience`, then sleeps.
+    fn wait_until_empty(&self, patience: Duration) {
+        let since = Instant::now();
+        while self.inside.load(Ordering::SeqCst) != 0 {
+            if since.elapsed() < patience {
+                for _ in 0..32 {
+                    std::hint::spin_loop();
+                }
+                continue;
+            }
+            let mut bed = lock(&self.bed);
+            self.caller_sleeps.store(true, Ordering::SeqCst);
+            while self.inside.load(Ordering::SeqCst) != 0 {
+                bed = self.wake.wait(bed).unwrap_or_else(PoisonError::into_inner);
+            }
+            self.caller_sleeps.store(false, Ordering::SeqCst);
+        }
     }
 }
 
@@ -153,9 +203,10 @@ impl Pool {
     /// What a worker does all its life.
     fn work(&self) -> ! {
         INSIDE.set(true);
+        let mut place = Place::new();
         loop {
             let seen = self.offers.load(Ordering::SeqCst);
-            if self.help() {
+            if self.help(&mut place) {
                 continue;
             }
             let idle_since = Instant::now();
@@ -170,11 +221,11 @@ impl Pool {
         }
     }
 
-    fn help(&self) -> bool {
+    fn help(&self, place: &mut Place) -> bool {
         let mut helped = false;
         // Not `any`, which stops at the first: a worker visits all slots before it looks for new offers.
         for slot in &self.slots {
-            helped |= slot.help();
+            helped |= slot.help(place);
         }
         helped
     }
@@ -211,6 +262,8 @@ impl Pool {
             f,
             tasks,
             next: AtomicUsize::new(0),
+            threads: helpers + 1,
+            processor: place::processor(),
             seats: AtomicUsize::new(helpers),
             panic: Mutex::new(None),
         };
@@ -225,21 +278,15 @@ impl Pool {
         }
         // Panics of tasks are kept in the job, so that this thread always comes to the end of this function.
         INSIDE.set(true);
-        job.run();
+        let since = Instant::now();
+        let taken = job.run();
         INSIDE.set(false);
         if let Some(slot) = slot {
             // No worker can come to the job from here on, and those inside are waited for: after that nobody knows it but this thread.
             slot.job.store(std::ptr::null_mut(), Ordering::SeqCst);
-            let mut turns = 0_u32;
-            while slot.inside.load(Ordering::SeqCst) != 0 {
-                turns += 1;
-                // More threads than cores: let the worker run.
-                if turns.is_multiple_of(128) {
-                    std::thread::yield_now()
-                } else {
-                    std::hint::spin_loop()
-                }
-            }
+            // A worker that runs ends its last task in about the time that ours took; one that does not has lost its core.
+            let patience = SPIN + 2 * since.elapsed() / taken.max(1);
+            slot.wait_until_empty(patience.min(LONGEST_WAIT));
             slot.taken.store(false, Ordering::Release);
         }
         if let Some(panic) = job.panic.into_inner().unwrap_or_else(PoisonError::into_inner) {
