@@ -20,7 +20,8 @@ fn threads_at_work(threads: usize) -> usize {
 /// Ends the process if it hangs, so that a child cannot outlive the test.
 fn watch() {
     std::thread::spawn(|| {
-        std::thread::sleep(Duration::from_secs(20));
+        // Counted in short sleeps: of a while in which the process is stopped only one is lost.
+        (0..600).for_each(|_| std::thread::sleep(Duration::from_millis(100)));
         // SAFETY: ends the process without running anything of the parent's.
         unsafe { libc::_exit(3) }
     });
