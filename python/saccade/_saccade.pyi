@@ -53,7 +53,9 @@ class ActionHead:
     def isa(self) -> str: ...
     @property
     def nbytes(self) -> int: ...
-    def warmup(self, num_vl_tokens: int, batch: int, num_samples: int | None) -> None: ...
+    def warmup(
+        self, num_vl_tokens: int, batch: int, num_samples: int | None, future_refresh: int | None
+    ) -> None: ...
     def encode(
         self,
         backbone_features: _Float32,
@@ -71,6 +73,7 @@ class ActionHead:
         noise: _Float32,
         num_steps: int | None,
         num_samples: int | None,
+        future_refresh: int | None,
         intervention: list[_Intervention],
         out: _Float32,
     ) -> None: ...

@@ -146,7 +146,7 @@ class ActionHead:
         path = _path("source", source)
         text = None if config is None else to_json(config)
         ids = None if embodiment_ids is None else int64("embodiment_ids", embodiment_ids).reshape(-1).tolist()
-        threads = None if num_threads is None else integer("num_threads", num_threads)
+        threads = _optional_integer("num_threads", num_threads)
         head = _saccade.ActionHead.load(path, text, ids, threads)
         options = {"config": text, "embodiment_ids": ids, "precision": precision, "num_threads": threads}
         return cls(head, str(Path(path).absolute()), options)
@@ -176,19 +176,30 @@ class ActionHead:
         """Bytes of weights in memory."""
         return self._head.nbytes
 
-    def warmup(self, num_vl_tokens: int, batch: int = 1, num_samples: int | None = None) -> None:
+    def warmup(
+        self,
+        num_vl_tokens: int,
+        batch: int = 1,
+        num_samples: int | None = None,
+        future_refresh: int | None = None,
+    ) -> None:
         """Allocates and touches all that calls of this size need, so that the first one is not slow.
 
         Args:
             num_vl_tokens: T_vl of the calls to come.
             batch: Their batch.
             num_samples: Their ``num_samples``.
+            future_refresh: Their ``future_refresh``.
 
         Raises:
             InputError: a size is not an integer of at least 1.
         """
-        samples = None if num_samples is None else integer("num_samples", num_samples)
-        self._head.warmup(integer("num_vl_tokens", num_vl_tokens), integer("batch", batch), samples)
+        self._head.warmup(
+            integer("num_vl_tokens", num_vl_tokens),
+            integer("batch", batch),
+            _optional_integer("num_samples", num_samples),
+            _optional_integer("future_refresh", future_refresh),
+        )
 
     def encode(
         self,
@@ -239,6 +250,7 @@ class ActionHead:
         seed: Any = None,
         num_steps: int | None = None,
         num_samples: int | None = None,
+        future_refresh: int | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
@@ -257,7 +269,14 @@ class ActionHead:
             num_steps: Euler steps, 1 to ``num_timestep_buckets``. Default the config's.
             num_samples: Chunks for each observation, from one context. None adds no axis to noise and
                 result; any integer adds one.
-            intervention: What to change inside the head; one, or several that act together.
+            future_refresh: The rows of state and future tokens run at every so many Euler steps only: r runs
+                them at steps 0, r, 2 r, ... At the other steps only the action rows run, and self-attention
+                reads the keys and values of the other rows as they last were. None and 1 are exact and give
+                the same bits; r from 2 on is faster and an approximation. From ``num_steps`` on they run at
+                the first step only.
+            intervention: What to change inside the head; one, or several that act together. With
+                ``future_refresh`` cuts and biases act on the rows that run; a patch of state or future rows
+                at a step at which they do not run is an error.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
 
         Returns:
@@ -269,7 +288,7 @@ class ActionHead:
             ``seed``.
         """
         held = _held(context)
-        samples = None if num_samples is None else integer("num_samples", num_samples)
+        samples = _optional_integer("num_samples", num_samples)
         config = self._config
         leading = (held.batch,) if samples is None else (held.batch, samples)
         output = result((*leading, config.action_horizon, config.action_dim), out)
@@ -279,8 +298,9 @@ class ActionHead:
             apart(float32("state", state), output),
             int64("embodiment_id", embodiment_id),
             apart(start, output),
-            _num_steps(num_steps),
+            _optional_integer("num_steps", num_steps),
             samples,
+            _optional_integer("future_refresh", future_refresh),
             _plain(intervention),
             output,
         )
@@ -299,6 +319,7 @@ class ActionHead:
         seed: Any = None,
         num_steps: int | None = None,
         num_samples: int | None = None,
+        future_refresh: int | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
@@ -314,6 +335,7 @@ class ActionHead:
             seed=seed,
             num_steps=num_steps,
             num_samples=num_samples,
+            future_refresh=future_refresh,
             intervention=intervention,
             out=out,
         )
@@ -374,8 +396,8 @@ class ActionHead:
     ) -> Trace[Array]:
         """Samples like :meth:`sample` and keeps what goes on inside.
 
-        All rows are computed in every block, the last included, where ``sample`` needs those of the actions
-        only.
+        All rows are computed at every step in every block, the last included, where ``sample`` needs those of
+        the actions only; so there is no ``future_refresh``.
 
         Args:
             context, state, embodiment_id, noise, seed, num_steps, intervention: As in :meth:`sample`.
@@ -416,7 +438,7 @@ class ActionHead:
             float32("state", state),
             int64("embodiment_id", embodiment_id),
             start,
-            _num_steps(num_steps),
+            _optional_integer("num_steps", num_steps),
             _plain(intervention),
             attention,
             hidden,
@@ -466,8 +488,8 @@ def _held(context: Context) -> _saccade.Context:
     return context._held
 
 
-def _num_steps(num_steps: int | None) -> int | None:
-    return None if num_steps is None else integer("num_steps", num_steps)
+def _optional_integer(name: str, value: int | None) -> int | None:
+    return None if value is None else integer(name, value)
 
 
 def _plain(given: Intervention | Sequence[Intervention] | None) -> list[dict[str, Any]]:

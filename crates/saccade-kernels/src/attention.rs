@@ -78,12 +78,36 @@ impl PackedKeyValues {
     /// # Panics
     /// If a shape does not fit, or columns are not contiguous.
     pub fn pack(&mut self, threads: usize, keys: MatRef<'_, f32>, values: MatRef<'_, f32>) {
+        self.len = keys.nrows();
+        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
+        reserve(&mut self.keys, self.num_heads * keys_size);
+        reserve(&mut self.values, self.num_heads * values_size);
+        self.finite = true;
+        self.pack_from(threads, 0, keys, values);
+    }
+
+    /// Replaces the keys and values from number `first` to the end; the others stay as they are.
+    ///
+    /// # Panics
+    /// If there are not as many of them as are replaced, a shape does not fit, or columns are not contiguous.
+    pub fn pack_from(
+        &mut self,
+        threads: usize,
+        first: usize,
+        keys: MatRef<'_, f32>,
+        values: MatRef<'_, f32>,
+    ) {
         let width = self.num_heads * self.head_dim;
-        let len = keys.nrows();
+        let count = keys.nrows();
+        assert_eq!(
+            first + count,
+            self.len,
+            "keys: expected all that are held from number {first} on"
+        );
         assert_eq!(keys.ncols(), width, "keys: expected num_heads * head_dim columns");
         assert_eq!(
             (values.nrows(), values.ncols()),
-            (len, width),
+            (count, width),
             "values: expected the shape of keys"
         );
         assert!(
@@ -94,16 +118,13 @@ impl PackedKeyValues {
             values.col_stride() == 1 || width <= 1,
             "values: expected contiguous rows"
         );
-        self.len = len;
-        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
-        reserve(&mut self.keys, self.num_heads * keys_size);
-        reserve(&mut self.values, self.num_heads * values_size);
-        self.finite = true;
-        if len == 0 || width == 0 {
+        if count == 0 || width == 0 {
             return;
         }
-        let finite = AtomicBool::new(true);
+        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
+        let finite = AtomicBool::new(self.finite);
         let job = Pack {
+            first,
             keys,
             values,
             keys_to: self.keys.as_mut_ptr(),
@@ -111,7 +132,7 @@ impl PackedKeyValues {
             lanes: lanes(self.isa),
             head_dim: self.head_dim,
         };
-        let threads = if 2 * len * width < ELEMENTS_FOR_THREADS {
+        let threads = if 2 * count * width < ELEMENTS_FOR_THREADS {
             1
         } else {
             threads
@@ -181,6 +202,8 @@ fn reserve(buffer: &mut AlignedBuffer<f32>, elements: usize) {
 }
 
 struct Pack<'a> {
+    /// Number of the first key that is replaced.
+    first: usize,
     keys: MatRef<'a, f32>,
     values: MatRef<'a, f32>,
     keys_to: *mut f32,
@@ -216,24 +239,27 @@ impl Pack<'_> {
                 std::slice::from_raw_parts(start, head_dim)
             }
         };
-        let len = self.keys.nrows();
-        for (index, panel) in keys_to.chunks_exact_mut(lanes * head_dim).enumerate() {
-            for lane in 0..lanes {
-                let key = index * lanes + lane;
-                let to = panel[lane..].iter_mut().step_by(lanes);
-                if key < len {
-                    to.zip(row(self.keys, key)).for_each(|(to, &from)| *to = from);
-                } else {
-                    to.for_each(|to| *to = 0.0);
-                }
+        let count = self.keys.nrows();
+        let end = self.first + count;
+        for key in self.first..end.next_multiple_of(lanes) {
+            let to = keys_to[key / lanes * lanes * head_dim + key % lanes..]
+                .iter_mut()
+                .step_by(lanes)
+                .take(head_dim);
+            if key < end {
+                to.zip(row(self.keys, key - self.first))
+                    .for_each(|(to, &from)| *to = from);
+            } else {
+                to.for_each(|to| *to = 0.0);
             }
         }
         let mut finite = true;
-        for (key, to) in values_to
-            .chunks_exact_mut(head_dim.next_multiple_of(lanes))
+        let padded = head_dim.next_multiple_of(lanes);
+        for (index, to) in values_to[self.first * padded..]
+            .chunks_exact_mut(padded)
             .enumerate()
         {
-            let from = row(self.values, key);
+            let from = row(self.values, index);
             finite &= from.iter().fold(true, |finite, value| finite & value.is_finite());
             to[..head_dim].copy_from_slice(from);
             to[head_dim..].fill(0.0);

@@ -377,6 +377,87 @@ fn packing_again_replaces_everything() {
 }
 
 #[test]
+fn packing_from_a_key_on_replaces_that_key_and_the_later_ones() {
+    for (keys, head_dim) in [(49, 48), (40, 7), (3, 5)] {
+        let (old, new) = (
+            Case::new(11, 5, keys, 2, head_dim, 1),
+            Case::new(12, 5, keys, 2, head_dim, 0),
+        );
+        let width = 2 * head_dim;
+        for (isa, first) in Isa::available()
+            .into_iter()
+            .flat_map(|isa| (0..=keys).map(move |first| (isa, first)))
+        {
+            let mut held = old.held(isa);
+            let tail = |of: &Strided| of.values()[first * width..].to_vec();
+            let (tail_keys, tail_values) = (tail(&new.keys), tail(&new.values));
+            held.pack_from(2, first, rows(&tail_keys, width), rows(&tail_values, width));
+            let joined = |old: &Strided, tail: &[f32]| {
+                let whole = [&old.values()[..first * width], tail].concat();
+                Strided::new(&whole, keys, width, 0)
+            };
+            let expected = Case {
+                keys: joined(&old.keys, &tail_keys),
+                values: joined(&old.values, &tail_values),
+                ..Case::new(12, 5, keys, 2, head_dim, 0)
+            };
+            let mut out = vec![0.0; 5 * width];
+            let queries = new.queries.view();
+            attention(
+                1,
+                queries,
+                &held,
+                new.scale,
+                None,
+                None,
+                rows_mut(&mut out, width),
+            );
+            assert_eq!(
+                bits(&out),
+                bits(&expected.run(isa, 1, None, None)),
+                "{isa}, from {first}"
+            );
+        }
+    }
+}
+
+#[test]
+fn an_infinite_value_that_stays_is_remembered() {
+    let (keys, mut values) = ([0.0; 6], [1.0; 6]);
+    values[0] = f32::INFINITY;
+    for isa in Isa::available() {
+        let mut held = PackedKeyValues::new(isa, 1, 2);
+        held.pack(1, rows(&keys, 2), rows(&values, 2));
+        held.pack_from(1, 2, rows(&keys[4..], 2), rows(&values[4..], 2));
+        let bias = LogitBias {
+            values: &[f32::NEG_INFINITY, 0.0, 0.0],
+            head_stride: 0,
+            query_stride: 0,
+        };
+        let mut out = [0.0; 2];
+        let query = [0.0; 2];
+        attention(
+            1,
+            rows(&query, 2),
+            &held,
+            1.0,
+            Some(bias),
+            None,
+            rows_mut(&mut out, 2),
+        );
+        assert_eq!(out, [1.0, 1.0], "{isa}: the removed value has no influence");
+    }
+}
+
+#[test]
+#[should_panic(expected = "all that are held from number 2 on")]
+fn packing_from_a_key_on_keeps_their_number() {
+    let mut held = PackedKeyValues::new(Isa::Portable, 1, 2);
+    held.pack(1, rows(&[0.0; 6], 2), rows(&[0.0; 6], 2));
+    held.pack_from(1, 2, rows(&[0.0; 4], 2), rows(&[0.0; 4], 2));
+}
+
+#[test]
 #[should_panic(expected = "queries: expected")]
 fn queries_of_another_width_panic() {
     let case = Case::new(11, 2, 3, 2, 4, 0);

@@ -264,8 +264,9 @@ impl ActionHead {
         num_vl_tokens: usize,
         batch: usize,
         num_samples: Option<usize>,
+        future_refresh: Option<usize>,
     ) -> PyResult<()> {
-        py.detach(|| self.0.warmup(num_vl_tokens, batch, num_samples))
+        py.detach(|| self.0.warmup(num_vl_tokens, batch, num_samples, future_refresh))
             .map_err(raise)
     }
 
@@ -302,6 +303,7 @@ impl ActionHead {
         noise: PyReadonlyArrayDyn<'_, f32>,
         num_steps: Option<usize>,
         num_samples: Option<usize>,
+        future_refresh: Option<usize>,
         intervention: Vec<PyIntervention<'_>>,
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
@@ -310,6 +312,7 @@ impl ActionHead {
         let sampling = Sampling {
             num_steps,
             num_samples,
+            future_refresh,
             interventions: &interventions(intervention)?,
         };
         py.detach(|| {
@@ -340,6 +343,7 @@ impl ActionHead {
         let sampling = Sampling {
             num_steps,
             num_samples: None,
+            future_refresh: None,
             interventions: &interventions(intervention)?,
         };
         let options = TraceOptions {

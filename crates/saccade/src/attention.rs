@@ -21,7 +21,15 @@ pub(crate) struct AttentionBuffers {
     kv: Vec<f32>,
     mix: Vec<f32>,
     bias: Vec<f32>,
-    packed: Option<PackedKeyValues>,
+    packed: Vec<PackedKeyValues>,
+}
+
+/// Keys and values of a self-attention that outlive the call.
+pub(crate) struct Held<'a> {
+    /// One for each sequence that ever was.
+    pub sequences: &'a mut Vec<PackedKeyValues>,
+    /// Those before this number stay as they are, the others are made from the rows given.
+    pub first: usize,
 }
 
 impl AttentionBuffers {
@@ -31,7 +39,7 @@ impl AttentionBuffers {
             kv: Vec::new(),
             mix: Vec::new(),
             bias: Vec::new(),
-            packed: None,
+            packed: Vec::new(),
         }
     }
 }
@@ -183,7 +191,7 @@ impl Attention {
     }
 
     /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences; `weights` is
-    /// `(groups, heads, queries, keys)`.
+    /// `(groups, heads, queries, keys)`. With `held` they are kept, and where it says so added to those already there.
     #[allow(clippy::too_many_arguments)] // As above.
     pub(crate) fn add_self(
         &self,
@@ -191,6 +199,7 @@ impl Attention {
         y: &[f32],
         source: &[f32],
         groups: usize,
+        held: Option<Held<'_>>,
         bias: Bias<'_>,
         mut weights: Option<&mut [f32]>,
         buffers: &mut AttentionBuffers,
@@ -201,17 +210,29 @@ impl Attention {
         let count = buffers.q.len() / width / groups; // query rows of a sequence
         let mix = sized(&mut buffers.mix, buffers.q.len());
         let (keys, values) = self.keys_values(engine, source, &mut buffers.kv);
-        let len = keys.nrows() / groups; // rows of a sequence
-        let logits = [self.num_heads, count, len];
-        let packed = buffers
-            .packed
-            .get_or_insert_with(|| PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim()));
+        let new = keys.nrows() / groups; // rows of a sequence whose keys and values these are
+        // Those that are not held share one place.
+        let (packed, places, first) = match held {
+            None => (&mut buffers.packed, 1, 0),
+            Some(held) => (held.sequences, groups, held.first),
+        };
+        if packed.len() < places {
+            packed.resize_with(places, || {
+                PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim())
+            });
+        }
+        let logits = [self.num_heads, count, first + new];
         for group in 0..groups {
-            packed.pack(
-                engine.threads,
-                keys.subrows(group * len, len),
-                values.subrows(group * len, len),
+            let packed = &mut packed[group % places];
+            let new = group * new..(group + 1) * new;
+            let (keys, values) = (
+                keys.subrows(new.start, new.len()),
+                values.subrows(new.start, new.len()),
             );
+            match first {
+                0 => packed.pack(engine.threads, keys, values),
+                _ => packed.pack_from(engine.threads, first, keys, values),
+            }
             let range = group * count * width..(group + 1) * count * width;
             attention(
                 engine.threads,

@@ -251,7 +251,7 @@ impl VlEncoder {
             let attention = &mut buffers.attention;
             block
                 .attention
-                .add_self(engine, y, y, elements.len(), bias, weights, attention, vl);
+                .add_self(engine, y, y, elements.len(), None, bias, weights, attention, vl);
             block.norm3.apply(engine, vl, y);
             block.feed_forward.add(engine, y, &mut buffers.hidden, vl);
             if let Some(kept) = recorded.hidden(index) {

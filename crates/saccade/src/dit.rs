@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use saccade_kernels::{Epilogue, PackedLinear, layer_norm};
+use saccade_kernels::{Epilogue, PackedKeyValues, PackedLinear, layer_norm};
 
-use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward};
+use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward, Held};
 use crate::cache::Cache;
 use crate::config::HeadConfig;
 use crate::context::Context;
 use crate::error::Result;
-use crate::intervention::{Changes, Groups};
+use crate::intervention::{Changes, Group, Groups};
 use crate::layers::{Engine, HeadTensors, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
 use crate::tables::{TIME_CHANNELS, embedding_time};
@@ -61,39 +61,49 @@ pub(crate) struct Pass<'a> {
     /// Which rows there are, and what is changed at Euler step `step`.
     pub changes: &'a Changes<'a>,
     pub step: usize,
-    pub last: LastBlock,
+    pub rows: Rows,
 }
 
-/// In the last block only the action rows are needed (spec I4). A trace shows all of them.
+/// Which rows run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum LastBlock {
-    ActionRows,
-    AllRows,
+pub(crate) enum Rows {
+    /// All in every block: what a trace shows.
+    All,
+    /// All, but in the last block only those of the actions, since nothing reads the others after it (spec I4).
+    Needed,
+    /// As [`Self::Needed`], and what the self-attention blocks read of them is held.
+    NeededAndHeld,
+    /// Those of the actions. The self-attention blocks read the held keys and values of the others.
+    Actions,
 }
 
 /// Memory of one pass that is kept for the next.
 pub(crate) struct DitBuffers {
-    /// The residual stream, `(sequences, rows, width)`: filled by the caller.
+    /// The residual stream, `(sequences, rows, width)`: filled by the caller, unless only the action rows run.
     pub h: Vec<f32>,
+    /// That of the action rows alone, `(sequences, action_rows, width)`: filled by the caller where only they run.
+    pub action: Vec<f32>,
     /// One for each batch element: filled by the caller.
     pub times: Vec<Arc<TimeModulations>>,
-    action: Vec<f32>,
     y: Vec<f32>,
     y_all: Vec<f32>,
     hidden: Vec<f32>,
     attention: AttentionBuffers,
+    /// By block, empty for cross-attention.
+    held: Vec<Vec<PackedKeyValues>>,
 }
 
 impl DitBuffers {
     pub(crate) fn new() -> Self {
         Self {
             h: Vec::new(),
-            times: Vec::new(),
             action: Vec::new(),
+            times: Vec::new(),
             y: Vec::new(),
             y_all: Vec::new(),
             hidden: Vec::new(),
             attention: AttentionBuffers::new(),
+            held: Vec::new(),
         }
     }
 }
@@ -197,8 +207,8 @@ impl Dit {
         }
     }
 
-    /// Runs all blocks over `buffers.h` and writes the output rows of the actions, `(sequences, action_rows, hidden_dim)`. What `recorded`
-    /// has places for is kept.
+    /// Runs all blocks over `buffers.h`, or over `buffers.action` where only these rows run, and writes the output rows of the actions,
+    /// `(sequences, action_rows, hidden_dim)`. What `recorded` has places for is kept.
     pub(crate) fn forward(
         &self,
         engine: Engine,
@@ -207,39 +217,23 @@ impl Dit {
         buffers: &mut DitBuffers,
         out: &mut Vec<f32>,
     ) {
-        let (final_block, blocks) = self.blocks.split_last().expect("a config has at least one block");
+        buffers.held.resize_with(self.blocks.len(), Vec::new);
         let mut h = std::mem::take(&mut buffers.h); // (sequences, rows, width)
-        for (index, block) in blocks.iter().enumerate() {
-            self.block(engine, pass, index, block, &mut h, None, recorded, buffers);
-        }
         let mut action = std::mem::take(&mut buffers.action); // (sequences, action_rows, width)
-        match pass.last {
-            LastBlock::ActionRows => {
-                gather_action_rows(&pass.changes.extent.groups, self.width, &h, &mut action);
-                self.block(
-                    engine,
-                    pass,
-                    blocks.len(),
-                    final_block,
-                    &mut action,
-                    Some(&h),
-                    recorded,
-                    buffers,
-                );
-            }
-            LastBlock::AllRows => {
-                self.block(
-                    engine,
-                    pass,
-                    blocks.len(),
-                    final_block,
-                    &mut h,
-                    None,
-                    recorded,
-                    buffers,
-                );
-                gather_action_rows(&pass.changes.extent.groups, self.width, &h, &mut action);
-            }
+        let last = self.blocks.len() - 1;
+        for (index, block) in self.blocks.iter().enumerate() {
+            let (x, all): (_, Option<&[f32]>) = match pass.rows {
+                Rows::Actions => (&mut action, None),
+                Rows::Needed | Rows::NeededAndHeld if index == last => {
+                    gather_action_rows(&pass.changes.extent.groups, self.width, &h, &mut action);
+                    (&mut action, Some(&h))
+                }
+                _ => (&mut h, None),
+            };
+            self.block(engine, pass, index, block, x, all, recorded, buffers);
+        }
+        if pass.rows == Rows::All {
+            gather_action_rows(&pass.changes.extent.groups, self.width, &h, &mut action);
         }
         let y = sized(&mut buffers.y, action.len());
         modulated_norm(
@@ -281,6 +275,7 @@ impl Dit {
             hidden,
             attention,
             times,
+            held: held_by_block,
             ..
         } = buffers;
         let norm = |h: &[f32], y: &mut [f32]| {
@@ -301,6 +296,7 @@ impl Dit {
             samples,
             changes,
             step,
+            rows: running,
             ..
         } = *pass;
         let groups = context.batch * samples;
@@ -323,9 +319,18 @@ impl Dit {
                     y_all
                 }
             };
+            let held = match running {
+                Rows::All | Rows::Needed => None,
+                Rows::NeededAndHeld => Some(0),
+                Rows::Actions => Some(changes.extent.groups.range(Group::Action).start),
+            };
+            let held = held.map(|first| Held {
+                sequences: &mut held_by_block[index],
+                first,
+            });
             block
                 .attention
-                .add_self(engine, y, source, groups, bias, weights, attention, x);
+                .add_self(engine, y, source, groups, held, bias, weights, attention, x);
         }
         layer_norm(
             engine.isa,

@@ -11,7 +11,7 @@ use crate::cache::Cache;
 use crate::checkpoint::Checkpoint;
 use crate::config::HeadConfig;
 use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
-use crate::dit::{Dit, DitBuffers, LastBlock, Pass};
+use crate::dit::{Dit, DitBuffers, Pass, Rows};
 use crate::error::{Error, Result, show_shape};
 use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, HeadTensors, TensorSource, sized};
@@ -69,7 +69,10 @@ pub struct Sampling<'a> {
     pub num_steps: Option<usize>,
     /// Chunks for each observation; none adds no axis to noise and result.
     pub num_samples: Option<usize>,
-    /// What to change inside the head.
+    /// The rows of state and future tokens run at every so many Euler steps, from the first one on. At the others only the action rows
+    /// run, and self-attention reads the others' keys and values as they last were. None and 1: at all steps, which is exact.
+    pub future_refresh: Option<usize>,
+    /// What to change inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an error.
     pub interventions: &'a [Intervention],
 }
 
@@ -272,20 +275,22 @@ impl ActionHead {
         let state = self.check_state(state, context.batch)?;
         let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, context.batch, sampling.num_samples)?;
+        let refresh = check_refresh(sampling.future_refresh)?;
         let extent = self.extent(sampling.interventions, context, num_steps)?;
         let changes = Changes::new(sampling.interventions, extent)?;
+        changes.check_refresh(refresh)?;
         let pass = Pass {
             context,
             samples,
             changes: &changes,
             step: 0,
-            last: LastBlock::ActionRows,
+            rows: Rows::Needed,
         };
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, context.batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
             let nothing = &mut Recorded::default();
-            self.euler_steps(&pass, noise.data, num_steps, nothing, workspace);
+            self.euler_steps(&pass, noise.data, num_steps, refresh, nothing, workspace);
             out.copy_from_slice(&workspace.x);
             Ok(())
         })
@@ -293,7 +298,8 @@ impl ActionHead {
 
     /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last included.
     ///
-    /// There is one chunk for each observation: `sampling.num_samples` must be none.
+    /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and `sampling.future_refresh` must
+    /// be none.
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, and for a trace of more than `options.max_bytes`.
@@ -310,6 +316,11 @@ impl ActionHead {
         if let Some(samples) = sampling.num_samples {
             return Err(Error::Input(format!(
                 "num_samples: expected none, since a trace is of one chunk an observation, got {samples}"
+            )));
+        }
+        if let Some(refresh) = sampling.future_refresh {
+            return Err(Error::Input(format!(
+                "future_refresh: expected none, since a trace is of all rows at every step, got {refresh}"
             )));
         }
         let (batch, config) = (context.batch, &self.config);
@@ -335,12 +346,12 @@ impl ActionHead {
             samples,
             changes: &changes,
             step: 0,
-            last: LastBlock::AllRows,
+            rows: Rows::All,
         };
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
-            self.euler_steps(&pass, noise.data, num_steps, &mut recorded, workspace);
+            self.euler_steps(&pass, noise.data, num_steps, 1, &mut recorded, workspace);
             let shape = [batch, config.action_horizon, config.action_dim];
             let actions = OwnedArray::new(workspace.x.clone(), &shape);
             Ok(Trace {
@@ -392,7 +403,7 @@ impl ActionHead {
                 samples: 1,
                 changes: &changes,
                 step: 0,
-                last: LastBlock::ActionRows,
+                rows: Rows::Needed,
             };
             let bucket = |element: usize| timesteps[element];
             self.step_velocity(&pass, bucket, &mut Recorded::default(), workspace);
@@ -405,7 +416,14 @@ impl ActionHead {
     ///
     /// # Errors
     /// [`Error::Input`] for a size of zero.
-    pub fn warmup(&self, num_vl_tokens: usize, batch: usize, num_samples: Option<usize>) -> Result<()> {
+    pub fn warmup(
+        &self,
+        num_vl_tokens: usize,
+        batch: usize,
+        num_samples: Option<usize>,
+        future_refresh: Option<usize>,
+    ) -> Result<()> {
+        check_refresh(future_refresh)?;
         for (name, size) in [
             ("num_vl_tokens", num_vl_tokens),
             ("batch", batch),
@@ -453,6 +471,7 @@ impl ActionHead {
             Array::new(&noise, &shape),
             &Sampling {
                 num_samples,
+                future_refresh,
                 ..Sampling::default()
             },
             &mut out,
@@ -475,23 +494,33 @@ impl ActionHead {
         )
     }
 
-    /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`.
+    /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`. At steps that `refresh` does not divide only the
+    /// action rows run.
     fn euler_steps(
         &self,
         pass: &Pass<'_>,
         noise: &[f32],
         num_steps: usize,
+        refresh: usize,
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) {
         sized(&mut workspace.x, noise.len()).copy_from_slice(noise);
         let dt = 1.0 / num_steps as f32;
+        let refreshes = |step: usize| step.is_multiple_of(refresh);
         for step in 0..num_steps {
             let bucket = self.bucket(step, num_steps);
             let times = &mut workspace.dit.times;
             times.clear();
             times.resize(pass.context.batch, self.dit.time(self.engine, bucket));
-            self.step_velocity(&Pass { step, ..*pass }, |_| bucket, recorded, workspace);
+            let rows = if !refreshes(step) {
+                Rows::Actions
+            } else if step + 1 < num_steps && !refreshes(step + 1) {
+                Rows::NeededAndHeld
+            } else {
+                pass.rows
+            };
+            self.step_velocity(&Pass { step, rows, ..*pass }, |_| bucket, recorded, workspace);
             for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
                 *x += dt * v;
             }
@@ -610,11 +639,14 @@ impl ActionHead {
         })
     }
 
-    /// `[state, future, action]` for each sequence, to the transformer's residual stream.
+    /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual stream.
     fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) {
         let Workspace {
             state, encoded, dit, ..
         } = workspace;
+        if pass.rows == Rows::Actions {
+            return sized(&mut dit.action, encoded.len()).copy_from_slice(encoded);
+        }
         let width = self.config.width;
         let actions = self.config.action_horizon * width;
         let sequence = pass.changes.extent.groups.num_rows() * width;
@@ -787,6 +819,16 @@ const MAX_WARMUP_ELEMENTS: usize = 1 << 31;
 /// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a problem.
 const MAX_THREADS: usize = 1024;
 
+/// Every how many Euler steps all rows run.
+fn check_refresh(future_refresh: Option<usize>) -> Result<usize> {
+    match future_refresh {
+        Some(0) => Err(Error::Input(
+            "future_refresh: expected at least 1, got 0".to_owned(),
+        )),
+        given => Ok(given.unwrap_or(1)),
+    }
+}
+
 /// The engine that the environment and `num_threads` ask for.
 pub(crate) fn engine(num_threads: Option<usize>) -> Result<Engine> {
     let isa = Isa::from_env().map_err(|error| Error::Input(error.to_string()))?;
@@ -885,7 +927,7 @@ mod tests {
     }
 
     /// One velocity with all rows, or only the needed ones, in the last block.
-    fn velocity(head: &ActionHead, context: &Context, bucket: usize, last: LastBlock) -> Vec<f32> {
+    fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: Rows) -> Vec<f32> {
         let mut workspace = Workspace::new();
         let config = &head.config;
         workspace
@@ -904,7 +946,7 @@ mod tests {
             samples: 1,
             changes: &changes,
             step: 0,
-            last,
+            rows,
         };
         head.step_velocity(&pass, |_| bucket, &mut Recorded::default(), &mut workspace);
         workspace.velocity
@@ -922,8 +964,8 @@ mod tests {
             let head = released(file);
             let context = context(&head, 3);
             for bucket in [0, 499, 999] {
-                let needed = velocity(&head, &context, bucket, LastBlock::ActionRows);
-                let all = velocity(&head, &context, bucket, LastBlock::AllRows);
+                let needed = velocity(&head, &context, bucket, Rows::Needed);
+                let all = velocity(&head, &context, bucket, Rows::All);
                 assert_eq!(needed, all, "{file} at {bucket}");
             }
         }
@@ -933,18 +975,18 @@ mod tests {
     fn kept_modulations_and_brackets_change_no_bit() {
         let (head, fresh) = (released(FILES[0]), released(FILES[0]));
         let kept = context(&head, 2);
-        let first = velocity(&head, &kept, 250, LastBlock::ActionRows);
+        let first = velocity(&head, &kept, 250, Rows::Needed);
         for bucket in 0..CACHED_BRACKETS + 10 {
-            velocity(&head, &kept, bucket, LastBlock::ActionRows);
+            velocity(&head, &kept, bucket, Rows::Needed);
         }
         assert_eq!(
-            velocity(&head, &kept, 250, LastBlock::ActionRows),
+            velocity(&head, &kept, 250, Rows::Needed),
             first,
             "pushed out and computed again"
         );
         let kept = context(&fresh, 2);
         assert_eq!(
-            velocity(&fresh, &kept, 250, LastBlock::ActionRows),
+            velocity(&fresh, &kept, 250, Rows::Needed),
             first,
             "never kept before"
         );

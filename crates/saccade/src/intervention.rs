@@ -246,6 +246,24 @@ impl<'a> Changes<'a> {
         Ok(changes)
     }
 
+    /// That no row is patched at a step at which it does not run: at steps that `refresh` does not divide only action rows do.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for such a patch.
+    pub(crate) fn check_refresh(&self, refresh: usize) -> Result<()> {
+        let actions = self.extent.groups.range(Group::Action).start;
+        let stays = |patch: &&PatchedRows<'_>| {
+            !patch.step.is_multiple_of(refresh) && patch.rows.iter().any(|row| *row < actions)
+        };
+        match self.patches.iter().find(stays) {
+            None => Ok(()),
+            Some(PatchedRows { step, block, .. }) => Err(Error::Input(format!(
+                "patch[({step}, {block})]: expected action tokens, since with future_refresh {refresh} the rows of state and future tokens \
+                 do not run at step {step}"
+            ))),
+        }
+    }
+
     /// Blocks of one kind in which the same interventions act share a bias.
     fn find_biases(&mut self, interventions: &[Intervention]) -> Result<()> {
         let mut known: BTreeMap<(bool, Vec<usize>), usize> = BTreeMap::new();

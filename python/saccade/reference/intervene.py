@@ -32,6 +32,9 @@ class BlockChange:
         stop_gradient: `(Q, K)` bool, True where the reader takes key and value as constants.
         patches: pairs of row indices `(n,)` and what replaces these rows after the block, `(n, width)` or
             `(B, n, width)`; the last one counts.
+        others: rows as self-attention read them before, where only the rows after these run;
+            `(B, O, width)`.
+        hold: is given the rows as self-attention reads them, `(B, R, width)`.
         keep_attention: is given the probabilities `(B, heads, Q, K)`.
         keep_hidden: is given the rows after the block and its patches, `(B, R, width)`.
     """
@@ -39,8 +42,16 @@ class BlockChange:
     logit_bias: Tensor | None = None
     stop_gradient: Tensor | None = None
     patches: Sequence[tuple[Tensor, Tensor]] = ()
+    others: Tensor | None = None
+    hold: Callable[[Tensor], None] | None = None
     keep_attention: Callable[[Tensor], None] | None = None
     keep_hidden: Callable[[Tensor], None] | None = None
+
+    def all_rows(self, y: Tensor) -> Tensor:
+        """What self-attention reads where the rows `y (B, R', width)` run: `(B, R, width)`."""
+        if self.hold is not None:
+            self.hold(y)
+        return y if self.others is None else torch.cat((self.others, y), dim=1)
 
     def after(self, rows: Tensor) -> Tensor:
         """The rows that the next block reads: `(B, R, width)` to the same shape."""
@@ -88,6 +99,7 @@ class Run:
         config: the head's.
         vl_embs: `(B, S, context_dim)`; its dtype and device are those of the run.
         num_steps: Euler steps.
+        future_refresh: the rows of state and future tokens run at every so many steps, from the first one on.
         intervention: one, several or none.
         drop_vl: bool `(B, S)`, True where a vision-language token is removed.
         stop_gradient: pairs as in `Intervention.cut`, cut in the backward pass only.
@@ -97,6 +109,7 @@ class Run:
     Attributes:
         rows: where each group of rows lies.
         future_tokens: `(N', width)` to use in place of the learned ones, or None.
+        held: what self-attention last read of the rows of state and future tokens, by block.
         attention, hidden: what was kept so far, by `(step, block)`.
 
     Raises:
@@ -109,6 +122,7 @@ class Run:
         vl_embs: Tensor,
         *,
         num_steps: int,
+        future_refresh: int = 1,
         intervention: Intervention | Sequence[Intervention] | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
@@ -118,6 +132,7 @@ class Run:
     ) -> None:
         self.config = config
         self.num_steps = num_steps
+        self.future_refresh = future_refresh
         self.batch, num_vl_tokens, _ = vl_embs.shape
         self.dtype, self.device = vl_embs.dtype, vl_embs.device
         interventions = as_interventions(intervention)
@@ -142,21 +157,35 @@ class Run:
         removed = removed_tokens(drop_vl, vl_embs)
         self.removed_bias = None if removed is None else removal_bias(removed, vl_embs.dtype)
         self.keep_attention, self.keep_hidden = check_record(record)
+        self.held: dict[int, Tensor] = {}
         self.attention: dict[tuple[int, int], Tensor] = {}
         self.hidden: dict[tuple[int, int], Tensor] = {}
         for edit in (*self.edits, self.kept):
             self.check(edit)
         self.check_edges("stop_gradient", self.stopped)
 
+    def first_row(self, step: int) -> int:
+        """The first row that runs at this Euler step: 0, or the first of the actions."""
+        return 0 if step % self.future_refresh == 0 else self.rows["action"].start
+
+    def hold(self, block: int, y: Tensor) -> None:
+        """Holds the rows of state and future tokens, of all rows `(B, R, width)`."""
+        self.held[block] = y[:, : self.rows["action"].start]
+
     def change(self, step: int, block: int) -> BlockChange:
-        """What happens in this block of this Euler step."""
+        """What happens in this block of this Euler step, to the rows that run."""
         place, cross = (step, block), is_cross(self.config, block)
+        first = self.first_row(step)
+        refreshed = not cross and self.future_refresh < self.num_steps and first == 0
         shown = self.kept.acts(step, block)
         attention, hidden = shown and self.keep_attention, shown and self.keep_hidden
+        bias = self.logit_bias(step, block, cross)
         return BlockChange(
-            logit_bias=self.logit_bias(step, block, cross),
-            stop_gradient=self.cut_keys(self.stopped, cross) if self.stopped.cut else None,
-            patches=self.patches(place),
+            logit_bias=None if bias is None else bias[..., -(self.num_rows - first) :, :],
+            stop_gradient=self.cut_keys(self.stopped, cross)[first:] if self.stopped.cut else None,
+            patches=[(index - first, values) for index, values in self.patches(place)],
+            others=None if cross or first == 0 else self.held[block],
+            hold=partial(self.hold, block) if refreshed else None,
             keep_attention=partial(self.attention.__setitem__, place) if attention else None,
             keep_hidden=partial(self.hidden.__setitem__, place) if hidden else None,
         )
@@ -235,8 +264,13 @@ class Run:
             for chosen, rows in groups.items():
                 name = f"patch[({step}, {block})]"
                 batch = (self.batch,) if rows.ndim == 3 else ()
-                expected = (*batch, self.count(name, chosen), self.config.width)
-                check_shape(f"{name}: {chosen[0]}", rows, expected)
+                count = self.count(name, chosen)
+                check_shape(f"{name}: {chosen[0]}", rows, (*batch, count, self.config.width))
+                if count and self.first_row(step) > 0 and chosen[0] != "action":
+                    raise InputError(
+                        f"{name}: {chosen[0]} tokens, expected action tokens, since with future_refresh "
+                        f"{self.future_refresh} the others do not run at step {step}"
+                    )
 
     def check_edges(self, name: str, edit: Edit) -> None:
         """Refuses tokens that are not there."""

@@ -225,7 +225,7 @@ class DiTBlock(nn.Module):
         y = self.norm1(rows, temb)
         attended, weights = self.attn1(
             y,
-            vl_embs if self.is_cross else y,
+            vl_embs if self.is_cross else change.all_rows(y),
             logit_bias=change.logit_bias,
             stop_gradient=change.stop_gradient,
             return_weights=change.keep_attention is not None,
@@ -514,7 +514,7 @@ class ActionHead(nn.Module):
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
     ) -> Tensor:
-        """`velocity` at one Euler step of a run."""
+        """`velocity` at one Euler step of a run, of which only those rows run that the run says."""
         config, horizon = self.config, self.config.action_horizon
         actions, state = self.as_input(actions), self.as_input(state)
         batch = vl_embs.shape[0]
@@ -534,7 +534,7 @@ class ActionHead(nn.Module):
         rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
 
         changes = [run.change(step, block) for block in range(config.num_layers)]
-        hidden = self.model(rows, vl_embs, timestep, changes)  # (B, R, hidden_dim)
+        hidden = self.model(rows[:, run.first_row(step) :], vl_embs, timestep, changes)  # (B, R', hidden_dim)
         return self.action_decoder(hidden[:, -horizon:], embodiment_id)  # (B, T, action_dim)
 
     def sample(
@@ -545,6 +545,7 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
+        future_refresh: int | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
@@ -555,22 +556,24 @@ class ActionHead(nn.Module):
             vl_embs, state, embodiment_id: as in `velocity`.
             noise: `(B, T, encoder_action_dim)`, standard normal.
             num_steps: default as the config says.
-            drop_vl, intervention, stop_gradient: as in `trace`.
+            future_refresh: the rows of state and future tokens run at every so many steps only, from the
+                first one on. At the others self-attention reads them as it last did. Default: at all steps.
+            drop_vl, intervention, stop_gradient: as in `trace`. A patch of rows at a step at which they do
+                not run is an error.
 
         Returns:
             Actions `(B, T, action_dim)`, normalised.
         """
-        return self.trace(
+        vl_embs = self.as_input(vl_embs)
+        run = self.run_of(
             vl_embs,
-            state,
-            embodiment_id,
-            noise=noise,
-            num_steps=num_steps,
+            num_steps,
+            future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
             drop_vl=drop_vl,
             intervention=intervention,
             stop_gradient=stop_gradient,
-            record=(),
-        ).actions
+        )
+        return self.euler_steps(run, vl_embs, state, embodiment_id, noise)
 
     def trace(
         self,
@@ -611,16 +614,10 @@ class ActionHead(nn.Module):
             ShapeError, DtypeError: an array that does not fit.
             InputError: a value out of range, an intervention that does not fit the head.
         """
-        config = self.config
-        num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
-        if not 1 <= num_steps <= config.num_timestep_buckets:
-            raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
-        vl_embs, actions = self.as_input(vl_embs), self.as_input(noise)
-        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
-        run = Run(
-            config,
+        vl_embs = self.as_input(vl_embs)
+        run = self.run_of(
             vl_embs,
-            num_steps=num_steps,
+            num_steps,
             intervention=intervention,
             drop_vl=drop_vl,
             stop_gradient=stop_gradient,
@@ -628,11 +625,33 @@ class ActionHead(nn.Module):
             blocks=blocks,
             steps=steps,
         )
-        for step in range(num_steps):
-            bucket = int(step / num_steps * config.num_timestep_buckets)
-            velocity = self.velocity_in(run, step, vl_embs, state, embodiment_id, actions, bucket)
-            actions = actions + velocity / num_steps
+        actions = self.euler_steps(run, vl_embs, state, embodiment_id, noise)
         return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
+
+    def run_of(self, vl_embs: Tensor, num_steps: int | None, **options: Any) -> Run:
+        """The run of so many Euler steps, with the other arguments of `Run`."""
+        config = self.config
+        num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
+        if not 1 <= num_steps <= config.num_timestep_buckets:
+            raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
+        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
+        return Run(config, vl_embs, num_steps=num_steps, **options)
+
+    def euler_steps(
+        self,
+        run: Run,
+        vl_embs: Tensor,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        noise: Tensor | np.ndarray,
+    ) -> Tensor:
+        """The steps of `sample`: actions `(B, T, action_dim)`."""
+        actions = self.as_input(noise)
+        for step in range(run.num_steps):
+            bucket = int(step / run.num_steps * self.config.num_timestep_buckets)
+            velocity = self.velocity_in(run, step, vl_embs, state, embodiment_id, actions, bucket)
+            actions = actions + velocity / run.num_steps
+        return actions
 
     def forward(
         self,
@@ -642,6 +661,7 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
+        future_refresh: int | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
@@ -653,6 +673,7 @@ class ActionHead(nn.Module):
             embodiment_id,
             noise=noise,
             num_steps=num_steps,
+            future_refresh=future_refresh,
             drop_vl=drop_vl,
             intervention=intervention,
             stop_gradient=stop_gradient,
