@@ -34,9 +34,14 @@ def runs(case: Case, refresh: int) -> list[Intervention]:
             }
             for (step, block), groups in (one.patch or {}).items()
         }
-        return replace(one, patch=patch)
+        changed: Intervention = replace(one, patch=patch)
+        return changed
 
     return [kept(one) for one in case.interventions]
+
+
+def patched(place: tuple[int, int], tokens: Any, rows: Any) -> Intervention:
+    return Intervention(patch={place: {tokens: rows}})
 
 
 def same(first: Any, second: Any) -> bool:
@@ -87,9 +92,9 @@ def test_one_is_exact_and_two_is_not(isa: str) -> None:
     for refresh in (None, 1):
         assert same(head(*given_arrays, noise=released.noise, future_refresh=refresh), exact)
     held = {r: head(*given_arrays, noise=released.noise, future_refresh=r) for r in (2, 3, 4, 7)}
-    assert not same(held[2], exact) and not same(held[2], held[3]) and not same(held[3], held[4])
+    for one, other in ((held[2], exact), (held[2], held[3]), (held[3], held[4])):
+        assert not same(one, other)
     assert same(held[4], held[7]), "4 steps: the others run at the first one only"
-    assert all(relative_error(chunk, exact) < 0.5 for chunk in held.values()), "still the same flow"
     # A call of another kind leaves nothing behind.
     assert same(head(*given_arrays, noise=released.noise), exact)
     assert same(head(*given_arrays, noise=released.noise, future_refresh=2), held[2])
@@ -116,7 +121,7 @@ def test_exact_where_no_block_reads_rows(isa: str) -> None:
     config = small_config(interleave=False)
     reference = random_head(config, 3)
     with torch.no_grad():
-        given_inputs = random_inputs(reference.config, 4, batch=2, num_vl_tokens=5)
+        given_inputs: dict[str, Any] = random_inputs(reference.config, 4, batch=2, num_vl_tokens=5)
         torch.testing.assert_close(
             reference(**given_inputs, future_refresh=2), reference(**given_inputs), rtol=0, atol=1e-5
         )
@@ -128,7 +133,7 @@ def test_exact_where_no_block_reads_rows(isa: str) -> None:
 def test_the_rows_of_the_state_are_held_too() -> None:
     """Without future tokens the state's row is all there is to hold."""
     engine, reference = both(small_config(num_future_tokens=0, num_steps=4), 5)
-    given_inputs = random_inputs(reference.config, 6, batch=2, num_vl_tokens=5)
+    given_inputs: dict[str, Any] = random_inputs(reference.config, 6, batch=2, num_vl_tokens=5)
     exact, held = (engine(**arrays(given_inputs), future_refresh=r) for r in (1, 2))
     assert not same(exact, held)
     with torch.no_grad():
@@ -138,10 +143,10 @@ def test_the_rows_of_the_state_are_held_too() -> None:
 def test_the_reference_holds_what_was_read() -> None:
     """By hand: at step 1 of 2 the rows of state and future tokens are those of step 0, patched back in."""
     reference = random_head(small_config(num_layers=2), 8, dtype=torch.float64)
-    given_inputs = random_inputs(reference.config, 9, batch=1, num_vl_tokens=5)
+    given_inputs: dict[str, Any] = random_inputs(reference.config, 9, batch=1, num_vl_tokens=5)
     with torch.no_grad():
         vl_embs = reference.encode(given_inputs.pop("backbone_features"))
-        block = reference.model.transformer_blocks[1]
+        block: Any = reference.model.transformer_blocks[1]
         read: list[torch.Tensor] = []
         block.norm1.register_forward_hook(lambda _module, _inputs, output: read.append(output.clone()))
         reference.sample(vl_embs, **given_inputs, num_steps=2, future_refresh=2)
@@ -192,30 +197,29 @@ def test_bits_do_not_depend_on_batch_samples_or_threads(isa: str) -> None:
         assert same(chunks(head, rows, noise=noise[rows, 0]), together[rows, 0])
 
 
-def test_a_patch_of_rows_that_do_not_run_is_refused(
-    head: saccade.ActionHead, inputs: dict[str, Any]
-) -> None:
+def test_a_patch_of_rows_that_do_not_run_is_refused(head: saccade.ActionHead, inputs: dict[str, Any]) -> None:
     width = head.config.width
-    for group in ("state", ("future", [2])):
-        late = Intervention(patch={(1, 0): {group: np.zeros((1, width), np.float32)}})
+    for group in ("state", ("future", (2,))):
+        late = patched((1, 0), group, np.zeros((1, width), np.float32))
         head.sample(**inputs, intervention=late)
-        with pytest.raises(saccade.InputError, match=r"patch\[\(1, 0\)\]: expected action tokens, since with f"):
+        with pytest.raises(
+            saccade.InputError, match=r"patch\[\(1, 0\)\]: expected action tokens, since with f"
+        ):
             head.sample(**inputs, intervention=late, future_refresh=2)
     for place in ((0, 1), (2, 0)):
-        row = {("future", (2,)): np.full((1, width), 0.5, np.float32)}
-        early = Intervention(patch={place: row})
+        early = patched(place, ("future", (2,)), np.full((1, width), 0.5, np.float32))
         assert not same(
             head.sample(**inputs, intervention=early, future_refresh=2),
             head.sample(**inputs, future_refresh=2),
         )
-    actions = {"action": np.zeros((head.config.action_horizon, width), np.float32)}
-    head.sample(**inputs, intervention=Intervention(patch={(1, 0): actions}), future_refresh=2)
+    actions = np.zeros((head.config.action_horizon, width), np.float32)
+    head.sample(**inputs, intervention=patched((1, 0), "action", actions), future_refresh=2)
 
 
 def test_the_reference_refuses_it_too() -> None:
     reference = random_head(small_config(), 1)
-    given_inputs = random_inputs(reference.config, 2, batch=1, num_vl_tokens=3)
-    late = Intervention(patch={(1, 0): {"state": np.zeros((1, reference.config.width), np.float32)}})
+    given_inputs: dict[str, Any] = random_inputs(reference.config, 2, batch=1, num_vl_tokens=3)
+    late = patched((1, 0), "state", np.zeros((1, reference.config.width), np.float32))
     with pytest.raises(saccade.InputError, match="state tokens, expected action tokens"):
         reference(**given_inputs, intervention=late, future_refresh=2)
 

@@ -47,7 +47,7 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
             .unwrap();
         let (state, noise) = (vec![0.2; 2 * 64], vec![0.3; 2 * 3 * 16 * 32]);
         let mut out = vec![0.0; noise.len()];
-        let mut sample = || {
+        let mut sample = |future_refresh| {
             head.sample(
                 &context,
                 Array::new(&state, &[2, 64]),
@@ -55,15 +55,22 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
                 Array::new(&noise, &[2, 3, 16, 32]),
                 &Sampling {
                     num_samples: Some(3),
+                    future_refresh,
                     ..Default::default()
                 },
                 &mut out,
             )
             .unwrap();
         };
-        sample();
-        let before = ALLOCATIONS.load(Ordering::Relaxed);
-        sample();
-        assert_eq!(ALLOCATIONS.load(Ordering::Relaxed), before, "{threads} threads");
+        for future_refresh in [None, Some(3)] {
+            sample(future_refresh);
+            let before = ALLOCATIONS.load(Ordering::Relaxed);
+            sample(future_refresh);
+            assert_eq!(
+                ALLOCATIONS.load(Ordering::Relaxed),
+                before,
+                "{threads} threads, future_refresh {future_refresh:?}"
+            );
+        }
     }
 }

@@ -176,7 +176,7 @@ class Run:
         """What happens in this block of this Euler step, to the rows that run."""
         place, cross = (step, block), is_cross(self.config, block)
         first = self.first_row(step)
-        refreshed = not cross and self.future_refresh < self.num_steps and first == 0
+        holds = not cross and first == 0 and self.future_refresh > 1
         shown = self.kept.acts(step, block)
         attention, hidden = shown and self.keep_attention, shown and self.keep_hidden
         bias = self.logit_bias(step, block, cross)
@@ -185,7 +185,7 @@ class Run:
             stop_gradient=self.cut_keys(self.stopped, cross)[first:] if self.stopped.cut else None,
             patches=[(index - first, values) for index, values in self.patches(place)],
             others=None if cross or first == 0 else self.held[block],
-            hold=partial(self.hold, block) if refreshed else None,
+            hold=partial(self.hold, block) if holds else None,
             keep_attention=partial(self.attention.__setitem__, place) if attention else None,
             keep_hidden=partial(self.hidden.__setitem__, place) if hidden else None,
         )
