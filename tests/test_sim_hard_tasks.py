@@ -122,7 +122,8 @@ def test_the_expert_succeeds_well_before_the_end(task: str) -> None:
             environment.restart(seed)
             expert = Expert(environment)
             steps = next(step for step in itertools.count(1) if environment.advance(expert.action()).success)
-            assert steps < 0.65 * environment.task.max_steps
+            # A fork leaves no time: the choice has to be made at once.
+            assert steps < (0.9 if task == "fork" else 0.65) * environment.task.max_steps
 
 
 @pytest.mark.parametrize("task", NAMES)
@@ -282,13 +283,13 @@ def test_the_mean_of_both_ways_touches_the_blue_ball_and_then_nothing_counts() -
             environment.restart(seed)
             for _ in range(environment.task.max_steps):
                 ways = []
-                for scenario.chosen in (0, 1):
+                for chosen in (0, 1):
+                    scenario.chosen = chosen
                     ways.append(Expert(environment).action())
                 environment.advance(np.mean(ways, axis=0))
-            assert scenario.spoiled
+            assert environment.advance(np.zeros(4)).reward < -TOUCH
             assert not go_to(environment, scenario.placed[0].position)
             environment.restart(seed)
-            assert not scenario.spoiled
             assert go_to(environment, scenario.placed[0].position)
 
 

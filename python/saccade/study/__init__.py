@@ -38,6 +38,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     ),
     "tvl": ("saccade.study.sweeps:TVL", "policies with different numbers of vision-language tokens"),
     "vlsa": ("saccade.study.sweeps:VLSA", "policies with different depths of VL self-attention"),
+    "fast": ("saccade.study.fast", "what faster modes cost in actions and in success, and what they save"),
 }
 
 

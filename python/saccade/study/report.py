@@ -21,6 +21,8 @@ from saccade.study.statistics import Estimate
 from saccade.study.tables import Provenance, provenance_path, read_study, table_path
 
 TITLE = "What do the future tokens do?"
+# A study that asks something else, and the page's title where it stands alone.
+ALONE = {"fast": "What do faster modes cost, and what do they save?"}
 PREAMBLE = (
     "Each section is made from the study's table beside this page. Intervals are 95 % intervals. Where an "
     "interval holds zero, no effect was found, which is not the same as no effect: what it leaves open is "
@@ -203,15 +205,18 @@ def write_report(directory: Path) -> tuple[Path, Path]:
             f"{directory}: holds no study; expected a table such as {next(iter(STUDIES))}.csv, "
             "written by `saccade study`"
         )
-    parts = [make_part(directory, name) for name in STUDIES]
+    measured = [name for name in STUDIES if provenance_path(directory, name).exists()]
+    alone = set(measured) <= set(ALONE)
+    title = ALONE[measured[0]] if alone else TITLE
+    parts = [make_part(directory, name) for name in (measured if alone else STUDIES)]
     if (directory / ATTENTION).is_dir():
         parts.append(attention_part(directory))
     page, markdown = directory / "report.html", directory / "report.md"
     template = resources.files("saccade.study").joinpath("report.html.jinja").read_text(encoding="utf-8")
     rendered = (
-        Environment(autoescape=True).from_string(template).render(title=TITLE, preamble=PREAMBLE, parts=parts)
+        Environment(autoescape=True).from_string(template).render(title=title, preamble=PREAMBLE, parts=parts)
     )
-    for path, text in ((page, rendered), (markdown, to_markdown(parts))):
+    for path, text in ((page, rendered), (markdown, to_markdown(title, parts))):
         with write_atomically(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     return page, markdown
@@ -301,9 +306,9 @@ def source(provenance: Provenance) -> str:
     )
 
 
-def to_markdown(parts: Sequence[Part]) -> str:
+def to_markdown(title: str, parts: Sequence[Part]) -> str:
     """The same page as Markdown, with pictures beside it."""
-    lines = [f"# {TITLE}", "", PREAMBLE, ""]
+    lines = [f"# {title}", "", PREAMBLE, ""]
     for part in parts:
         section = part.section
         lines += [f"## {section.title}", ""]

@@ -1,0 +1,506 @@
+"""The study of fast modes: what a mode computes, when a task counts, what is said, and features of a file."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+import torch
+from reference_cases import small_config
+
+import saccade
+from saccade import InputError
+from saccade.cli import main
+from saccade.reference import ActionHead as Reference
+from saccade.reference import random_weights
+from saccade.sim import graphics
+from saccade.sim.policy import DEMO_CHECKPOINT, Policy
+from saccade.sim.rollout import environment_for, run_episode
+from saccade.study import fast, fast_report
+from saccade.study.fast_modes import (
+    INTEGRATORS,
+    Calibration,
+    Mode,
+    ModeEngine,
+    best_times,
+    cross_mass,
+    even_times,
+    integrate,
+    many_steps,
+    sample,
+)
+from saccade.study.fast_report import BASELINE, LOSS, NO_LOSS, ONE_STEP, OPEN
+from saccade.study.statistics import holm, p_of_loss, paired_difference, tango
+from saccade.study.tables import read_provenance, read_table
+
+Float64Array = npt.NDArray[np.float64]
+PLAIN = Calibration()
+
+
+@pytest.fixture(autouse=True)
+def no_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine that runs these tests draws; test_sim_environment.py has the probe."""
+    monkeypatch.setattr(graphics, "check", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A random head in the released layout."""
+    folder = tmp_path_factory.mktemp("checkpoint")
+    random_weights.write_checkpoint(folder, small_config(), seed=1)
+    return folder
+
+
+def observation(head: saccade.ActionHead, seed: int = 0) -> tuple[Any, ...]:
+    """Features, state, embodiment and noise for one look."""
+    inputs = random_weights.random_inputs(head.config, seed, batch=1, num_vl_tokens=6)
+    features, state, noise = (inputs[name].numpy() for name in ("backbone_features", "state", "noise"))
+    return features, state, int(inputs["embodiment_id"][0]), noise
+
+
+@pytest.mark.parametrize("name", [*fast.SCREENED, *fast.JUDGED, "bfloat16-euler-8-refresh-3-drop-10"])
+def test_a_mode_has_the_name_that_it_was_read_from(name: str) -> None:
+    assert Mode.parse(name).name == name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        "euler-4",
+        "float16-euler-4",
+        "float32-rk4-4",
+        "float32-euler",
+        "float32-euler-0",
+        "float32-euler-1001",
+        "float32-euler--4",
+        "float32-euler-4.0",
+        "float32-euler-four",
+        "float32-euler-4-refresh",
+        "float32-euler-4-refresh-0",
+        "float32-heun-4-refresh-2",
+        "float32-euler-4-drop-100",
+        "float32-euler-4-drop-1-drop-2",
+        "float32-euler-4-skip-2",
+        "float32-adams-1",
+        "float32-times-1",
+        "float32-euler-٤",
+    ],
+)
+def test_other_names_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match="mode: given"):
+        Mode.parse(name)
+
+
+def test_modes_ask_as_often_as_they_say() -> None:
+    for integrator in INTEGRATORS:
+        calls: list[float] = []
+
+        def velocity(x: npt.NDArray[np.float32], time: float, calls: list[float] = calls) -> Any:
+            calls.append(time)
+            return np.zeros_like(x)
+
+        integrate(velocity, np.zeros((1, 2, 3), np.float32), integrator, even_times(3))
+        assert len(calls) == Mode("float32", integrator, 3).evaluations
+        assert calls[0] == 0
+        assert max(calls) <= 1
+
+
+def test_integrators_have_the_order_that_their_names_promise() -> None:
+    """dx/dt = 2 t x has the solution x(0) exp(t^2)."""
+    start = np.array([[[0.5, -2.0, 7.0]]], np.float32)
+    exact = start[..., :2].astype(np.float64) * math.e
+
+    def velocity(x: npt.NDArray[np.float32], time: float) -> Float64Array:
+        return x[..., :2].astype(np.float64) * 2.0 * time  # the third has no velocity
+
+    def error(integrator: str, steps: int) -> float:
+        found = integrate(velocity, start, integrator, even_times(steps))
+        assert found[0, 0, 2] == 7.0
+        return float(np.abs(found[..., :2] - exact).max())
+
+    for integrator, order in (("euler", 1), ("heun", 2), ("midpoint", 2), ("adams", 2)):
+        measured = math.log2(error(integrator, 16) / error(integrator, 32))
+        assert measured == pytest.approx(order, abs=0.3), integrator
+        assert start[0, 0, 0] == 0.5  # what was given stays
+
+
+def test_uneven_times_are_followed() -> None:
+    """v = 2t from times 0, a: the sum of length times slope is (1 - a) * 2a."""
+    found = integrate(
+        lambda x, time: np.full_like(x, 2 * time), np.zeros((1, 1, 1), np.float32), "times", (0.0, 0.7, 1.0)
+    )
+    assert found[0, 0, 0] == pytest.approx(0.3 * 1.4, abs=1e-6)
+
+
+def test_times_are_moved_to_where_the_error_is_least() -> None:
+    for aim in ((0.62,), (0.2, 0.9), (0.05, 0.1, 0.15)):
+
+        def error(times: tuple[float, ...], aim: tuple[float, ...] = aim) -> float:
+            return sum(abs(one - other) for one, other in zip(times[1:-1], aim, strict=True))
+
+        found = best_times(error, len(aim) + 1)
+        assert found == pytest.approx((0.0, *aim, 1.0), abs=0.0101)
+        assert list(found) == sorted(set(found))
+
+
+def test_euler_by_hand_is_what_the_head_does(checkpoint: Path) -> None:
+    head = saccade.ActionHead.load(checkpoint)
+    features, state, embodiment, noise = observation(head)
+    context = head.encode(features)
+    for steps in (1, 3, 7):
+        whole = sample(head, Mode("float32", "euler", steps), PLAIN, context, state, embodiment, noise)
+        grid = Calibration(times=(even_times(steps),))
+        by_hand = sample(head, Mode("float32", "times", steps), grid, context, state, embodiment, noise)
+        np.testing.assert_allclose(by_hand, whole, rtol=0, atol=3e-6)
+
+
+@pytest.mark.parametrize("integrator", ["heun", "midpoint", "adams"])
+def test_integrators_against_the_reference_in_float64(checkpoint: Path, integrator: str) -> None:
+    head, reference = saccade.ActionHead.load(checkpoint), Reference.load(checkpoint, dtype=torch.float64)
+    features, state, embodiment, noise = observation(head)
+    found = sample(
+        head, Mode("float32", integrator, 2), PLAIN, head.encode(features), state, embodiment, noise
+    )
+    with torch.no_grad():
+        vl_embs = reference.encode(features)
+
+        def velocity(x: Float64Array, bucket: int) -> Float64Array:
+            tensor: Float64Array = reference.velocity(
+                vl_embs, state, embodiment, torch.from_numpy(x), bucket
+            ).numpy()
+            return tensor
+
+        x = noise.astype(np.float64)
+        first = velocity(x, 0)
+        if integrator == "heun":
+            x = x + 0.25 * (first + velocity(x + 0.5 * first, 500))
+            second = velocity(x, 500)
+            x = x + 0.25 * (second + velocity(x + 0.5 * second, 999))
+        elif integrator == "midpoint":
+            x = x + 0.5 * velocity(x + 0.25 * first, 250)
+            x = x + 0.5 * velocity(x + 0.25 * velocity(x, 500), 750)
+        else:
+            x = x + 0.5 * first
+            x = x + 0.5 * (1.5 * velocity(x, 500) - 0.5 * first)
+    np.testing.assert_allclose(found, x, rtol=0, atol=2e-5)
+
+
+def test_many_steps_come_closer_than_any_mode() -> None:
+    """On the shipped policy: a random head's velocity jumps between buckets of time."""
+    head = saccade.ActionHead.load(DEMO_CHECKPOINT)
+    rng = np.random.default_rng(0)
+    context = head.encode(rng.standard_normal((1, 57, head.config.context_dim), dtype=np.float32))
+    state, noise = np.zeros((1, 4), np.float32), rng.standard_normal((1, 16, 4), dtype=np.float32)
+    limit = head.sample(context, state, 0, noise=noise, num_steps=1000)
+
+    def error(found: Any) -> float:
+        return float(np.abs(found - limit).mean())
+
+    by_mode = [
+        error(sample(head, Mode("float32", integrator, 4), PLAIN, context, state, 0, noise))
+        for integrator in ("euler", "midpoint", "adams")
+    ]
+    assert error(many_steps(head, context, state, 0, noise)) < 0.35 * min(by_mode)
+
+
+def test_tokens_with_the_least_attention_go_and_removed_ones_do_not_count() -> None:
+    calibration = Calibration(mass=(0.3, 0.0, 0.1, 0.2, 0.4))
+    assert np.flatnonzero(calibration.least(40, None)[0]).tolist() == [1, 2]
+    assert np.flatnonzero(calibration.least(19, None)[0]).tolist() == []
+    removed = np.array([[False, True, False, False, False]])
+    assert np.flatnonzero(calibration.least(50, removed)[0]).tolist() == [1, 2, 3]
+    assert removed.sum() == 1
+
+
+def test_a_dropping_mode_encodes_without_those_tokens(checkpoint: Path) -> None:
+    head = saccade.ActionHead.load(checkpoint)
+    features, state, embodiment, noise = observation(head)
+    mass = cross_mass(head, head.encode(features), state, embodiment, noise)
+    assert mass.shape == (6,)
+    assert mass.sum() == pytest.approx(1.0, abs=1e-5)
+    engine = ModeEngine(
+        str(checkpoint), Mode.parse("float32-euler-4-drop-50"), Calibration(mass=tuple(mass.tolist()))
+    )
+    kept = np.sort(np.argsort(mass)[3:])
+    fewer = engine.encode(features)
+    np.testing.assert_allclose(
+        engine.sample(fewer, state, noise),
+        head.sample(head.encode(features[:, kept]), state, 0, noise=noise, num_steps=4),
+        atol=1e-5,
+    )
+    with pytest.raises(InputError, match="intervention: given one"):
+        engine.sample(fewer, state, noise, saccade.Intervention())
+
+
+def outcomes(
+    rate_by_mode: Mapping[str, Callable[[int], bool]], task: str = "fork", count: int = 300
+) -> pd.DataFrame:
+    """A table of episodes, each mode by a rule of the seed."""
+    return pd.DataFrame(
+        [
+            {"part": "episodes", "task": task, "seed": seed, "mode": mode, "success": rule(seed), "steps": 30}
+            for mode, rule in rate_by_mode.items()
+            for seed in range(count)
+        ]
+    )
+
+
+def test_a_task_counts_only_if_one_step_fails_for_certain() -> None:
+    table = pd.concat(
+        [
+            outcomes({BASELINE: lambda seed: seed % 10 > 0, ONE_STEP: lambda seed: seed % 10 > 4}),
+            outcomes({BASELINE: lambda seed: True, ONE_STEP: lambda seed: seed % 50 > 0}, task="reach"),
+            # 8 points are lost, but 30 episodes cannot show that it is more than 5.
+            outcomes(
+                {BASELINE: lambda seed: True, ONE_STEP: lambda seed: seed % 12 > 0}, task="push", count=30
+            ),
+            outcomes({BASELINE: lambda seed: True}, task="two-goals"),
+        ]
+    )
+    found = {task: fast_report.counts(one) for task, one in fast_report.separations(table).items()}
+    assert found == {"fork": True, "reach": False, "push": False}
+    lines = fast_report.gate_lines(fast_report.separations(table))
+    assert lines[0].startswith("fork counts: one Euler step against four: 50 against 90 %, -40.0 (")
+    assert all("judges no mode" in line for line in lines[1:])
+    assert len(lines) == 3
+
+
+def test_no_mode_is_judged_where_no_task_counts() -> None:
+    table = outcomes(
+        {BASELINE: lambda seed: True, ONE_STEP: lambda seed: True, "int8-euler-4": lambda seed: False}
+    )
+    results = fast_report.results_of(table)
+    assert all(one.verdict is None for one in results.values())
+    assert "no mode is judged" in fast_report.gate_lines(fast_report.separations(table))[-1]
+    assert fast_report.verdict_lines(results) == []
+
+
+def test_verdicts_and_the_frontier() -> None:
+    def timed(mode: str, milliseconds: float) -> dict[str, Any]:
+        return {
+            "part": "time", "task": "n1.5", "seed": 0, "mode": mode, "encode_ms": 1.0,
+            "sample_ms": milliseconds - 1.0, "chunk_ms": milliseconds, "chunk_ms_low": milliseconds,
+            "chunk_ms_high": milliseconds, "rounds": 5, "num_threads": 2, "isa": "avx2", "num_vl_tokens": 296,
+        }  # fmt: skip
+
+    rules: dict[str, Callable[[int], bool]] = {
+        BASELINE: lambda seed: seed % 10 > 0,
+        ONE_STEP: lambda seed: seed % 10 > 5,
+        "int8-euler-4": lambda seed: seed % 10 > 0,  # the same episodes
+        "bfloat16-euler-4": lambda seed: seed % 10 > 0 and seed != 11,  # as good, but slower than int8
+        "float32-euler-2": lambda seed: seed % 10 > 1,  # 10 points less
+        "float32-heun-1": lambda seed: (seed * 7) % 10 > 0 if seed % 3 else seed % 10 > 0,  # the same rate
+    }
+    spent = {
+        BASELINE: 100.0,
+        ONE_STEP: 40.0,
+        "int8-euler-4": 20.0,
+        "bfloat16-euler-4": 50.0,
+        "float32-euler-2": 60.0,
+    }
+    table = pd.concat([outcomes(rules), pd.DataFrame([timed(*item) for item in spent.items()])])
+    results = fast_report.results_of(table)
+    assert list(results) == [
+        ONE_STEP, "float32-euler-2", BASELINE, "float32-heun-1", "bfloat16-euler-4", "int8-euler-4"
+    ]  # fmt: skip
+    verdicts = {name: one.verdict for name, one in results.items()}
+    assert verdicts.pop("float32-heun-1") in (OPEN, NO_LOSS)
+    assert verdicts == {
+        BASELINE: None,
+        ONE_STEP: None,
+        "int8-euler-4": NO_LOSS,
+        "bfloat16-euler-4": NO_LOSS,
+        "float32-euler-2": LOSS,
+    }
+    assert fast_report.recommended(results) == ["int8-euler-4"]
+    # Holm: four modes are judged, and the control of the gate is not one of them.
+    p_values = [one.pairs.p_value for name, one in results.items() if one.pairs and name != ONE_STEP]
+    assert [one.p_value for one in results.values() if one.p_value is not None] == holm(p_values)
+    lines = fast_report.verdict_lines(results)
+    assert any(
+        line.startswith("int8-euler-4: no loss, 0.0 (") and "0.20 of the time" in line for line in lines
+    )
+    assert any(line.startswith("float32-euler-2: success is lower by 10.0 points") for line in lines)
+    assert lines[-1].endswith("time: int8-euler-4.")
+
+
+def test_no_loss_is_the_interval_that_excludes_it() -> None:
+    for pairs in (20, 100, 400):
+        for only_first in (0, 1, 5, 12):
+            for only_second in (0, 2, 7, 8):
+                first = (
+                    [True] * only_first + [False] * only_second + [True] * (pairs - only_first - only_second)
+                )
+                second = [False] * only_first + [True] * (pairs - only_first)
+                one = paired_difference(first, second)
+                assert (one.only_first, one.only_second) == (only_first, only_second)
+                assert (p_of_loss(one, 0.05) < 0.025) == (tango(only_first, only_second, pairs).low > -0.05)
+
+
+def test_one_episode_in_every_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = random_weights.small_config()
+    monkeypatch.setattr(random_weights, "n15_config", lambda num_embodiments: small)
+    monkeypatch.setattr(fast, "FULL_TOKENS", 7)
+    monkeypatch.setattr(fast, "MOST_ROUNDS", 3)
+    monkeypatch.setattr(fast, "CALIBRATION_EPISODES", 1)
+    modes = f"{ONE_STEP},float32-times-2,float32-euler-4-drop-50"
+    arguments = ["--tasks", "reach", "--episodes", "1", "--modes", modes, "--out", str(tmp_path)]
+    assert main(["study", "fast", *arguments]) == 0
+    assert "no mode is judged" in capsys.readouterr().out
+    table = read_table(tmp_path / "fast.csv")
+    names = {*modes.split(","), BASELINE}
+    for part, task in (("chunks", "reach"), ("episodes", "reach"), ("time", "own"), ("time", "n1.5")):
+        assert set(table[(table["part"] == part) & (table["task"] == task)]["mode"]) == names
+    chunks: Any = table[table["part"] == "chunks"].set_index("mode")
+    assert chunks.loc[BASELINE, "chunk_change"] == 0.0
+    assert chunks.loc[ONE_STEP, "chunk_change"] > 0.0
+    assert chunks.loc[BASELINE, "chunk_error"] < chunks.loc[ONE_STEP, "chunk_error"]
+    assert chunks.loc["float32-times-2", "chunk_error"] < chunks.loc[ONE_STEP, "chunk_error"]
+    assert (chunks["noise_change"] > 0).all()
+
+    # The baseline is what `saccade rollout` does.
+    policy = Policy.load(num_threads=1)
+    environment = environment_for(policy, "reach")
+    episode = run_episode(environment, policy, 0)
+    environment.close()
+    row: Any = table[table["part"] == "episodes"].set_index("mode").loc[BASELINE]
+    assert (row["success"], row["steps"], row["chunks"]) == (episode.success, episode.steps, episode.chunks)
+    assert (
+        len(table[(table["part"] == "calibrate") & (table["task"] == "mass")])
+        == policy.config.backbone.num_tokens
+    )
+
+    provenance = read_provenance(tmp_path / "fast.json")
+    assert provenance.complete
+    assert str(DEMO_CHECKPOINT) not in (tmp_path / "fast.json").read_text()  # tables are committed
+    done = {path: path.stat().st_mtime_ns for path in (tmp_path / "fast" / "cells").iterdir()}
+    more = [*arguments, "--parts", "chunks,episodes"]
+    more[more.index(modes)] = f"{modes},float32-euler-2"
+    assert main(["study", "fast", *more]) == 0
+    assert all(path.stat().st_mtime_ns == time for path, time in done.items())
+    assert len(list((tmp_path / "fast" / "cells").iterdir())) == len(done) + 2
+
+    assert main(["study", "report", str(tmp_path)]) == 0
+    report = (tmp_path / "report.md").read_text()
+    assert report.startswith("# What do faster modes cost, and what do they save?")
+    assert "n-runtime" not in report
+    assert (tmp_path / "figures" / "fast-errors.png").exists()
+
+
+def features_file(folder: Path, **changes: Any) -> Path:
+    config = saccade.HeadConfig.from_dict(small_config())
+    inputs = random_weights.random_inputs(config, 2, batch=5, num_vl_tokens=6)
+    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in inputs.items() if name != "noise"}
+    arrays |= {"embodiment_id": np.array([0, 2, 2, 2, 0]), "episode": np.array([7, 7, 3, 3, 7])} | changes
+    np.savez(folder / "looks.npz", **{name: array for name, array in arrays.items() if array is not None})
+    return folder / "looks.npz"
+
+
+def on_features(checkpoint: Path, file: Path, out: Path, *more: str) -> int:
+    return main(
+        ["study", "fast", "--checkpoint", str(checkpoint), "--features", str(file), "--out", str(out), *more]
+    )
+
+
+def test_features_of_a_file_against_the_reference(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fast, "MOST_ROUNDS", 3)
+    file = features_file(tmp_path)
+    modes = "float32-euler-2,float32-times-2,float32-euler-4-drop-50"
+    assert on_features(checkpoint, file, tmp_path / "out", "--modes", modes, "--seed", "4") == 0
+    printed = capsys.readouterr().out
+    assert "float32-euler-2: actions change by" in printed
+    assert "times what another noise changes" in printed
+    assert "of the time of a chunk (this checkpoint)" in printed
+    assert "Success: not measured, a file of features has no closed loop." in printed
+
+    table = read_table(tmp_path / "out" / "fast.csv")
+    chunks: Any = table[table["part"] == "chunks"].set_index(["mode", "seed"])
+    # Rows 2 and 3 are episode 3, the first in order, and calibrate; the rest measures calibrated modes.
+    assert sorted(chunks.loc["float32-euler-2"].index) == [0, 1, 2, 3, 4]
+    assert sorted(chunks.loc["float32-times-2"].index) == [0, 1, 4]
+    assert set(table[table["part"] == "time"]["mode"]) == {BASELINE, *modes.split(",")}
+    assert set(table[table["part"] == "time"]["task"]) == {"own"}
+
+    arrays, reference = np.load(file), Reference.load(checkpoint, dtype=torch.float64)
+    for row in range(5):
+        noise = np.random.default_rng([4, row]).standard_normal((1, 4, 5, 3), dtype=np.float32)
+
+        def chunk(steps: int, draw: int, row: int = row, noise: Any = noise) -> Any:
+            with torch.no_grad():
+                vl_embs = reference.encode(arrays["backbone_features"][row : row + 1])
+                embodiment, start = int(arrays["embodiment_id"][row]), noise[:, draw]
+                state = arrays["state"][row : row + 1]
+                return reference.sample(vl_embs, state, embodiment, noise=start, num_steps=steps).numpy()
+
+        found: Any = chunks.loc[("float32-euler-2", row)]
+        assert found["chunk_change"] == pytest.approx(np.abs(chunk(2, 0) - chunk(4, 0)).mean(), rel=1e-3)
+        assert found["noise_change"] == pytest.approx(np.abs(chunk(4, 1) - chunk(4, 0)).mean(), rel=1e-3)
+    assert "episode 3" not in printed
+    assert json.loads((tmp_path / "out" / "fast.json").read_text())["settings"]["features"]["episodes"] == 2
+    assert main(["study", "report", str(tmp_path / "out")]) == 0
+    assert "from a file of features" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_one_episode_calibrates_nothing_and_removed_positions_stay_so(
+    checkpoint: Path, tmp_path: Path
+) -> None:
+    dropped = np.zeros((5, 6), bool)
+    dropped[:, :2] = True
+    file = features_file(tmp_path, episode=np.zeros(5, np.int64), drop_vl=dropped)
+    arguments = ("--parts", "chunks", "--modes", "float32-euler-2,float32-times-2")
+    assert on_features(checkpoint, file, tmp_path / "out", *arguments) == 0
+    table = read_table(tmp_path / "out" / "fast.csv")
+    assert set(table["mode"]) == {BASELINE, "float32-euler-2"}
+    shorter = np.load(file)["backbone_features"][:, 2:]
+    file = features_file(tmp_path, episode=np.zeros(5, np.int64), backbone_features=shorter)
+    assert on_features(checkpoint, file, tmp_path / "shorter", *arguments) == 0
+    columns = ["chunk_change", "chunk_error"]
+    np.testing.assert_allclose(
+        table[columns], read_table(tmp_path / "shorter" / "fast.csv")[columns], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--modes", "float32-rk4-2"), "mode: given 'float32-rk4-2'"),
+        (("--parts", "episodes"), "not with --features"),
+        (("--parts", "loops"), "parts: unknown name 'loops', expected one of chunks, episodes, time"),
+        (("--tasks", "reach"), "--tasks: not with --features"),
+        (("--seed", "-1"), "--seed: given -1"),
+    ],
+)
+def test_bad_input_is_one_line(
+    checkpoint: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    assert on_features(checkpoint, features_file(tmp_path), tmp_path / "out", *arguments) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.count("\n") == 1
+    assert not (tmp_path / "out" / "fast.csv").exists()
+
+
+def test_a_missing_file_is_named(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert on_features(checkpoint, tmp_path / "none.npz", tmp_path / "out") == 2
+    assert "none.npz" in capsys.readouterr().err
+    file = features_file(tmp_path, backbone_features=np.zeros((5, 6, 3), np.float32))
+    assert on_features(checkpoint, file, tmp_path / "out") == 2
+    assert "backbone_features" in capsys.readouterr().err
