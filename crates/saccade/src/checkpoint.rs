@@ -6,20 +6,26 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use bytemuck::Pod;
 use half::{bf16, f16};
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
 
 use crate::error::{Error, Result, show_shape};
+use crate::layout::TensorSpec;
 
 /// A longer header is hostile: the released head has 314 tensors in 40 kB.
 const MAX_HEADER_BYTES: u64 = 100_000_000;
 
 /// Where a head's tensors may stand in a checkpoint, longest first.
 const HEAD_PREFIXES: [&str; 2] = ["_groot_model.action_head.", "action_head."];
+
+/// What the name of a tensor's scales adds to its own: `X.weight` of int8 has `X.weight_scale`.
+pub(crate) const SCALE_SUFFIX: &str = "_scale";
 
 /// The elements of one tensor, in the type they are stored in; float16 is widened to float32, which is exact.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,15 +34,30 @@ pub enum Elements {
     F32(Vec<f32>),
     /// bfloat16, kept as it is.
     Bf16(Vec<bf16>),
+    /// int8 from -127 to 127, and what each row, an index of the first axis, is multiplied by.
+    Int8 {
+        /// The whole numbers.
+        values: Vec<i8>,
+        /// One for each row: finite, not negative, zero only for a row of zeros.
+        scales: Vec<f32>,
+    },
 }
 
 impl Elements {
-    /// The elements as float32, exactly.
+    /// The elements as float32: exactly, except that int8 times its scale is rounded.
     #[must_use]
     pub fn into_f32(self) -> Vec<f32> {
         match self {
             Self::F32(values) => values,
             Self::Bf16(values) => values.into_iter().map(bf16::to_f32).collect(),
+            Self::Int8 { values, scales } => {
+                let row = values.len() / scales.len().max(1);
+                let scale = |index: usize| scales[index / row];
+                let values = values.iter().enumerate();
+                values
+                    .map(|(index, &value)| f32::from(value) * scale(index))
+                    .collect()
+            }
         }
     }
 }
@@ -115,25 +136,42 @@ impl Checkpoint {
     ///
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
-    pub fn check(&self, prefix: &str, expected: &[(String, Vec<usize>)]) -> Result<()> {
+    pub(crate) fn check(&self, prefix: &str, expected: &[TensorSpec]) -> Result<()> {
         let mut problems = Vec::new();
         let mut known = BTreeSet::new();
-        for (name, shape) in expected {
-            let name = format!("{prefix}{name}");
+        for spec in expected {
+            let name = format!("{prefix}{}", spec.name);
+            let scale = format!("{name}{SCALE_SUFFIX}");
             match self.entries.get(&name) {
                 // A tensor without elements carries nothing, and some writers leave it out.
-                None if shape.contains(&0) => {}
-                None => problems.push(format!("{name} is missing, expected {}", show_shape(shape))),
-                Some(entry) if entry.info.shape != *shape => problems.push(format!(
+                None if spec.shape.contains(&0) => {}
+                None => problems.push(format!("{name} is missing, expected {}", show_shape(&spec.shape))),
+                Some(entry) if entry.info.shape != spec.shape => problems.push(format!(
                     "{name} has shape {}, expected {}",
                     show_shape(&entry.info.shape),
-                    show_shape(shape)
+                    show_shape(&spec.shape)
                 )),
+                Some(entry) if spec.may_be_int8 && entry.info.dtype == Dtype::I8 => {
+                    problems.extend(self.scale_problem(&name, &scale, spec.shape[0]));
+                    known.insert(scale);
+                }
                 Some(entry) if !is_readable(entry.info.dtype) => {
+                    let int8 = if spec.may_be_int8 {
+                        ", or I8 with its scale"
+                    } else {
+                        ""
+                    };
                     problems.push(format!(
-                        "{name} is {:?}, expected F32, BF16 or F16",
+                        "{name} is {:?}, expected F32, BF16 or F16{int8}",
                         entry.info.dtype
                     ));
+                }
+                Some(entry) if spec.may_be_int8 && self.entries.contains_key(&scale) => {
+                    problems.push(format!(
+                        "{scale} stands beside {name} of {:?}, expected I8",
+                        entry.info.dtype
+                    ));
+                    known.insert(scale);
                 }
                 Some(_) => {}
             }
@@ -158,29 +196,47 @@ impl Checkpoint {
         )))
     }
 
-    /// Reads tensor `name` whole.
+    /// What is wrong with the scales of the int8 tensor `name` of `rows` rows, by the header.
+    fn scale_problem(&self, name: &str, scale: &str, rows: usize) -> Option<String> {
+        match self.entries.get(scale) {
+            None => Some(format!("{name} is I8 and {scale} is missing, expected ({rows},)")),
+            Some(entry) if entry.info.shape != [rows] => Some(format!(
+                "{scale} has shape {}, expected ({rows},)",
+                show_shape(&entry.info.shape)
+            )),
+            Some(entry) if entry.info.dtype != Dtype::F32 => {
+                Some(format!("{scale} is {:?}, expected F32", entry.info.dtype))
+            }
+            Some(_) => None,
+        }
+    }
+
+    /// Reads tensor `name` whole; int8 with its scales.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] if there is no such tensor, its type is not F32, BF16 or F16, or the file cannot be read.
+    /// [`Error::Checkpoint`] if there is no such tensor, its type is not F32, BF16, F16 or I8 with scales, or the file cannot be read.
     pub fn read(&self, name: &str) -> Result<Elements> {
         let entry = self.entry(name)?;
+        if entry.info.dtype == Dtype::I8 {
+            return self.read_int8(name, entry);
+        }
         let elements = entry.info.shape.iter().product();
         self.read_elements(name, entry, 0, elements)
     }
 
-    /// Reads slice `index` of the first axis of tensor `name`.
+    /// Reads the slices `wanted` of the first axis of tensor `name`.
     ///
     /// # Errors
-    /// As [`Checkpoint::read`], and if there is no such slice.
-    pub fn read_slice(&self, name: &str, index: usize) -> Result<Elements> {
+    /// As [`Checkpoint::read`], and if there are no such slices. int8 is read whole only.
+    pub fn read_slices(&self, name: &str, wanted: Range<usize>) -> Result<Elements> {
         let entry = self.entry(name)?;
         match entry.info.shape.split_first() {
-            Some((&size, rest)) if index < size => {
-                let elements = rest.iter().product();
-                self.read_elements(name, entry, index * elements, elements)
+            Some((&size, rest)) if wanted.start <= wanted.end && wanted.end <= size => {
+                let elements: usize = rest.iter().product();
+                self.read_elements(name, entry, wanted.start * elements, wanted.len() * elements)
             }
             _ => Err(Error::Checkpoint(format!(
-                "source: {name} has shape {} and no slice {index}",
+                "source: {name} has shape {} and no slices {wanted:?}",
                 show_shape(&entry.info.shape)
             ))),
         }
@@ -197,49 +253,83 @@ impl Checkpoint {
     }
 
     fn read_elements(&self, name: &str, entry: &Entry, first: usize, count: usize) -> Result<Elements> {
-        let read = |size: usize| {
-            let (path, file) = &self.files[entry.file];
-            let mut file: &File = file;
-            let mut bytes = vec![0; count * size];
-            file.seek(SeekFrom::Start(entry.start + (first * size) as u64))
-                .and_then(|_| file.read_exact(&mut bytes))
-                .map_err(|error| {
-                    Error::Checkpoint(format!(
-                        "source: {name} cannot be read from {}: {error}",
-                        path.display()
-                    ))
-                })?;
-            Ok::<_, Error>(bytes)
-        };
-        let halves = |bytes: &[u8]| -> Vec<u16> {
-            bytes
-                .chunks_exact(2)
-                .map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
-                .collect()
-        };
         match entry.info.dtype {
             Dtype::F32 => {
-                let bytes = read(4)?;
-                let quads = bytes.chunks_exact(4);
-                Ok(Elements::F32(
-                    quads
-                        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-                        .collect(),
-                ))
+                let mut values: Vec<f32> = self.read_plain(name, entry, first, count)?;
+                from_little_endian(&mut values, |value| f32::from_bits(u32::from_le(value.to_bits())));
+                Ok(Elements::F32(values))
             }
-            Dtype::BF16 => Ok(Elements::Bf16(
-                halves(&read(2)?).into_iter().map(bf16::from_bits).collect(),
-            )),
-            Dtype::F16 => Ok(Elements::F32(
-                halves(&read(2)?)
+            Dtype::BF16 => {
+                let mut values: Vec<bf16> = self.read_plain(name, entry, first, count)?;
+                from_little_endian(&mut values, |value| {
+                    bf16::from_bits(u16::from_le(value.to_bits()))
+                });
+                Ok(Elements::Bf16(values))
+            }
+            Dtype::F16 => {
+                let halves: Vec<u16> = self.read_plain(name, entry, first, count)?;
+                let widened = halves
                     .into_iter()
-                    .map(|bits| f16::from_bits(bits).to_f32())
-                    .collect(),
-            )),
+                    .map(|bits| f16::from_bits(u16::from_le(bits)).to_f32());
+                Ok(Elements::F32(widened.collect()))
+            }
             other => Err(Error::Checkpoint(format!(
                 "source: {name} is {other:?}, expected F32, BF16 or F16"
             ))),
         }
+    }
+
+    fn read_int8(&self, name: &str, entry: &Entry) -> Result<Elements> {
+        let scale = format!("{name}{SCALE_SUFFIX}");
+        let rows = entry.info.shape.first().copied().unwrap_or(1);
+        if let Some(problem) = self.scale_problem(name, &scale, rows) {
+            return Err(Error::Checkpoint(format!("source: {problem}")));
+        }
+        let values: Vec<i8> = self.read_plain(name, entry, 0, entry.info.shape.iter().product())?;
+        let scales = self
+            .read_elements(&scale, self.entry(&scale)?, 0, rows)?
+            .into_f32();
+        let bad = |problem: String| Err(Error::Checkpoint(format!("source: {problem}")));
+        if let Some(row) = scales
+            .iter()
+            .position(|scale| !(scale.is_finite() && *scale >= 0.0))
+        {
+            return bad(format!(
+                "{scale} is {} at index {row}, expected finite scales that are not negative",
+                scales[row]
+            ));
+        }
+        if values.contains(&i8::MIN) {
+            return bad(format!("{name} holds -128, expected -127 to 127"));
+        }
+        let width = values.len() / rows.max(1);
+        let unscaled = |row: usize| {
+            values[row * width..(row + 1) * width]
+                .iter()
+                .any(|&value| value != 0)
+        };
+        if let Some(row) = (0..rows).find(|&row| scales[row] == 0.0 && unscaled(row)) {
+            return bad(format!(
+                "{scale} is 0 at index {row}, whose row of {name} is not zero"
+            ));
+        }
+        Ok(Elements::Int8 { values, scales })
+    }
+
+    /// `count` elements from number `first` on, as their bytes stand in the file.
+    fn read_plain<T: Pod>(&self, name: &str, entry: &Entry, first: usize, count: usize) -> Result<Vec<T>> {
+        let (path, file) = &self.files[entry.file];
+        let mut file: &File = file;
+        let mut values = vec![T::zeroed(); count];
+        file.seek(SeekFrom::Start(entry.start + (first * size_of::<T>()) as u64))
+            .and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)))
+            .map_err(|error| {
+                Error::Checkpoint(format!(
+                    "source: {name} cannot be read from {}: {error}",
+                    path.display()
+                ))
+            })?;
+        Ok(values)
     }
 
     fn add_file(&mut self, path: &Path) -> Result<()> {
@@ -294,6 +384,13 @@ impl Checkpoint {
                 problems.join("\n  ")
             )))
         }
+    }
+}
+
+/// Puts the bytes of each value in this machine's order; on most machines there is nothing to do, and no code.
+fn from_little_endian<T: Copy>(values: &mut [T], convert: impl Fn(T) -> T) {
+    if cfg!(target_endian = "big") {
+        values.iter_mut().for_each(|value| *value = convert(*value));
     }
 }
 

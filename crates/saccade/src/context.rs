@@ -7,8 +7,9 @@ use saccade_kernels::PackedKeyValues;
 use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward};
 use crate::config::HeadConfig;
 use crate::error::Result;
-use crate::layers::{Engine, HeadTensors, Norm, sized};
+use crate::layers::{Engine, Norm, sized};
 use crate::layout::{HeadNames, VlBlockNames};
+use crate::reading::HeadTensors;
 use crate::trace::{Keep, Recorded, Shapes};
 
 /// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate

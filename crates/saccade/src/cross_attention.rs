@@ -11,7 +11,7 @@ use crate::checkpoint::Elements;
 use crate::error::{Error, Result, show_shape};
 use crate::head::engine;
 use crate::layers::{Engine, TensorSource};
-use crate::layout::AttentionNames;
+use crate::layout::{AttentionNames, TensorSpec};
 
 /// A tensor given in memory: its shape and elements.
 pub type NamedTensors = BTreeMap<String, (Vec<usize>, Elements)>;
@@ -245,9 +245,9 @@ fn logit_bias(
     Ok(Some(values))
 }
 
-fn check_tensors(tensors: &NamedTensors, expected: &[(String, Vec<usize>)]) -> Result<()> {
+fn check_tensors(tensors: &NamedTensors, expected: &[TensorSpec]) -> Result<()> {
     let mut problems = Vec::new();
-    for (name, shape) in expected {
+    for TensorSpec { name, shape, .. } in expected {
         match tensors.get(name) {
             None => problems.push(format!("{name} is missing")),
             Some((given, _)) if given != shape => {
@@ -262,7 +262,7 @@ fn check_tensors(tensors: &NamedTensors, expected: &[(String, Vec<usize>)]) -> R
     }
     let unknown = tensors
         .keys()
-        .filter(|name| !expected.iter().any(|(known, _)| known == *name));
+        .filter(|name| !expected.iter().any(|known| known.name == **name));
     problems.extend(unknown.map(|name| format!("{name} is unknown")));
     if problems.is_empty() {
         return Ok(());

@@ -10,8 +10,9 @@ use crate::config::HeadConfig;
 use crate::context::Context;
 use crate::error::Result;
 use crate::intervention::{Changes, Group, Groups};
-use crate::layers::{Engine, HeadTensors, load_linear, rows, rows_mut, sized};
+use crate::layers::{Engine, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
+use crate::reading::HeadTensors;
 use crate::tables::{TIME_CHANNELS, embedding_time};
 use crate::trace::{Recorded, StepBlock};
 

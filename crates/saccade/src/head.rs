@@ -14,8 +14,9 @@ use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
 use crate::dit::{Dit, DitBuffers, Pass, Rows};
 use crate::error::{Error, Result, show_shape};
 use crate::intervention::{Changes, Extent, Intervention};
-use crate::layers::{ActionEncoder, CategoryLinear, Engine, HeadTensors, TensorSource, sized};
+use crate::layers::{ActionEncoder, CategoryLinear, Engine, TensorSource, sized};
 use crate::layout::HeadNames;
+use crate::reading::HeadTensors;
 use crate::tables::action_time;
 use crate::trace::{Keep, Recorded, Shapes, StepBlock, Trace, TraceOptions};
 
@@ -143,36 +144,41 @@ impl ActionHead {
         };
         let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
         let names = HeadNames::new(&config);
-        let tensors = HeadTensors {
-            prefix: checkpoint.head_prefix()?,
-            checkpoint: &checkpoint,
-        };
-        checkpoint.check(tensors.prefix, &names.tensors())?;
+        let prefix = checkpoint.head_prefix()?;
+        checkpoint.check(prefix, &names.tensors())?;
+        let wanted = names.reading_order(&config, &embodiment_ids);
+        HeadTensors::read_ahead(&checkpoint, prefix, wanted, |tensors| {
+            Self::from_tensors(tensors, engine, config, &names, embodiment_ids)
+        })
+    }
 
+    /// Asks for tensors in the order of [`HeadNames::reading_order`].
+    fn from_tensors(
+        tensors: &HeadTensors<'_>,
+        engine: Engine,
+        config: HeadConfig,
+        names: &HeadNames,
+        embodiment_ids: Vec<usize>,
+    ) -> Result<Self> {
         let ids = &embodiment_ids;
-        let category = |names| CategoryLinear::load(&tensors, engine.isa, names, ids);
+        let category = |names| CategoryLinear::load(tensors, engine.isa, names, ids);
         let [state_1, state_2] = &names.state_encoder;
         let [decoder_1, decoder_2] = &names.action_decoder;
         Ok(Self {
             engine,
             id: next_id(),
-            vl: VlEncoder::load(&tensors, engine, &config, &names)?,
+            vl: VlEncoder::load(tensors, engine, &config, names)?,
             state_encoder: [category(state_1)?, category(state_2)?],
-            action_encoder: ActionEncoder::load(&tensors, engine.isa, &names.action_encoder, ids)?,
+            action_encoder: ActionEncoder::load(tensors, engine.isa, &names.action_encoder, ids)?,
             future_tokens: match config.num_future_tokens {
                 0 => Vec::new(),
                 _ => tensors.tensor(&names.future_tokens.0)?.into_f32(),
             },
             position_embedding: match &names.position_embedding {
                 None => None,
-                Some((name, _)) => {
-                    let mut table = tensors.tensor(name)?.into_f32();
-                    table.truncate(config.action_horizon * config.width);
-                    table.shrink_to_fit();
-                    Some(table)
-                }
+                Some((name, _)) => Some(tensors.slices(name, 0..config.action_horizon)?.into_f32()),
             },
-            dit: Dit::load(&tensors, engine, &config, &names)?,
+            dit: Dit::load(tensors, engine, &config, names)?,
             action_decoder: [category(decoder_1)?, category(decoder_2)?],
             brackets: Cache::new(CACHED_BRACKETS),
             workspaces: Mutex::new(Vec::new()),
@@ -1004,7 +1010,7 @@ mod tests {
         let (width, id, bucket) = (head.config.width, 1, 250);
         let slice = |name: &str| {
             let tensor = checkpoint
-                .read_slice(&format!("action_head.action_encoder.{name}"), id)
+                .read_slices(&format!("action_head.action_encoder.{name}"), id..id + 1)
                 .unwrap();
             tensor.into_f32().into_iter().map(f64::from).collect::<Vec<_>>()
         };

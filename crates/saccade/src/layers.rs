@@ -4,9 +4,10 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 use saccade_kernels::{Epilogue, Isa, PackedLinear, WeightRef, layer_norm};
 
-use crate::checkpoint::{Checkpoint, Elements};
+use crate::checkpoint::Elements;
 use crate::error::{Error, Result};
 use crate::layout::{CategoryLinearNames, LinearNames, NormNames};
+use crate::reading::HeadTensors;
 
 /// Which instruction set and how many threads the kernels use.
 #[derive(Clone, Copy, Debug)]
@@ -19,26 +20,6 @@ pub(crate) struct Engine {
 pub(crate) trait TensorSource {
     /// Tensor `name`, whole.
     fn tensor(&self, name: &str) -> Result<Elements>;
-}
-
-/// A checkpoint in which the head stands under a prefix.
-pub(crate) struct HeadTensors<'a> {
-    pub checkpoint: &'a Checkpoint,
-    pub prefix: &'static str,
-}
-
-impl HeadTensors<'_> {
-    /// Slice `index` of the first axis of tensor `name`.
-    fn slice(&self, name: &str, index: usize) -> Result<Elements> {
-        self.checkpoint
-            .read_slice(&format!("{}{name}", self.prefix), index)
-    }
-}
-
-impl TensorSource for HeadTensors<'_> {
-    fn tensor(&self, name: &str) -> Result<Elements> {
-        self.checkpoint.read(&format!("{}{name}", self.prefix))
-    }
 }
 
 /// `data` as rows of `width`.
@@ -64,6 +45,7 @@ fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> 
         Elements::Bf16(data) => {
             WeightRef::Bf16(MatRef::from_row_major_slice(data, out_features, in_features))
         }
+        Elements::Int8 { .. } => unreachable!("widened by the caller"),
     }
 }
 
@@ -87,10 +69,11 @@ pub(crate) fn load_linear(
 ) -> Result<PackedLinear> {
     let mut tensors = Vec::with_capacity(parts.len());
     for names in parts {
-        tensors.push((
-            source.tensor(&names.weight)?,
-            source.tensor(&names.bias)?.into_f32(),
-        ));
+        let weight = match source.tensor(&names.weight)? {
+            int8 @ Elements::Int8 { .. } => Elements::F32(int8.into_f32()),
+            float => float,
+        };
+        tensors.push((weight, source.tensor(&names.bias)?.into_f32()));
     }
     let views: Vec<_> = parts
         .iter()
@@ -152,8 +135,8 @@ impl CategoryLinear {
         embodiment_ids: &[usize],
     ) -> Result<Self> {
         Self::build(names.num_embodiments, embodiment_ids, |id| {
-            let weight = tensors.slice(&names.weight, id)?;
-            let bias = tensors.slice(&names.bias, id)?.into_f32();
+            let weight = tensors.slices(&names.weight, id..id + 1)?;
+            let bias = tensors.slices(&names.bias, id..id + 1)?.into_f32();
             let view = in_major_view(&weight, names.in_features, names.out_features);
             pack(isa, &[(view, Some(&bias))])
         })
@@ -233,10 +216,10 @@ impl ActionEncoder {
         let num_embodiments = w1.num_embodiments;
         let mut time = Vec::with_capacity(embodiment_ids.len());
         let action = CategoryLinear::build(num_embodiments, embodiment_ids, |id| {
-            let first = tensors.slice(&w1.weight, id)?.into_f32();
-            let first_bias = tensors.slice(&w1.bias, id)?.into_f32();
-            let second = tensors.slice(&w2.weight, id)?;
-            let second_bias = tensors.slice(&w2.bias, id)?.into_f32();
+            let first = tensors.slices(&w1.weight, id..id + 1)?.into_f32();
+            let first_bias = tensors.slices(&w1.bias, id..id + 1)?.into_f32();
+            let second = tensors.slices(&w2.weight, id..id + 1)?;
+            let second_bias = tensors.slices(&w2.bias, id..id + 1)?.into_f32();
             let second_view = in_major_view(&second, 2 * width, width);
 
             // Products in float64: the fused layer is then closer to the exact one than two float32 layers are.

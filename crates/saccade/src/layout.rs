@@ -1,5 +1,7 @@
 //! Names and shapes of the head's tensors: the one place that knows them. All else asks for a part by what it is.
 
+use std::ops::Range;
+
 use crate::config::HeadConfig;
 
 /// `weight (out_features, in_features)` and `bias (out_features)`.
@@ -9,6 +11,24 @@ pub(crate) struct LinearNames {
     pub bias: String,
     pub in_features: usize,
     pub out_features: usize,
+    /// Whether it is one of the layers that [`Precision::Int8`](crate::Precision::Int8) runs in int8: they do nearly all the work.
+    pub in_int8: bool,
+}
+
+/// A tensor that a checkpoint must hold.
+#[derive(Clone, Debug)]
+pub(crate) struct TensorSpec {
+    pub name: String,
+    pub shape: Vec<usize>,
+    /// Whether it may be stored as int8 with a scale for each row: the weights that run so.
+    pub may_be_int8: bool,
+}
+
+/// A tensor to read, or some slices of its first axis.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Wanted {
+    pub name: String,
+    pub slices: Option<Range<usize>>,
 }
 
 /// One linear layer per embodiment: `W (num_embodiments, in_features, out_features)` and `b (num_embodiments, out_features)`.
@@ -146,18 +166,17 @@ impl HeadNames {
         }
     }
 
-    /// Name and shape of every tensor.
-    pub(crate) fn tensors(&self) -> Vec<(String, Vec<usize>)> {
-        let mut tensors = vec![self.future_tokens.clone()];
-        tensors.extend(self.position_embedding.clone());
+    /// Every tensor.
+    pub(crate) fn tensors(&self) -> Vec<TensorSpec> {
+        let mut tensors = vec![TensorSpec::plain(&self.future_tokens.0, &self.future_tokens.1)];
+        if let Some((name, shape)) = &self.position_embedding {
+            tensors.push(TensorSpec::plain(name, shape));
+        }
         if let Some(norm) = &self.vlln {
             norm.list(&mut tensors);
         }
         for block in &self.vl_blocks {
-            block.norm1.list(&mut tensors);
-            block.attention.list(&mut tensors);
-            block.norm3.list(&mut tensors);
-            block.feed_forward.list(&mut tensors);
+            block.list(&mut tensors);
         }
         for layer in self
             .state_encoder
@@ -168,14 +187,84 @@ impl HeadNames {
             layer.list(&mut tensors);
         }
         for block in &self.blocks {
-            block.modulation.list(&mut tensors);
-            block.attention.list(&mut tensors);
-            block.feed_forward.list(&mut tensors);
+            block.list(&mut tensors);
         }
         for layer in self.timestep_embedder.iter().chain(&self.proj_out) {
             layer.list(&mut tensors);
         }
         tensors
+    }
+
+    /// What a head with these embodiments reads, in the order in which it is loaded: [`ActionHead::load`](crate::ActionHead::load) asks
+    /// for the same.
+    pub(crate) fn reading_order(&self, config: &HeadConfig, embodiment_ids: &[usize]) -> Vec<Wanted> {
+        let mut order = Vec::new();
+        let whole = |order: &mut Vec<Wanted>, list: &dyn Fn(&mut Vec<TensorSpec>)| {
+            let mut tensors = Vec::new();
+            list(&mut tensors);
+            order.extend(tensors.into_iter().map(|spec| Wanted::whole(spec.name)));
+        };
+        let slices = |order: &mut Vec<Wanted>, layers: &[CategoryLinearNames]| {
+            for &id in embodiment_ids {
+                for name in layers.iter().flat_map(|layer| [&layer.weight, &layer.bias]) {
+                    order.push(Wanted::slices(name, id..id + 1));
+                }
+            }
+        };
+        if let Some(norm) = &self.vlln {
+            whole(&mut order, &|tensors| norm.list(tensors));
+        }
+        for block in &self.vl_blocks {
+            whole(&mut order, &|tensors| block.list(tensors));
+        }
+        for layer in &self.state_encoder {
+            slices(&mut order, std::slice::from_ref(layer));
+        }
+        let [fused @ .., last] = &self.action_encoder;
+        slices(&mut order, fused);
+        slices(&mut order, std::slice::from_ref(last));
+        if config.num_future_tokens > 0 {
+            order.push(Wanted::whole(self.future_tokens.0.clone()));
+        }
+        if let Some((name, _)) = &self.position_embedding {
+            order.push(Wanted::slices(name, 0..config.action_horizon));
+        }
+        for layer in &self.timestep_embedder {
+            whole(&mut order, &|tensors| layer.list(tensors));
+        }
+        for block in &self.blocks {
+            whole(&mut order, &|tensors| block.list(tensors));
+        }
+        for layer in &self.proj_out {
+            whole(&mut order, &|tensors| layer.list(tensors));
+        }
+        for layer in &self.action_decoder {
+            slices(&mut order, std::slice::from_ref(layer));
+        }
+        order
+    }
+}
+
+impl TensorSpec {
+    fn plain(name: &str, shape: &[usize]) -> Self {
+        Self {
+            name: name.to_owned(),
+            shape: shape.to_vec(),
+            may_be_int8: false,
+        }
+    }
+}
+
+impl Wanted {
+    pub(crate) fn whole(name: String) -> Self {
+        Self { name, slices: None }
+    }
+
+    pub(crate) fn slices(name: &str, slices: Range<usize>) -> Self {
+        Self {
+            name: name.to_owned(),
+            slices: Some(slices),
+        }
     }
 }
 
@@ -186,22 +275,35 @@ impl LinearNames {
             bias: format!("{name}.bias"),
             in_features,
             out_features,
+            in_int8: false,
         }
     }
 
-    fn list(&self, tensors: &mut Vec<(String, Vec<usize>)>) {
-        tensors.push((self.weight.clone(), vec![self.out_features, self.in_features]));
-        tensors.push((self.bias.clone(), vec![self.out_features]));
+    /// A layer that int8 runs in int8.
+    fn in_int8(name: &str, in_features: usize, out_features: usize) -> Self {
+        Self {
+            in_int8: true,
+            ..Self::new(name, in_features, out_features)
+        }
+    }
+
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
+        tensors.push(TensorSpec {
+            may_be_int8: self.in_int8,
+            ..TensorSpec::plain(&self.weight, &[self.out_features, self.in_features])
+        });
+        tensors.push(TensorSpec::plain(&self.bias, &[self.out_features]));
     }
 }
 
 impl CategoryLinearNames {
-    fn list(&self, tensors: &mut Vec<(String, Vec<usize>)>) {
-        tensors.push((
-            self.weight.clone(),
-            vec![self.num_embodiments, self.in_features, self.out_features],
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
+        let weight = [self.num_embodiments, self.in_features, self.out_features];
+        tensors.push(TensorSpec::plain(&self.weight, &weight));
+        tensors.push(TensorSpec::plain(
+            &self.bias,
+            &[self.num_embodiments, self.out_features],
         ));
-        tensors.push((self.bias.clone(), vec![self.num_embodiments, self.out_features]));
     }
 }
 
@@ -214,9 +316,9 @@ impl NormNames {
         }
     }
 
-    fn list(&self, tensors: &mut Vec<(String, Vec<usize>)>) {
-        tensors.push((self.weight.clone(), vec![self.width]));
-        tensors.push((self.bias.clone(), vec![self.width]));
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
+        tensors.push(TensorSpec::plain(&self.weight, &[self.width]));
+        tensors.push(TensorSpec::plain(&self.bias, &[self.width]));
     }
 }
 
@@ -224,21 +326,21 @@ impl AttentionNames {
     /// `path` with its final dot, or empty for an attention on its own.
     pub(crate) fn new(path: &str, width: usize, context_dim: usize) -> Self {
         Self {
-            to_q: LinearNames::new(&format!("{path}to_q"), width, width),
-            to_k: LinearNames::new(&format!("{path}to_k"), context_dim, width),
-            to_v: LinearNames::new(&format!("{path}to_v"), context_dim, width),
-            to_out: LinearNames::new(&format!("{path}to_out.0"), width, width),
+            to_q: LinearNames::in_int8(&format!("{path}to_q"), width, width),
+            to_k: LinearNames::in_int8(&format!("{path}to_k"), context_dim, width),
+            to_v: LinearNames::in_int8(&format!("{path}to_v"), context_dim, width),
+            to_out: LinearNames::in_int8(&format!("{path}to_out.0"), width, width),
         }
     }
 
-    fn list(&self, tensors: &mut Vec<(String, Vec<usize>)>) {
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
         for layer in [&self.to_q, &self.to_k, &self.to_v, &self.to_out] {
             layer.list(tensors);
         }
     }
 
-    /// Name and shape of every tensor.
-    pub(crate) fn tensors(&self) -> Vec<(String, Vec<usize>)> {
+    /// Every tensor.
+    pub(crate) fn tensors(&self) -> Vec<TensorSpec> {
         let mut tensors = Vec::new();
         self.list(&mut tensors);
         tensors
@@ -248,12 +350,12 @@ impl AttentionNames {
 impl FeedForwardNames {
     fn new(path: &str, width: usize) -> Self {
         Self {
-            proj: LinearNames::new(&format!("{path}.ff.net.0.proj"), width, 4 * width),
-            out: LinearNames::new(&format!("{path}.ff.net.2"), 4 * width, width),
+            proj: LinearNames::in_int8(&format!("{path}.ff.net.0.proj"), width, 4 * width),
+            out: LinearNames::in_int8(&format!("{path}.ff.net.2"), 4 * width, width),
         }
     }
 
-    fn list(&self, tensors: &mut Vec<(String, Vec<usize>)>) {
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
         self.proj.list(tensors);
         self.out.list(tensors);
     }
@@ -270,6 +372,13 @@ impl VlBlockNames {
             feed_forward: FeedForwardNames::new(&path, width),
         }
     }
+
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
+        self.norm1.list(tensors);
+        self.attention.list(tensors);
+        self.norm3.list(tensors);
+        self.feed_forward.list(tensors);
+    }
 }
 
 impl DitBlockNames {
@@ -285,5 +394,11 @@ impl DitBlockNames {
             attention: AttentionNames::new(&format!("{path}.attn1."), config.width, keys_from),
             feed_forward: FeedForwardNames::new(&path, config.width),
         }
+    }
+
+    fn list(&self, tensors: &mut Vec<TensorSpec>) {
+        self.modulation.list(tensors);
+        self.attention.list(tensors);
+        self.feed_forward.list(tensors);
     }
 }

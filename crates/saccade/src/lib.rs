@@ -21,6 +21,7 @@ mod head;
 mod intervention;
 mod layers;
 mod layout;
+mod reading;
 mod tables;
 mod trace;
 

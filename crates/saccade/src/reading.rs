@@ -1,0 +1,90 @@
+//! Reading ahead: a thread reads the next tensor while the layers are made of the last one.
+
+use std::ops::Range;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::Builder;
+
+use crate::checkpoint::{Checkpoint, Elements};
+use crate::error::Result;
+use crate::layers::TensorSource;
+use crate::layout::Wanted;
+
+/// A checkpoint in which the head stands under a prefix.
+pub(crate) struct HeadTensors<'a> {
+    checkpoint: &'a Checkpoint,
+    prefix: &'static str,
+    /// What the thread has read, in the order given to [`HeadTensors::read_ahead`]; none where the system grants no thread.
+    ahead: Option<Receiver<Read>>,
+}
+
+/// A tensor that was asked for, and what came of it.
+struct Read {
+    wanted: Wanted,
+    elements: Result<Elements>,
+}
+
+impl HeadTensors<'_> {
+    /// Calls `load` with tensors that are read ahead in the order `wanted`, in which it must ask for them.
+    ///
+    /// There are at most three tensors in memory: the one that the thread reads, one that waits, and the one that `load` has.
+    pub(crate) fn read_ahead<R>(
+        checkpoint: &Checkpoint,
+        prefix: &'static str,
+        wanted: Vec<Wanted>,
+        load: impl FnOnce(&HeadTensors<'_>) -> Result<R>,
+    ) -> Result<R> {
+        let (sender, receiver) = sync_channel(1);
+        std::thread::scope(|scope| {
+            let read = move || read_all(checkpoint, prefix, wanted, &sender);
+            let thread = Builder::new()
+                .name("saccade-read".to_owned())
+                .spawn_scoped(scope, read);
+            // The receiver is dropped with these tensors, before the scope waits for the thread: a load that fails stops the reading.
+            load(&HeadTensors {
+                checkpoint,
+                prefix,
+                ahead: thread.is_ok().then_some(receiver),
+            })
+        })
+    }
+
+    /// Slices `slices` of the first axis of tensor `name`.
+    pub(crate) fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements> {
+        self.take(Wanted::slices(name, slices))
+    }
+
+    fn take(&self, wanted: Wanted) -> Result<Elements> {
+        let Some(ahead) = &self.ahead else {
+            return read(self.checkpoint, self.prefix, &wanted);
+        };
+        let read = ahead.recv().expect("the thread reads all that was wanted");
+        assert_eq!(
+            read.wanted, wanted,
+            "tensors are asked for in the order in which they are read"
+        );
+        read.elements
+    }
+}
+
+impl TensorSource for HeadTensors<'_> {
+    fn tensor(&self, name: &str) -> Result<Elements> {
+        self.take(Wanted::whole(name.to_owned()))
+    }
+}
+
+fn read_all(checkpoint: &Checkpoint, prefix: &str, wanted: Vec<Wanted>, sender: &SyncSender<Read>) {
+    for wanted in wanted {
+        let elements = read(checkpoint, prefix, &wanted);
+        if sender.send(Read { wanted, elements }).is_err() {
+            return;
+        }
+    }
+}
+
+fn read(checkpoint: &Checkpoint, prefix: &str, wanted: &Wanted) -> Result<Elements> {
+    let name = format!("{prefix}{}", wanted.name);
+    match &wanted.slices {
+        None => checkpoint.read(&name),
+        Some(slices) => checkpoint.read_slices(&name, slices.clone()),
+    }
+}
