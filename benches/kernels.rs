@@ -5,7 +5,9 @@ use std::hint::black_box;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use faer::{MatMut, MatRef};
 use saccade_benches::random::Random;
-use saccade_kernels::{Isa, PackedKeyValues, PackedLinear, WeightRef, gelu_tanh, layer_norm, relu, silu};
+use saccade_kernels::{
+    Arithmetic, Isa, PackedKeyValues, PackedLinear, WeightRef, gelu_tanh, layer_norm, relu, silu,
+};
 
 const ROWS: usize = 49;
 const WIDTH: usize = 1536;
@@ -61,7 +63,7 @@ fn packing(criterion: &mut Criterion) {
     group.throughput(Throughput::Bytes((4 * WIDTH * WIDTH) as u64));
     for (name, view) in [("out x in", view), ("in x out", view.transpose())] {
         group.bench_function(format!("PackedLinear 1536 x 1536, weights {name}"), |bencher| {
-            bencher.iter(|| PackedLinear::pack(isa, &[(WeightRef::F32(view), None)]));
+            bencher.iter(|| PackedLinear::pack(isa, Arithmetic::Float32, 1, &[(WeightRef::F32(view), None)]));
         });
     }
     let keys = MatRef::from_row_major_slice(&weight[..296 * WIDTH], 296, WIDTH);

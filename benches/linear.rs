@@ -13,7 +13,7 @@ use saccade_benches::options::Options;
 use saccade_benches::peak::multiply_adds;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::{Epilogue, Isa, PackedLinear, WeightRef};
+use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
 
 /// `(rows, in_features, out_features)`: a DiT block's feed-forward and projections, and a VL self-attention block's projection.
 const SHAPES: [(usize, usize, usize); 4] = [
@@ -95,7 +95,10 @@ fn saccade<'a>(shape: &'a Shape, options: &Options, contenders: &mut Vec<Contend
                 )),
                 _ => WeightRef::Bf16(MatRef::from_row_major_slice(&narrow, shape.outputs, shape.inputs)),
             };
-            let pack = || PackedLinear::pack(isa, &[(weight, None)]).expect("one part always fits");
+            let pack = || {
+                PackedLinear::pack(isa, Arithmetic::Float32, 1, &[(weight, None)])
+                    .expect("one part always fits")
+            };
             let layers = Arc::new(copies(pack().nbytes(), pack));
             for &threads in &options.threads {
                 let layers = Arc::clone(&layers);
@@ -108,7 +111,13 @@ fn saccade<'a>(shape: &'a Shape, options: &Options, contenders: &mut Vec<Contend
                     move |turn, x, out| {
                         let out = MatMut::from_row_major_slice_mut(out, shape.rows, shape.outputs);
                         let x = MatRef::from_row_major_slice(x, shape.rows, shape.inputs);
-                        layers[turn % layers.len()].apply(threads, x, Epilogue::Store, out);
+                        layers[turn % layers.len()].apply(
+                            threads,
+                            x,
+                            Epilogue::Store,
+                            out,
+                            &mut LinearScratch::new(),
+                        );
                     },
                 );
             }

@@ -16,8 +16,8 @@ const CHAINS: usize = 12;
 pub fn multiply_adds(isa: Isa, threads: usize) -> (f64, impl FnMut()) {
     let iterations = 200_000;
     let lanes = match isa {
-        Isa::Avx512 => 16,
-        Isa::Avx2 => 8,
+        Isa::Avx512f | Isa::Avx512 => 16,
+        Isa::Avx2 | Isa::Avx2Vnni => 8,
         _ => 4,
     };
     let work = (iterations * CHAINS * lanes * threads) as f64;
@@ -29,10 +29,10 @@ fn chains(isa: Isa, iterations: usize) {
     match isa {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: the CPU has the instruction set.
-        Isa::Avx512 => unsafe { chains_avx512(iterations) },
+        Isa::Avx512f | Isa::Avx512 => unsafe { chains_avx512(iterations) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
-        Isa::Avx2 => unsafe { chains_avx2(iterations) },
+        Isa::Avx2 | Isa::Avx2Vnni => unsafe { chains_avx2(iterations) },
         _ => chains_portable(iterations),
     }
 }

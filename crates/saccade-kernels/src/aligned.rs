@@ -15,6 +15,7 @@ mod sealed {
     pub trait Zeroable: Copy + Send + Sync {}
     impl Zeroable for f32 {}
     impl Zeroable for u32 {}
+    impl Zeroable for i32 {}
 }
 
 /// A fixed number of elements on a 64-byte boundary, zero at first.

@@ -385,8 +385,8 @@ pub fn attention(
 fn tile_rows(isa: Isa) -> usize {
     match isa {
         Isa::Portable => 4,
-        Isa::Avx2 => 6,
-        Isa::Avx512 => 8,
+        Isa::Avx2 | Isa::Avx2Vnni => 6,
+        Isa::Avx512f | Isa::Avx512 => 8,
     }
 }
 

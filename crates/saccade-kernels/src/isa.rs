@@ -20,7 +20,11 @@ pub enum Isa {
     Portable,
     /// AVX2 with FMA.
     Avx2,
-    /// AVX-512 F, VL, BW and DQ.
+    /// AVX2 with 256-bit int8 dot products: AVX-VNNI, or AVX512-VNNI with VL.
+    Avx2Vnni,
+    /// AVX-512 F, VL, BW and DQ, without dot products.
+    Avx512f,
+    /// AVX-512 with whichever of the dot products AVX512-BF16 and AVX512-VNNI this CPU has; [`Isa::Avx512f`] where it has neither.
     Avx512,
 }
 
@@ -32,7 +36,7 @@ pub struct IsaError {
     known: bool,
 }
 
-const ALL: [Isa; 3] = [Isa::Portable, Isa::Avx2, Isa::Avx512];
+const ALL: [Isa; 5] = [Isa::Portable, Isa::Avx2, Isa::Avx2Vnni, Isa::Avx512f, Isa::Avx512];
 
 impl Isa {
     /// The fastest one that this CPU has.
@@ -55,7 +59,13 @@ impl Isa {
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => {
+            Self::Avx2Vnni => {
+                Self::Avx2.is_available()
+                    && (is_x86_feature_detected!("avxvnni")
+                        || (is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512vl")))
+            }
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512f | Self::Avx512 => {
                 is_x86_feature_detected!("avx512f")
                     && is_x86_feature_detected!("avx512vl")
                     && is_x86_feature_detected!("avx512bw")
@@ -65,6 +75,39 @@ impl Isa {
             #[cfg(not(target_arch = "x86_64"))]
             _ => false,
         }
+    }
+
+    /// The dot products that it uses on this CPU: `bf16` (pairs of bfloat16), `vnni` (quads of int8).
+    ///
+    /// ```
+    /// assert!(saccade_kernels::Isa::Portable.dot_products().is_empty());
+    /// ```
+    #[must_use]
+    pub fn dot_products(self) -> Vec<&'static str> {
+        [("bf16", self.has_bf16_dot()), ("vnni", self.has_vnni())]
+            .into_iter()
+            .filter_map(|(name, has)| has.then_some(name))
+            .collect()
+    }
+
+    /// Whether pairs of bf16 are multiplied and summed in one instruction.
+    pub(crate) fn has_bf16_dot(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return self == Self::Avx512 && self.is_available() && is_x86_feature_detected!("avx512bf16");
+        #[cfg(not(target_arch = "x86_64"))]
+        false
+    }
+
+    /// Whether quads of int8 are multiplied and summed in one instruction.
+    pub(crate) fn has_vnni(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        return match self {
+            Self::Avx2Vnni => self.is_available(),
+            Self::Avx512 => self.is_available() && is_x86_feature_detected!("avx512vnni"),
+            _ => false,
+        };
+        #[cfg(not(target_arch = "x86_64"))]
+        false
     }
 
     /// The one that `SACCADE_ISA` names; the best where it is unset or empty.
@@ -95,6 +138,8 @@ impl fmt::Display for Isa {
         formatter.write_str(match self {
             Self::Portable => "portable",
             Self::Avx2 => "avx2",
+            Self::Avx2Vnni => "avx2vnni",
+            Self::Avx512f => "avx512f",
             Self::Avx512 => "avx512",
         })
     }

@@ -18,7 +18,9 @@ pub use activation::{exp, gelu_tanh, relu, silu};
 pub use attention::{LogitBias, PackedKeyValues, attention};
 pub use half::bf16;
 pub use isa::{ISA_VARIABLE, Isa, IsaError};
-pub use linear::{Element, Epilogue, KernelError, PackedLinear, WeightRef};
+pub use linear::{
+    Arithmetic, Element, Epilogue, KernelError, LinearScratch, PackedLinear, WeightRef, quantize_rows,
+};
 pub use norm::layer_norm;
 pub use pool::parallel_for;
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};

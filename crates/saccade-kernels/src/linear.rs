@@ -5,6 +5,9 @@
 //! of the summed dimension is walked from front to back; parts are cut at fixed places and added in order. So an output's bits depend on its row, its weights and the instruction set only: never on how many
 //! rows there are, nor on how the work is split.
 
+mod pack;
+mod product;
+mod rows;
 mod tile;
 
 use faer::{MatMut, MatRef};
@@ -13,8 +16,12 @@ use half::bf16;
 use crate::aligned::AlignedBuffer;
 use crate::isa::Isa;
 use crate::pool::parallel_for;
-use crate::simd::dispatch;
-use tile::{Job, Panel, PanelRun, Rows, Stored};
+use crate::simd::{dispatch, dispatch_dots};
+use pack::pack_panels;
+pub use pack::quantize_rows;
+use product::{Bf16Pairs, F32, Int8Quads, WidenedBf16};
+pub use rows::LinearScratch;
+use tile::{Job, Panel, PanelRun, Rows};
 
 /// Weights to pack, `(out_features, in_features)`, of any strides.
 #[derive(Clone, Copy, Debug)]
@@ -23,6 +30,13 @@ pub enum WeightRef<'a> {
     F32(MatRef<'a, f32>),
     /// bfloat16.
     Bf16(MatRef<'a, bf16>),
+    /// int8 as [`quantize_rows`] makes it: an element stands for itself times its row's scale.
+    Int8 {
+        /// -127 to 127.
+        values: MatRef<'a, i8>,
+        /// One for each row.
+        scales: &'a [f32],
+    },
 }
 
 impl WeightRef<'_> {
@@ -30,8 +44,33 @@ impl WeightRef<'_> {
         match self {
             Self::F32(view) => (view.nrows(), view.ncols()),
             Self::Bf16(view) => (view.nrows(), view.ncols()),
+            Self::Int8 { values, .. } => (values.nrows(), values.ncols()),
         }
     }
+
+    /// `count` rows from `first` on.
+    fn subrows(&self, first: usize, count: usize) -> Self {
+        match self {
+            Self::F32(view) => Self::F32(view.subrows(first, count)),
+            Self::Bf16(view) => Self::Bf16(view.subrows(first, count)),
+            Self::Int8 { values, scales } => Self::Int8 {
+                values: values.subrows(first, count),
+                scales: &scales[first..first + count],
+            },
+        }
+    }
+}
+
+/// How a [`PackedLinear`] multiplies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Arithmetic {
+    /// float32 throughout. Weights that are bf16 stay so in memory, and are widened in registers.
+    Float32,
+    /// Weights and activations rounded to bf16, products and sums in float32.
+    Bfloat16,
+    /// Weights quantised to int8, one scale for each output; activations to 8 bits (7 where the CPU has no int8 dot product), one scale for
+    /// each row; sums in int32.
+    Int8,
 }
 
 /// How weights are stored in a [`PackedLinear`].
@@ -40,8 +79,10 @@ impl WeightRef<'_> {
 pub enum Element {
     /// float32.
     F32,
-    /// bfloat16, widened in registers: the same bits as float32 storage of the same values.
+    /// bfloat16.
     Bf16,
+    /// int8 with a float32 scale for each output.
+    Int8,
 }
 
 /// What is done with `x W^T + bias` while it is in registers.
@@ -83,38 +124,56 @@ pub enum KernelError {
         /// Elements of its bias.
         given: usize,
     },
+    /// int8 weights do not have one scale for each output.
+    #[error("int8 weights of {expected} out_features need as many scales, got {given}")]
+    Scales {
+        /// Outputs of the part.
+        expected: usize,
+        /// Its scales.
+        given: usize,
+    },
+    /// A sum of so many products could overflow.
+    #[error("int8 arithmetic takes at most {MAX_INT8_INPUTS} in_features, got {given}")]
+    TooManyInputs {
+        /// Of the parts.
+        given: usize,
+    },
 }
+
+/// 255 * 127 times this is less than 2^31.
+const MAX_INT8_INPUTS: usize = 1 << 16;
 
 /// A linear layer whose weights were packed for one instruction set.
 ///
 /// ```
 /// use faer::{MatMut, MatRef};
-/// use saccade_kernels::{Epilogue, Isa, PackedLinear, WeightRef};
+/// use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
 ///
 /// let weight = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]; // (out_features 3, in_features 2)
 /// let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, 3, 2));
-/// let layer = PackedLinear::pack(Isa::best(), &[(weight, Some(&[0.0, 0.0, 10.0]))]).unwrap();
+/// let parts = [(weight, Some(&[0.0, 0.0, 10.0][..]))];
+/// let layer = PackedLinear::pack(Isa::best(), Arithmetic::Float32, 1, &parts).unwrap();
 ///
 /// let x = MatRef::from_row_major_slice(&[1.0, 1.0], 1, 2);
 /// let mut out = [0.0; 3];
-/// layer.apply(1, x, Epilogue::Store, MatMut::from_row_major_slice_mut(&mut out, 1, 3));
+/// let out_view = MatMut::from_row_major_slice_mut(&mut out, 1, 3);
+/// layer.apply(1, x, Epilogue::Store, out_view, &mut LinearScratch::new());
 /// assert_eq!(out, [3.0, 7.0, 21.0]);
 /// ```
 pub struct PackedLinear {
     isa: Isa,
+    arithmetic: Arithmetic,
+    element: Element,
     in_features: usize,
     out_features: usize,
-    panels: Panels,
+    /// `[panel][k / step][column]`, words of `step` consecutive `k`, the first one lowest: one float32, two bf16 (what native products read,
+    /// and the cheapest to widen) or four int8. The last word is padded with zeros.
+    panels: AlignedBuffer<u32>,
     /// One for each column of the panels, zero in the padding.
     bias: AlignedBuffer<f32>,
-}
-
-/// `[panel][k][column]`.
-enum Panels {
-    F32(AlignedBuffer<f32>),
-    /// `[panel][k / 2][column]`, each element an even `k` in its low half and the following odd one in its high half: what native bf16
-    /// products read, and the cheapest to widen. An odd `in_features` is padded with zero.
-    Bf16(AlignedBuffer<u32>),
+    /// The columns' scales and the sums of their weights, for int8; otherwise empty.
+    scales: AlignedBuffer<f32>,
+    sums: AlignedBuffer<i32>,
 }
 
 /// Rows that go through a panel together: their activations should stay in the second-level cache while the panel streams past. 96 rows
@@ -126,16 +185,21 @@ const ROW_BLOCK: usize = 96;
 const MACS_FOR_THREADS: usize = 1 << 19;
 
 impl PackedLinear {
-    /// Packs `parts`, stacked along `out_features`; a missing bias is zero.
+    /// Packs `parts`, stacked along `out_features`, on `threads` threads; a missing bias is zero.
     ///
-    /// Stored as bf16 only if every part is bf16; otherwise widened to f32, which is exact.
+    /// For [`Arithmetic::Float32`] stored as bf16 only if every part is bf16; otherwise widened to f32, which is exact but for int8.
     ///
     /// # Errors
-    /// [`KernelError`] if there is no part, or the parts do not fit together.
+    /// [`KernelError`] if there is no part, the parts do not fit together, or there are more than 65536 `in_features` for int8.
     ///
     /// # Panics
     /// If this CPU lacks `isa`.
-    pub fn pack(isa: Isa, parts: &[(WeightRef<'_>, Option<&[f32]>)]) -> Result<Self, KernelError> {
+    pub fn pack(
+        isa: Isa,
+        arithmetic: Arithmetic,
+        threads: usize,
+        parts: &[(WeightRef<'_>, Option<&[f32]>)],
+    ) -> Result<Self, KernelError> {
         assert!(isa.is_available(), "this CPU lacks {isa}");
         let in_features = parts.first().ok_or(KernelError::NoParts)?.0.shape().1;
         let mut out_features = 0;
@@ -155,7 +219,18 @@ impl PackedLinear {
                     given: bias.len(),
                 });
             }
+            if let WeightRef::Int8 { scales, .. } = weight
+                && scales.len() != outputs
+            {
+                return Err(KernelError::Scales {
+                    expected: outputs,
+                    given: scales.len(),
+                });
+            }
             out_features += outputs;
+        }
+        if arithmetic == Arithmetic::Int8 && in_features > MAX_INT8_INPUTS {
+            return Err(KernelError::TooManyInputs { given: in_features });
         }
         let columns = panel_columns(isa);
         let num_panels = out_features.div_ceil(columns);
@@ -167,20 +242,29 @@ impl PackedLinear {
             }
             column += weight.shape().0;
         }
-        let bf16 = parts
-            .iter()
-            .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
-        let panels = if bf16 {
-            Panels::Bf16(pack_bf16(parts, in_features, columns, num_panels))
-        } else {
-            Panels::F32(pack_f32(parts, in_features, columns, num_panels))
+        let element = match arithmetic {
+            Arithmetic::Float32
+                if parts
+                    .iter()
+                    .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_))) =>
+            {
+                Element::Bf16
+            }
+            Arithmetic::Float32 => Element::F32,
+            Arithmetic::Bfloat16 => Element::Bf16,
+            Arithmetic::Int8 => Element::Int8,
         };
+        let (panels, scales, sums) = pack_panels(threads, element, columns, parts);
         Ok(Self {
             isa,
+            arithmetic,
+            element,
             in_features,
             out_features,
             panels,
             bias,
+            scales,
+            sums,
         })
     }
 
@@ -199,10 +283,13 @@ impl PackedLinear {
     /// How the weights are stored.
     #[must_use]
     pub fn element(&self) -> Element {
-        match self.panels {
-            Panels::F32(_) => Element::F32,
-            Panels::Bf16(_) => Element::Bf16,
-        }
+        self.element
+    }
+
+    /// How it multiplies.
+    #[must_use]
+    pub fn arithmetic(&self) -> Arithmetic {
+        self.arithmetic
     }
 
     /// The instruction set that it was packed for.
@@ -214,18 +301,24 @@ impl PackedLinear {
     /// Bytes held.
     #[must_use]
     pub fn nbytes(&self) -> usize {
-        let panels = match &self.panels {
-            Panels::F32(panels) => panels.len(),
-            Panels::Bf16(panels) => panels.len(),
-        };
-        4 * (panels + self.bias.len())
+        4 * (self.panels.len() + self.bias.len() + self.scales.len() + self.sums.len())
     }
 
     /// `out = epilogue(x W^T + bias)` for rows `x (rows, in_features)` and `out (rows, out_features)`, both row-major with any row stride.
     ///
+    /// For [`Arithmetic::Bfloat16`] and [`Arithmetic::Int8`] the rows are converted first, into `scratch`. A row with NaN or infinity gives NaN
+    /// for int8.
+    ///
     /// # Panics
     /// If a shape does not fit, or columns are not contiguous.
-    pub fn apply(&self, threads: usize, x: MatRef<'_, f32>, epilogue: Epilogue, out: MatMut<'_, f32>) {
+    pub fn apply(
+        &self,
+        threads: usize,
+        x: MatRef<'_, f32>,
+        epilogue: Epilogue,
+        out: MatMut<'_, f32>,
+        scratch: &mut LinearScratch,
+    ) {
         let rows = x.nrows();
         assert_eq!(x.ncols(), self.in_features, "x: expected in_features columns");
         assert_eq!(
@@ -246,15 +339,27 @@ impl PackedLinear {
         );
         let columns = panel_columns(self.isa);
         let num_panels = self.out_features.div_ceil(columns);
-        let job = Job::new(x, out, epilogue);
         let blocks = rows.div_ceil(ROW_BLOCK);
         let threads = if rows * self.in_features * self.out_features < MACS_FOR_THREADS {
             1
         } else {
             threads
         };
-        // The panel that this thread will probably take next.
-        let ahead = threads;
+        let out_stride = out.row_stride();
+        let mut job = Job {
+            x: x.as_ptr().cast(),
+            x_stride: x.row_stride(),
+            in_features: self.in_features,
+            quantized: &[],
+            out: out.as_ptr_mut(),
+            out_stride,
+            epilogue,
+        };
+        if self.arithmetic != Arithmetic::Float32 {
+            let converted = scratch.convert(self.isa, self.arithmetic, threads, x);
+            (job.x, job.x_stride) = (converted.words, converted.stride as isize);
+            job.quantized = converted.quantized;
+        }
         // Row blocks outside, panels inside: threads then share a block of activations and walk the weights side by side.
         parallel_for(threads, blocks * num_panels, &|task| {
             let (block, panel) = (task / num_panels, task % num_panels);
@@ -262,26 +367,43 @@ impl PackedLinear {
                 first: rows * block / blocks,
                 end: rows * (block + 1) / blocks,
             };
-            match &self.panels {
-                Panels::F32(panels) => self.run_panel(&job, rows, panels, panel, ahead),
-                Panels::Bf16(panels) => self.run_panel(&job, rows, panels, panel, ahead),
-            }
+            self.run_panel(&job, rows, panel, threads);
         });
     }
 
-    /// Runs a block of rows through panel number `panel` of `panels`, all of this layer's.
-    fn run_panel<E: Stored>(&self, job: &Job, rows: Rows, panels: &[E], panel: usize, ahead: usize) {
+    /// Runs a block of rows through panel number `panel`; this thread will probably take the one `ahead` of it next.
+    fn run_panel(&self, job: &Job<'_>, rows: Rows, panel: usize, ahead: usize) {
         let columns = panel_columns(self.isa);
-        let size = self.in_features.div_ceil(E::STEP) * columns;
+        let size = self.in_features.div_ceil(self.element.per_word()) * columns;
         let first = panel * columns;
         let panel = Panel {
-            weights: &panels[panel * size..][..size],
+            weights: &self.panels[panel * size..][..size],
             bias: &self.bias[first..first + columns],
+            scales: self.scales.get(first..first + columns).unwrap_or_default(),
+            sums: self.sums.get(first..first + columns).unwrap_or_default(),
             first,
             width: columns.min(self.out_features - first),
             ahead,
         };
-        dispatch(self.isa, PanelRun { job, rows, panel });
+        match self.element {
+            Element::F32 => dispatch(self.isa, PanelRun::<F32>::new(job, rows, panel)),
+            Element::Bf16 if self.arithmetic == Arithmetic::Bfloat16 && self.isa.has_bf16_dot() => {
+                dispatch_dots(self.isa, PanelRun::<Bf16Pairs>::new(job, rows, panel));
+            }
+            Element::Bf16 => dispatch(self.isa, PanelRun::<WidenedBf16>::new(job, rows, panel)),
+            Element::Int8 => dispatch_dots(self.isa, PanelRun::<Int8Quads>::new(job, rows, panel)),
+        }
+    }
+}
+
+impl Element {
+    /// Elements in four bytes.
+    fn per_word(self) -> usize {
+        match self {
+            Self::F32 => 1,
+            Self::Bf16 => 2,
+            Self::Int8 => 4,
+        }
     }
 }
 
@@ -289,76 +411,7 @@ impl PackedLinear {
 fn panel_columns(isa: Isa) -> usize {
     match isa {
         Isa::Portable => tile::PORTABLE_COLUMNS,
-        Isa::Avx2 => tile::AVX2_COLUMNS,
-        Isa::Avx512 => tile::AVX512_COLUMNS,
-    }
-}
-
-fn pack_f32(
-    parts: &[(WeightRef<'_>, Option<&[f32]>)],
-    in_features: usize,
-    columns: usize,
-    num_panels: usize,
-) -> AlignedBuffer<f32> {
-    let mut panels = AlignedBuffer::zeroed(num_panels * columns * in_features);
-    let mut first = 0;
-    for (weight, _) in parts {
-        let start = |row: usize| (first + row) / columns * columns * in_features + (first + row) % columns;
-        match weight {
-            WeightRef::F32(view) => for_each(*view, start, |start, k, value| {
-                panels[start + k * columns] = value
-            }),
-            WeightRef::Bf16(view) => {
-                for_each(*view, start, |start, k, value| {
-                    panels[start + k * columns] = value.to_f32()
-                });
-            }
-        }
-        first += weight.shape().0;
-    }
-    panels
-}
-
-fn pack_bf16(
-    parts: &[(WeightRef<'_>, Option<&[f32]>)],
-    in_features: usize,
-    columns: usize,
-    num_panels: usize,
-) -> AlignedBuffer<u32> {
-    let pairs = in_features.div_ceil(2);
-    let mut panels = AlignedBuffer::zeroed(num_panels * columns * pairs);
-    let mut first = 0;
-    for (weight, _) in parts {
-        let WeightRef::Bf16(view) = weight else {
-            unreachable!("the caller has looked at all parts")
-        };
-        let start = |row: usize| (first + row) / columns * columns * pairs + (first + row) % columns;
-        for_each(*view, start, |start, k, value| {
-            panels[start + k / 2 * columns] |= u32::from(value.to_bits()) << (16 * (k % 2));
-        });
-        first += view.nrows();
-    }
-    panels
-}
-
-/// Visits all elements in blocks, so that neither the reading nor the writing side jumps through memory at every element;
-/// `start` is computed once for each row of a block.
-fn for_each<T: Copy>(
-    view: MatRef<'_, T>,
-    start: impl Fn(usize) -> usize,
-    mut visit: impl FnMut(usize, usize, T),
-) {
-    const BLOCK: usize = 16;
-    for row in (0..view.nrows()).step_by(BLOCK) {
-        let count = BLOCK.min(view.nrows() - row);
-        let starts: [usize; BLOCK] = std::array::from_fn(|index| start(row + index));
-        for first in (0..view.ncols()).step_by(BLOCK) {
-            let block = view.submatrix(row, first, count, BLOCK.min(view.ncols() - first));
-            for k in 0..block.ncols() {
-                for (index, &start) in starts[..count].iter().enumerate() {
-                    visit(start, first + k, block[(index, k)]);
-                }
-            }
-        }
+        Isa::Avx2 | Isa::Avx2Vnni => tile::AVX2_COLUMNS,
+        Isa::Avx512f | Isa::Avx512 => tile::AVX512_COLUMNS,
     }
 }

@@ -6,7 +6,9 @@ use common::{Strided, bits, gamma, numbers, rows, rows_mut};
 use faer::MatRef;
 use half::bf16;
 use proptest::prelude::*;
-use saccade_kernels::{Element, Epilogue, Isa, KernelError, PackedLinear, WeightRef};
+use saccade_kernels::{
+    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, PackedLinear, WeightRef,
+};
 
 const EPILOGUES: [Epilogue; 5] = [
     Epilogue::Store,
@@ -79,7 +81,7 @@ fn pack(isa: Isa, parts: &[Part], weights: &[Weights], inputs: usize) -> PackedL
             (weight, part.bias.then_some(&weights.bias[..]))
         })
         .collect();
-    PackedLinear::pack(isa, &views).unwrap()
+    PackedLinear::pack(isa, Arithmetic::Float32, 1, &views).unwrap()
 }
 
 /// The function of an epilogue, and how far a change of its input can change it at most (its steepest slope).
@@ -153,7 +155,7 @@ proptest! {
             let stored = if parts.iter().all(|part| part.bf16) { Element::Bf16 } else { Element::F32 };
             prop_assert_eq!((layer.in_features(), layer.out_features(), layer.element(), layer.isa()), (inputs, outputs, stored, isa));
             let mut out = Strided::new(&before, row_count, outputs, gaps.1);
-            layer.apply(threads, x.view(), epilogue, out.view_mut());
+            layer.apply(threads, x.view(), epilogue, out.view_mut(), &mut LinearScratch::new());
             check(&parts, &weights, &x, &before, &out.values(), epilogue);
         }
     }
@@ -181,6 +183,7 @@ fn apply(layer: &PackedLinear, threads: usize, x: &[f32], epilogue: Epilogue) ->
         rows(x, layer.in_features()),
         epilogue,
         rows_mut(&mut out, columns),
+        &mut LinearScratch::new(),
     );
     out
 }
@@ -338,6 +341,8 @@ fn huge_and_tiny_values_survive() {
         let weight = [f32::MAX, 1.0, f32::MIN_POSITIVE / 4.0];
         let layer = PackedLinear::pack(
             isa,
+            Arithmetic::Float32,
+            1,
             &[(WeightRef::F32(MatRef::from_row_major_slice(&weight, 3, 1)), None)],
         )
         .unwrap();
@@ -353,8 +358,16 @@ fn parts_that_do_not_fit_are_refused() {
     let weight = [0.0; 12];
     let weight = |outputs, inputs| WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs));
     let isa = Isa::best();
-    assert!(matches!(PackedLinear::pack(isa, &[]), Err(KernelError::NoParts)));
-    let widths = PackedLinear::pack(isa, &[(weight(3, 4), None), (weight(4, 3), None)]);
+    assert!(matches!(
+        PackedLinear::pack(isa, Arithmetic::Float32, 1, &[]),
+        Err(KernelError::NoParts)
+    ));
+    let widths = PackedLinear::pack(
+        isa,
+        Arithmetic::Float32,
+        1,
+        &[(weight(3, 4), None), (weight(4, 3), None)],
+    );
     assert!(matches!(
         widths,
         Err(KernelError::InFeatures {
@@ -362,7 +375,7 @@ fn parts_that_do_not_fit_are_refused() {
             given: 3
         })
     ));
-    let bias = PackedLinear::pack(isa, &[(weight(3, 4), Some(&[1.0; 4]))]);
+    let bias = PackedLinear::pack(isa, Arithmetic::Float32, 1, &[(weight(3, 4), Some(&[1.0; 4]))]);
     assert!(matches!(
         bias,
         Err(KernelError::Bias {
@@ -376,7 +389,13 @@ fn parts_that_do_not_fit_are_refused() {
 #[should_panic(expected = "x: expected")]
 fn an_input_of_another_width_panics() {
     let layer = &layers(Isa::best(), 4, 4)[0];
-    layer.apply(1, rows(&[0.0; 6], 3), Epilogue::Store, rows_mut(&mut [0.0; 8], 4));
+    layer.apply(
+        1,
+        rows(&[0.0; 6], 3),
+        Epilogue::Store,
+        rows_mut(&mut [0.0; 8], 4),
+        &mut LinearScratch::new(),
+    );
 }
 
 #[test]
@@ -388,5 +407,6 @@ fn an_output_of_another_shape_panics() {
         rows(&[0.0; 8], 4),
         Epilogue::Store,
         rows_mut(&mut [0.0; 12], 4),
+        &mut LinearScratch::new(),
     );
 }

@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use common::{numbers, rows, rows_mut};
 use faer::MatRef;
 use saccade_kernels::{
-    Epilogue, Isa, LogitBias, PackedKeyValues, PackedLinear, WeightRef, attention, gelu_tanh, layer_norm,
-    parallel_for, silu,
+    Arithmetic, Epilogue, Isa, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, WeightRef, attention,
+    gelu_tanh, layer_norm, parallel_for, silu,
 };
 
 /// The system's allocator, counting what all threads ask of it.
@@ -50,15 +50,20 @@ fn the_second_call_of_a_shape_allocates_nothing() {
     let bias = numbers(3, 296, 1.0);
     for isa in Isa::available() {
         let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, WIDTH, WIDTH));
-        let layer = PackedLinear::pack(isa, &[(weight, None)]).unwrap();
+        let pack = |arithmetic| PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
+        let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);
+        let mut scratch = LinearScratch::new();
         let mut held = PackedKeyValues::new(isa, 8, WIDTH / 8);
         let mut out = vec![0.0; 296 * WIDTH];
         let mut weights = vec![0.0; 8 * 296 * 296];
         let mut pass = |threads, count: usize| {
             let x = rows(&x[..count * WIDTH], WIDTH);
             let out = &mut out[..count * WIDTH];
-            layer.apply(threads, x, Epilogue::GeluTanh, rows_mut(out, WIDTH));
-            layer.apply(threads, x, Epilogue::Add, rows_mut(out, WIDTH));
+            for layer in &layers {
+                for epilogue in [Epilogue::GeluTanh, Epilogue::Add] {
+                    layer.apply(threads, x, epilogue, rows_mut(out, WIDTH), &mut scratch);
+                }
+            }
             layer_norm(isa, threads, x, 1e-5, None, rows_mut(out, WIDTH));
             held.pack(threads, x, x);
             let bias = LogitBias {

@@ -1,7 +1,7 @@
 //! Multi-head attention with its projections, and the feed-forward: what VL blocks and DiT blocks share.
 
 use faer::MatRef;
-use saccade_kernels::{Epilogue, LogitBias, PackedKeyValues, PackedLinear, attention};
+use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, attention};
 
 use crate::error::Result;
 use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
@@ -22,6 +22,8 @@ pub(crate) struct AttentionBuffers {
     mix: Vec<f32>,
     bias: Vec<f32>,
     packed: Vec<PackedKeyValues>,
+    /// For the linear layers around the attention too: none of them runs beside another.
+    pub linear: LinearScratch,
 }
 
 /// Keys and values of a self-attention that outlive the call.
@@ -40,6 +42,7 @@ impl AttentionBuffers {
             mix: Vec::new(),
             bias: Vec::new(),
             packed: Vec::new(),
+            linear: LinearScratch::new(),
         }
     }
 }
@@ -121,8 +124,9 @@ impl Attention {
         source: &[f32],
         groups: usize,
         buffer: &mut Vec<f32>,
+        scratch: &mut LinearScratch,
     ) -> Vec<PackedKeyValues> {
-        let (keys, values) = self.keys_values(engine, source, buffer);
+        let (keys, values) = self.keys_values(engine, source, buffer, scratch);
         let len = keys.nrows() / groups;
         (0..groups)
             .map(|group| {
@@ -142,12 +146,18 @@ impl Attention {
         engine: Engine,
         source: &[f32],
         buffer: &'a mut Vec<f32>,
+        scratch: &mut LinearScratch,
     ) -> (MatRef<'a, f32>, MatRef<'a, f32>) {
         let source = rows(source, self.to_kv.in_features());
         let both = self.to_kv.out_features();
         let buffer = sized(buffer, source.nrows() * both); // (rows, keys | values)
-        self.to_kv
-            .apply(engine.threads, source, Epilogue::Store, rows_mut(buffer, both));
+        self.to_kv.apply(
+            engine.threads,
+            source,
+            Epilogue::Store,
+            rows_mut(buffer, both),
+            scratch,
+        );
         rows(buffer, both).split_at_col(both / 2)
     }
 
@@ -186,8 +196,13 @@ impl Attention {
                 rows_mut(&mut mix[range], width),
             );
         }
-        self.to_out
-            .apply(engine.threads, rows(mix, width), epilogue, rows_mut(x, width));
+        self.to_out.apply(
+            engine.threads,
+            rows(mix, width),
+            epilogue,
+            rows_mut(x, width),
+            &mut buffers.linear,
+        );
     }
 
     /// `x += out(attention(y, keys and values of source))` within each of `groups` sequences; `weights` is
@@ -209,7 +224,7 @@ impl Attention {
         self.queries(engine, y, buffers);
         let count = buffers.q.len() / width / groups; // query rows of a sequence
         let mix = sized(&mut buffers.mix, buffers.q.len());
-        let (keys, values) = self.keys_values(engine, source, &mut buffers.kv);
+        let (keys, values) = self.keys_values(engine, source, &mut buffers.kv, &mut buffers.linear);
         let new = keys.nrows() / groups; // rows of a sequence whose keys and values these are
         // Those that are not held share one place.
         let (packed, places, first) = match held {
@@ -249,6 +264,7 @@ impl Attention {
             rows(mix, width),
             Epilogue::Add,
             rows_mut(x, width),
+            &mut buffers.linear,
         );
     }
 
@@ -260,6 +276,7 @@ impl Attention {
             rows(y, width),
             Epilogue::Store,
             rows_mut(q, width),
+            &mut buffers.linear,
         );
     }
 
@@ -294,7 +311,14 @@ impl FeedForward {
     }
 
     /// `x += feed_forward(y)`.
-    pub(crate) fn add(&self, engine: Engine, y: &[f32], buffer: &mut Vec<f32>, x: &mut [f32]) {
+    pub(crate) fn add(
+        &self,
+        engine: Engine,
+        y: &[f32],
+        buffer: &mut Vec<f32>,
+        scratch: &mut LinearScratch,
+        x: &mut [f32],
+    ) {
         let (width, inner) = (self.proj.in_features(), self.proj.out_features());
         let hidden = sized(buffer, y.len() / width * inner);
         self.proj.apply(
@@ -302,12 +326,14 @@ impl FeedForward {
             rows(y, width),
             Epilogue::GeluTanh,
             rows_mut(hidden, inner),
+            scratch,
         );
         self.out.apply(
             engine.threads,
             rows(hidden, inner),
             Epilogue::Add,
             rows_mut(x, width),
+            scratch,
         );
     }
 

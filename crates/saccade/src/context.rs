@@ -206,7 +206,12 @@ impl VlEncoder {
             );
             for (attention, keys_values) in cross.iter().zip(&mut keys_values) {
                 if let Some(attention) = attention {
-                    keys_values.extend(attention.project(engine, vl, groups, &mut buffers.hidden));
+                    let EncodeBuffers {
+                        hidden,
+                        attention: own,
+                        ..
+                    } = &mut *buffers;
+                    keys_values.extend(attention.project(engine, vl, groups, hidden, &mut own.linear));
                 }
             }
         }
@@ -254,7 +259,9 @@ impl VlEncoder {
                 .attention
                 .add_self(engine, y, y, elements.len(), None, bias, weights, attention, vl);
             block.norm3.apply(engine, vl, y);
-            block.feed_forward.add(engine, y, &mut buffers.hidden, vl);
+            block
+                .feed_forward
+                .add(engine, y, &mut buffers.hidden, &mut buffers.attention.linear, vl);
             if let Some(kept) = recorded.hidden(index) {
                 kept[part(num_vl_tokens * self.context_dim)].copy_from_slice(vl);
             }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
-use saccade_kernels::{Epilogue, PackedKeyValues};
+use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
 
 use crate::array::Array;
 use crate::attention::{Attention, AttentionBuffers, Bias};
@@ -126,10 +126,13 @@ impl CrossAttention {
     pub fn project(&self, encoder_hidden_states: Array<'_>) -> Result<KeyValues> {
         let (batch, num_vl_tokens) =
             self.check_rows("encoder_hidden_states", encoder_hidden_states, self.context_dim)?;
-        let mut buffer = Vec::new();
-        let packed = self
-            .attention
-            .project(self.engine, encoder_hidden_states.data, batch, &mut buffer);
+        let packed = self.attention.project(
+            self.engine,
+            encoder_hidden_states.data,
+            batch,
+            &mut Vec::new(),
+            &mut LinearScratch::new(),
+        );
         Ok(KeyValues {
             batch,
             num_vl_tokens,

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use saccade_kernels::{Epilogue, PackedKeyValues, PackedLinear, layer_norm};
+use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues, PackedLinear, layer_norm};
 
 use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward, Held};
 use crate::cache::Cache;
@@ -170,13 +170,15 @@ impl Dit {
     }
 
     fn modulations(&self, engine: Engine, timestep: usize) -> TimeModulations {
-        let row = |layer: &PackedLinear, x: &[f32], epilogue| {
+        let mut scratch = LinearScratch::new();
+        let mut row = |layer: &PackedLinear, x: &[f32], epilogue| {
             let mut out = vec![0.0; layer.out_features()];
             layer.apply(
                 engine.threads,
                 rows(x, x.len()),
                 epilogue,
                 rows_mut(&mut out, layer.out_features()),
+                &mut scratch,
             );
             out
         };
@@ -184,8 +186,9 @@ impl Dit {
         embedding_time(timestep, &mut table);
         let [linear_1, linear_2] = &self.timestep_embedder;
         // Every use of the embedding goes through SiLU first, so it is applied here once.
-        let silu_temb = row(linear_2, &row(linear_1, &table, Epilogue::Silu), Epilogue::Silu);
-        let modulation = |layer: &PackedLinear, scale_first: bool| {
+        let hidden = row(linear_1, &table, Epilogue::Silu);
+        let silu_temb = row(linear_2, &hidden, Epilogue::Silu);
+        let mut modulation = |layer: &PackedLinear, scale_first: bool| {
             let both = row(layer, &silu_temb, Epilogue::Store);
             let (first, second) = both.split_at(self.width);
             let (scale, shift) = if scale_first {
@@ -253,6 +256,7 @@ impl Dit {
             rows(y, self.width),
             Epilogue::Store,
             rows_mut(out, hidden_dim),
+            &mut buffers.attention.linear,
         );
         (buffers.h, buffers.action) = (h, action);
     }
@@ -341,7 +345,9 @@ impl Dit {
             None,
             rows_mut(y, self.width),
         );
-        block.feed_forward.add(engine, y, hidden, x);
+        block
+            .feed_forward
+            .add(engine, y, hidden, &mut attention.linear, x);
         changes.patch(step, index, first_row, samples, x);
         if let Some(kept) = recorded.hidden((step, index)) {
             kept.copy_from_slice(x);

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-use saccade_kernels::{Epilogue, Isa, silu};
+use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
@@ -109,6 +109,7 @@ struct Workspace {
     output: Vec<f32>,
     decoder_hidden: Vec<f32>,
     velocity: Vec<f32>,
+    linear: LinearScratch,
 }
 
 impl Workspace {
@@ -125,6 +126,7 @@ impl Workspace {
             output: Vec::new(),
             decoder_hidden: Vec::new(),
             velocity: Vec::new(),
+            linear: LinearScratch::new(),
         }
     }
 }
@@ -544,18 +546,20 @@ impl ActionHead {
             embodiment_ids,
             state_hidden,
             state: encoded,
+            linear,
             ..
         } = workspace;
         let batch = embodiment_ids.len();
         let [layer1, layer2] = &self.state_encoder;
         let hidden = sized(state_hidden, batch * self.config.hidden_dim);
-        layer1.apply(self.engine, embodiment_ids, state, Epilogue::Relu, hidden);
+        layer1.apply(self.engine, embodiment_ids, state, Epilogue::Relu, hidden, linear);
         layer2.apply(
             self.engine,
             embodiment_ids,
             hidden,
             Epilogue::Store,
             sized(encoded, batch * self.config.width),
+            linear,
         );
     }
 
@@ -575,17 +579,32 @@ impl ActionHead {
             output,
             decoder_hidden,
             velocity,
+            linear,
             ..
         } = workspace;
         self.dit.forward(self.engine, pass, recorded, dit, output);
         let [layer1, layer2] = &self.action_decoder;
         let hidden = sized(decoder_hidden, output.len());
-        layer1.apply(self.engine, embodiment_ids, output, Epilogue::Relu, hidden);
+        layer1.apply(
+            self.engine,
+            embodiment_ids,
+            output,
+            Epilogue::Relu,
+            hidden,
+            linear,
+        );
         let velocity = sized(
             velocity,
             output.len() / self.config.hidden_dim * self.config.action_dim,
         );
-        layer2.apply(self.engine, embodiment_ids, hidden, Epilogue::Store, velocity);
+        layer2.apply(
+            self.engine,
+            embodiment_ids,
+            hidden,
+            Epilogue::Store,
+            velocity,
+            linear,
+        );
     }
 
     /// Action rows from noisy actions (spec 1.3 with I12), to `workspace.encoded (batch, samples, action_horizon, width)`.
@@ -595,6 +614,7 @@ impl ActionHead {
             x,
             tokens,
             encoded,
+            linear,
             ..
         } = workspace;
         let (width, horizon) = (self.config.width, self.config.action_horizon);
@@ -612,12 +632,17 @@ impl ActionHead {
         let encoder = &self.action_encoder;
         encoder
             .action
-            .apply(self.engine, embodiment_ids, x, Epilogue::Add, tokens);
+            .apply(self.engine, embodiment_ids, x, Epilogue::Add, tokens, linear);
         silu(self.engine.isa, tokens);
         let encoded = sized(encoded, tokens.len());
-        encoder
-            .out
-            .apply(self.engine, embodiment_ids, tokens, Epilogue::Store, encoded);
+        encoder.out.apply(
+            self.engine,
+            embodiment_ids,
+            tokens,
+            Epilogue::Store,
+            encoded,
+            linear,
+        );
         if let Some(positions) = &self.position_embedding {
             for chunk in encoded.chunks_exact_mut(positions.len()) {
                 for (value, position) in chunk.iter_mut().zip(positions) {
@@ -640,6 +665,7 @@ impl ActionHead {
                 &tau,
                 Epilogue::Store,
                 &mut bracket,
+                &mut LinearScratch::new(),
             );
             bracket
         })

@@ -2,7 +2,7 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
-use saccade_kernels::{Epilogue, Isa, PackedLinear, WeightRef, layer_norm};
+use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef, layer_norm};
 
 use crate::checkpoint::Elements;
 use crate::error::{Error, Result};
@@ -54,11 +54,13 @@ fn in_major_view(elements: &Elements, in_features: usize, out_features: usize) -
     match weight_view(elements, in_features, out_features) {
         WeightRef::F32(view) => WeightRef::F32(view.transpose()),
         WeightRef::Bf16(view) => WeightRef::Bf16(view.transpose()),
+        WeightRef::Int8 { .. } => unreachable!("category-specific weights are not int8"),
     }
 }
 
 fn pack(isa: Isa, parts: &[(WeightRef<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
-    PackedLinear::pack(isa, parts).map_err(|error| Error::Checkpoint(format!("source: {error}")))
+    PackedLinear::pack(isa, Arithmetic::Float32, 1, parts)
+        .map_err(|error| Error::Checkpoint(format!("source: {error}")))
 }
 
 /// Packs the layers `parts`, which have the same inputs, as one: their outputs stand side by side.
@@ -169,6 +171,7 @@ impl CategoryLinear {
         x: &[f32],
         epilogue: Epilogue,
         out: &mut [f32],
+        scratch: &mut LinearScratch,
     ) {
         let (mut x, mut out) = (x, out);
         let (x_element, out_element) = (x.len() / embodiment_ids.len(), out.len() / embodiment_ids.len());
@@ -182,6 +185,7 @@ impl CategoryLinear {
                 rows(x_run, layer.in_features()),
                 epilogue,
                 rows_mut(out_run, layer.out_features()),
+                scratch,
             );
             (x, out) = (x_rest, out_rest);
         }
@@ -257,6 +261,10 @@ fn submatrix(weight: WeightRef<'_>, first: usize, count: usize) -> WeightRef<'_>
     match weight {
         WeightRef::F32(view) => WeightRef::F32(view.subcols(first, count)),
         WeightRef::Bf16(view) => WeightRef::Bf16(view.subcols(first, count)),
+        WeightRef::Int8 { values, scales } => WeightRef::Int8 {
+            values: values.subcols(first, count),
+            scales,
+        },
     }
 }
 
@@ -264,6 +272,9 @@ fn widened(weight: WeightRef<'_>) -> Mat<f64> {
     match weight {
         WeightRef::F32(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| f64::from(view[(i, j)])),
         WeightRef::Bf16(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| view[(i, j)].to_f64()),
+        WeightRef::Int8 { values, scales } => Mat::from_fn(values.nrows(), values.ncols(), |i, j| {
+            f64::from(values[(i, j)]) * f64::from(scales[i])
+        }),
     }
 }
 

@@ -1,11 +1,13 @@
 //! One panel of a packed linear layer over a block of rows, tile by tile.
 
-use faer::{MatMut, MatRef};
+use std::marker::PhantomData;
+use std::mem::MaybeUninit;
 
+use super::product::{Bf16Pairs, F32, Int8Quads, Product, WidenedBf16, With};
+use super::rows::Quantized;
 use super::{Epilogue, ROW_BLOCK};
 use crate::activation::{gelu_tanh_vector, silu_vector};
-use crate::isa::Isa;
-use crate::simd::{Kernel, Vector};
+use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, load, store};
 
 /// Vectors of a panel's row, and rows of the largest tile: `ROWS x VECTORS` accumulators, `VECTORS` weights and one broadcast fit the registers.
 const PORTABLE: (usize, usize) = (1, 4);
@@ -31,31 +33,21 @@ const K_BLOCK: usize = 2 * SUM_PART;
 const LINE: usize = 16;
 
 /// The activations and results of one call, as raw parts that tasks write to side by side.
-pub(super) struct Job {
-    x: *const f32,
-    x_stride: isize,
-    out: *mut f32,
-    out_stride: isize,
-    in_features: usize,
-    epilogue: Epilogue,
+pub(super) struct Job<'a> {
+    /// Rows of 4-byte words: float32, pairs of bf16 or quads of bytes, as the product reads them.
+    pub x: *const u32,
+    /// In words.
+    pub x_stride: isize,
+    pub in_features: usize,
+    /// How each row was quantised, for int8.
+    pub quantized: &'a [Quantized],
+    pub out: *mut f32,
+    pub out_stride: isize,
+    pub epilogue: Epilogue,
 }
 
 // SAFETY: tasks read `x` and write disjoint parts of `out`: no two have a row block and a panel in common.
-unsafe impl Sync for Job {}
-
-impl Job {
-    /// The views must outlive the job's use; `PackedLinear::apply` keeps them borrowed.
-    pub(super) fn new(x: MatRef<'_, f32>, out: MatMut<'_, f32>, epilogue: Epilogue) -> Self {
-        Self {
-            x: x.as_ptr(),
-            x_stride: x.row_stride(),
-            in_features: x.ncols(),
-            out_stride: out.row_stride(),
-            out: out.as_ptr_mut(),
-            epilogue,
-        }
-    }
-}
+unsafe impl Sync for Job<'_> {}
 
 /// A block of rows, at most [`ROW_BLOCK`].
 #[derive(Clone, Copy)]
@@ -65,91 +57,116 @@ pub(super) struct Rows {
 }
 
 /// One panel and the columns of `out` that it makes.
-pub(super) struct Panel<'a, E> {
-    pub weights: &'a [E],
+pub(super) struct Panel<'a> {
+    pub weights: &'a [u32],
     pub bias: &'a [f32],
+    /// Of each column, for int8: what one step of its weights is worth, and their sum.
+    pub scales: &'a [f32],
+    pub sums: &'a [i32],
     pub first: usize,
     pub width: usize,
     /// How many panels further the one lies that should be on its way to the cache.
     pub ahead: usize,
 }
 
-/// An element of a panel: `STEP` consecutive `k` of one column.
-pub(super) trait Stored: Copy {
-    const STEP: usize;
+/// Runs a block of rows through one panel: columns `first .. first + width` of `out`.
+pub(super) struct PanelRun<'a, P> {
+    pub job: &'a Job<'a>,
+    pub rows: Rows,
+    pub panel: Panel<'a>,
+    product: PhantomData<P>,
+}
+
+impl<'a, P> PanelRun<'a, P> {
+    pub(super) fn new(job: &'a Job<'a>, rows: Rows, panel: Panel<'a>) -> Self {
+        Self {
+            job,
+            rows,
+            panel,
+            product: PhantomData,
+        }
+    }
 
     /// # Safety
-    /// A vector of elements at `pointer`; the caller runs with `V`'s instruction set.
-    unsafe fn widen<V: Vector>(pointer: *const Self, part: usize) -> V;
-}
-
-impl Stored for f32 {
-    const STEP: usize = 1;
-
+    /// The caller runs with `V`'s instruction set and what `Q` needs; the panel was packed for `Q`.
     #[inline(always)]
-    unsafe fn widen<V: Vector>(pointer: *const Self, _: usize) -> V {
-        // SAFETY: as promised by the caller.
-        unsafe { V::load(pointer) }
-    }
-}
-
-impl Stored for u32 {
-    const STEP: usize = 2;
-
-    #[inline(always)]
-    unsafe fn widen<V: Vector>(pointer: *const Self, part: usize) -> V {
-        // SAFETY: as promised by the caller.
+    unsafe fn all<V: Vector, Q: Product<V>>(self) {
+        let Self { job, rows, panel, .. } = self;
+        assert!(rows.end - rows.first <= ROW_BLOCK);
+        // Widening takes registers: 8 rows of bf16 weights spill (0.77 of the FMA peak at 296 x 2048 x 1536), 7 do not (0.94).
+        // SAFETY: the caller's promise; the job's views cover rows and columns.
         unsafe {
-            if part == 0 {
-                V::load_low_halves(pointer)
-            } else {
-                V::load_high_halves(pointer)
+            match V::REGISTERS {
+                8 => panel_rows::<V, Q, { PORTABLE.0 }>(job, rows, &panel, PORTABLE.1),
+                16 => panel_rows::<V, Q, { AVX2.0 }>(job, rows, &panel, AVX2.1),
+                _ => panel_rows::<V, Q, { AVX512.0 }>(job, rows, &panel, AVX512.1 + 1 - Q::ROW_WORDS),
             }
         }
     }
 }
 
-/// Runs a block of rows through one panel: columns `first .. first + width` of `out`.
-pub(super) struct PanelRun<'a, E> {
-    pub job: &'a Job,
-    pub rows: Rows,
-    pub panel: Panel<'a, E>,
-}
-
-impl<E: Stored> Kernel for PanelRun<'_, E> {
+impl Kernel for PanelRun<'_, F32> {
     type Output = ();
 
     #[inline(always)]
     unsafe fn run<V: Vector>(self) {
-        let Self { job, rows, panel } = self;
-        assert!(rows.end - rows.first <= ROW_BLOCK);
-        // Widening takes registers: 8 rows of bf16 weights spill (0.77 of the FMA peak at 296 x 2048 x 1536), 7 do not (0.94).
-        // SAFETY: the caller has the instruction set; the panel was packed for it, and the job's views cover rows and columns.
-        unsafe {
-            match V::ISA {
-                Isa::Portable => panel_rows::<V, E, { PORTABLE.0 }>(job, rows, &panel, PORTABLE.1),
-                Isa::Avx2 => panel_rows::<V, E, { AVX2.0 }>(job, rows, &panel, AVX2.1),
-                Isa::Avx512 => panel_rows::<V, E, { AVX512.0 }>(job, rows, &panel, AVX512.1 + 1 - E::STEP),
-            }
+        // SAFETY: the caller's promise.
+        unsafe { self.all::<V, F32>() }
+    }
+}
+
+impl Kernel for PanelRun<'_, WidenedBf16> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<V: Vector>(self) {
+        // SAFETY: the caller's promise.
+        unsafe { self.all::<V, WidenedBf16>() }
+    }
+}
+
+impl DotKernel for PanelRun<'_, Bf16Pairs> {
+    type Output = ();
+    const DOT: Dot = Dot::Bf16;
+
+    #[inline(always)]
+    unsafe fn run<V: Vector, D: Dots<V>>(self) {
+        // Elsewhere the layer widens: rows that are float32 already need no widening.
+        if D::HAS_BF16 {
+            // SAFETY: the caller's promise.
+            unsafe { self.all::<V, With<Bf16Pairs, D>>() }
+        } else {
+            unreachable!("only where there is a product of bf16")
         }
+    }
+}
+
+impl DotKernel for PanelRun<'_, Int8Quads> {
+    type Output = ();
+    const DOT: Dot = Dot::Int8;
+
+    #[inline(always)]
+    unsafe fn run<V: Vector, D: Dots<V>>(self) {
+        // SAFETY: the caller's promise.
+        unsafe { self.all::<V, With<Int8Quads, D>>() }
     }
 }
 
 /// # Safety
 /// The caller runs with `V`'s instruction set. `panel` holds `in_features` steps of `NV` vectors, `job` the rows and the panel's columns.
 #[inline(always)]
-unsafe fn panel_rows<V: Vector, E: Stored, const NV: usize>(
-    job: &Job,
+unsafe fn panel_rows<V: Vector, P: Product<V>, const NV: usize>(
+    job: &Job<'_>,
     rows: Rows,
-    panel: &Panel<'_, E>,
+    panel: &Panel<'_>,
     max_rows: usize,
 ) {
     let count = rows.end - rows.first;
     let tiles = count.div_ceil(max_rows);
-    let steps = job.in_features.div_ceil(E::STEP);
-    let block_steps = K_BLOCK / E::STEP;
+    let steps = job.in_features.div_ceil(P::STEP);
+    let block_steps = K_BLOCK / P::STEP;
     let blocks = steps.div_ceil(block_steps).max(1);
-    let mut sums = Sums([const { std::mem::MaybeUninit::uninit() }; ROW_BLOCK * MAX_COLUMNS]);
+    let mut sums = Sums([const { MaybeUninit::uninit() }; ROW_BLOCK * MAX_COLUMNS]);
     for block in 0..blocks {
         let part = Part {
             first: block * block_steps,
@@ -160,30 +177,38 @@ unsafe fn panel_rows<V: Vector, E: Stored, const NV: usize>(
             let (first, end) = (count * tile / tiles, count * (tile + 1) / tiles);
             let place = Place {
                 row: rows.first + first,
-                sums: sums.0[first * NV * V::LANES..].as_mut_ptr().cast::<f32>(),
+                sums: sums.0[first * NV * V::LANES..].as_mut_ptr().cast::<u32>(),
                 tile,
                 tiles,
             };
             // SAFETY: the caller's promise; the tile lies within the rows, and its sums within the block's.
             unsafe {
                 match end - first {
-                    1 => tile_part::<V, E, NV, 1>(job, panel, &part, &place),
-                    2 => tile_part::<V, E, NV, 2>(job, panel, &part, &place),
-                    3 => tile_part::<V, E, NV, 3>(job, panel, &part, &place),
-                    4 => tile_part::<V, E, NV, 4>(job, panel, &part, &place),
-                    5 => tile_part::<V, E, NV, 5>(job, panel, &part, &place),
-                    6 => tile_part::<V, E, NV, 6>(job, panel, &part, &place),
-                    7 => tile_part::<V, E, NV, 7>(job, panel, &part, &place),
-                    8 => tile_part::<V, E, NV, 8>(job, panel, &part, &place),
-                    _ => unreachable!("a tile has 1 to 8 rows"),
+                    1 => tile_part::<V, P, NV, 1>(job, panel, &part, &place),
+                    2 => tile_part::<V, P, NV, 2>(job, panel, &part, &place),
+                    3 => tile_part::<V, P, NV, 3>(job, panel, &part, &place),
+                    4 => tile_part::<V, P, NV, 4>(job, panel, &part, &place),
+                    // Only where there are registers for them.
+                    5 if V::REGISTERS > 8 => tile_part::<V, P, NV, 5>(job, panel, &part, &place),
+                    6 if V::REGISTERS > 8 => tile_part::<V, P, NV, 6>(job, panel, &part, &place),
+                    7 if V::REGISTERS > 16 => tile_part::<V, P, NV, 7>(job, panel, &part, &place),
+                    8 if V::REGISTERS > 16 => tile_part::<V, P, NV, 8>(job, panel, &part, &place),
+                    rows => unreachable!("a tile of {rows} rows"),
                 }
             }
+        }
+    }
+    for row in 0..count {
+        for vector in 0..NV {
+            let sums = sums.0[(row * NV + vector) * V::LANES..].as_ptr().cast::<u32>();
+            // SAFETY: the caller's promise; all tiles have stored their sums.
+            unsafe { finish::<V, P>(job, panel, rows.first + row, vector * V::LANES, sums) }
         }
     }
 }
 
 #[repr(align(64))]
-struct Sums([std::mem::MaybeUninit<f32>; ROW_BLOCK * MAX_COLUMNS]);
+struct Sums([MaybeUninit<u32>; ROW_BLOCK * MAX_COLUMNS]);
 
 /// A part of the steps over `k`.
 struct Part {
@@ -194,7 +219,7 @@ struct Part {
 /// Where a tile begins: its first row, and its unfinished sums.
 struct Place {
     row: usize,
-    sums: *mut f32,
+    sums: *mut u32,
     tile: usize,
     tiles: usize,
 }
@@ -204,9 +229,9 @@ struct Place {
 /// # Safety
 /// As [`panel_rows`]; rows `place.row .. place.row + MR` are in the job, and `place.sums` has room for the tile.
 #[inline(always)]
-unsafe fn tile_part<V: Vector, E: Stored, const NV: usize, const MR: usize>(
-    job: &Job,
-    panel: &Panel<'_, E>,
+unsafe fn tile_part<V: Vector, P: Product<V>, const NV: usize, const MR: usize>(
+    job: &Job<'_>,
+    panel: &Panel<'_>,
     part: &Part,
     place: &Place,
 ) {
@@ -223,13 +248,12 @@ unsafe fn tile_part<V: Vector, E: Stored, const NV: usize, const MR: usize>(
         let next = weights
             .wrapping_add(panel.ahead * panel.weights.len() + panel.weights.len() * place.tile / place.tiles);
         let stride = row_elements.div_ceil(place.tiles);
-        let steps = job.in_features.div_ceil(E::STEP);
         let mut first = part.first;
         loop {
-            let end = part.end.min(first + SUM_PART / E::STEP);
-            let mut acc = [[V::splat(0.0); NV]; MR];
-            // An odd `in_features` leaves the last step of a two-element panel half filled: `x` ends there.
-            let whole = end.min(job.in_features / E::STEP);
+            let end = part.end.min(first + SUM_PART / P::STEP);
+            let mut acc = [[P::zero(); NV]; MR];
+            // Rows that are read where they lie may end within the last step.
+            let whole = end.min(job.in_features / P::STEP);
             // Few rows leave little time: a step's share is then longer than a cache line. The loops are apart because one register more
             // for the general case makes the common one spill.
             if place.tiles < NV {
@@ -237,51 +261,28 @@ unsafe fn tile_part<V: Vector, E: Stored, const NV: usize, const MR: usize>(
                     for line in 0..NV {
                         V::prefetch(next.wrapping_add(step * stride + line * LINE).cast());
                     }
-                    multiply_add::<V, E, NV, MR>(
-                        &mut acc,
-                        &x,
-                        weights.add(step * row_elements),
-                        step * E::STEP,
-                        E::STEP,
-                    );
+                    P::multiply_add(&mut acc, &x, weights.add(step * row_elements), step, P::STEP);
                 }
             } else {
                 for step in first..whole {
                     V::prefetch(next.wrapping_add(step * stride).cast());
-                    multiply_add::<V, E, NV, MR>(
-                        &mut acc,
-                        &x,
-                        weights.add(step * row_elements),
-                        step * E::STEP,
-                        E::STEP,
-                    );
+                    P::multiply_add(&mut acc, &x, weights.add(step * row_elements), step, P::STEP);
                 }
             }
             if whole < end {
-                multiply_add::<V, E, NV, MR>(
-                    &mut acc,
-                    &x,
-                    weights.add(whole * row_elements),
-                    whole * E::STEP,
-                    1,
-                );
+                let rest = job.in_features - whole * P::STEP;
+                P::multiply_add(&mut acc, &x, weights.add(whole * row_elements), whole, rest);
             }
             if first != 0 {
                 for (r, row) in acc.iter_mut().enumerate() {
                     for (v, sum) in row.iter_mut().enumerate() {
-                        *sum = V::load(place.sums.add((r * NV + v) * V::LANES)).add(*sum);
+                        *sum = P::add(P::load(place.sums.add((r * NV + v) * V::LANES)), *sum);
                     }
                 }
             }
-            if end == steps {
-                for (r, sums) in acc.iter().enumerate() {
-                    finish(job, panel, place.row + r, sums);
-                }
-            } else {
-                for (r, row) in acc.iter().enumerate() {
-                    for (v, sum) in row.iter().enumerate() {
-                        sum.store(place.sums.add((r * NV + v) * V::LANES));
-                    }
+            for (r, row) in acc.iter().enumerate() {
+                for (v, sum) in row.iter().enumerate() {
+                    P::store(*sum, place.sums.add((r * NV + v) * V::LANES));
                 }
             }
             first = end;
@@ -292,72 +293,39 @@ unsafe fn tile_part<V: Vector, E: Stored, const NV: usize, const MR: usize>(
     }
 }
 
-/// `acc += x[k .. k + count]` times the weights of one step.
+/// Bias, activation and residual of one row and the columns from `column` on, a vector of them, and their way to `out`. After the tiles and
+/// not in them: a sum's way through the first-level cache is nothing beside its making, and the code is there once, not in each tile.
 ///
 /// # Safety
-/// `weights` are `NV` vectors, `x` has `k + count` elements in each row; the caller runs with `V`'s instruction set.
+/// The caller runs with `V`'s instruction set; `row` and the panel's columns are in the job, `sums` holds a vector.
 #[inline(always)]
-unsafe fn multiply_add<V: Vector, E: Stored, const NV: usize, const MR: usize>(
-    acc: &mut [[V; NV]; MR],
-    x: &[*const f32; MR],
-    weights: *const E,
-    k: usize,
-    count: usize,
-) {
-    for part in 0..count {
-        // SAFETY: the caller's promise.
-        unsafe {
-            // Loops, not closures: a closure is a function without `V`'s features until it is inlined.
-            let mut w = [V::splat(0.0); NV];
-            for (v, w) in w.iter_mut().enumerate() {
-                *w = E::widen(weights.add(v * V::LANES), part);
-            }
-            for r in 0..MR {
-                let x = V::splat(*x[r].add(k + part));
-                for v in 0..NV {
-                    acc[r][v] = x.fma(w[v], acc[r][v]);
-                }
-            }
-        }
-    }
-}
-
-/// Bias, activation and residual of one row of a tile, and its way to `out`.
-///
-/// # Safety
-/// The caller runs with `V`'s instruction set; `row` and the panel's columns are in the job.
-#[inline(always)]
-unsafe fn finish<V: Vector, E: Stored, const NV: usize>(
-    job: &Job,
-    panel: &Panel<'_, E>,
+unsafe fn finish<V: Vector, P: Product<V>>(
+    job: &Job<'_>,
+    panel: &Panel<'_>,
     row: usize,
-    sums: &[V; NV],
+    column: usize,
+    sums: *const u32,
 ) {
+    if column >= panel.width {
+        return;
+    }
     // SAFETY: the caller's promise; partial vectors stay within the panel's columns.
     unsafe {
-        let out = job.out.offset(row as isize * job.out_stride).add(panel.first);
-        for (v, &sum) in sums.iter().enumerate() {
-            let column = v * V::LANES;
-            if column >= panel.width {
-                break;
-            }
-            let lanes = V::LANES.min(panel.width - column);
-            let out = out.add(column);
-            let value = sum.add(V::load(panel.bias.as_ptr().add(column)));
-            let value = match job.epilogue {
-                Epilogue::Store => value,
-                Epilogue::GeluTanh => gelu_tanh_vector(value),
-                // The second operand where they do not compare: NaN stays.
-                Epilogue::Relu => V::splat(0.0).max(value),
-                Epilogue::Silu => silu_vector(value),
-                Epilogue::Add if lanes == V::LANES => V::load(out).add(value),
-                Epilogue::Add => V::load_partial(out, lanes).add(value),
-            };
-            if lanes == V::LANES {
-                value.store(out)
-            } else {
-                value.store_partial(out, lanes)
-            }
-        }
+        let out = job
+            .out
+            .offset(row as isize * job.out_stride)
+            .add(panel.first + column);
+        let lanes = V::LANES.min(panel.width - column);
+        let value = P::value(P::load(sums), job, row, panel, column);
+        let value = value.add(V::load(panel.bias.as_ptr().add(column)));
+        let value = match job.epilogue {
+            Epilogue::Store => value,
+            Epilogue::GeluTanh => gelu_tanh_vector(value),
+            // The second operand where they do not compare: NaN stays.
+            Epilogue::Relu => V::splat(0.0).max(value),
+            Epilogue::Silu => silu_vector(value),
+            Epilogue::Add => load::<V>(out, lanes).add(value),
+        };
+        store(value, out, lanes);
     }
 }

@@ -1,0 +1,552 @@
+//! The packed linear layer in bf16 and int8: against the exact product of the rounded or quantised operands, on every instruction set.
+
+mod common;
+
+use common::{Strided, bits, gamma, numbers, rows, rows_mut};
+use faer::{MatMut, MatRef};
+use half::bf16;
+use proptest::prelude::*;
+use saccade_kernels::{
+    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, PackedLinear, WeightRef, quantize_rows,
+};
+
+const NARROW: [Arithmetic; 2] = [Arithmetic::Bfloat16, Arithmetic::Int8];
+
+fn pack(isa: Isa, arithmetic: Arithmetic, weight: &[f32], bias: &[f32]) -> PackedLinear {
+    let inputs = weight.len() / bias.len().max(1);
+    let weight = WeightRef::F32(MatRef::from_row_major_slice(weight, bias.len(), inputs));
+    PackedLinear::pack(isa, arithmetic, 1, &[(weight, Some(bias))]).unwrap()
+}
+
+fn apply(layer: &PackedLinear, threads: usize, x: &[f32], epilogue: Epilogue) -> Vec<f32> {
+    let (inputs, outputs) = (layer.in_features(), layer.out_features());
+    let mut out = vec![0.5; x.len() / inputs * outputs];
+    let mut scratch = LinearScratch::new();
+    layer.apply(
+        threads,
+        rows(x, inputs),
+        epilogue,
+        rows_mut(&mut out, outputs),
+        &mut scratch,
+    );
+    out
+}
+
+/// The values that an operand has after rounding or quantisation, in float64.
+struct Operand {
+    values: Vec<f64>,
+}
+
+impl Operand {
+    fn rounded(values: &[f32]) -> Self {
+        Self {
+            values: values
+                .iter()
+                .map(|&value| bf16::from_f32(value).to_f64())
+                .collect(),
+        }
+    }
+
+    /// Weights in int8, by the definition.
+    fn weight(values: &[f32], inputs: usize) -> Self {
+        let mut all = Vec::with_capacity(values.len());
+        for row in values.chunks_exact(inputs) {
+            let scale = row.iter().fold(0.0f32, |max, value| max.max(value.abs())) / 127.0;
+            all.extend(row.iter().map(|value| {
+                let steps = if scale < f32::MIN_POSITIVE {
+                    0.0
+                } else {
+                    (value / scale).round_ties_even()
+                };
+                f64::from(steps) * f64::from(scale)
+            }));
+        }
+        Self { values: all }
+    }
+
+    /// Activations in bytes up to `steps`, by the definition.
+    fn bytes(values: &[f32], inputs: usize, steps: f32) -> Self {
+        let mut all = Vec::with_capacity(values.len());
+        for row in values.chunks_exact(inputs) {
+            let low = row.iter().fold(0.0f32, |low, &value| low.min(value));
+            let high = row.iter().fold(0.0f32, |high, &value| high.max(value));
+            let scale = high / steps - low / steps;
+            if scale < f32::MIN_POSITIVE {
+                all.extend(row.iter().map(|_| 0.0));
+                continue;
+            }
+            let inverse = 1.0 / scale;
+            let zero = (-low * inverse).round_ties_even();
+            all.extend(row.iter().map(|value| {
+                let byte = ((value * inverse).round_ties_even() + zero).clamp(0.0, steps);
+                f64::from(byte - zero) * f64::from(scale)
+            }));
+        }
+        Self { values: all }
+    }
+}
+
+/// Largest byte of activations: 8 bits where the instruction set has what multiplies them without saturating.
+fn steps(isa: Isa) -> f32 {
+    let eight_bits = isa == Isa::Portable || isa.dot_products().contains(&"vnni");
+    if eight_bits { 255.0 } else { 129.0 }
+}
+
+fn operands(
+    isa: Isa,
+    arithmetic: Arithmetic,
+    x: &[f32],
+    weight: &[f32],
+    inputs: usize,
+) -> (Operand, Operand) {
+    match arithmetic {
+        Arithmetic::Bfloat16 => (Operand::rounded(x), Operand::rounded(weight)),
+        _ => (
+            Operand::bytes(x, inputs, steps(isa)),
+            Operand::weight(weight, inputs),
+        ),
+    }
+}
+
+/// Every element against float64. bf16: each product and addition of the sum may be rounded once. int8: sums are exact, so only the scales
+/// and the bias round.
+fn check(
+    isa: Isa,
+    arithmetic: Arithmetic,
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    inputs: usize,
+    out: &[f32],
+) {
+    let (x, weight) = operands(isa, arithmetic, x, weight, inputs);
+    let operations = if arithmetic == Arithmetic::Int8 {
+        5
+    } else {
+        2 * inputs + 2
+    };
+    for (row, x) in x.values.chunks_exact(inputs).enumerate() {
+        for (column, weight) in weight.values.chunks_exact(inputs).enumerate() {
+            let products = x.iter().zip(weight).map(|(x, w)| x * w);
+            let exact = products.clone().sum::<f64>() + f64::from(bias[column]);
+            let magnitude = if arithmetic == Arithmetic::Int8 {
+                (exact - f64::from(bias[column])).abs() + f64::from(bias[column]).abs()
+            } else {
+                products.map(f64::abs).sum::<f64>() + f64::from(bias[column]).abs()
+            };
+            // The float64 sum rounds too; results below the smallest normal number may be lost.
+            let bound = gamma(operations) * magnitude + 1e-12 * magnitude + f64::from(f32::MIN_POSITIVE);
+            let given = f64::from(out[row * bias.len() + column]);
+            assert!(
+                (given - exact).abs() <= bound,
+                "{isa}, {arithmetic:?}, ({row}, {column}): {given} instead of {exact}, allowed {bound}"
+            );
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(80))]
+
+    #[test]
+    fn agrees_with_the_exact_product(
+        row_count in 1..=70_usize, inputs in 1..=300_usize, outputs in 1..=120_usize, threads in 1..4_usize, seed in 0..u64::MAX / 2,
+    ) {
+        let x = numbers(seed, row_count * inputs, 3.0);
+        let weight = numbers(seed + 1, outputs * inputs, 0.1);
+        let bias = numbers(seed + 2, outputs, 1.0);
+        for isa in Isa::available() {
+            for arithmetic in NARROW {
+                let layer = pack(isa, arithmetic, &weight, &bias);
+                prop_assert_eq!(layer.arithmetic(), arithmetic);
+                check(isa, arithmetic, &x, &weight, &bias, inputs, &apply(&layer, threads, &x, Epilogue::Store));
+            }
+        }
+    }
+}
+
+#[test]
+fn every_small_size_agrees_with_the_exact_product() {
+    let (x, weight) = (numbers(1, 70 * 70, 1.0), numbers(2, 70 * 70, 1.0));
+    let bias = numbers(3, 70, 1.0);
+    for isa in Isa::available() {
+        for arithmetic in NARROW {
+            for size in 1..=70 {
+                for (rows, inputs, outputs) in [(size, 7, 5), (3, size, 5), (3, 7, size)] {
+                    let (x, weight) = (&x[..rows * inputs], &weight[..outputs * inputs]);
+                    let layer = pack(isa, arithmetic, weight, &bias[..outputs]);
+                    let out = apply(&layer, 1, x, Epilogue::Store);
+                    check(isa, arithmetic, x, weight, &bias[..outputs], inputs, &out);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn long_sums_agree_with_the_exact_product() {
+    let inputs = 8192;
+    let (x, weight) = (numbers(4, 9 * inputs, 1.0), numbers(5, 50 * inputs, 1.0));
+    let bias = numbers(6, 50, 1.0);
+    for isa in Isa::available() {
+        for arithmetic in NARROW {
+            let layer = pack(isa, arithmetic, &weight, &bias);
+            check(
+                isa,
+                arithmetic,
+                &x,
+                &weight,
+                &bias,
+                inputs,
+                &apply(&layer, 2, &x, Epilogue::Store),
+            );
+        }
+    }
+}
+
+/// All bytes and weights at their largest: sums reach what they can reach, and pairs of products what saturating instructions make of them.
+#[test]
+fn the_largest_sums_do_not_overflow() {
+    let inputs = 1 << 16;
+    for (sign, low) in [(1.0, 0.0), (-1.0, 0.0), (1.0, -1.0)] {
+        let mut x = vec![1.0; inputs];
+        x[0] = low;
+        let weight = vec![sign; inputs];
+        for isa in Isa::available() {
+            let layer = pack(isa, Arithmetic::Int8, &weight, &[0.0]);
+            let out = apply(&layer, 1, &x, Epilogue::Store);
+            check(isa, Arithmetic::Int8, &x, &weight, &[0.0], inputs, &out);
+        }
+    }
+    let weight = vec![0.0; inputs + 1];
+    let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, 1, inputs + 1));
+    let packed = PackedLinear::pack(Isa::best(), Arithmetic::Int8, 1, &[(weight, None)]);
+    assert!(matches!(packed, Err(KernelError::TooManyInputs { given }) if given == inputs + 1));
+}
+
+#[test]
+fn bits_depend_neither_on_threads_nor_on_other_rows() {
+    for (inputs, outputs) in [(70, 99), (1500, 230), (3001, 49)] {
+        let x = numbers(9, 210 * inputs, 1.0);
+        let weight = numbers(10, outputs * inputs, 0.1);
+        let bias = numbers(11, outputs, 1.0);
+        for isa in Isa::available() {
+            for arithmetic in NARROW {
+                let layer = pack(isa, arithmetic, &weight, &bias);
+                let all = bits(&apply(&layer, 1, &x, Epilogue::GeluTanh));
+                for threads in [2, 3, 8] {
+                    assert_eq!(
+                        bits(&apply(&layer, threads, &x, Epilogue::GeluTanh)),
+                        all,
+                        "{isa}, {arithmetic:?}"
+                    );
+                }
+                for (first, count) in [
+                    (0, 1),
+                    (13, 1),
+                    (209, 1),
+                    (5, 2),
+                    (40, 7),
+                    (11, 49),
+                    (96, 97),
+                    (3, 200),
+                ] {
+                    let part = apply(
+                        &layer,
+                        2,
+                        &x[first * inputs..][..count * inputs],
+                        Epilogue::GeluTanh,
+                    );
+                    let expected = &all[first * outputs..][..count * outputs];
+                    assert_eq!(
+                        bits(&part),
+                        expected,
+                        "{isa}, {arithmetic:?}, {count} rows from {first}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn packing_on_more_threads_gives_the_same_bits() {
+    let (inputs, outputs) = (37, 311);
+    let weight = numbers(23, outputs * inputs, 1.0);
+    let x = numbers(24, 5 * inputs, 1.0);
+    let parts = [(0, 100), (100, 101), (101, 311)].map(|(first, end): (usize, usize)| {
+        let rows = MatRef::from_row_major_slice(&weight[first * inputs..end * inputs], end - first, inputs);
+        (WeightRef::F32(rows), None)
+    });
+    for isa in Isa::available() {
+        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+            let out = |threads, parts: &[(WeightRef<'_>, Option<&[f32]>)]| {
+                let layer = PackedLinear::pack(isa, arithmetic, threads, parts).unwrap();
+                bits(&apply(&layer, 1, &x, Epilogue::Store))
+            };
+            let whole = WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs));
+            let expected = out(1, &[(whole, None)]);
+            for threads in [1, 2, 5] {
+                assert_eq!(out(threads, &parts), expected, "{isa}, {arithmetic:?}");
+            }
+        }
+    }
+}
+
+/// The scratch keeps what an earlier, larger call left in it; strided views, all epilogues.
+#[test]
+fn a_used_scratch_changes_nothing() {
+    let (inputs, outputs) = (61, 53);
+    let weight = numbers(12, outputs * inputs, 1.0);
+    let bias = numbers(13, outputs, 1.0);
+    let x = numbers(14, 20 * inputs, 1.0);
+    let large = vec![f32::NAN; 200 * 100];
+    for isa in Isa::available() {
+        for arithmetic in NARROW {
+            let mut scratch = LinearScratch::new();
+            let (bigger, layer) = (
+                pack(isa, arithmetic, &[1.0; 100], &[0.0]),
+                pack(isa, arithmetic, &weight, &bias),
+            );
+            let mut out = [0.0; 200];
+            bigger.apply(
+                1,
+                rows(&large, 100),
+                Epilogue::Store,
+                rows_mut(&mut out, 1),
+                &mut scratch,
+            );
+            assert!(out.iter().all(|value| value.is_nan()), "{isa}, {arithmetic:?}");
+            assert!(scratch.nbytes() > 0);
+            for epilogue in [Epilogue::Store, Epilogue::Relu, Epilogue::Silu, Epilogue::Add] {
+                let strided = Strided::new(&x, 20, inputs, 3);
+                let mut out = Strided::new(&[0.5; 20 * 53], 20, outputs, 2);
+                layer.apply(2, strided.view(), epilogue, out.view_mut(), &mut scratch);
+                assert_eq!(
+                    bits(&out.values()),
+                    bits(&apply(&layer, 1, &x, epilogue)),
+                    "{isa}, {arithmetic:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn stored_weights_give_the_bits_of_weights_narrowed_at_pack() {
+    for (inputs, outputs) in [(1, 3), (63, 101), (640, 50)] {
+        let weight = numbers(15, outputs * inputs, 1.0);
+        let x = numbers(16, 20 * inputs, 1.0);
+        let narrow: Vec<_> = weight.iter().map(|&value| bf16::from_f32(value)).collect();
+        let (mut values, mut scales) = (vec![0; weight.len()], vec![0.0; outputs]);
+        quantize_rows(
+            WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs)),
+            &mut values,
+            &mut scales,
+        );
+        let bf16 = WeightRef::Bf16(MatRef::from_row_major_slice(&narrow, outputs, inputs));
+        let int8 = WeightRef::Int8 {
+            values: MatRef::from_row_major_slice(&values, outputs, inputs),
+            scales: &scales,
+        };
+        let dequantized: Vec<f32> = values
+            .iter()
+            .enumerate()
+            .map(|(index, &value)| f32::from(value) * scales[index / inputs])
+            .collect();
+        for isa in Isa::available() {
+            let zeros = vec![0.0; outputs];
+            let out = |weight, arithmetic| {
+                let layer = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
+                bits(&apply(&layer, 1, &x, Epilogue::Store))
+            };
+            let expected = |weight: &[f32], arithmetic| {
+                bits(&apply(
+                    &pack(isa, arithmetic, weight, &zeros),
+                    1,
+                    &x,
+                    Epilogue::Store,
+                ))
+            };
+            assert_eq!(
+                out(bf16, Arithmetic::Bfloat16),
+                expected(&weight, Arithmetic::Bfloat16),
+                "{isa}"
+            );
+            assert_eq!(
+                out(int8, Arithmetic::Int8),
+                expected(&weight, Arithmetic::Int8),
+                "{isa}"
+            );
+            assert_eq!(
+                out(int8, Arithmetic::Float32),
+                expected(&dequantized, Arithmetic::Float32),
+                "{isa}"
+            );
+            assert_eq!(
+                out(int8, Arithmetic::Bfloat16),
+                expected(&dequantized, Arithmetic::Bfloat16),
+                "{isa}"
+            );
+        }
+    }
+}
+
+#[test]
+fn rows_of_any_size_keep_to_the_bound() {
+    let inputs = 40;
+    let weight = numbers(17, 21 * inputs, 1e-3);
+    let bias = vec![0.0; 21];
+    for isa in Isa::available() {
+        for arithmetic in NARROW {
+            let layer = pack(isa, arithmetic, &weight, &bias);
+            for scale in [0.0, 1e-45, 1e-38, 1e-36, 1e-30, 1e20, 3e38] {
+                let mut x = numbers(18, 3 * inputs, scale);
+                // One row of one sign, one of a single value.
+                x[inputs..2 * inputs].iter_mut().for_each(|x| *x = -x.abs());
+                x[2 * inputs..].fill(scale);
+                check(
+                    isa,
+                    arithmetic,
+                    &x,
+                    &weight,
+                    &bias,
+                    inputs,
+                    &apply(&layer, 1, &x, Epilogue::Store),
+                );
+            }
+        }
+        let tiny = pack(isa, Arithmetic::Int8, &vec![1e-44; 3 * inputs], &[1.0; 3]);
+        assert_eq!(apply(&tiny, 1, &vec![5.0; inputs], Epilogue::Store), [1.0; 3]);
+    }
+}
+
+#[test]
+fn nan_and_infinity_stay_in_their_row() {
+    let (inputs, outputs) = (130, 70);
+    let clean = numbers(19, 20 * inputs, 1.0);
+    let weight = numbers(20, outputs * inputs, 1.0);
+    let bias = numbers(21, outputs, 1.0);
+    for isa in Isa::available() {
+        for arithmetic in NARROW {
+            let layer = pack(isa, arithmetic, &weight, &bias);
+            for epilogue in [
+                Epilogue::Store,
+                Epilogue::Relu,
+                Epilogue::GeluTanh,
+                Epilogue::Silu,
+                Epilogue::Add,
+            ] {
+                let expected = bits(&apply(&layer, 1, &clean, epilogue));
+                for poison in [
+                    f32::NAN,
+                    -f32::NAN,
+                    f32::from_bits(0x7f80_0001),
+                    f32::INFINITY,
+                    f32::NEG_INFINITY,
+                ] {
+                    for place in [0, 77, 129] {
+                        let mut x = clean.clone();
+                        x[6 * inputs + place] = poison;
+                        let out = apply(&layer, 2, &x, epilogue);
+                        for (row, part) in out.chunks_exact(outputs).enumerate() {
+                            if row != 6 {
+                                assert_eq!(
+                                    bits(part),
+                                    expected[row * outputs..][..outputs],
+                                    "{isa}, {arithmetic:?}"
+                                );
+                            } else if poison.is_nan() || arithmetic == Arithmetic::Int8 {
+                                assert!(
+                                    part.iter().all(|value| value.is_nan()),
+                                    "{isa}, {arithmetic:?}, {poison}"
+                                );
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn weights_that_are_not_finite_give_nan() {
+    for isa in Isa::available() {
+        let mut weight = [1.0; 12];
+        weight[5] = f32::INFINITY;
+        let layer = pack(isa, Arithmetic::Int8, &weight, &[0.0; 3]);
+        let out = apply(&layer, 1, &[1.0; 4], Epilogue::Store);
+        assert!(
+            out[1].is_nan() && (out[0] - 4.0).abs() < 1e-6 && (out[2] - 4.0).abs() < 1e-6,
+            "{isa}: {out:?}"
+        );
+    }
+}
+
+#[test]
+fn sizes_of_zero_are_fine() {
+    for isa in Isa::available() {
+        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+            let weight = |outputs, inputs| WeightRef::F32(MatRef::from_row_major_slice(&[], outputs, inputs));
+            let no_inputs =
+                PackedLinear::pack(isa, arithmetic, 1, &[(weight(3, 0), Some(&[1.0, 2.0, 3.0]))]).unwrap();
+            let mut out = [0.0; 6];
+            let x = MatRef::from_row_major_slice(&[], 2, 0);
+            let mut scratch = LinearScratch::new();
+            no_inputs.apply(1, x, Epilogue::Store, rows_mut(&mut out, 3), &mut scratch);
+            assert_eq!(out, [1.0, 2.0, 3.0, 1.0, 2.0, 3.0], "{isa}, {arithmetic:?}");
+            let no_outputs = PackedLinear::pack(isa, arithmetic, 1, &[(weight(0, 5), None)]).unwrap();
+            let nowhere = MatMut::from_row_major_slice_mut(&mut [], 1, 0);
+            no_outputs.apply(1, rows(&[1.0; 5], 5), Epilogue::Store, nowhere, &mut scratch);
+            let layer = pack(isa, arithmetic, &[1.0; 6], &[0.0; 2]);
+            layer.apply(
+                1,
+                rows(&[], 3),
+                Epilogue::Store,
+                rows_mut(&mut [], 2),
+                &mut scratch,
+            );
+        }
+    }
+}
+
+#[test]
+fn memory_is_what_the_element_takes() {
+    let (inputs, outputs) = (256, 480);
+    let weight = vec![1.0; outputs * inputs];
+    for isa in Isa::available() {
+        let bytes = |arithmetic| pack(isa, arithmetic, &weight, &vec![0.0; outputs]).nbytes();
+        let per_weight = |arithmetic| bytes(arithmetic) / (inputs * outputs);
+        let all = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8];
+        assert_eq!(all.map(per_weight), [4, 2, 1], "{isa}");
+        assert_eq!(
+            pack(isa, Arithmetic::Int8, &weight, &vec![0.0; outputs]).element(),
+            Element::Int8
+        );
+    }
+}
+
+#[test]
+fn quantize_rows_keeps_to_half_a_step() {
+    let (rows, inputs) = (30, 77);
+    let weight = numbers(22, rows * inputs, 2.0);
+    let (mut values, mut scales) = (vec![0; weight.len()], vec![0.0; rows]);
+    let view = MatRef::from_row_major_slice(&weight, rows, inputs);
+    quantize_rows(WeightRef::F32(view), &mut values, &mut scales);
+    for (index, (&value, &w)) in values.iter().zip(&weight).enumerate() {
+        let scale = f64::from(scales[index / inputs]);
+        assert!((f64::from(value) * scale - f64::from(w)).abs() <= 0.500_001 * scale && value != i8::MIN);
+    }
+    for row in values.chunks_exact(inputs) {
+        assert_eq!(row.iter().map(|value| value.unsigned_abs()).max(), Some(127));
+    }
+    // Any layout of the same weights gives the same bits.
+    let transposed: Vec<f32> = (0..rows * inputs)
+        .map(|i| weight[i % rows * inputs + i / rows])
+        .collect();
+    let (mut again, mut again_scales) = (vec![0; weight.len()], vec![0.0; rows]);
+    let view = MatRef::from_row_major_slice(&transposed, inputs, rows).transpose();
+    quantize_rows(WeightRef::F32(view), &mut again, &mut again_scales);
+    assert_eq!((again, bits(&again_scales)), (values, bits(&scales)));
+}
