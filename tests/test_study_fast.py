@@ -193,6 +193,23 @@ def test_integrators_against_the_reference_in_float64(checkpoint: Path, integrat
     np.testing.assert_allclose(found, x, rtol=0, atol=2e-5)
 
 
+@pytest.mark.parametrize("refresh", [2, 3])
+def test_refresh_against_the_reference_in_float64(checkpoint: Path, refresh: int) -> None:
+    head, reference = saccade.ActionHead.load(checkpoint), Reference.load(checkpoint, dtype=torch.float64)
+    features, state, embodiment, noise = observation(head)
+    mode = Mode.parse(f"float32-euler-4-refresh-{refresh}")
+    found = sample(head, mode, PLAIN, head.encode(features), state, embodiment, noise)
+    with torch.no_grad():
+        expected, exact = (
+            reference.sample(
+                reference.encode(features), state, embodiment, noise=noise, num_steps=4, future_refresh=every
+            ).numpy()
+            for every in (refresh, None)
+        )
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
+    assert np.abs(found - exact).max() > 1e-3
+
+
 def test_many_steps_come_closer_than_any_mode() -> None:
     """On the shipped policy: a random head's velocity jumps between buckets of time."""
     head = saccade.ActionHead.load(DEMO_CHECKPOINT)

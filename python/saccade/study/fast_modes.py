@@ -171,7 +171,7 @@ def sample(
             embodiment_id,
             noise=noise,
             num_steps=mode.num_steps,
-            **({"future_refresh": mode.refresh} if mode.refresh > 1 else {}),  # type: ignore[arg-type]
+            future_refresh=mode.refresh,
         )
         return np.asarray(found)
     times = calibration.grid(mode.num_steps) if mode.integrator == "times" else even_times(mode.num_steps)
