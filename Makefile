@@ -6,6 +6,9 @@ VENV ?= .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 
+PEERS_VENV ?= .venv-peers
+PEERS_ARGS ?=
+
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
 # The build tool is in the environment, so a build neither downloads anything nor uses another version of it.
@@ -15,11 +18,12 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help rollout test test-rust test-python lint format setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format setup-rollout setup-test clean
 
 help:
 	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
 	@echo "make test      every test, Rust and Python"
+	@echo "make bench-peers   saccade beside every engine that runs the same head; report in out/peers"
 	@echo "make lint      what .ci/run checks besides the tests"
 	@echo "make format    formats all Rust and Python files"
 	@echo "make clean     removes the virtual environment and what was built"
@@ -48,6 +52,10 @@ lint: setup-test
 	$(BIN)/mypy
 	$(BIN)/stubtest saccade._saccade
 
+# Other engines, in an environment of their own. PEERS_ARGS=--help lists what can be asked for.
+bench-peers: setup-peers
+	SACCADE_PEERS_GGML=$(PEERS_VENV)/ggml/build/bin $(PEERS_VENV)/bin/python -m benches.peers $(PEERS_ARGS)
+
 format: setup-test
 	cargo fmt --all
 	$(BIN)/ruff check --fix .
@@ -63,6 +71,12 @@ setup-test:
 	@$(PYTHON) .ci/needs.py python rust opengl
 	@$(MAKE) -s $(VENV)/.test
 	@$(MAKE) -s $(VENV)/.extension
+
+setup-peers:
+	@$(PYTHON) .ci/needs.py python rust
+	@$(MAKE) -s $(PEERS_VENV)/.engines
+	@$(MAKE) -s $(PEERS_VENV)/.extension
+	@$(MAKE) -s $(PEERS_VENV)/.ggml
 
 # A copied or moved checkout has an environment that points elsewhere: it is made anew.
 $(VENV)/.tools: constraints.txt
@@ -87,6 +101,27 @@ $(VENV)/.extension: pyproject.toml $(RUST_SOURCES)
 	@$(INSTALL) . --no-deps
 	@touch $@
 
+PEERS_PIP := $(PEERS_VENV)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --constraint benches/peers/constraints.txt
+ENGINES := torch diffusers transformers onnx onnxscript onnxruntime openvino matplotlib cmake ninja maturin safetensors numpy
+
+$(PEERS_VENV)/.engines: benches/peers/constraints.txt
+	@test "$$($(PEERS_VENV)/bin/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(PEERS_VENV))" || $(PYTHON) -m venv --clear $(PEERS_VENV)
+	@echo "setting up: torch, ONNX Runtime, OpenVINO (large; minutes on the first run)"
+	@$(PEERS_PIP) $(ENGINES)
+	@$(PEERS_PIP) --no-deps lerobot
+	@touch $@
+
+$(PEERS_VENV)/.extension: pyproject.toml $(RUST_SOURCES) $(PEERS_VENV)/.engines
+	@echo "setting up: the Rust head, in release"
+	@MATURIN_PEP517_ARGS=--locked $(PEERS_PIP) --no-build-isolation --no-deps --editable .
+	@touch $@
+
+# ggml as llama-cpp-python ships it, built for this CPU. Without it the report lacks ggml and says so; nothing else needs it.
+$(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
+	@echo "setting up: ggml (builds it; minutes)"
+	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report goes without it"
+	@touch $@
+
 clean:
-	rm -rf $(VENV) target out
+	rm -rf $(VENV) $(PEERS_VENV) target out
 	find python -name '*.so' -delete

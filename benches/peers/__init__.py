@@ -1,0 +1,1 @@
+"""saccade beside every engine that can run the same head: what `make bench-peers` measures and reports."""

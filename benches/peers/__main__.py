@@ -1,0 +1,198 @@
+"""saccade beside its peers: what runs the same head on this machine, and how fast.
+
+    make bench-peers                                       the usual set, about a quarter of an hour
+    make bench-peers PEERS_ARGS="--only blocks --threads 2 --rounds 9"
+    make bench-peers PEERS_ARGS="--full"                   every piece at every size: hours
+    make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
+    python -m benches.peers report                         the report of what was measured, again
+    python -m benches.peers report --readme                the README's table, and nothing else
+    python -m benches.peers report --write                 the tables of README and docs/performance.md
+
+Every contender lives in a process of its own with the thread count it is asked for and waits while another
+works; a round lets each do every piece of work once, in an order that rotates. Before it is timed its result
+is compared with the reference in float32. Measurements are added to a JSON file: what was cut short goes on
+where it stopped, and contenders that have all their rounds are not started again.
+
+Needs the environment that `make bench-peers` sets up; a contender whose package is missing is left out, with
+the reason in the report. The whole head in all contenders takes 12 GB of memory; `--memory` sets how much may
+be used at a time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from benches.peers import machine, processes, report
+from benches.peers.cases import WORKS, Case, default_cases, full_cases
+from benches.peers.contenders import CONTENDERS, GROUPS
+from benches.peers.processes import Ready, note
+from benches.peers.results import Results
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit status."""
+    args = parse(arguments)
+    results = Results(args.results)
+    if args.command == "report":
+        return report.command(results, args)
+    machine_now = machine.describe()
+    before = results.data["machine"]
+    if before and before["cpu"] != machine_now["cpu"]:
+        raise SystemExit(f"bench-peers: {args.results} is of another machine: {before['cpu']}")
+    results.data["machine"] = machine_now
+    measure_all(results, args)
+    if not args.prepare:
+        report.write(results, args.results.parent)
+    return 0
+
+
+def measure_all(results: Results, args: argparse.Namespace) -> None:
+    """All cases, until they are done or the time is up."""
+    end = time.monotonic() + args.seconds if args.seconds else float("inf")
+    cases = chosen_cases(args)
+    if not args.prepare:
+        for threads in args.threads:
+            results.data["peaks"].append(machine.peaks(threads))
+        if args.linear_rounds and any(case.piece == "linear" for case in cases):
+            results.data["linear"].append(machine.linear_bench(args.threads, args.linear_rounds))
+        results.save()
+    for case in cases:
+        for batch in batches(results, case, args):
+            if time.monotonic() > end:
+                note("the time is up; the next run goes on here")
+                return
+            processes.prepare(case, args.work)
+            measure(results, case, batch, args, end)
+
+
+def chosen_cases(args: argparse.Namespace) -> list[Case]:
+    """What the command line asks for."""
+    cases = full_cases(args.threads) if args.full else default_cases(args.threads)
+    changed = {
+        name: getattr(args, name)
+        for name in ("num_vl_tokens", "num_future_tokens", "batch", "samples", "steps")
+        if getattr(args, name) is not None
+    }
+    cases = [replace(case, size=args.size, **changed) for case in cases if case.piece in args.only]
+    return list(dict.fromkeys(cases))
+
+
+def batches(results: Results, case: Case, args: argparse.Namespace) -> list[list[str]]:
+    """Contenders with rounds to do, as many at a time as fit into memory, behind the first of their group."""
+    found: list[list[str]] = []
+    for group in GROUPS.values():
+        able = [name for name in group if case.piece in group[name].pieces and name in args.contenders]
+        pending = [name for name in able if results.rounds(case, name) < args.rounds]
+        if args.prepare:
+            found += [[name] for name in able]
+            continue
+        anchor = able[0] if able else ""
+        while pending:
+            batch, used = [anchor], gigabytes(case, anchor)
+            for name in [name for name in pending if name != anchor]:
+                if used + gigabytes(case, name) <= args.memory:
+                    batch.append(name)
+                    used += gigabytes(case, name)
+            if len(batch) == 1 and pending != [anchor]:
+                batch = pending[:1]  # it has no room beside the anchor
+            found.append(batch)
+            pending = [name for name in pending if name not in batch]
+    return found
+
+
+def gigabytes(case: Case, name: str) -> float:
+    """Memory of a contender, roughly: the weights of the whole head, or of a fifth of it."""
+    return CONTENDERS[name].gigabytes * (1.0 if case.piece in ("head", "cost") else 0.3)
+
+
+def measure(results: Results, case: Case, names: list[str], args: argparse.Namespace, end: float) -> None:
+    """Builds a batch and lets it run its rounds; the file is written after each of them."""
+    with processes.contenders(names, case, args.work) as (pipes, said):
+        if args.prepare:
+            for name, answer in said.items():
+                if isinstance(answer, Ready):
+                    note(f"{name}: max abs error {answer.error:.2e} of {answer.scale:.2e}")
+            return
+        record = results.open(case)
+        for name, answer in said.items():
+            record["contenders"][name] = (
+                {"error": answer.error, "scale": answer.scale, "notes": answer.notes, "seconds": {}}
+                if isinstance(answer, Ready)
+                else {"failed": str(answer)}
+            )
+        results.save()
+        rounds = max(args.rounds - min(results.rounds(case, name) for name in names), 0)
+        for index in range(rounds if pipes else 0):
+            if time.monotonic() > end:
+                note("the time is up; the next run goes on here")
+                break
+            note(f"{case}: round {index + 1} of {rounds}")
+            seconds = processes.round_of(pipes, said, case.works, index)
+            for name, works in seconds.items():
+                for work, value in works.items():
+                    record["contenders"][name]["seconds"].setdefault(work, []).append(value)
+            results.save()
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benches.peers",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = ("measure", "report")
+    parser.add_argument("command", nargs="?", choices=commands, default="measure", help="default: measure")
+    parser.add_argument("--full", action="store_true", help="every size, not only the usual one")
+    parser.add_argument(
+        "--only", nargs="+", choices=WORKS, default=list(WORKS), metavar="PIECE", help=" ".join(WORKS)
+    )
+    parser.add_argument(
+        "--contenders",
+        nargs="+",
+        choices=CONTENDERS,
+        metavar="NAME",
+        help="default: all but the settings that another one beats; of: " + ", ".join(CONTENDERS),
+    )
+    parser.add_argument("--threads", type=int, nargs="+", default=[2, 1], help="thread counts (default 2 1)")
+    parser.add_argument("--rounds", type=int, default=5, help="repetitions of everything (default 5)")
+    parser.add_argument(
+        "--linear-rounds", type=int, default=8, help="of `cargo bench --bench linear`; 0: without (default 8)"
+    )
+    parser.add_argument("--seconds", type=float, help="stop after so long; the next run goes on")
+    parser.add_argument("--memory", type=float, default=12, help="GB that contenders may use (default 12)")
+    parser.add_argument(
+        "--prepare", action="store_true", help="write inputs and graphs, compare results, time nothing"
+    )
+    for name in ("num-vl-tokens", "num-future-tokens", "batch", "samples", "steps"):
+        parser.add_argument(f"--{name}", type=int, help="this one, in every case")
+    parser.add_argument(
+        "--size", choices=("full", "small"), default="full", help="small: to see that it works"
+    )
+    parser.add_argument(
+        "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
+    )
+    parser.add_argument(
+        "--results", type=Path, help="the JSON file (default results.json in the folder of --work)"
+    )
+    parser.add_argument("--readme", action="store_true", help="report: print the README's table only")
+    parser.add_argument(
+        "--write", action="store_true", help="report: write README.md and docs/performance.md"
+    )
+    args = parser.parse_args(arguments)
+    args.results = args.results or args.work / "results.json"
+    if args.contenders is None:
+        args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]
+    if args.rounds < 1 or min(args.threads) < 1:
+        parser.error("--rounds and --threads must be at least 1")
+    return args
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        sys.exit(main())

@@ -1,0 +1,17 @@
+#!/bin/sh
+# Builds ggml from the sources in llama-cpp-python's source package: build_ggml.sh ENVIRONMENT; the libraries lie in
+# ENVIRONMENT/ggml/build/bin. The version is that of constraints.txt.
+set -eu
+environment=$(cd "$1" && pwd)
+constraints=$(cd "$(dirname "$0")" && pwd)/constraints.txt
+requirement=$(grep '^llama-cpp-python==' "$constraints")
+mkdir -p "$environment/ggml"
+cd "$environment/ggml"
+"$environment/bin/python" -m pip --disable-pip-version-check download --quiet --no-deps --no-binary llama-cpp-python "$requirement"
+rm -rf source build && mkdir source
+tar xzf llama_cpp_python-*.tar.gz --strip-components 1 -C source
+PATH="$environment/bin:$PATH"
+# llama.cpp's own options for the CPU: native instruction set, llamafile's products, OpenMP.
+cmake -S source/vendor/llama.cpp -B build -G Ninja -DCMAKE_BUILD_TYPE=Release -DGGML_CCACHE=OFF \
+    -DLLAMA_BUILD_TESTS=OFF -DLLAMA_BUILD_EXAMPLES=OFF -DLLAMA_BUILD_TOOLS=OFF -DLLAMA_BUILD_SERVER=OFF >cmake.log
+cmake --build build --target ggml >build.log

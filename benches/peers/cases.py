@@ -1,0 +1,147 @@
+"""What is measured: pieces of the head, their sizes, and how many multiply-adds each takes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from saccade import HeadConfig
+
+NUM_BLOCKS = 4  # of the piece "blocks": cross, self, cross, self
+LINEAR_SHAPES = ((49, 1536, 6144), (49, 6144, 1536), (49, 1536, 1536), (296, 2048, 1536))
+"""`(rows, inputs, outputs)`: a DiT block's feed-forward and projections, a projection of the features."""
+COST: dict[str, tuple[int, ...]] = {
+    "N": (0, 16, 32, 64, 128),
+    "T_vl": (74, 148, 296, 559, 822),
+    "steps": (1, 2, 4, 8),
+    "samples": (1, 2, 4, 8),
+}
+"""What the time of a chunk is measured against, each varied alone about the released size."""
+WORKS: dict[str, tuple[str, ...]] = {
+    "linear": tuple(f"{rows} x {inputs} x {outputs}" for rows, inputs, outputs in LINEAR_SHAPES),
+    "cross": ("held", "both"),
+    "blocks": ("held", "both"),
+    "head": ("encode", "sample", "both"),
+    "cost": (
+        *(f"encode, T_vl {value}" for value in COST["T_vl"]),
+        *(f"sample, {name} {value}" for name, values in COST.items() for value in values),
+    ),
+}
+"""What can be timed of a piece. `held`: keys and values of the observation are held from before."""
+
+
+@dataclass(frozen=True, order=True)
+class Case:
+    """One piece of the head at one size.
+
+    Attributes:
+        piece: A key of `WORKS`: the linear layers alone (`LINEAR_SHAPES`), the attention of the eight cross
+            blocks, four DiT blocks, the whole head, the whole head at the sizes of `COST`.
+        threads: Threads that every engine is given.
+        num_vl_tokens: T_vl.
+        num_future_tokens: N.
+        batch: Observations.
+        samples: Chunks for each observation.
+        steps: Euler steps (of the whole head).
+        size: `full` (N1.5) or `small` (to see that it works).
+    """
+
+    piece: str
+    threads: int
+    num_vl_tokens: int = 296
+    num_future_tokens: int = 32
+    batch: int = 1
+    samples: int = 1
+    steps: int = 4
+    size: str = "full"
+
+    @property
+    def works(self) -> tuple[str, ...]:
+        """What is timed of it."""
+        return WORKS[self.piece]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Its fields, for JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.piece} T_vl {self.num_vl_tokens} N {self.num_future_tokens} batch {self.batch} "
+            f"samples {self.samples} steps {self.steps}, {self.threads} threads"
+        )
+
+
+def default_cases(threads: list[int]) -> list[Case]:
+    """What fits a quarter of an hour: the released size, one view, N 32, one observation, one chunk."""
+    cases = [Case(piece, count) for piece in ("head", "blocks", "cross", "linear") for count in threads]
+    return [*cases, Case("cost", max(threads))]
+
+
+def full_cases(threads: list[int]) -> list[Case]:
+    """Every piece at T_vl 296 and 822, N 0 / 32 / 64, one and eight observations, one and eight chunks."""
+    cases = []
+    for default in default_cases(threads):
+        cases.append(default)
+        if default.piece in ("linear", "cost"):
+            continue
+        for vl in (296, 822):
+            # The cross-attention sees N only as more rows; four blocks have no samples of one observation.
+            for future in (0, 32, 64):
+                cases.append(replace(default, num_vl_tokens=vl, num_future_tokens=future))
+            cases.append(replace(default, num_vl_tokens=vl, batch=8))
+            if default.piece != "blocks":
+                cases.append(replace(default, num_vl_tokens=vl, samples=8))
+    return list(dict.fromkeys(cases))
+
+
+def exact_macs(config: HeadConfig, case: Case) -> dict[str, float]:
+    """Multiply-adds of the exact computation by work: the floor that every engine is measured against.
+
+    Of the whole head nothing is counted that can be saved without changing a result: keys and values of the
+    cross blocks once an observation, the last self-attention block and the output for the action rows only,
+    all that depends on the time alone kept from earlier.
+    """
+    if case.piece == "linear":
+        products = (float(rows * inputs * outputs) for rows, inputs, outputs in LINEAR_SHAPES)
+        return dict(zip(case.works, products, strict=True))
+    if case.piece == "cost":
+        return {work: exact_macs(config, case_of_cost(case, work))[work.split(",")[0]] for work in case.works}
+    vl, width, hidden, horizon = case.num_vl_tokens, config.width, config.hidden_dim, config.action_horizon
+    rows = 1 + case.num_future_tokens + horizon
+    cross = [index % 2 == 0 or not config.interleave_self_attention for index in range(config.num_layers)]
+    key_values = sum(cross) * 2 * vl * config.context_dim * width
+    if case.piece == "cross":
+        attention = sum(cross) * (2 * rows * width**2 + 2 * rows * vl * width)
+        return _works(case.batch * key_values, case.batch * case.samples * attention)
+    if case.piece == "blocks":
+        blocks = sum(_block(config, rows, rows, vl, is_cross) for is_cross in cross)
+        return _works(case.batch * key_values, case.batch * blocks)
+    encode = config.vl_num_layers * (12 * vl * config.context_dim**2 + 2 * vl * vl * config.context_dim)
+    encode += key_values
+    step = 0
+    for index, is_cross in enumerate(cross):
+        queries = horizon if index == config.num_layers - 1 and not is_cross else rows
+        step += _block(config, queries, rows, vl, is_cross)
+    step += horizon * (config.encoder_action_dim * width + width**2)  # action encoder, two layers made one
+    step += horizon * (width * hidden + hidden**2 + hidden * config.action_dim)  # output and decoder
+    state = config.state_history * config.state_dim * hidden + hidden * width
+    sample = case.batch * (case.samples * case.steps * step + state)
+    return {"encode": case.batch * encode, "sample": sample, "both": case.batch * encode + sample}
+
+
+def case_of_cost(case: Case, work: str) -> Case:
+    """The whole head at the size that a work of the piece `cost` names."""
+    name, value = work.partition(", ")[2].split(" ")
+    field = {"N": "num_future_tokens", "T_vl": "num_vl_tokens"}.get(name, name)
+    return replace(case, piece="head", **{field: int(value)})
+
+
+def _works(key_values: float, held: float) -> dict[str, float]:
+    return {"held": held, "both": key_values + held}
+
+
+def _block(config: HeadConfig, queries: int, rows: int, vl: int, is_cross: bool) -> int:
+    """One DiT block's: query, output, feed-forward; scores, values; a self block's keys and values."""
+    width = config.width
+    keys = vl if is_cross else rows
+    return queries * 10 * width**2 + 2 * queries * keys * width + (0 if is_cross else rows * 2 * width**2)

@@ -1,0 +1,134 @@
+"""Who is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One engine in one setting.
+
+    Attributes:
+        label: Its name in tables.
+        engine: The module of `benches.peers.engines` that builds it.
+        pieces: What it can run.
+        gigabytes: Of memory while it runs the whole head at full size, roughly.
+        options: What the engine's `build` reads.
+        environment: Set in its process.
+        usual: Whether it is part of a run that names nobody; the others are settings that were tried and
+            that another setting of the same engine beats.
+    """
+
+    label: str
+    engine: str
+    pieces: tuple[str, ...]
+    gigabytes: float
+    options: Mapping[str, Any]
+    environment: Mapping[str, str] = field(default_factory=dict)
+    usual: bool = True
+
+
+ALL = ("linear", "cross", "blocks", "head")
+PARTS = ("cross", "blocks", "head")
+
+
+def _saccade(
+    precision: str, gigabytes: float, isa: str | None = None, refresh: int | None = None
+) -> Contender:
+    label = f"saccade {precision}"
+    options: dict[str, Any] = {"precision": precision}
+    if refresh is not None:
+        options["future_refresh"] = refresh
+        label += f", future_refresh={refresh}"
+    if isa is not None:
+        label += f" ({isa})"
+    return Contender(
+        label,
+        "saccade_head",
+        ("head",) if refresh else PARTS if isa else (*PARTS, "cost"),
+        gigabytes,
+        options,
+        {} if isa is None else {"SACCADE_ISA": isa},
+    )
+
+
+GROUPS: Mapping[str, Mapping[str, Contender]] = {
+    "float32": {
+        "saccade-float32": _saccade("float32", 3.3),
+        "lerobot-float32": Contender(
+            "lerobot 0.4.4 float32", "lerobot", ("blocks", "head"), 3.6, {"arithmetic": "float32"}
+        ),
+        "saccade-float32-avx2": _saccade("float32", 3.3, "avx2"),
+        "torch-float32": Contender("torch float32", "pytorch", ALL, 3.6, {"arithmetic": "float32"}),
+        "compile-float32": Contender(
+            "torch.compile float32", "pytorch", ALL, 6.5, {"arithmetic": "float32", "compiled": True}
+        ),
+        "compile-float32-autotuned": Contender(
+            "torch.compile float32, autotuned",
+            "pytorch",
+            ALL,
+            6.5,
+            {"arithmetic": "float32", "compiled": True, "autotuned": True},
+            usual=False,
+        ),
+        "onnxruntime-float32": Contender(
+            "ONNX Runtime float32", "onnx_runtime", ALL, 4.5, {"arithmetic": "float32"}
+        ),
+        "openvino-float32": Contender("OpenVINO float32", "open_vino", ALL, 4.5, {"arithmetic": "float32"}),
+        "ggml-float32": Contender("ggml f32", "ggml", ("linear",), 1, {"arithmetic": "float32"}),
+    },
+    "narrow": {
+        "saccade-bfloat16": _saccade("bfloat16", 1.8),
+        "lerobot-bfloat16": Contender(
+            "lerobot 0.4.4 bfloat16", "lerobot", ("blocks", "head"), 2.0, {"arithmetic": "autocast"}
+        ),
+        "openvino-bfloat16": Contender("OpenVINO bfloat16", "open_vino", ALL, 3, {"arithmetic": "bfloat16"}),
+        "saccade-int8": _saccade("int8", 1.0),
+        "saccade-int8-refresh2": _saccade("int8", 1.0, refresh=2),
+        "saccade-int8-refresh4": _saccade("int8", 1.0, refresh=4),
+        "saccade-bfloat16-avx2": _saccade("bfloat16", 1.8, "avx2"),
+        "saccade-int8-avx2": _saccade("int8", 1.0, "avx2"),
+        "torch-bfloat16": Contender("torch bfloat16", "pytorch", ALL, 2.2, {"arithmetic": "bfloat16"}),
+        "compile-bfloat16": Contender(
+            "torch.compile bfloat16", "pytorch", ALL, 3.5, {"arithmetic": "bfloat16", "compiled": True}
+        ),
+        "onnxruntime-int8": Contender(
+            "ONNX Runtime int8, dynamic", "onnx_runtime", ALL, 1.8, {"arithmetic": "int8"}
+        ),
+        "ggml-float16": Contender("ggml f16", "ggml", ("linear",), 1, {"arithmetic": "float16"}),
+        "ggml-bfloat16": Contender("ggml bf16", "ggml", ("linear",), 1, {"arithmetic": "bfloat16"}),
+        "ggml-int8": Contender("ggml q8_0", "ggml", ("linear",), 1, {"arithmetic": "int8"}),
+        "lerobot-bfloat16-pure": Contender(
+            "lerobot 0.4.4 bfloat16, no autocast",
+            "lerobot",
+            ("blocks", "head"),
+            2.0,
+            {"arithmetic": "bfloat16"},
+            usual=False,
+        ),
+        "torch-autocast": Contender(
+            "torch bfloat16 autocast", "pytorch", ALL, 2.2, {"arithmetic": "autocast"}, usual=False
+        ),
+        "compile-autocast": Contender(
+            "torch.compile bfloat16 autocast",
+            "pytorch",
+            ALL,
+            3.5,
+            {"arithmetic": "autocast", "compiled": True},
+            usual=False,
+        ),
+        "torch-int8": Contender(
+            "torch int8, dynamic", "pytorch", PARTS, 1.8, {"arithmetic": "int8"}, usual=False
+        ),
+    },
+}
+"""By arithmetic, so that a batch of them fits into memory; the first of each is the one that the others'
+times are divided by, round by round.
+"""
+
+CONTENDERS: Mapping[str, Contender] = {
+    name: contender for group in GROUPS.values() for name, contender in group.items()
+}

@@ -1,0 +1,82 @@
+"""ONNX Runtime: the pieces exported by torch, in float32 or dynamically quantised to int8."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from benches.peers.engines import Built, Task, graphs
+
+
+class OnnxRuntime:
+    """Options: `arithmetic` is `float32` or `int8` (weights int8 per output channel, inputs uint8)."""
+
+    def __init__(self, task: Task) -> None:
+        self.arithmetic = task.options["arithmetic"]
+        self.folder = task.graphs
+        self.options = onnxruntime.SessionOptions()
+        self.options.intra_op_num_threads = task.case.threads
+        self.options.inter_op_num_threads = 1
+        self.options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
+
+    def graph(self, name: str, module: Callable[[], nn.Module], inputs: tuple[Tensor, ...]) -> graphs.Graph:
+        """A session of the exported module."""
+        path = self.folder / f"{name}.onnx"
+        if not path.exists():
+            export(module(), inputs, path)
+        if self.arithmetic == "int8":
+            narrow = self.folder / f"{name}-int8.onnx"
+            if not narrow.exists():
+                quantize(path, narrow)
+            path = narrow
+        session = onnxruntime.InferenceSession(path, self.options, providers=["CPUExecutionProvider"])
+        names = [each.name for each in session.get_inputs()]
+
+        def call(*arrays: NDArray[np.float32]) -> tuple[Any, ...]:
+            return tuple(session.run(None, dict(zip(names, arrays, strict=True))))
+
+        return call
+
+    def array(self, tensor: Tensor) -> NDArray[np.float32]:
+        """A NumPy array, which the session reads in place."""
+        return np.ascontiguousarray(tensor.numpy())
+
+    def numpy(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
+        """As it is."""
+        return array
+
+
+def export(module: nn.Module, inputs: tuple[Tensor, ...], path: Path) -> None:
+    """Writes the module as ONNX with its weights beside it; renamed when it is whole."""
+    part = path.with_name(f"part-{path.name}")
+    torch.onnx.export(module.eval(), inputs, part, dynamo=True, external_data=True, verbose=False)
+    part.rename(path)
+
+
+def quantize(path: Path, narrow: Path) -> None:
+    """Weights of matrix products to int8, one scale an output channel."""
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    part = narrow.with_name(f"part-{narrow.name}")
+    quantize_dynamic(
+        path,
+        part,
+        per_channel=True,
+        weight_type=QuantType.QInt8,
+        use_external_data_format=True,
+        extra_options={"MatMulConstBOnly": True},
+    )
+    part.rename(narrow)
+
+
+def build(task: Task) -> Built:
+    """The works of the task's piece."""
+    torch.set_num_threads(task.case.threads)
+    return graphs.build(OnnxRuntime(task), task)

@@ -1,0 +1,93 @@
+"""The machine: its name, what it is running, and what it can do at most."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import saccade
+
+ROOT = Path(__file__).resolve().parents[2]
+FLAGS = ("avx2", "fma", "f16c", "avx_vnni", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx512_bf16")
+AMX = ("amx_tile", "amx_bf16", "amx_int8")
+PACKAGES = ("saccade", "torch", "lerobot", "diffusers", "onnxruntime", "openvino", "numpy")
+
+
+def describe() -> dict[str, Any]:
+    """CPU, its flags that matter here, cores, memory, and the versions of all engines."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    cpuinfo = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    flags = set(cpuinfo.get("flags", "").split())
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    config = saccade.show_config("dicts")
+    return {
+        "cpu": cpuinfo.get("model name", platform.machine()),
+        "family": f"family {cpuinfo.get('cpu family')}, model {cpuinfo.get('model')}",
+        "flags": [flag for flag in FLAGS + AMX if flag in flags],
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gb": round(memory / 1e9),
+        "kernel": platform.release(),
+        "isa": config["isa"],
+        "isas": config["available_isas"],
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in PACKAGES},
+            "ggml": os.environ.get("SACCADE_PEERS_GGML_VERSION", ""),
+        },
+        "commit": said("git", "rev-parse", "--short", "HEAD"),
+    }
+
+
+def version(name: str) -> str:
+    """Of an installed package; empty if it is not."""
+    if name == "saccade":
+        return saccade.__version__
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def said(*command: str) -> str:
+    """What a command printed, or nothing if it failed."""
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def peaks(threads: int) -> dict[str, Any]:
+    """What the CPU can do now: multiply-adds a second from registers, of every instruction set and
+    arithmetic; read bandwidth; clock.
+    """
+    return {"threads": threads, **saccade._saccade.measure_peaks(threads)}
+
+
+def linear_bench(threads: list[int], rounds: int) -> Any:
+    """What `cargo bench --bench linear` measures of saccade's linear layers beside the peak."""
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        command = [
+            "cargo",
+            "bench",
+            "--locked",
+            "--quiet",
+            "--package",
+            "saccade-benches",
+            "--bench",
+            "linear",
+        ]
+        command += [
+            "--",
+            "--threads",
+            ",".join(map(str, threads)),
+            "--rounds",
+            str(rounds),
+            "--json",
+            file.name,
+        ]
+        subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
+        return json.load(file)

@@ -1,0 +1,201 @@
+"""One process for each contender, which waits while another works, and rounds over all of them.
+
+No idle thread of one spins beside another that is measured, and nobody shares an allocator. A round lets
+every contender do every work once, in an order that rotates, so that a drift of the clock meets all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benches.peers import inputs
+from benches.peers.cases import Case
+from benches.peers.contenders import CONTENDERS
+from benches.peers.engines import Built, Task
+
+PAUSE = 0.2  # seconds of rest before a measurement; the threads of the one before have gone to sleep by then
+SAMPLE = (
+    0.05  # a sample lasts at least so many seconds: long against the clock and against a scheduler's tick
+)
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A contender that has built its works.
+
+    Attributes:
+        error: Largest absolute difference from the reference.
+        scale: Largest absolute value of the reference.
+        notes: The engine's.
+        works: What it can be asked to do.
+    """
+
+    error: float
+    scale: float
+    notes: str
+    works: tuple[str, ...]
+
+
+def worker(pipe: Connection, name: str, case: Case, work_folder: Path) -> None:
+    """A contender's process: builds, then does what each message says and answers with seconds."""
+    try:
+        contender = CONTENDERS[name]
+        graphs = graphs_folder(case, work_folder)
+        graphs.mkdir(parents=True, exist_ok=True)
+        arrays = inputs.expected_of(case, work_folder)
+        task = Task(case, dict(contender.options), inputs.checkpoint(case, work_folder), arrays, graphs)
+        engine = importlib.import_module(f"benches.peers.engines.{contender.engine}")
+        built: Built = engine.build(task)
+        error, scale = difference(built.result(), arrays["expected"])
+        for work in built.works.values():
+            work()  # the first call allocates and may compile; it is not timed
+        pipe.send(Ready(error, scale, built.notes, tuple(built.works)))
+        repeats: dict[str, int] = {}
+        while (asked := pipe.recv()) is not None:
+            pipe.send(seconds_of(built, asked, repeats))
+    except Exception as error:
+        pipe.send(RuntimeError(f"{type(error).__name__}: {error}"))
+
+
+def difference(result: Any, expected: Any) -> tuple[float, float]:
+    """Largest absolute difference and largest absolute expected value.
+
+    Raises:
+        ValueError: another shape, or a value that is not finite.
+    """
+    if result.shape != expected.shape:
+        raise ValueError(f"the result has shape {result.shape}, expected {expected.shape}")
+    if not np.isfinite(result).all():
+        raise ValueError("the result has values that are not finite")
+    return float(np.abs(result - expected).max()), float(np.abs(expected).max())
+
+
+def seconds_of(built: Built, work: str, repeats: dict[str, int]) -> float:
+    """Seconds of one layer or piece: of one call, or the mean of so many as fill a sample."""
+    run, times = built.works[work], repeats.get(work, 1)
+    start = time.perf_counter()
+    for _ in range(times):
+        run()
+    seconds = (time.perf_counter() - start) / times
+    if work not in repeats:
+        repeats[work] = max(1, int(SAMPLE / seconds))
+        if repeats[work] > 1:
+            return seconds_of(built, work, repeats)
+    return seconds / built.calls.get(work, 1)
+
+
+def graphs_folder(case: Case, work_folder: Path) -> Path:
+    """Where the graphs of a case lie, whatever its threads and steps."""
+    parts = (case.size, case.piece, case.num_vl_tokens, case.num_future_tokens, case.batch, case.samples)
+    return work_folder / "graphs" / "-".join(map(str, parts))
+
+
+def prepare(case: Case, work_folder: Path) -> None:
+    """Writes the case's checkpoint and expected result, in a process of its own: this one stays small."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=inputs.expected_of, args=(case, work_folder)
+    )
+    process.start()
+    process.join()
+    if process.exitcode != 0:
+        raise SystemExit(f"bench-peers: the inputs of {case} could not be made")
+
+
+@contextlib.contextmanager
+def contenders(
+    names: list[str], case: Case, work_folder: Path
+) -> Iterator[tuple[dict[str, Connection], dict[str, Ready | RuntimeError]]]:
+    """Processes that have built their works, one after the other; and what each said, an error too.
+
+    Only those that are ready have a pipe.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    pipes: dict[str, Connection] = {}
+    said: dict[str, Ready | RuntimeError] = {}
+    processes = []
+    try:
+        for name in names:
+            note(f"{case}: building {name}")
+            ours, theirs = spawn.Pipe()
+            process = spawn.Process(target=worker, args=(theirs, name, case, work_folder), daemon=True)
+            with environment_of(name, case, work_folder):
+                process.start()
+            theirs.close()
+            processes.append(process)
+            try:
+                answer = ours.recv()
+            except EOFError:
+                process.join()
+                answer = RuntimeError(f"the process ended with status {process.exitcode}")
+            said[name] = answer
+            if isinstance(answer, Ready):
+                pipes[name] = ours
+            else:
+                note(f"{name} failed: {answer}")
+        yield pipes, said
+    finally:
+        for pipe in pipes.values():
+            with contextlib.suppress(OSError):
+                pipe.send(None)
+        for process in processes:
+            process.join(timeout=10)
+            process.kill()
+            process.join()
+
+
+@contextlib.contextmanager
+def environment_of(name: str, case: Case, work_folder: Path) -> Iterator[None]:
+    """The environment that a contender's process is started with."""
+    before = os.environ.copy()
+    os.environ.update(
+        {
+            "OMP_NUM_THREADS": str(case.threads),
+            "MKL_NUM_THREADS": str(case.threads),
+            "SACCADE_NUM_THREADS": str(case.threads),
+            "THP_MEM_ALLOC_ENABLE": "1",  # torch then asks for huge pages
+            "TORCHINDUCTOR_CACHE_DIR": str((work_folder / "inductor").absolute()),
+            **CONTENDERS[name].environment,
+        }
+    )
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+def round_of(
+    pipes: Mapping[str, Connection], said: Mapping[str, Any], works: tuple[str, ...], index: int
+) -> dict[str, dict[str, float]]:
+    """Seconds of every contender and work, once; contender number `index` begins."""
+    names = list(pipes)
+    turn = index % len(names)
+    seconds: dict[str, dict[str, float]] = {}
+    for name in names[turn:] + names[:turn]:
+        seconds[name] = {}
+        for work in works:
+            if work in said[name].works:
+                time.sleep(PAUSE)
+                pipes[name].send(work)
+                answer = pipes[name].recv()
+                if isinstance(answer, Exception):
+                    raise answer
+                seconds[name][work] = answer
+    return seconds
+
+
+def note(message: str) -> None:
+    """Progress, beside the result."""
+    print(f"bench-peers: {message}", file=sys.stderr, flush=True)

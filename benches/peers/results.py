@@ -1,0 +1,143 @@
+"""What was measured, as a JSON file that grows from run to run, and the statistics of it."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from benches.peers.cases import Case
+
+FORMAT = 1
+TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
+"""Of the reference's largest absolute value; what differs by more is not ranked."""
+
+
+class Results:
+    """The measurements of one machine.
+
+    Attributes:
+        path: The file; written after every round.
+        data: Its content: `machine`, `peaks` (one entry a run and thread count), `linear` (what
+            `cargo bench --bench linear` printed), and `records`: a case, and the seconds of contenders that
+            ran in turn, with as many rounds for each.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        empty: dict[str, Any] = {"format": FORMAT, "machine": {}, "peaks": [], "linear": [], "records": []}
+        self.data = json.loads(path.read_text()) if path.exists() else empty
+        if self.data["format"] != FORMAT:
+            raise SystemExit(f"bench-peers: {path} has format {self.data['format']}, expected {FORMAT}")
+
+    def save(self) -> None:
+        """Writes the file; renamed when it is whole."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        part = self.path.with_name(self.path.name + ".part")
+        part.write_text(json.dumps(rounded(self.data), indent=1) + "\n")
+        part.replace(self.path)
+
+    @property
+    def cases(self) -> list[Case]:
+        """The cases that hold a record, in the order in which they were first measured."""
+        return list(dict.fromkeys(Case(**record["case"]) for record in self.data["records"]))
+
+    def records(self, case: Case) -> Iterator[dict[str, Any]]:
+        """The records of a case, oldest first."""
+        return (record for record in self.data["records"] if Case(**record["case"]) == case)
+
+    def open(self, case: Case) -> dict[str, Any]:
+        """A new record."""
+        record: dict[str, Any] = {"case": case.as_dict(), "contenders": {}}
+        self.data["records"].append(record)
+        return record
+
+    def entries(self, case: Case, name: str) -> Iterator[dict[str, Any]]:
+        """What was recorded of a contender."""
+        for record in self.records(case):
+            if name in record["contenders"]:
+                yield record["contenders"][name]
+
+    def rounds(self, case: Case, name: str) -> int:
+        """How many rounds a contender has done; a contender that failed has none to do."""
+        entries = list(self.entries(case, name))
+        if entries and "failed" in entries[-1]:
+            return 1 << 30
+        return sum(len(next(iter(entry["seconds"].values()), [])) for entry in entries)
+
+    def seconds(self, case: Case, name: str, work: str) -> list[float]:
+        """All times of one work."""
+        return [
+            value for entry in self.entries(case, name) for value in entry.get("seconds", {}).get(work, [])
+        ]
+
+    def names(self, case: Case) -> list[str]:
+        """Contenders of a case with at least one round."""
+        names = dict.fromkeys(name for record in self.records(case) for name in record["contenders"])
+        return [name for name in names if 0 < self.rounds(case, name) < 1 << 30]
+
+    def error(self, case: Case, name: str) -> tuple[float, float]:
+        """Largest absolute difference from the reference, and the reference's largest absolute value."""
+        entry = [entry for entry in self.entries(case, name) if "error" in entry][-1]
+        return entry["error"], entry["scale"]
+
+    def is_correct(self, case: Case, name: str) -> bool:
+        """Whether the contender's result is as near as its arithmetic allows."""
+        error, scale = self.error(case, name)
+        arithmetic = next((kind for kind in TOLERANCE if kind in name), "bfloat16")
+        return error <= TOLERANCE[arithmetic] * scale
+
+    def ratios(self, case: Case, slower: str, faster: str, work: str) -> list[float]:
+        """Time of `slower` over that of `faster`, of the rounds that both did in turn."""
+        pairs: list[float] = []
+        for record in self.records(case):
+            entries = [record["contenders"].get(name, {}).get("seconds", {}) for name in (slower, faster)]
+            times = [entry.get(work, []) for entry in entries]
+            pairs += [above / below for above, below in zip(*times, strict=False)]
+        return pairs
+
+    def ratio(self, case: Case, slower: str, faster: str, work: str) -> tuple[float, float, float] | None:
+        """Quartiles of `ratios`; of all pairs of their times where the two were never measured in turn."""
+        pairs = self.ratios(case, slower, faster, work)
+        if not pairs:
+            times = [self.seconds(case, name, work) for name in (slower, faster)]
+            pairs = [above / below for above in times[0] for below in times[1]]
+        return quartiles(pairs) if pairs else None
+
+    def peak(self, threads: int, isa: str, arithmetic: str) -> float | None:
+        """Multiply-adds a second from registers, the median over the runs; None if not measured."""
+        values = [
+            entry["macs_per_second"].get(isa, {}).get(arithmetic)
+            for entry in self.data["peaks"]
+            if entry["threads"] == threads
+        ]
+        known = [value for value in values if value]
+        return statistics.median(known) if known else None
+
+    def bandwidth(self, threads: int) -> float | None:
+        """Bytes a second read from memory, the median over the runs; None if not measured."""
+        values = [
+            entry["read_bytes_per_second"] for entry in self.data["peaks"] if entry["threads"] == threads
+        ]
+        known = [value for value in values if value]
+        return statistics.median(known) if known else None
+
+
+def quartiles(values: Iterable[float]) -> tuple[float, float, float]:
+    """First quartile, median, third quartile."""
+    held = list(values)
+    if len(held) == 1:
+        return held[0], held[0], held[0]
+    first, median, third = statistics.quantiles(held, n=4, method="inclusive")
+    return first, median, third
+
+
+def rounded(value: Any) -> Any:
+    """Numbers to six digits, which is more than any of them holds."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
