@@ -16,8 +16,8 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyType};
 use saccade::{
-    Array, Checkpoint, Elements, Error, Features, Group, Isa, Keep, LoadOptions, OwnedArray, Patch, Recorded,
-    Sampling, Tokens, TraceOptions,
+    Array, Checkpoint, Elements, Error, Features, Group, Isa, Keep, LoadOptions, OwnedArray, Part, Patch,
+    Profile, Recorded, Sampling, Tokens, TraceOptions,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -489,6 +489,39 @@ fn parse_config<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>
     config_dict(py, &saccade::HeadConfig::from_json(text).map_err(raise)?)
 }
 
+/// Name, without a prefix, and shape of every tensor of a head with this config.
+#[pyfunction]
+fn tensor_shapes(text: &str) -> PyResult<Vec<(String, Vec<usize>)>> {
+    let config = saccade::HeadConfig::from_json(text).map_err(raise)?;
+    Ok(saccade::tensor_shapes(&config))
+}
+
+/// Begins to count where the time of this thread's calls goes.
+#[pyfunction]
+fn start_profile() {
+    Profile::start();
+}
+
+/// Ends it: `(calls, seconds, multiply_adds, bytes)` by part.
+#[pyfunction]
+fn take_profile(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+    let profile = Profile::take().unwrap_or_default();
+    let dict = PyDict::new(py);
+    for part in Part::ALL {
+        let counter = profile.part(part);
+        dict.set_item(
+            part.name(),
+            (
+                counter.calls,
+                counter.time.as_secs_f64(),
+                counter.multiply_adds,
+                counter.bytes,
+            ),
+        )?;
+    }
+    Ok(dict)
+}
+
 #[pyfunction]
 fn read_tensors<'py>(py: Python<'py>, source: PathBuf, prefix: &str) -> PyResult<Bound<'py, PyDict>> {
     let checkpoint = Checkpoint::open(&source).map_err(raise)?;
@@ -528,7 +561,10 @@ mod _saccade {
     #[pymodule_export]
     use super::{ActionHead, Context, CrossAttention, KeyValues};
     #[pymodule_export]
-    use super::{available_isas, default_num_threads, parse_config, read_tensors, selected_isa};
+    use super::{
+        available_isas, default_num_threads, parse_config, read_tensors, selected_isa, start_profile,
+        take_profile, tensor_shapes,
+    };
 
     #[pymodule_export]
     #[allow(non_upper_case_globals)]

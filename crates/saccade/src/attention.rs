@@ -1,11 +1,12 @@
 //! Multi-head attention with its projections, and the feed-forward: what VL blocks and DiT blocks share.
 
 use faer::MatRef;
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, attention};
+use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
 
 use crate::error::Result;
 use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
 use crate::layout::{AttentionNames, FeedForwardNames};
+use crate::profile::{Part, apply, attention, pack};
 
 /// `to_q`, `to_k` over `to_v`, `to_out`: `out(softmax(q k^T / sqrt(head_dim)) v)`, heads being contiguous slices.
 pub(crate) struct Attention {
@@ -126,13 +127,15 @@ impl Attention {
         buffer: &mut Vec<f32>,
         scratch: &mut LinearScratch,
     ) -> Vec<PackedKeyValues> {
-        let (keys, values) = self.keys_values(engine, source, buffer, scratch);
+        let (keys, values) = self.keys_values(engine, Part::ContextToKv, source, buffer, scratch);
         let len = keys.nrows() / groups;
         (0..groups)
             .map(|group| {
                 let mut packed = PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim());
-                packed.pack(
+                pack(
                     engine.threads,
+                    &mut packed,
+                    0,
                     keys.subrows(group * len, len),
                     values.subrows(group * len, len),
                 );
@@ -144,6 +147,7 @@ impl Attention {
     fn keys_values<'a>(
         &self,
         engine: Engine,
+        part: Part,
         source: &[f32],
         buffer: &'a mut Vec<f32>,
         scratch: &mut LinearScratch,
@@ -151,7 +155,9 @@ impl Attention {
         let source = rows(source, self.to_kv.in_features());
         let both = self.to_kv.out_features();
         let buffer = sized(buffer, source.nrows() * both); // (rows, keys | values)
-        self.to_kv.apply(
+        apply(
+            part,
+            &self.to_kv,
             engine.threads,
             source,
             Epilogue::Store,
@@ -196,7 +202,9 @@ impl Attention {
                 rows_mut(&mut mix[range], width),
             );
         }
-        self.to_out.apply(
+        apply(
+            Part::ToOut,
+            &self.to_out,
             engine.threads,
             rows(mix, width),
             epilogue,
@@ -224,7 +232,8 @@ impl Attention {
         self.queries(engine, y, buffers);
         let count = buffers.q.len() / width / groups; // query rows of a sequence
         let mix = sized(&mut buffers.mix, buffers.q.len());
-        let (keys, values) = self.keys_values(engine, source, &mut buffers.kv, &mut buffers.linear);
+        let (keys, values) =
+            self.keys_values(engine, Part::ToKv, source, &mut buffers.kv, &mut buffers.linear);
         let new = keys.nrows() / groups; // rows of a sequence whose keys and values these are
         // Those that are not held share one place.
         let (packed, places, first) = match held {
@@ -244,10 +253,7 @@ impl Attention {
                 keys.subrows(new.start, new.len()),
                 values.subrows(new.start, new.len()),
             );
-            match first {
-                0 => packed.pack(engine.threads, keys, values),
-                _ => packed.pack_from(engine.threads, first, keys, values),
-            }
+            pack(engine.threads, packed, first, keys, values);
             let range = group * count * width..(group + 1) * count * width;
             attention(
                 engine.threads,
@@ -259,7 +265,9 @@ impl Attention {
                 rows_mut(&mut mix[range], width),
             );
         }
-        self.to_out.apply(
+        apply(
+            Part::ToOut,
+            &self.to_out,
             engine.threads,
             rows(mix, width),
             Epilogue::Add,
@@ -271,7 +279,9 @@ impl Attention {
     fn queries(&self, engine: Engine, y: &[f32], buffers: &mut AttentionBuffers) {
         let width = self.width();
         let q = sized(&mut buffers.q, y.len());
-        self.to_q.apply(
+        apply(
+            Part::ToQ,
+            &self.to_q,
             engine.threads,
             rows(y, width),
             Epilogue::Store,
@@ -321,14 +331,18 @@ impl FeedForward {
     ) {
         let (width, inner) = (self.proj.in_features(), self.proj.out_features());
         let hidden = sized(buffer, y.len() / width * inner);
-        self.proj.apply(
+        apply(
+            Part::FeedForwardIn,
+            &self.proj,
             engine.threads,
             rows(y, width),
             Epilogue::GeluTanh,
             rows_mut(hidden, inner),
             scratch,
         );
-        self.out.apply(
+        apply(
+            Part::FeedForwardOut,
+            &self.out,
             engine.threads,
             rows(hidden, inner),
             Epilogue::Add,

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues, PackedLinear, layer_norm};
+use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues, PackedLinear};
 
 use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward, Held};
 use crate::cache::Cache;
@@ -12,6 +12,7 @@ use crate::error::Result;
 use crate::intervention::{Changes, Group, Groups};
 use crate::layers::{Engine, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
+use crate::profile::{Part, apply, layer_norm};
 use crate::reading::HeadTensors;
 use crate::tables::{TIME_CHANNELS, embedding_time};
 use crate::trace::{Recorded, StepBlock};
@@ -251,7 +252,9 @@ impl Dit {
         );
         let hidden_dim = self.output.out_features();
         let out = sized(out, action.len() / self.width * hidden_dim);
-        self.output.apply(
+        apply(
+            Part::Output,
+            &self.output,
             engine.threads,
             rows(y, self.width),
             Epilogue::Store,
@@ -338,8 +341,7 @@ impl Dit {
                 .add_self(engine, y, source, groups, held, bias, weights, attention, x);
         }
         layer_norm(
-            engine.isa,
-            engine.threads,
+            engine,
             rows(x, self.width),
             BLOCK_EPS,
             None,
@@ -382,14 +384,7 @@ fn modulated_norm(
         let (y_run, y_rest) = std::mem::take(&mut y).split_at_mut(run.len() * element);
         let Modulation { scale, shift } = modulation(&run[0]);
         let (h_run, y_run) = (rows(h_run, width), rows_mut(y_run, width));
-        layer_norm(
-            engine.isa,
-            engine.threads,
-            h_run,
-            eps,
-            Some((scale, shift)),
-            y_run,
-        );
+        layer_norm(engine, h_run, eps, Some((scale, shift)), y_run);
         (h, y) = (h_rest, y_rest);
     }
 }

@@ -2,11 +2,12 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
-use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef, layer_norm};
+use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
 
 use crate::checkpoint::Elements;
 use crate::error::{Error, Result};
 use crate::layout::{CategoryLinearNames, LinearNames, NormNames};
+use crate::profile::{Part, apply, layer_norm};
 use crate::reading::HeadTensors;
 
 /// Which instruction set and how many threads the kernels use.
@@ -109,8 +110,7 @@ impl Norm {
         let width = self.weight.len();
         let scale_shift = Some((self.weight.as_slice(), self.bias.as_slice()));
         layer_norm(
-            engine.isa,
-            engine.threads,
+            engine,
             rows(x, width),
             self.eps,
             scale_shift,
@@ -180,7 +180,9 @@ impl CategoryLinear {
             let layer = self.of(run[0]);
             let (x_run, x_rest) = x.split_at(x_element * run.len());
             let (out_run, out_rest) = std::mem::take(&mut out).split_at_mut(out_element * run.len());
-            layer.apply(
+            apply(
+                Part::Embodiment,
+                layer,
                 engine.threads,
                 rows(x_run, layer.in_features()),
                 epilogue,

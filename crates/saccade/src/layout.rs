@@ -99,6 +99,16 @@ pub(crate) struct HeadNames {
     pub proj_out: [LinearNames; 2],
 }
 
+/// Name, without a prefix, and shape of every tensor of a head's checkpoint.
+#[must_use]
+pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
+    let tensors = HeadNames::new(config).tensors();
+    tensors
+        .into_iter()
+        .map(|tensor| (tensor.name, tensor.shape))
+        .collect()
+}
+
 /// Width of the sinusoidal table of the time embedding.
 pub(crate) const TIME_CHANNELS: usize = 256;
 

@@ -1,0 +1,230 @@
+//! Where the time of a thread's calls goes, by part. Costs a branch around every kernel call unless that thread asked for it.
+
+use std::cell::RefCell;
+use std::time::{Duration, Instant};
+
+use faer::{MatMut, MatRef};
+use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
+
+use crate::layers::Engine;
+
+/// A part of the head's work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Part {
+    /// Queries of all attentions.
+    ToQ,
+    /// Keys and values of the self-attentions.
+    ToKv,
+    /// Keys and values of the cross-attentions, once an observation.
+    ContextToKv,
+    /// Bringing keys and values into the layout that the attention reads.
+    Pack,
+    /// Scores, softmax and the sum of values.
+    Attention,
+    /// The projection after the attention.
+    ToOut,
+    /// First layer of the feed-forward, with its activation.
+    FeedForwardIn,
+    /// Its second layer.
+    FeedForwardOut,
+    /// Layer norms, with what they scale and shift by.
+    Norm,
+    /// The layers that embodiments have of their own: encoders of state and actions, decoder of actions.
+    Embodiment,
+    /// The projection after the last block.
+    Output,
+}
+
+impl Part {
+    /// All parts, in the order of the calls.
+    pub const ALL: [Self; 11] = [
+        Self::ToQ,
+        Self::ToKv,
+        Self::ContextToKv,
+        Self::Pack,
+        Self::Attention,
+        Self::ToOut,
+        Self::FeedForwardIn,
+        Self::FeedForwardOut,
+        Self::Norm,
+        Self::Embodiment,
+        Self::Output,
+    ];
+
+    /// Its name in a report.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::ToQ => "to_q",
+            Self::ToKv => "to_kv",
+            Self::ContextToKv => "context_to_kv",
+            Self::Pack => "pack",
+            Self::Attention => "attention",
+            Self::ToOut => "to_out",
+            Self::FeedForwardIn => "feed_forward_in",
+            Self::FeedForwardOut => "feed_forward_out",
+            Self::Norm => "norm",
+            Self::Embodiment => "embodiment",
+            Self::Output => "output",
+        }
+    }
+}
+
+/// What was done in one part.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counter {
+    /// Calls of a kernel.
+    pub calls: u64,
+    /// Time in them.
+    pub time: Duration,
+    /// Multiply-adds of their matrix products.
+    pub multiply_adds: u64,
+    /// Bytes of weights, or of held keys and values, that they read at least once.
+    pub bytes: u64,
+}
+
+/// Counters of every part.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Profile {
+    counters: [Counter; Part::ALL.len()],
+}
+
+impl Profile {
+    /// Begins to count what this thread does from now on; earlier counts are forgotten.
+    pub fn start() {
+        CURRENT.replace(Some(Self::default()));
+    }
+
+    /// Ends it, and hands over what was counted; none if it was not begun.
+    #[must_use]
+    pub fn take() -> Option<Self> {
+        CURRENT.take()
+    }
+
+    /// What was counted of a part.
+    #[must_use]
+    pub fn part(&self, part: Part) -> Counter {
+        self.counters[part as usize]
+    }
+}
+
+thread_local! {
+    static CURRENT: RefCell<Option<Profile>> = const { RefCell::new(None) };
+}
+
+/// Runs `call`, whose work is `(multiply_adds, bytes)`, and counts it if this thread counts.
+fn counted<R>(part: Part, work: (usize, usize), call: impl FnOnce() -> R) -> R {
+    if !CURRENT.with_borrow(Option::is_some) {
+        return call();
+    }
+    let start = Instant::now();
+    let result = call();
+    let time = start.elapsed();
+    CURRENT.with_borrow_mut(|profile| {
+        if let Some(profile) = profile {
+            let counter = &mut profile.counters[part as usize];
+            counter.calls += 1;
+            counter.time += time;
+            counter.multiply_adds += work.0 as u64;
+            counter.bytes += work.1 as u64;
+        }
+    });
+    result
+}
+
+/// [`PackedLinear::apply`], counted.
+#[allow(clippy::too_many_arguments)] // The kernel's, and the part.
+pub(crate) fn apply(
+    part: Part,
+    layer: &PackedLinear,
+    threads: usize,
+    x: MatRef<'_, f32>,
+    epilogue: Epilogue,
+    out: MatMut<'_, f32>,
+    scratch: &mut LinearScratch,
+) {
+    let multiply_adds = x.nrows() * layer.in_features() * layer.out_features();
+    counted(part, (multiply_adds, layer.nbytes()), || {
+        layer.apply(threads, x, epilogue, out, scratch);
+    });
+}
+
+/// [`saccade_kernels::attention`], counted.
+pub(crate) fn attention(
+    threads: usize,
+    queries: MatRef<'_, f32>,
+    kv: &PackedKeyValues,
+    scale: f32,
+    bias: Option<LogitBias<'_>>,
+    weights: Option<&mut [f32]>,
+    out: MatMut<'_, f32>,
+) {
+    let multiply_adds = 2 * queries.nrows() * kv.len() * queries.ncols();
+    counted(Part::Attention, (multiply_adds, kv.nbytes()), || {
+        saccade_kernels::attention(threads, queries, kv, scale, bias, weights, out);
+    });
+}
+
+/// [`saccade_kernels::layer_norm`], counted.
+pub(crate) fn layer_norm(
+    engine: Engine,
+    x: MatRef<'_, f32>,
+    eps: f32,
+    scale_shift: Option<(&[f32], &[f32])>,
+    out: MatMut<'_, f32>,
+) {
+    counted(Part::Norm, (0, 0), || {
+        saccade_kernels::layer_norm(engine.isa, engine.threads, x, eps, scale_shift, out);
+    });
+}
+
+/// [`PackedKeyValues::pack_from`], counted; from 0 it is [`PackedKeyValues::pack`].
+pub(crate) fn pack(
+    threads: usize,
+    packed: &mut PackedKeyValues,
+    first: usize,
+    keys: MatRef<'_, f32>,
+    values: MatRef<'_, f32>,
+) {
+    counted(Part::Pack, (0, 0), || match first {
+        0 => packed.pack(threads, keys, values),
+        _ => packed.pack_from(threads, first, keys, values),
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_between_start_and_take_on_this_thread_only() {
+        let work = || counted(Part::ToQ, (6, 24), || 7);
+        assert_eq!(work(), 7);
+        assert_eq!(Profile::take(), None, "nothing is counted before");
+        Profile::start();
+        std::thread::scope(|scope| {
+            scope.spawn(work);
+        });
+        work();
+        work();
+        let profile = Profile::take().unwrap();
+        let Counter {
+            calls,
+            multiply_adds,
+            bytes,
+            ..
+        } = profile.part(Part::ToQ);
+        assert_eq!((calls, multiply_adds, bytes), (2, 12, 48));
+        assert_eq!(profile.part(Part::Norm), Counter::default());
+        work();
+        assert_eq!(Profile::take(), None);
+    }
+
+    #[test]
+    fn parts_are_listed_in_their_order() {
+        for (index, part) in Part::ALL.into_iter().enumerate() {
+            assert_eq!(part as usize, index);
+        }
+    }
+}
