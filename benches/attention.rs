@@ -4,10 +4,9 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
 use saccade_benches::measure::{Contender, measure};
 use saccade_benches::options::Options;
-use saccade_benches::peak::multiply_adds;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::{Isa, LogitBias, PackedKeyValues, attention};
+use saccade_kernels::{Arithmetic, Isa, LogitBias, PackedKeyValues, attention};
 
 /// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, self-attention of a VL block.
 const SHAPES: [(usize, usize, usize, usize); 3] = [(49, 296, 32, 48), (49, 49, 32, 48), (296, 296, 32, 64)];
@@ -56,15 +55,7 @@ fn main() {
         let mut contenders = Vec::new();
         for &threads in &options.threads {
             for isa in Isa::available() {
-                let (work, run) = multiply_adds(isa, threads);
-                let name = peak_name(isa);
-                contenders.push(Contender {
-                    name,
-                    threads,
-                    work,
-                    relative_to: None,
-                    run: Box::new(run),
-                });
+                contenders.push(Contender::peak(isa, Arithmetic::Float32, threads));
                 saccade(&shape, isa, threads, &bias, &mut contenders);
             }
         }
@@ -74,10 +65,6 @@ fn main() {
         report.case(&name, &measure(&options, &mut contenders));
     }
     report.end(&options);
-}
-
-fn peak_name(isa: Isa) -> String {
-    format!("peak {isa}")
 }
 
 fn saccade<'a>(
@@ -98,7 +85,7 @@ fn saccade<'a>(
             name: format!("saccade {isa}{what}"),
             threads,
             work: macs(shape),
-            relative_to: Some(peak_name(base)),
+            relative_to: Some(Contender::peak_name(base, Arithmetic::Float32)),
             run,
         });
     };
@@ -189,7 +176,7 @@ fn plain<'a>(shape: &'a Shape, contenders: &mut Vec<Contender<'a>>) {
         name: "faer products, plain softmax".to_owned(),
         threads: 1,
         work: macs(shape),
-        relative_to: Some(peak_name(Isa::best())),
+        relative_to: Some(Contender::peak_name(Isa::best(), Arithmetic::Float32)),
         run: Box::new(run),
     });
 }

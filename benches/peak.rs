@@ -1,10 +1,10 @@
-//! The ceilings that the other benches are compared with: multiply-adds a second, checked against clock x units, and read bandwidth.
+//! The ceilings that the other benches are compared with: multiply-accumulates a second, checked against clock x units, and read bandwidth.
 
 use saccade_benches::measure::{Contender, measure, quantile};
 use saccade_benches::options::Options;
-use saccade_benches::peak::{clock, multiply_adds, read_bandwidth};
 use saccade_benches::report::Report;
-use saccade_kernels::Isa;
+use saccade_kernels::peak::{clock_hz, read_bytes_per_second};
+use saccade_kernels::{Arithmetic, Isa};
 
 fn main() {
     let options = Options::from_args();
@@ -12,37 +12,33 @@ fn main() {
     let mut contenders = Vec::new();
     for &threads in &options.threads {
         for isa in Isa::available() {
-            let (work, run) = multiply_adds(isa, threads);
-            let name = format!("multiply-adds {isa}");
-            contenders.push(Contender {
-                name,
-                threads,
-                work,
-                relative_to: None,
-                run: Box::new(run),
-            });
+            for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+                contenders.push(Contender::peak(isa, arithmetic, threads));
+            }
         }
     }
     let rates = measure(&options, &mut contenders);
-    report.case("float32 multiply-adds from registers", &rates);
-    if let Some(clock) = clock() {
-        println!("\nclock {clock:.2} GHz (a chain of dependent multiplications)");
+    report.case("multiply-accumulates from registers", &rates);
+    if let Some(clock) = clock_hz() {
+        println!(
+            "\nclock {:.2} GHz (a chain of dependent multiplications)",
+            clock * 1e-9
+        );
         for entry in rates.iter().filter(|entry| entry.threads == 1) {
-            // A 512-bit unit makes 16 in a cycle, two 256-bit units as many.
+            // Of float32 a 512-bit unit makes 16 in a cycle, two 256-bit units as many; of bf16 twice, of int8 four times as many.
             println!(
                 "{:<34}{:>8.2} multiply-accumulates a cycle",
                 entry.name,
-                quantile(&entry.rates, 0.5) / clock
+                1e9 * quantile(&entry.rates, 0.5) / clock
             );
         }
     }
-    let memory = vec![1u64; 1 << 26];
     println!();
     for &threads in &options.threads {
-        let samples: Vec<_> = (0..options.rounds.min(10))
-            .map(|_| read_bandwidth(&memory, threads))
-            .collect();
-        println!("read, {threads} threads{:>34.1} GB/s", quantile(&samples, 0.5));
+        println!(
+            "read, {threads} threads{:>34.1} GB/s",
+            1e-9 * read_bytes_per_second(threads)
+        );
     }
     report.end(&options);
 }

@@ -2,6 +2,5 @@
 
 pub mod measure;
 pub mod options;
-pub mod peak;
 pub mod random;
 pub mod report;

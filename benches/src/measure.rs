@@ -4,6 +4,9 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
+use saccade_kernels::peak::multiply_accumulate;
+use saccade_kernels::{Arithmetic, Isa};
+
 use crate::options::{Clock, Options};
 
 /// Something to time.
@@ -18,6 +21,39 @@ pub struct Contender<'a> {
     pub relative_to: Option<String>,
     /// One call.
     pub run: Box<dyn FnMut() + 'a>,
+}
+
+impl Contender<'_> {
+    /// The most that the instructions of `isa` and `arithmetic` can do.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "a count of operations")]
+    pub fn peak(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Self {
+        Self {
+            name: Self::peak_name(isa, arithmetic),
+            threads,
+            work: multiply_accumulate(isa, arithmetic, threads) as f64,
+            relative_to: None,
+            run: Box::new(move || {
+                multiply_accumulate(isa, arithmetic, threads);
+            }),
+        }
+    }
+
+    /// What [`Self::peak`] is called.
+    #[must_use]
+    pub fn peak_name(isa: Isa, arithmetic: Arithmetic) -> String {
+        format!("peak {isa}, {}", arithmetic_name(arithmetic))
+    }
+}
+
+/// As users spell it.
+#[must_use]
+pub fn arithmetic_name(arithmetic: Arithmetic) -> &'static str {
+    match arithmetic {
+        Arithmetic::Float32 => "float32",
+        Arithmetic::Bfloat16 => "bfloat16",
+        Arithmetic::Int8 => "int8",
+    }
 }
 
 /// Rates of one contender, in `1e9` multiply-accumulates a second, one a round.

@@ -22,8 +22,10 @@ pub struct Options {
     pub json: Option<PathBuf>,
     /// Wall time or processor time.
     pub clock: Clock,
-    /// Only shapes and contenders whose name contains it.
+    /// Only cases whose name contains it.
     pub filter: Option<String>,
+    /// Whether other libraries are measured too.
+    pub peers: bool,
 }
 
 const USAGE: &str = "\
@@ -31,6 +33,7 @@ const USAGE: &str = "\
   --rounds N        samples of each contender (default 30)
   --clock wall|cpu  wall time, or processor time for one thread on a busy machine (default wall)
   --json PATH       writes the numbers as JSON
+  --no-peers        saccade only
   FILTER            only cases whose name contains it";
 
 impl Options {
@@ -53,12 +56,14 @@ impl Options {
             json: None,
             clock: Clock::Wall,
             filter: None,
+            peers: true,
         };
         while let Some(arg) = args.next() {
             let mut value = || args.next().ok_or_else(|| format!("{arg}: a value is missing"));
             match arg.as_str() {
                 // Cargo passes it to every bench.
                 "--bench" => {}
+                "--no-peers" => options.peers = false,
                 "--threads" => {
                     let threads: Result<_, _> = value()?.split(',').map(str::parse).collect();
                     options.threads = threads.map_err(|error| format!("--threads: {error}"))?;

@@ -57,7 +57,7 @@ impl<T: sealed::Zeroable> AlignedBuffer<T> {
     }
 
     fn layout(len: usize) -> Layout {
-        let alignment = if len * size_of::<T>() < 2 * HUGE_PAGE {
+        let alignment = if len * size_of::<T>() < HUGE_PAGE {
             ALIGNMENT
         } else {
             HUGE_PAGE

@@ -10,6 +10,7 @@ mod attention;
 mod isa;
 mod linear;
 mod norm;
+pub mod peak;
 mod pool;
 mod simd;
 mod threads;

@@ -57,8 +57,9 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn round_to_bf16(self) -> Self;
     /// `LANES` bfloat16, rounded so.
     unsafe fn store_bf16(self, to: *mut u16);
-    /// `LANES` bytes of lanes that hold whole numbers in `0..=255`; any byte for other lanes.
-    unsafe fn store_bytes(self, to: *mut u8);
+    /// `LANES` bytes: each lane rounded to the nearest whole number, ties to even, plus `zero`, and `most` where that is more. Any byte for
+    /// lanes with which this is not in `0..=256`.
+    unsafe fn store_bytes(self, zero: Self::Ints, most: Self::Ints, to: *mut u8);
     /// Every lane `x`.
     unsafe fn splat_int(x: i32) -> Self::Ints;
     /// `LANES` integers.
@@ -401,9 +402,11 @@ mod portable {
         }
 
         #[inline(always)]
-        unsafe fn store_bytes(self, to: *mut u8) {
+        unsafe fn store_bytes(self, zero: [i32; 8], most: [i32; 8], to: *mut u8) {
+            let whole = self.0.map(|x| ((x + ROUND) - ROUND) as i32);
+            let bytes = zip_ints(zip_ints(whole, zero, i32::wrapping_add), most, i32::min);
             // SAFETY: the caller gives room for eight elements.
-            unsafe { to.cast::<[u8; 8]>().write_unaligned(self.0.map(|x| x as u8)) }
+            unsafe { to.cast::<[u8; 8]>().write_unaligned(bytes.map(|byte| byte as u8)) }
         }
 
         #[inline(always)]
@@ -780,10 +783,11 @@ mod x86 {
         }
 
         #[inline(always)]
-        unsafe fn store_bytes(self, to: *mut u8) {
+        unsafe fn store_bytes(self, zero: __m256i, most: __m256i, to: *mut u8) {
             // SAFETY: the caller gives room for eight elements.
             unsafe {
-                let integers = _mm256_cvtps_epi32(self);
+                let integers = _mm256_add_epi32(_mm256_cvtps_epi32(self), zero);
+                let integers = _mm256_min_epi32(integers, most);
                 let low = _mm256_castsi256_si128(integers);
                 let halves = _mm_packus_epi32(low, _mm256_extracti128_si256::<1>(integers));
                 _mm_storel_epi64(to.cast(), _mm_packus_epi16(halves, halves));
@@ -1007,9 +1011,13 @@ mod x86 {
         }
 
         #[inline(always)]
-        unsafe fn store_bytes(self, to: *mut u8) {
+        unsafe fn store_bytes(self, zero: __m512i, most: __m512i, to: *mut u8) {
             // SAFETY: the caller gives room for sixteen elements.
-            unsafe { _mm_storeu_si128(to.cast(), _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(self))) }
+            unsafe {
+                let integers = _mm512_add_epi32(_mm512_cvtps_epi32(self), zero);
+                let integers = _mm512_min_epi32(integers, most);
+                _mm_storeu_si128(to.cast(), _mm512_cvtepi32_epi8(integers));
+            }
         }
 
         #[inline(always)]

@@ -209,30 +209,48 @@ impl DotKernel for Part<'_> {
 unsafe fn quantize_row<V: Vector, D: Dots<V>>(x: *const f32, width: usize, bytes: *mut u8) -> Quantized {
     // SAFETY: the caller's promise.
     unsafe {
+        // Chains of their own, which do not wait for each other.
+        const CHAINS: usize = 4;
         let zero = V::splat(0.0);
-        let (mut low, mut high, mut not_finite) = (zero, zero, zero);
-        for i in (0..width).step_by(V::LANES) {
-            let x = load::<V>(x.add(i), V::LANES.min(width - i));
-            low = x.min(low);
-            high = x.max(high);
+        let (mut lows, mut highs, mut not_finite) = ([zero; CHAINS], [zero; CHAINS], [zero; CHAINS]);
+        let mut look = |chain: usize, x: V| {
+            lows[chain] = x.min(lows[chain]);
+            highs[chain] = x.max(highs[chain]);
             // Zero, except that infinity and NaN give NaN.
-            not_finite = x.fma(zero, not_finite);
+            not_finite[chain] = x.fma(zero, not_finite[chain]);
+        };
+        let vectors = width / V::LANES;
+        for i in (0..vectors / CHAINS * CHAINS).step_by(CHAINS) {
+            for chain in 0..CHAINS {
+                look(chain, V::load(x.add((i + chain) * V::LANES)));
+            }
         }
-        let (low, high) = (-zero.sub(low).reduce_max(), high.reduce_max());
-        let steps = f32::from(D::MAX_BYTE);
+        for i in vectors / CHAINS * CHAINS..width.div_ceil(V::LANES) {
+            let first = i * V::LANES;
+            look(0, load::<V>(x.add(first), V::LANES.min(width - first)));
+        }
+        let [low, high] = [(lows, -1.0), (highs, 1.0)].map(|(all, sign)| {
+            let all = all.map(|all| all.mul(V::splat(sign)));
+            sign * all[0].max(all[1]).max(all[2].max(all[3])).reduce_max()
+        });
+        let not_finite = not_finite[0]
+            .add(not_finite[1])
+            .add(not_finite[2].add(not_finite[3]));
+        let steps = D::MAX_BYTE;
         // Not the difference, which could overflow.
-        let scale = high / steps - low / steps;
+        let scale = high / f32::from(steps) - low / f32::from(steps);
         let is_zero = scale < f32::MIN_POSITIVE;
         let inverse = if is_zero { 0.0 } else { 1.0 / scale };
-        let offset = (-low * inverse).round_ties_even();
+        let offset = (-low * inverse).round_ties_even() as i32;
+        let (inverse, most) = (V::splat(inverse), V::splat_int(i32::from(steps)));
+        let zero_byte = V::splat_int(offset);
         for i in (0..width).step_by(V::LANES) {
             let x = load::<V>(x.add(i), V::LANES.min(width - i));
-            let byte = x.mul(V::splat(inverse)).round().add(V::splat(offset));
-            byte.max(zero).min(V::splat(steps)).store_bytes(bytes.add(i));
+            x.mul(inverse).store_bytes(zero_byte, most, bytes.add(i));
         }
         let quantized = Quantized {
             scale: if is_zero { 0.0 } else { scale },
-            zero: offset as i32,
+            zero: offset,
         };
         if not_finite.reduce_add().is_nan() {
             Quantized {

@@ -19,15 +19,10 @@ pub(super) const AVX2_COLUMNS: usize = 8 * AVX2.0;
 pub(super) const AVX512_COLUMNS: usize = 16 * AVX512.0;
 const MAX_COLUMNS: usize = AVX512_COLUMNS;
 
-/// The summed dimension is cut at multiples of this. A tile's sums over one part begin at zero and are added to those of the parts before:
-/// one running float32 sum over the 8192 inputs of a feed-forward loses five times as much as parts of 512 do (measured on the
-/// full head).
-const SUM_PART: usize = 512;
-
 /// Steps over the summed dimension after which the next tile takes the same block of the panel, which is then still in the cache: whole
-/// parts. Each block begins the rows' streams anew; with two parts, together with huge pages for the weights, AVX2 went from 0.85 to 0.89
-/// of the FMA peak at 49 x 1536 x 6144 on Zen 4, AVX-512 from 0.94 to 0.95.
-const K_BLOCK: usize = 2 * SUM_PART;
+/// parts. Each block begins the rows' streams anew; with two parts of float32, together with huge pages for the weights, AVX2 went from 0.85
+/// to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4, AVX-512 from 0.94 to 0.95.
+const BLOCK_STEPS: usize = 1024;
 
 /// Elements, of four bytes, in a cache line.
 const LINE: usize = 16;
@@ -164,13 +159,12 @@ unsafe fn panel_rows<V: Vector, P: Product<V>, const NV: usize>(
     let count = rows.end - rows.first;
     let tiles = count.div_ceil(max_rows);
     let steps = job.in_features.div_ceil(P::STEP);
-    let block_steps = K_BLOCK / P::STEP;
-    let blocks = steps.div_ceil(block_steps).max(1);
+    let blocks = steps.div_ceil(BLOCK_STEPS).max(1);
     let mut sums = Sums([const { MaybeUninit::uninit() }; ROW_BLOCK * MAX_COLUMNS]);
     for block in 0..blocks {
         let part = Part {
-            first: block * block_steps,
-            end: steps.min((block + 1) * block_steps),
+            first: block * BLOCK_STEPS,
+            end: steps.min((block + 1) * BLOCK_STEPS),
         };
         for tile in 0..tiles {
             // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
@@ -198,11 +192,15 @@ unsafe fn panel_rows<V: Vector, P: Product<V>, const NV: usize>(
             }
         }
     }
-    for row in 0..count {
-        for vector in 0..NV {
-            let sums = sums.0[(row * NV + vector) * V::LANES..].as_ptr().cast::<u32>();
-            // SAFETY: the caller's promise; all tiles have stored their sums.
-            unsafe { finish::<V, P>(job, panel, rows.first + row, vector * V::LANES, sums) }
+    let sums = sums.0.as_ptr().cast::<u32>();
+    // SAFETY: the caller's promise; all tiles have stored their sums.
+    unsafe {
+        match job.epilogue {
+            Epilogue::Store => finish::<V, P, Store, NV>(job, rows, panel, sums),
+            Epilogue::GeluTanh => finish::<V, P, GeluTanh, NV>(job, rows, panel, sums),
+            Epilogue::Relu => finish::<V, P, Relu, NV>(job, rows, panel, sums),
+            Epilogue::Silu => finish::<V, P, Silu, NV>(job, rows, panel, sums),
+            Epilogue::Add => finish::<V, P, Add, NV>(job, rows, panel, sums),
         }
     }
 }
@@ -248,9 +246,18 @@ unsafe fn tile_part<V: Vector, P: Product<V>, const NV: usize, const MR: usize>(
         let next = weights
             .wrapping_add(panel.ahead * panel.weights.len() + panel.weights.len() * place.tile / place.tiles);
         let stride = row_elements.div_ceil(place.tiles);
+        if part.first == 0 {
+            // The rows of `out` are written after the tiles: by then they are here.
+            for r in 0..MR {
+                let out = job.out.offset((place.row + r) as isize * job.out_stride);
+                for v in 0..NV {
+                    V::prefetch(out.wrapping_add(panel.first + v * V::LANES).cast());
+                }
+            }
+        }
         let mut first = part.first;
         loop {
-            let end = part.end.min(first + SUM_PART / P::STEP);
+            let end = part.end.min(first + P::PART_STEPS);
             let mut acc = [[P::zero(); NV]; MR];
             // Rows that are read where they lie may end within the last step.
             let whole = end.min(job.in_features / P::STEP);
@@ -293,39 +300,88 @@ unsafe fn tile_part<V: Vector, P: Product<V>, const NV: usize, const MR: usize>(
     }
 }
 
-/// Bias, activation and residual of one row and the columns from `column` on, a vector of them, and their way to `out`. After the tiles and
-/// not in them: a sum's way through the first-level cache is nothing beside its making, and the code is there once, not in each tile.
+/// What an [`Epilogue`] makes of a vector of sums with their bias.
+trait Finish {
+    /// # Safety
+    /// The caller runs with `V`'s instruction set; `out` points to `lanes` elements.
+    unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V;
+}
+
+struct Store;
+struct GeluTanh;
+struct Relu;
+struct Silu;
+struct Add;
+
+impl Finish for Store {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
+        value
+    }
+}
+
+impl Finish for GeluTanh {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { gelu_tanh_vector(value) }
+    }
+}
+
+impl Finish for Relu {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
+        // SAFETY: the caller's promise. The second operand where they do not compare: NaN stays.
+        unsafe { V::splat(0.0).max(value) }
+    }
+}
+
+impl Finish for Silu {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { silu_vector(value) }
+    }
+}
+
+impl Finish for Add {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { load::<V>(out, lanes).add(value) }
+    }
+}
+
+/// Bias, activation and residual of a block of rows, and their way to `out`. After the tiles and not in them: a sum's way through the
+/// first-level cache is nothing beside its making, and the code is there once, not in each tile.
 ///
 /// # Safety
-/// The caller runs with `V`'s instruction set; `row` and the panel's columns are in the job, `sums` holds a vector.
+/// The caller runs with `V`'s instruction set; `rows` and the panel's columns are in the job, `sums` holds `NV` vectors for each row.
 #[inline(always)]
-unsafe fn finish<V: Vector, P: Product<V>>(
+unsafe fn finish<V: Vector, P: Product<V>, F: Finish, const NV: usize>(
     job: &Job<'_>,
+    rows: Rows,
     panel: &Panel<'_>,
-    row: usize,
-    column: usize,
     sums: *const u32,
 ) {
-    if column >= panel.width {
-        return;
-    }
-    // SAFETY: the caller's promise; partial vectors stay within the panel's columns.
-    unsafe {
-        let out = job
-            .out
-            .offset(row as isize * job.out_stride)
-            .add(panel.first + column);
+    for vector in 0..panel.width.div_ceil(V::LANES) {
+        let column = vector * V::LANES;
         let lanes = V::LANES.min(panel.width - column);
-        let value = P::value(P::load(sums), job, row, panel, column);
-        let value = value.add(V::load(panel.bias.as_ptr().add(column)));
-        let value = match job.epilogue {
-            Epilogue::Store => value,
-            Epilogue::GeluTanh => gelu_tanh_vector(value),
-            // The second operand where they do not compare: NaN stays.
-            Epilogue::Relu => V::splat(0.0).max(value),
-            Epilogue::Silu => silu_vector(value),
-            Epilogue::Add => load::<V>(out, lanes).add(value),
-        };
-        store(value, out, lanes);
+        // SAFETY: the caller's promise; partial vectors stay within the panel's columns.
+        unsafe {
+            let bias = V::load(panel.bias.as_ptr().add(column));
+            let columns = P::columns(panel, column);
+            let mut out = job
+                .out
+                .offset(rows.first as isize * job.out_stride)
+                .add(panel.first + column);
+            let mut sums = sums.add(column);
+            for row in rows.first..rows.end {
+                let value = P::value(P::load(sums), columns, job.quantized, row).add(bias);
+                store(F::of(value, out, lanes), out, lanes);
+                out = out.wrapping_offset(job.out_stride);
+                sums = sums.add(NV * V::LANES);
+            }
+        }
     }
 }
