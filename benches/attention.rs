@@ -6,7 +6,7 @@ use saccade_benches::measure::{Contender, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::{Arithmetic, Isa, LogitBias, PackedKeyValues, attention};
+use saccade_kernels::{Arithmetic, Element, Isa, LogitBias, PackedKeyValues, attention};
 
 /// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, self-attention of a VL block.
 const SHAPES: [(usize, usize, usize, usize); 3] = [(49, 296, 32, 48), (49, 49, 32, 48), (296, 296, 32, 64)];
@@ -76,7 +76,7 @@ fn saccade<'a>(
 ) {
     let width = shape.width();
     let scale = 1.0 / (shape.head_dim as f32).sqrt();
-    let mut held = PackedKeyValues::new(isa, shape.num_heads, shape.head_dim);
+    let mut held = PackedKeyValues::new(isa, Element::F32, shape.num_heads, shape.head_dim);
     let (k, v) = (rows(&shape.k, width), rows(&shape.v, width));
     held.pack(threads, k, v);
     let base = if isa == Isa::Portable { Isa::best() } else { isa };

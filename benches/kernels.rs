@@ -6,7 +6,7 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use faer::{MatMut, MatRef};
 use saccade_benches::random::Random;
 use saccade_kernels::{
-    Arithmetic, Isa, PackedKeyValues, PackedLinear, WeightRef, gelu_tanh, layer_norm, relu, silu,
+    Arithmetic, Element, Isa, PackedKeyValues, PackedLinear, WeightRef, gelu_tanh, layer_norm, relu, silu,
 };
 
 const ROWS: usize = 49;
@@ -67,7 +67,7 @@ fn packing(criterion: &mut Criterion) {
         });
     }
     let keys = MatRef::from_row_major_slice(&weight[..296 * WIDTH], 296, WIDTH);
-    let mut held = PackedKeyValues::new(isa, 32, WIDTH / 32);
+    let mut held = PackedKeyValues::new(isa, Element::F32, 32, WIDTH / 32);
     group.throughput(Throughput::Bytes((8 * 296 * WIDTH) as u64));
     group.bench_function("PackedKeyValues 296 x 1536", |bencher| {
         bencher.iter(|| held.pack(1, keys, keys))

@@ -162,6 +162,17 @@ pub(crate) unsafe trait Dots<V: Vector> {
         }
     }
 
+    /// `first` and then `second`, `2 * LANES` elements, rounded to bfloat16 as [`Vector::round_to_bf16`] does; a native conversion may take
+    /// denormals for zero.
+    #[inline(always)]
+    unsafe fn store_bf16(first: V, second: V, to: *mut u16) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            first.store_bf16(to);
+            second.store_bf16(to.add(V::LANES));
+        }
+    }
+
     /// `sum` and the four products of each lane's unsigned bytes `x`, at most [`Self::MAX_BYTE`], and signed bytes `w`, none of them -128.
     #[inline(always)]
     unsafe fn int8(sum: V::Ints, x: V::Ints, w: V::Ints) -> V::Ints {
@@ -604,6 +615,15 @@ mod x86 {
                     transmute::<__m512i, __m512bh>(a),
                     transmute::<__m512i, __m512bh>(b),
                 )
+            }
+        }
+
+        #[inline(always)]
+        unsafe fn store_bf16(first: __m512, second: __m512, to: *mut u16) {
+            // SAFETY: as above.
+            unsafe {
+                let pairs = transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(second, first));
+                _mm512_storeu_si512(to.cast(), pairs);
             }
         }
     }

@@ -3,10 +3,41 @@
 mod common;
 
 use common::{ROUNDING, Strided, bits, numbers, rows, rows_mut};
+use std::fmt;
+
 use proptest::prelude::*;
-use saccade_kernels::{Isa, LogitBias, PackedKeyValues, attention};
+use saccade_kernels::{Element, Isa, LogitBias, PackedKeyValues, attention, bf16};
 
 const REMOVED: f32 = f32::NEG_INFINITY;
+
+/// Half a unit in the last place of 1 in bfloat16.
+const BF16_ROUNDING: f64 = 1.0 / 256.0;
+
+/// A way to compute.
+#[derive(Clone, Copy)]
+struct Kind {
+    isa: Isa,
+    element: Element,
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(formatter, "{}, {:?}", self.isa, self.element)
+    }
+}
+
+/// All that this CPU has.
+fn kinds() -> impl Iterator<Item = Kind> {
+    let of = |isa| [Element::F32, Element::Bf16].map(|element| Kind { isa, element });
+    Isa::available().into_iter().flat_map(of)
+}
+
+fn best() -> Kind {
+    Kind {
+        isa: Isa::best(),
+        element: Element::F32,
+    }
+}
 
 struct Case {
     queries: Strided,
@@ -36,15 +67,15 @@ impl Case {
         }
     }
 
-    fn held(&self, isa: Isa) -> PackedKeyValues {
-        let mut held = PackedKeyValues::new(isa, self.num_heads, self.head_dim);
+    fn held(&self, kind: Kind) -> PackedKeyValues {
+        let mut held = PackedKeyValues::new(kind.isa, kind.element, self.num_heads, self.head_dim);
         held.pack(1, self.keys.view(), self.values.view());
         held
     }
 
     fn run(
         &self,
-        isa: Isa,
+        kind: Kind,
         threads: usize,
         bias: Option<LogitBias<'_>>,
         weights: Option<&mut [f32]>,
@@ -54,7 +85,7 @@ impl Case {
         attention(
             threads,
             self.queries.view(),
-            &self.held(isa),
+            &self.held(kind),
             self.scale,
             bias,
             weights,
@@ -64,7 +95,21 @@ impl Case {
     }
 
     /// In float64, with what rounding may change: `(out, its bound, probabilities, their bounds)`.
-    fn exact(&self, bias: impl Fn(usize, usize, usize) -> f32) -> (Vec<f64>, Vec<f64>, Vec<f64>, Vec<f64>) {
+    ///
+    /// `Bf16` rounds the two factors of every product of a logit, the probabilities and the values. Logits are off by `d` at most, so that
+    /// a probability before it is divided by their sum has a factor between `exp(-d)` and `exp(d)`, and after it at most `exp(2 d)`. What
+    /// rounding does to the probabilities is in their sum too: a factor of at most `(1 + e) / (1 - e)`.
+    fn exact(
+        &self,
+        element: Element,
+        bias: impl Fn(usize, usize, usize) -> f32,
+    ) -> (Vec<f64>, Vec<f64>, Vec<f64>, Vec<f64>) {
+        // Of an element; of a probability, with its cheaper exponential.
+        let (rounding, share_rounding) = match element {
+            Element::F32 => (0.0, 0.0),
+            _ => (BF16_ROUNDING, BF16_ROUNDING + 1.1e-4),
+        };
+        let share_factor = (1.0 + share_rounding) / (1.0 - share_rounding);
         let (queries, keys, values) = (self.queries.view(), self.keys.view(), self.values.view());
         let (mut out, mut bounds) = (
             vec![0.0; queries.nrows() * queries.ncols()],
@@ -86,8 +131,9 @@ impl Case {
                         let bias = f64::from(bias(head, query, key));
                         let logit = products.sum::<f64>() * f64::from(self.scale) + bias;
                         if logit.is_finite() {
-                            logit_error = logit_error
-                                .max((self.head_dim + 3) as f64 * ROUNDING * (magnitude + bias.abs()));
+                            let rounded = (1.0 + rounding) * (1.0 + rounding) - 1.0;
+                            let summed = (self.head_dim + 3) as f64 * ROUNDING * (magnitude + bias.abs());
+                            logit_error = logit_error.max(rounded * magnitude + summed);
                         }
                         logit
                     })
@@ -99,7 +145,8 @@ impl Case {
                     .collect();
                 let sum: f64 = shares.iter().sum();
                 // Twice the logits' error (own and in the sum), `exp`, sums over keys, and the division; small logits lose the digits of the largest.
-                let relative = 2.0 * logit_error + (keys.nrows() as f64 + 40.0) * ROUNDING;
+                let relative =
+                    (2.0 * logit_error + (keys.nrows() as f64 + 40.0) * ROUNDING).exp() * share_factor - 1.0;
                 for (key, &share) in shares.iter().enumerate() {
                     let weight = if sum > 0.0 { share / sum } else { 0.0 };
                     weights.push(weight);
@@ -114,7 +161,8 @@ impl Case {
                         let value = f64::from(values[(key, column)]);
                         if weight > 0.0 {
                             out[index] += weight * value;
-                            bounds[index] += (weight * (relative + distance) + 1e-38) * value.abs();
+                            let error = weight * (relative + distance) + 1e-38;
+                            bounds[index] += (error + rounding * (weight + error)) * value.abs();
                         }
                     }
                 }
@@ -171,15 +219,15 @@ proptest! {
             None => 0.0,
             Some(_) => bias[head * head_stride + query * query_stride + key],
         };
-        let (out, bounds, weights, weight_bounds) = case.exact(at);
-        for isa in Isa::available() {
+        for kind in kinds() {
+            let (out, bounds, weights, weight_bounds) = case.exact(kind.element, at);
             let bias = rank.map(|_| LogitBias { values: &bias, head_stride, query_stride });
-            let plain = case.run(isa, threads, bias, None);
-            assert_close(&format!("{isa}, output"), &plain, &out, &bounds);
+            let plain = case.run(kind, threads, bias, None);
+            assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
             let mut given = vec![f32::NAN; num_heads * queries * keys];
-            let with_weights = case.run(isa, threads, bias, Some(&mut given));
+            let with_weights = case.run(kind, threads, bias, Some(&mut given));
             prop_assert_eq!(bits(&with_weights), bits(&plain));
-            assert_close(&format!("{isa}, weight"), &given, &weights, &weight_bounds);
+            assert_close(&format!("{kind}, weight"), &given, &weights, &weight_bounds);
         }
     }
 }
@@ -188,9 +236,9 @@ proptest! {
 fn agrees_with_float64_at_the_heads_sizes() {
     for (queries, keys, head_dim) in [(49, 296, 48), (49, 49, 48), (60, 296, 64), (5, 700, 300)] {
         let case = Case::new(1, queries, keys, 2, head_dim, 0);
-        let (out, bounds, _, _) = case.exact(|_, _, _| 0.0);
-        for isa in Isa::available() {
-            assert_close(&isa.to_string(), &case.run(isa, 2, None, None), &out, &bounds);
+        for kind in kinds() {
+            let (out, bounds, _, _) = case.exact(kind.element, |_, _, _| 0.0);
+            assert_close(&kind.to_string(), &case.run(kind, 2, None, None), &out, &bounds);
         }
     }
 }
@@ -199,9 +247,9 @@ fn agrees_with_float64_at_the_heads_sizes() {
 fn logits_that_would_overflow_are_stable() {
     let mut case = Case::new(2, 7, 150, 2, 48, 0);
     case.scale = 60.0;
-    let (out, bounds, _, _) = case.exact(|_, _, _| 0.0);
-    for isa in Isa::available() {
-        assert_close(&isa.to_string(), &case.run(isa, 1, None, None), &out, &bounds);
+    for kind in kinds() {
+        let (out, bounds, _, _) = case.exact(kind.element, |_, _, _| 0.0);
+        assert_close(&kind.to_string(), &case.run(kind, 1, None, None), &out, &bounds);
     }
 }
 
@@ -212,15 +260,15 @@ fn a_query_with_no_key_left_gets_zeros() {
     for query in [0, 4, 8] {
         bias[query * 130..][..130].fill(REMOVED);
     }
-    for isa in Isa::available() {
+    for kind in kinds() {
         let mut weights = vec![f32::NAN; 2 * 9 * 130];
         let bias = LogitBias {
             values: &bias,
             head_stride: 0,
             query_stride: 130,
         };
-        let out = case.run(isa, 1, Some(bias), Some(&mut weights));
-        let none = case.run(isa, 1, None, None);
+        let out = case.run(kind, 1, Some(bias), Some(&mut weights));
+        let none = case.run(kind, 1, None, None);
         for query in 0..9 {
             let row = &out[query * 96..][..96];
             if query % 4 == 0 {
@@ -232,8 +280,8 @@ fn a_query_with_no_key_left_gets_zeros() {
         }
     }
     let empty = Case::new(4, 3, 0, 2, 48, 0);
-    for isa in Isa::available() {
-        assert_eq!(empty.run(isa, 2, None, Some(&mut [])), [0.0; 3 * 96]);
+    for kind in kinds() {
+        assert_eq!(empty.run(kind, 2, None, Some(&mut [])), [0.0; 3 * 96]);
     }
 }
 
@@ -255,20 +303,20 @@ fn a_removed_key_has_no_influence_whatever_it_holds() {
             head_stride: 0,
             query_stride: 0,
         };
-        for isa in Isa::available() {
+        for kind in kinds() {
             let mut weights = vec![f32::NAN; 2 * 9 * 130];
-            let out = poisoned.run(isa, 1, Some(bias), Some(&mut weights));
-            let expected = clean.run(isa, 1, Some(bias), None);
+            let out = poisoned.run(kind, 1, Some(bias), Some(&mut weights));
+            let expected = clean.run(kind, 1, Some(bias), None);
             for (out, expected) in out.iter().zip(&expected) {
                 assert!(
                     (out - expected).abs() <= 1e-6,
-                    "{isa}, {poison}: {out} instead of {expected}"
+                    "{kind}, {poison}: {out} instead of {expected}"
                 );
             }
             for row in weights.chunks_exact(130) {
                 assert!(
                     [0, 40, 95, 96, 129].iter().all(|&key| row[key] == 0.0),
-                    "{isa}, {poison}"
+                    "{kind}, {poison}"
                 );
             }
         }
@@ -280,8 +328,8 @@ fn nan_stays_with_its_query_and_head() {
     let clean = Case::new(6, 20, 100, 3, 48, 0);
     let mut case = Case::new(6, 20, 100, 3, 48, 0);
     case.queries.view_mut()[(7, 50)] = f32::NAN;
-    for isa in Isa::available() {
-        let (out, expected) = (case.run(isa, 2, None, None), clean.run(isa, 1, None, None));
+    for kind in kinds() {
+        let (out, expected) = (case.run(kind, 2, None, None), clean.run(kind, 1, None, None));
         for (index, (out, expected)) in out.iter().zip(&expected).enumerate() {
             let (query, head) = (index / 144, index % 144 / 48);
             if (query, head) == (7, 1) {
@@ -295,14 +343,16 @@ fn nan_stays_with_its_query_and_head() {
 
 #[test]
 fn weights_are_the_probabilities_that_were_used() {
-    let case = Case::new(7, 11, 205, 3, 40, 0);
-    for isa in Isa::available() {
-        let mut weights = vec![f32::NAN; 3 * 11 * 205];
-        let out = case.run(isa, 2, None, Some(&mut weights));
-        for (index, row) in weights.chunks_exact(205).enumerate() {
+    // Values that bfloat16 holds exactly.
+    let mut case = Case::new(7, 11, 405, 3, 40, 0);
+    round(&mut case.values);
+    for kind in kinds() {
+        let mut weights = vec![f32::NAN; 3 * 11 * 405];
+        let out = case.run(kind, 2, None, Some(&mut weights));
+        for (index, row) in weights.chunks_exact(405).enumerate() {
             let (head, query) = (index / 11, index % 11);
             let sum: f64 = row.iter().map(|&weight| f64::from(weight)).sum();
-            assert!((sum - 1.0).abs() < 1e-5, "{isa}: weights add up to {sum}");
+            assert!((sum - 1.0).abs() < 1e-5, "{kind}: weights add up to {sum}");
             for column in head * 40..(head + 1) * 40 {
                 let expected: f64 = row
                     .iter()
@@ -321,16 +371,16 @@ fn bits_do_not_depend_on_threads_nor_on_other_queries() {
         let case = Case::new(8, queries, keys, 4, head_dim, 0);
         let all = case.queries.values();
         let width = 4 * head_dim;
-        for isa in Isa::available() {
-            let held = case.held(isa);
+        for kind in kinds() {
+            let held = case.held(kind);
             let mut weights = vec![0.0; 4 * queries * keys];
-            let expected = bits(&case.run(isa, 1, None, Some(&mut weights)));
+            let expected = bits(&case.run(kind, 1, None, Some(&mut weights)));
             for threads in [2, 3, 8] {
                 let mut other = vec![0.0; 4 * queries * keys];
                 assert_eq!(
-                    bits(&case.run(isa, threads, None, Some(&mut other))),
+                    bits(&case.run(kind, threads, None, Some(&mut other))),
                     expected,
-                    "{isa}, {threads} threads"
+                    "{kind}, {threads} threads"
                 );
                 assert_eq!(bits(&other), bits(&weights));
             }
@@ -341,9 +391,54 @@ fn bits_do_not_depend_on_threads_nor_on_other_queries() {
                 assert_eq!(
                     bits(&out),
                     expected[first * width..][..count * width],
-                    "{isa}, {count} from {first}"
+                    "{kind}, {count} from {first}"
                 );
             }
+        }
+    }
+}
+
+/// Rounded to bfloat16 where they lie.
+fn round(matrix: &mut Strided) {
+    for row in 0..matrix.rows {
+        for column in 0..matrix.columns {
+            let element = &mut matrix.view_mut()[(row, column)];
+            *element = bf16::from_f32(*element).to_f32();
+        }
+    }
+}
+
+fn apply(held: &PackedKeyValues, case: &Case) -> Vec<f32> {
+    let width = case.num_heads * case.head_dim;
+    let mut out = vec![f32::NAN; case.queries.rows * width];
+    attention(
+        1,
+        case.queries.view(),
+        held,
+        case.scale,
+        None,
+        None,
+        rows_mut(&mut out, width),
+    );
+    out
+}
+
+/// Without an instruction for their products, bfloat16 keys and values are those numbers in float32.
+#[test]
+fn widened_bf16_has_the_bits_of_float32() {
+    for (queries, keys, head_dim) in [(49, 296, 48), (3, 1, 1), (7, 35, 5), (10, 700, 33), (2, 3, 301)] {
+        let case = Case::new(12, queries, keys, 3, head_dim, 2);
+        let mut rounded = Case::new(12, queries, keys, 3, head_dim, 2);
+        round(&mut rounded.keys);
+        round(&mut rounded.values);
+        for isa in Isa::available() {
+            if isa.dot_products().contains(&"bf16") {
+                continue;
+            }
+            let kind = |element| Kind { isa, element };
+            let given = apply(&case.held(kind(Element::Bf16)), &case);
+            let expected = apply(&rounded.held(kind(Element::F32)), &case);
+            assert_eq!(bits(&given), bits(&expected), "{isa}, {keys} keys x {head_dim}");
         }
     }
 }
@@ -351,13 +446,13 @@ fn bits_do_not_depend_on_threads_nor_on_other_queries() {
 #[test]
 fn packing_again_replaces_everything() {
     let (long, short) = (Case::new(9, 5, 211, 2, 30, 1), Case::new(10, 5, 34, 2, 30, 0));
-    for isa in Isa::available() {
-        let mut held = long.held(isa);
+    for kind in kinds() {
+        let mut held = long.held(kind);
         let nbytes = held.nbytes();
         held.pack(2, short.keys.view(), short.values.view());
         assert_eq!(
             (held.len(), held.num_heads(), held.head_dim(), held.isa()),
-            (34, 2, 30, isa)
+            (34, 2, 30, kind.isa)
         );
         assert!(!held.is_empty() && held.nbytes() <= nbytes);
         for held in [&held, &held.clone()] {
@@ -371,7 +466,7 @@ fn packing_again_replaces_everything() {
                 None,
                 rows_mut(&mut out, 60),
             );
-            assert_eq!(bits(&out), bits(&short.run(isa, 1, None, None)));
+            assert_eq!(bits(&out), bits(&short.run(kind, 1, None, None)));
         }
     }
 }
@@ -384,11 +479,8 @@ fn packing_from_a_key_on_replaces_that_key_and_the_later_ones() {
             Case::new(12, 5, keys, 2, head_dim, 0),
         );
         let width = 2 * head_dim;
-        for (isa, first) in Isa::available()
-            .into_iter()
-            .flat_map(|isa| (0..=keys).map(move |first| (isa, first)))
-        {
-            let mut held = old.held(isa);
+        for (kind, first) in kinds().flat_map(|kind| (0..=keys).map(move |first| (kind, first))) {
+            let mut held = old.held(kind);
             let tail = |of: &Strided| of.values()[first * width..].to_vec();
             let (tail_keys, tail_values) = (tail(&new.keys), tail(&new.values));
             held.pack_from(2, first, rows(&tail_keys, width), rows(&tail_values, width));
@@ -414,8 +506,8 @@ fn packing_from_a_key_on_replaces_that_key_and_the_later_ones() {
             );
             assert_eq!(
                 bits(&out),
-                bits(&expected.run(isa, 1, None, None)),
-                "{isa}, from {first}"
+                bits(&expected.run(kind, 1, None, None)),
+                "{kind}, from {first}"
             );
         }
     }
@@ -425,8 +517,8 @@ fn packing_from_a_key_on_replaces_that_key_and_the_later_ones() {
 fn an_infinite_value_that_stays_is_remembered() {
     let (keys, mut values) = ([0.0; 6], [1.0; 6]);
     values[0] = f32::INFINITY;
-    for isa in Isa::available() {
-        let mut held = PackedKeyValues::new(isa, 1, 2);
+    for kind in kinds() {
+        let mut held = PackedKeyValues::new(kind.isa, kind.element, 1, 2);
         held.pack(1, rows(&keys, 2), rows(&values, 2));
         held.pack_from(1, 2, rows(&keys[4..], 2), rows(&values[4..], 2));
         let bias = LogitBias {
@@ -445,14 +537,14 @@ fn an_infinite_value_that_stays_is_remembered() {
             None,
             rows_mut(&mut out, 2),
         );
-        assert_eq!(out, [1.0, 1.0], "{isa}: the removed value has no influence");
+        assert_eq!(out, [1.0, 1.0], "{kind}: the removed value has no influence");
     }
 }
 
 #[test]
 #[should_panic(expected = "all that are held from number 2 on")]
 fn packing_from_a_key_on_keeps_their_number() {
-    let mut held = PackedKeyValues::new(Isa::Portable, 1, 2);
+    let mut held = PackedKeyValues::new(Isa::Portable, Element::F32, 1, 2);
     held.pack(1, rows(&[0.0; 6], 2), rows(&[0.0; 6], 2));
     held.pack_from(1, 2, rows(&[0.0; 4], 2), rows(&[0.0; 4], 2));
 }
@@ -464,7 +556,7 @@ fn queries_of_another_width_panic() {
     attention(
         1,
         rows(&[0.0; 12], 6),
-        &case.held(Isa::best()),
+        &case.held(best()),
         1.0,
         None,
         None,
@@ -481,12 +573,12 @@ fn a_bias_that_is_too_short_panics() {
         head_stride: 6,
         query_stride: 3,
     };
-    case.run(Isa::best(), 1, Some(bias), None);
+    case.run(best(), 1, Some(bias), None);
 }
 
 #[test]
 #[should_panic(expected = "weights: expected")]
 fn weights_of_another_shape_panic() {
     let case = Case::new(11, 2, 3, 2, 4, 0);
-    case.run(Isa::best(), 1, None, Some(&mut [0.0; 11]));
+    case.run(best(), 1, None, Some(&mut [0.0; 11]));
 }

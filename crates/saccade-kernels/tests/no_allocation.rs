@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use common::{numbers, rows, rows_mut};
 use faer::MatRef;
 use saccade_kernels::{
-    Arithmetic, Epilogue, Isa, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, WeightRef, attention,
-    gelu_tanh, layer_norm, parallel_for, silu,
+    Arithmetic, Element, Epilogue, Isa, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, WeightRef,
+    attention, gelu_tanh, layer_norm, parallel_for, silu,
 };
 
 /// The system's allocator, counting what all threads ask of it.
@@ -53,7 +53,7 @@ fn the_second_call_of_a_shape_allocates_nothing() {
         let pack = |arithmetic| PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
         let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);
         let mut scratch = LinearScratch::new();
-        let mut held = PackedKeyValues::new(isa, 8, WIDTH / 8);
+        let mut held = PackedKeyValues::new(isa, Element::F32, 8, WIDTH / 8);
         let mut out = vec![0.0; 296 * WIDTH];
         let mut weights = vec![0.0; 8 * 296 * 296];
         let mut pass = |threads, count: usize| {

@@ -1,7 +1,7 @@
 //! Multi-head attention with its projections, and the feed-forward: what VL blocks and DiT blocks share.
 
 use faer::MatRef;
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
+use saccade_kernels::{Element, Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
 
 use crate::error::Result;
 use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
@@ -131,7 +131,8 @@ impl Attention {
         let len = keys.nrows() / groups;
         (0..groups)
             .map(|group| {
-                let mut packed = PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim());
+                let mut packed =
+                    PackedKeyValues::new(engine.isa, Element::F32, self.num_heads, self.head_dim());
                 pack(
                     engine.threads,
                     &mut packed,
@@ -242,7 +243,7 @@ impl Attention {
         };
         if packed.len() < places {
             packed.resize_with(places, || {
-                PackedKeyValues::new(engine.isa, self.num_heads, self.head_dim())
+                PackedKeyValues::new(engine.isa, Element::F32, self.num_heads, self.head_dim())
             });
         }
         let logits = [self.num_heads, count, first + new];
