@@ -21,7 +21,7 @@ use pack::pack_panels;
 pub use pack::quantize_rows;
 use product::{Bf16Pairs, F32, Int8Quads, WidenedBf16};
 pub use rows::LinearScratch;
-use tile::{Job, Panel, PanelRun, Rows};
+use tile::{Block, Job, Panel, PanelRun, ROW_BLOCK, Tiles, shape};
 
 /// Weights to pack, `(out_features, in_features)`, of any strides.
 #[derive(Clone, Copy, Debug)]
@@ -176,13 +176,13 @@ pub struct PackedLinear {
     sums: AlignedBuffer<i32>,
 }
 
-/// Rows that go through a panel together: their activations should stay in the second-level cache while the panel streams past. 96 rows
-/// of 2048 are 768 kB, three quarters of a 1 MB cache.
-const ROW_BLOCK: usize = 96;
-
 /// Below this many multiply-accumulates a second thread costs more than it saves: waking one takes about 5 us, in which a core does
 /// about 250 k of them.
 const MACS_FOR_THREADS: usize = 1 << 19;
+
+/// Tasks that each thread should have, if they are not smaller than that: one that begins its last task late keeps the others waiting for a
+/// quarter of the work at most.
+const TASKS_PER_THREAD: usize = 4;
 
 impl PackedLinear {
     /// Packs `parts`, stacked along `out_features`, on `threads` threads; a missing bias is zero.
@@ -232,7 +232,7 @@ impl PackedLinear {
         if arithmetic == Arithmetic::Int8 && in_features > MAX_INT8_INPUTS {
             return Err(KernelError::TooManyInputs { given: in_features });
         }
-        let columns = panel_columns(isa);
+        let (columns, _) = shape(isa, false);
         let num_panels = out_features.div_ceil(columns);
         let mut bias = AlignedBuffer::zeroed(num_panels * columns);
         let mut column = 0;
@@ -337,18 +337,25 @@ impl PackedLinear {
             out.col_stride() == 1 || out.ncols() <= 1,
             "out: expected contiguous rows"
         );
-        let columns = panel_columns(self.isa);
+        let macs = rows * self.in_features * self.out_features;
+        let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
+        let (columns, tile_rows) = shape(self.isa, self.element == Element::Bf16 && !self.has_bf16_dot());
         let num_panels = self.out_features.div_ceil(columns);
-        let blocks = rows.div_ceil(ROW_BLOCK);
-        let threads = if rows * self.in_features * self.out_features < MACS_FOR_THREADS {
-            1
-        } else {
-            threads
+        let tiles = Tiles {
+            rows,
+            count: rows.div_ceil(tile_rows),
         };
+        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another.
+        let wanted = (TASKS_PER_THREAD * threads)
+            .div_ceil(num_panels)
+            .min(macs / (num_panels * MACS_FOR_THREADS));
+        let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
+        let blocks = rows.div_ceil(ROW_BLOCK).max(most);
         let out_stride = out.row_stride();
         let mut job = Job {
             x: x.as_ptr().cast(),
             x_stride: x.row_stride(),
+            tiles,
             in_features: self.in_features,
             quantized: &[],
             out: out.as_ptr_mut(),
@@ -363,17 +370,21 @@ impl PackedLinear {
         // Row blocks outside, panels inside: threads then share a block of activations and walk the weights side by side.
         parallel_for(threads, blocks * num_panels, &|task| {
             let (block, panel) = (task / num_panels, task % num_panels);
-            let rows = Rows {
-                first: rows * block / blocks,
-                end: rows * (block + 1) / blocks,
+            let block = Block {
+                first: tiles.count * block / blocks,
+                end: tiles.count * (block + 1) / blocks,
             };
-            self.run_panel(&job, rows, panel, threads);
+            self.run_panel(&job, block, columns, panel, threads);
         });
     }
 
+    /// Whether its products are those of an instruction for bf16.
+    fn has_bf16_dot(&self) -> bool {
+        self.arithmetic == Arithmetic::Bfloat16 && self.isa.has_bf16_dot()
+    }
+
     /// Runs a block of rows through panel number `panel`; this thread will probably take the one `ahead` of it next.
-    fn run_panel(&self, job: &Job<'_>, rows: Rows, panel: usize, ahead: usize) {
-        let columns = panel_columns(self.isa);
+    fn run_panel(&self, job: &Job<'_>, block: Block, columns: usize, panel: usize, ahead: usize) {
         let size = self.in_features.div_ceil(self.element.per_word()) * columns;
         let first = panel * columns;
         let panel = Panel {
@@ -386,12 +397,12 @@ impl PackedLinear {
             ahead,
         };
         match self.element {
-            Element::F32 => dispatch(self.isa, PanelRun::<F32>::new(job, rows, panel)),
-            Element::Bf16 if self.arithmetic == Arithmetic::Bfloat16 && self.isa.has_bf16_dot() => {
-                dispatch_dots(self.isa, PanelRun::<Bf16Pairs>::new(job, rows, panel));
+            Element::F32 => dispatch(self.isa, PanelRun::<F32>::new(job, block, panel)),
+            Element::Bf16 if self.has_bf16_dot() => {
+                dispatch_dots(self.isa, PanelRun::<Bf16Pairs>::new(job, block, panel));
             }
-            Element::Bf16 => dispatch(self.isa, PanelRun::<WidenedBf16>::new(job, rows, panel)),
-            Element::Int8 => dispatch_dots(self.isa, PanelRun::<Int8Quads>::new(job, rows, panel)),
+            Element::Bf16 => dispatch(self.isa, PanelRun::<WidenedBf16>::new(job, block, panel)),
+            Element::Int8 => dispatch_dots(self.isa, PanelRun::<Int8Quads>::new(job, block, panel)),
         }
     }
 }
@@ -404,14 +415,5 @@ impl Element {
             Self::Bf16 => 2,
             Self::Int8 => 4,
         }
-    }
-}
-
-/// Output columns of a panel: as many vectors as leave registers for a tile that hides the latency of the multiply-adds.
-fn panel_columns(isa: Isa) -> usize {
-    match isa {
-        Isa::Portable => tile::PORTABLE_COLUMNS,
-        Isa::Avx2 | Isa::Avx2Vnni => tile::AVX2_COLUMNS,
-        Isa::Avx512f | Isa::Avx512 => tile::AVX512_COLUMNS,
     }
 }

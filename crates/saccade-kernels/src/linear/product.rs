@@ -14,8 +14,6 @@ const SUM_PART: usize = 512;
 pub(super) trait Product<V: Vector> {
     /// Consecutive `k` in a word of the panel.
     const STEP: usize;
-    /// Words of a row that a step takes.
-    const ROW_WORDS: usize;
     /// Steps that are summed from zero, at multiples of which the summed dimension is cut; their sums are added to those of the parts before.
     const PART_STEPS: usize;
     /// A vector of sums.
@@ -121,7 +119,6 @@ macro_rules! float_sums {
 
 impl<V: Vector> Product<V> for F32 {
     const STEP: usize = 1;
-    const ROW_WORDS: usize = 1;
     const PART_STEPS: usize = SUM_PART / <Self as Product<V>>::STEP;
     float_sums!();
 
@@ -151,7 +148,6 @@ impl<V: Vector> Product<V> for F32 {
 
 impl<V: Vector> Product<V> for WidenedBf16 {
     const STEP: usize = 2;
-    const ROW_WORDS: usize = 2;
     const PART_STEPS: usize = SUM_PART / <Self as Product<V>>::STEP;
     float_sums!();
 
@@ -188,7 +184,6 @@ impl<V: Vector> Product<V> for WidenedBf16 {
 
 impl<V: Vector, D: Dots<V>> Product<V> for With<Bf16Pairs, D> {
     const STEP: usize = 2;
-    const ROW_WORDS: usize = 1;
     const PART_STEPS: usize = SUM_PART / <Self as Product<V>>::STEP;
     float_sums!();
 
@@ -218,7 +213,6 @@ impl<V: Vector, D: Dots<V>> Product<V> for With<Bf16Pairs, D> {
 
 impl<V: Vector, D: Dots<V>> Product<V> for With<Int8Quads, D> {
     const STEP: usize = 4;
-    const ROW_WORDS: usize = 1;
     // Integers lose nothing.
     const PART_STEPS: usize = usize::MAX / 2;
     type Sum = V::Ints;

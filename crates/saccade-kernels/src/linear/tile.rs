@@ -2,22 +2,40 @@
 
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
+use std::ops::Range;
 
+use super::Epilogue;
 use super::product::{Bf16Pairs, F32, Int8Quads, Product, WidenedBf16, With};
 use super::rows::Quantized;
-use super::{Epilogue, ROW_BLOCK};
 use crate::activation::{gelu_tanh_vector, silu_vector};
-use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, load, store};
+use crate::isa::Isa;
+use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, lanes, load, store};
 
 /// Vectors of a panel's row, and rows of the largest tile: `ROWS x VECTORS` accumulators, `VECTORS` weights and one broadcast fit the registers.
 const PORTABLE: (usize, usize) = (1, 4);
 const AVX2: (usize, usize) = (2, 6);
 const AVX512: (usize, usize) = (3, 8);
 
-pub(super) const PORTABLE_COLUMNS: usize = 8 * PORTABLE.0;
-pub(super) const AVX2_COLUMNS: usize = 8 * AVX2.0;
-pub(super) const AVX512_COLUMNS: usize = 16 * AVX512.0;
-const MAX_COLUMNS: usize = AVX512_COLUMNS;
+const MAX_COLUMNS: usize = 16 * AVX512.0;
+
+/// Rows that go through a panel together: their activations should stay in the second-level cache while the panel streams past. 96 rows
+/// of 2048 are 768 kB, three quarters of a 1 MB cache.
+pub(super) const ROW_BLOCK: usize = 96;
+
+/// Blocks are whole tiles, so that one may be larger.
+const MAX_ROWS: usize = ROW_BLOCK + AVX512.1;
+
+/// Output columns of a panel, and rows of the largest tile, where bf16 weights are widened or not.
+pub(super) fn shape(isa: Isa, widens: bool) -> (usize, usize) {
+    let (vectors, rows) = match isa {
+        Isa::Portable => PORTABLE,
+        Isa::Avx2 | Isa::Avx2Vnni => AVX2,
+        Isa::Avx512f | Isa::Avx512 => AVX512,
+    };
+    // Widening takes registers: one row less does not spill. Shares of the FMA peak at 296 x 2048 x 1536 on Zen 4: 8 and 7 rows of AVX-512
+    // 0.77 and 0.97, 6 and 5 rows of AVX2 0.70 and 0.88.
+    (vectors * lanes(isa), rows - usize::from(widens))
+}
 
 /// Steps over the summed dimension after which the next tile takes the same block of the panel, which is then still in the cache: whole
 /// parts. Each block begins the rows' streams anew; with two parts of float32, together with huge pages for the weights, AVX2 went from 0.85
@@ -33,6 +51,7 @@ pub(super) struct Job<'a> {
     pub x: *const u32,
     /// In words.
     pub x_stride: isize,
+    pub tiles: Tiles,
     pub in_features: usize,
     /// How each row was quantised, for int8.
     pub quantized: &'a [Quantized],
@@ -44,9 +63,23 @@ pub(super) struct Job<'a> {
 // SAFETY: tasks read `x` and write disjoint parts of `out`: no two have a row block and a panel in common.
 unsafe impl Sync for Job<'_> {}
 
-/// A block of rows, at most [`ROW_BLOCK`].
+/// How the rows of a call are dealt: evenly, so that 49 are 7 tiles of 7, not 6 of 8 and one of 1.
 #[derive(Clone, Copy)]
-pub(super) struct Rows {
+pub(super) struct Tiles {
+    pub rows: usize,
+    pub count: usize,
+}
+
+impl Tiles {
+    /// The first row of tile number `tile`.
+    pub(super) fn first_row(&self, tile: usize) -> usize {
+        self.rows * tile / self.count
+    }
+}
+
+/// Tiles `first .. end`, of at most [`MAX_ROWS`] rows together.
+#[derive(Clone, Copy)]
+pub(super) struct Block {
     pub first: usize,
     pub end: usize,
 }
@@ -67,16 +100,16 @@ pub(super) struct Panel<'a> {
 /// Runs a block of rows through one panel: columns `first .. first + width` of `out`.
 pub(super) struct PanelRun<'a, P> {
     pub job: &'a Job<'a>,
-    pub rows: Rows,
+    pub block: Block,
     pub panel: Panel<'a>,
     product: PhantomData<P>,
 }
 
 impl<'a, P> PanelRun<'a, P> {
-    pub(super) fn new(job: &'a Job<'a>, rows: Rows, panel: Panel<'a>) -> Self {
+    pub(super) fn new(job: &'a Job<'a>, block: Block, panel: Panel<'a>) -> Self {
         Self {
             job,
-            rows,
+            block,
             panel,
             product: PhantomData,
         }
@@ -86,15 +119,15 @@ impl<'a, P> PanelRun<'a, P> {
     /// The caller runs with `V`'s instruction set and what `Q` needs; the panel was packed for `Q`.
     #[inline(always)]
     unsafe fn all<V: Vector, Q: Product<V>>(self) {
-        let Self { job, rows, panel, .. } = self;
-        assert!(rows.end - rows.first <= ROW_BLOCK);
-        // Widening takes registers: 8 rows of bf16 weights spill (0.77 of the FMA peak at 296 x 2048 x 1536), 7 do not (0.94).
+        let Self {
+            job, block, panel, ..
+        } = self;
         // SAFETY: the caller's promise; the job's views cover rows and columns.
         unsafe {
             match V::REGISTERS {
-                8 => panel_rows::<V, Q, { PORTABLE.0 }>(job, rows, &panel, PORTABLE.1),
-                16 => panel_rows::<V, Q, { AVX2.0 }>(job, rows, &panel, AVX2.1),
-                _ => panel_rows::<V, Q, { AVX512.0 }>(job, rows, &panel, AVX512.1 + 1 - Q::ROW_WORDS),
+                8 => panel_rows::<V, Q, { PORTABLE.0 }>(job, block, &panel),
+                16 => panel_rows::<V, Q, { AVX2.0 }>(job, block, &panel),
+                _ => panel_rows::<V, Q, { AVX512.0 }>(job, block, &panel),
             }
         }
     }
@@ -152,28 +185,29 @@ impl DotKernel for PanelRun<'_, Int8Quads> {
 #[inline(always)]
 unsafe fn panel_rows<V: Vector, P: Product<V>, const NV: usize>(
     job: &Job<'_>,
-    rows: Rows,
+    tiles: Block,
     panel: &Panel<'_>,
-    max_rows: usize,
 ) {
-    let count = rows.end - rows.first;
-    let tiles = count.div_ceil(max_rows);
+    let first_row = job.tiles.first_row(tiles.first);
+    let rows = first_row..job.tiles.first_row(tiles.end);
+    assert!(rows.len() <= MAX_ROWS);
     let steps = job.in_features.div_ceil(P::STEP);
     let blocks = steps.div_ceil(BLOCK_STEPS).max(1);
-    let mut sums = Sums([const { MaybeUninit::uninit() }; ROW_BLOCK * MAX_COLUMNS]);
+    let mut sums = Sums([const { MaybeUninit::uninit() }; MAX_ROWS * MAX_COLUMNS]);
     for block in 0..blocks {
         let part = Part {
             first: block * BLOCK_STEPS,
             end: steps.min((block + 1) * BLOCK_STEPS),
         };
-        for tile in 0..tiles {
-            // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
-            let (first, end) = (count * tile / tiles, count * (tile + 1) / tiles);
+        for tile in tiles.first..tiles.end {
+            let (first, end) = (job.tiles.first_row(tile), job.tiles.first_row(tile + 1));
             let place = Place {
-                row: rows.first + first,
-                sums: sums.0[first * NV * V::LANES..].as_mut_ptr().cast::<u32>(),
-                tile,
-                tiles,
+                row: first,
+                sums: sums.0[(first - first_row) * NV * V::LANES..]
+                    .as_mut_ptr()
+                    .cast::<u32>(),
+                tile: tile - tiles.first,
+                tiles: tiles.end - tiles.first,
             };
             // SAFETY: the caller's promise; the tile lies within the rows, and its sums within the block's.
             unsafe {
@@ -206,7 +240,7 @@ unsafe fn panel_rows<V: Vector, P: Product<V>, const NV: usize>(
 }
 
 #[repr(align(64))]
-struct Sums([MaybeUninit<u32>; ROW_BLOCK * MAX_COLUMNS]);
+struct Sums([MaybeUninit<u32>; MAX_ROWS * MAX_COLUMNS]);
 
 /// A part of the steps over `k`.
 struct Part {
@@ -360,7 +394,7 @@ impl Finish for Add {
 #[inline(always)]
 unsafe fn finish<V: Vector, P: Product<V>, F: Finish, const NV: usize>(
     job: &Job<'_>,
-    rows: Rows,
+    rows: Range<usize>,
     panel: &Panel<'_>,
     sums: *const u32,
 ) {
@@ -373,10 +407,10 @@ unsafe fn finish<V: Vector, P: Product<V>, F: Finish, const NV: usize>(
             let columns = P::columns(panel, column);
             let mut out = job
                 .out
-                .offset(rows.first as isize * job.out_stride)
+                .offset(rows.start as isize * job.out_stride)
                 .add(panel.first + column);
             let mut sums = sums.add(column);
-            for row in rows.first..rows.end {
+            for row in rows.clone() {
                 let value = P::value(P::load(sums), columns, job.quantized, row).add(bias);
                 store(F::of(value, out, lanes), out, lanes);
                 out = out.wrapping_offset(job.out_stride);
