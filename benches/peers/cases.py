@@ -17,17 +17,21 @@ COST: dict[str, tuple[int, ...]] = {
     "samples": (1, 2, 4, 8),
 }
 """What the time of a chunk is measured against, each varied alone about the released size."""
+FIELDS = {"N": "num_future_tokens", "T_vl": "num_vl_tokens"}
+"""The fields of a case by the names of `COST`, where they differ."""
 WORKS: dict[str, tuple[str, ...]] = {
     "linear": tuple(f"{rows} x {inputs} x {outputs}" for rows, inputs, outputs in LINEAR_SHAPES),
     "cross": ("held", "both"),
     "blocks": ("held", "both"),
-    "head": ("encode", "sample", "both"),
+    "head": ("encode", "sample"),
     "cost": (
         *(f"encode, T_vl {value}" for value in COST["T_vl"]),
         *(f"sample, {name} {value}" for name, values in COST.items() for value in values),
     ),
 }
-"""What can be timed of a piece. `held`: keys and values of the observation are held from before."""
+"""What is timed of a piece. `held`: keys and values of the observation are held from before; `both`: they are
+computed too. Of the whole head `both` is the sum of its two works in the same round.
+"""
 
 
 @dataclass(frozen=True, order=True)
@@ -60,6 +64,11 @@ class Case:
         """What is timed of it."""
         return WORKS[self.piece]
 
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """What is reported of it."""
+        return (*self.works, "both") if self.piece == "head" else self.works
+
     def as_dict(self) -> dict[str, Any]:
         """Its fields, for JSON."""
         return asdict(self)
@@ -73,7 +82,7 @@ class Case:
 
 def default_cases(threads: list[int]) -> list[Case]:
     """What fits a quarter of an hour: the released size, one view, N 32, one observation, one chunk."""
-    cases = [Case(piece, count) for piece in ("head", "blocks", "cross", "linear") for count in threads]
+    cases = [Case(piece, count) for count in threads for piece in ("head", "blocks", "cross", "linear")]
     return [*cases, Case("cost", max(threads))]
 
 
@@ -132,8 +141,8 @@ def exact_macs(config: HeadConfig, case: Case) -> dict[str, float]:
 def case_of_cost(case: Case, work: str) -> Case:
     """The whole head at the size that a work of the piece `cost` names."""
     name, value = work.partition(", ")[2].split(" ")
-    field = {"N": "num_future_tokens", "T_vl": "num_vl_tokens"}.get(name, name)
-    return replace(case, piece="head", **{field: int(value)})
+    changed: dict[str, Any] = {FIELDS.get(name, name): int(value)}
+    return replace(case, piece="head", **changed)
 
 
 def _works(key_values: float, held: float) -> dict[str, float]:

@@ -134,7 +134,7 @@ def expected_of(case: Case, folder: Path) -> Arrays:
             actions = head.sample(vl_embs, state, EMBODIMENT, noise=noise, num_steps=case.steps)
             arrays["expected"] = actions.numpy().reshape(case.batch, case.samples, *actions.shape[1:])
     part = path.with_suffix(".part.npz")
-    np.savez(part, **arrays)
+    np.savez(part, allow_pickle=False, **arrays)
     part.rename(path)
     return arrays
 

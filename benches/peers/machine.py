@@ -82,6 +82,7 @@ def linear_bench(threads: list[int], rounds: int) -> Any:
         ]
         command += [
             "--",
+            "--no-peers",
             "--threads",
             ",".join(map(str, threads)),
             "--rounds",

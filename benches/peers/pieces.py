@@ -9,6 +9,9 @@ Shapes: B observations, S samples of each, R rows of a sequence, E the width, C 
 features.
 """
 
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
+
 from __future__ import annotations
 
 from typing import Any
@@ -48,7 +51,7 @@ class Linears(nn.Module):
         self.weights = nn.ParameterList(frozen(weight) for weight in weights)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
-        """`(rows, inputs)` to as many `(rows, outputs)` as there are layers."""
+        """`(B, rows, inputs)` to as many `(B, rows, outputs)` as there are layers."""
         return tuple(F.linear(x, weight) for weight in self.weights)
 
 
@@ -254,7 +257,8 @@ def times(head: ActionHead, embodiment: int, num_steps: int) -> list[tuple[Tenso
 
 def of_category(layer: Modules, embodiment: int) -> nn.Linear:
     """One embodiment's slice of a category-specific layer."""
-    linear = nn.Linear(*layer.W.shape[1:], device="meta")
+    inputs, outputs = layer.W.shape[1:]
+    linear = nn.Linear(inputs, outputs, device="meta")
     linear.weight = frozen(layer.W[embodiment].T)
     linear.bias = frozen(layer.b[embodiment])
     return linear

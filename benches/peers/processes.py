@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -117,31 +118,33 @@ def prepare(case: Case, work_folder: Path) -> None:
 def contenders(
     names: list[str], case: Case, work_folder: Path
 ) -> Iterator[tuple[dict[str, Connection], dict[str, Ready | RuntimeError]]]:
-    """Processes that have built their works, one after the other; and what each said, an error too.
+    """Processes that have built their works, and what each said, an error too.
 
-    Only those that are ready have a pipe.
+    They build at the same time. Only those that are ready have a pipe.
     """
     spawn = multiprocessing.get_context("spawn")
     pipes: dict[str, Connection] = {}
     said: dict[str, Ready | RuntimeError] = {}
-    processes = []
+    processes: dict[str, SpawnProcess] = {}
     try:
+        note(f"{case}: building {', '.join(names)}")
+        ours: dict[str, Connection] = {}
         for name in names:
-            note(f"{case}: building {name}")
-            ours, theirs = spawn.Pipe()
+            ours[name], theirs = spawn.Pipe()
             process = spawn.Process(target=worker, args=(theirs, name, case, work_folder), daemon=True)
             with environment_of(name, case, work_folder):
                 process.start()
             theirs.close()
-            processes.append(process)
+            processes[name] = process
+        for name, pipe in ours.items():
             try:
-                answer = ours.recv()
+                answer = pipe.recv()
             except EOFError:
-                process.join()
-                answer = RuntimeError(f"the process ended with status {process.exitcode}")
+                processes[name].join()
+                answer = RuntimeError(f"the process ended with status {processes[name].exitcode}")
             said[name] = answer
             if isinstance(answer, Ready):
-                pipes[name] = ours
+                pipes[name] = pipe
             else:
                 note(f"{name} failed: {answer}")
         yield pipes, said
@@ -149,7 +152,7 @@ def contenders(
         for pipe in pipes.values():
             with contextlib.suppress(OSError):
                 pipe.send(None)
-        for process in processes:
+        for process in processes.values():
             process.join(timeout=10)
             process.kill()
             process.join()

@@ -69,9 +69,7 @@ class Results:
 
     def seconds(self, case: Case, name: str, work: str) -> list[float]:
         """All times of one work."""
-        return [
-            value for entry in self.entries(case, name) for value in entry.get("seconds", {}).get(work, [])
-        ]
+        return [value for entry in self.entries(case, name) for value in times(entry, work)]
 
     def names(self, case: Case) -> list[str]:
         """Contenders of a case with at least one round."""
@@ -93,17 +91,16 @@ class Results:
         """Time of `slower` over that of `faster`, of the rounds that both did in turn."""
         pairs: list[float] = []
         for record in self.records(case):
-            entries = [record["contenders"].get(name, {}).get("seconds", {}) for name in (slower, faster)]
-            times = [entry.get(work, []) for entry in entries]
-            pairs += [above / below for above, below in zip(*times, strict=False)]
+            both = [times(record["contenders"].get(name, {}), work) for name in (slower, faster)]
+            pairs += [above / below for above, below in zip(*both, strict=False)]
         return pairs
 
     def ratio(self, case: Case, slower: str, faster: str, work: str) -> tuple[float, float, float] | None:
         """Quartiles of `ratios`; of all pairs of their times where the two were never measured in turn."""
         pairs = self.ratios(case, slower, faster, work)
         if not pairs:
-            times = [self.seconds(case, name, work) for name in (slower, faster)]
-            pairs = [above / below for above in times[0] for below in times[1]]
+            both = [self.seconds(case, name, work) for name in (slower, faster)]
+            pairs = [above / below for above in both[0] for below in both[1]]
         return quartiles(pairs) if pairs else None
 
     def peak(self, threads: int, isa: str, arithmetic: str) -> float | None:
@@ -123,6 +120,14 @@ class Results:
         ]
         known = [value for value in values if value]
         return statistics.median(known) if known else None
+
+
+def times(entry: dict[str, Any], work: str) -> list[float]:
+    """A contender's times in one record, one a round; `both` of the whole head is the sum of its works."""
+    seconds = entry.get("seconds", {})
+    if work == "both" and "encode" in seconds:
+        return [sum(pair) for pair in zip(seconds["encode"], seconds["sample"], strict=True)]
+    return list(seconds.get(work, []))
 
 
 def quartiles(values: Iterable[float]) -> tuple[float, float, float]:

@@ -56,6 +56,7 @@ def linear(engine: Engine, task: Task, loaded: Callable[[], ActionHead]) -> Buil
     for index, (name, (_, inputs, outputs)) in enumerate(zip(task.case.works, LINEAR_SHAPES, strict=True)):
         copies = max(2, WEIGHT_BYTES // (4 * inputs * outputs))
         weight, x = (torch.from_numpy(task.arrays[f"{letter}{index}"]) for letter in "wx")
+        x = x[None]  # a batch, as layers of the head have it
 
         def module(weight: Tensor = weight, copies: int = copies) -> nn.Module:
             return pieces.Linears([weight.roll(shift, 0) for shift in range(copies)])
@@ -149,11 +150,7 @@ def whole(engine: Engine, task: Task, loaded: Callable[[], ActionHead]) -> Built
 
     shape = task.arrays["expected"].shape
     return Built(
-        {
-            "encode": lambda: encode(own_features),
-            "sample": lambda: sample(own_held),
-            "both": lambda: sample(encode(own_features)),
-        },
+        {"encode": lambda: encode(own_features), "sample": lambda: sample(own_held)},
         lambda: engine.numpy(sample(encode(own_features))).reshape(shape),
     )
 

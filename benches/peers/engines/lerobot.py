@@ -69,7 +69,7 @@ def whole(task: Task, head: Any, run: Callable[[Callable[[], Any]], Callable[[],
 
     both = run(lambda: sample(encoded()))
     return Built(
-        {"encode": run(encoded), "sample": run(lambda: sample(vl_embs)), "both": both},
+        {"encode": run(encoded), "sample": run(lambda: sample(vl_embs))},
         lambda: both().float().numpy().reshape(task.arrays["expected"].shape),
     )
 

@@ -39,7 +39,8 @@ class Torch:
             if self.arithmetic == "autocast" and isinstance(layer, nn.ParameterList):
                 layer.to(torch.bfloat16)
         if self.arithmetic == "int8":
-            built = torch.ao.quantization.quantize_dynamic(built, {nn.Linear}, dtype=torch.qint8)
+            quantize: Any = torch.ao.quantization.quantize_dynamic
+            built = quantize(built, {nn.Linear}, dtype=torch.qint8)
         run: Callable[..., Any] = built
         if self.compiled:
             import torch._inductor.config as inductor

@@ -87,11 +87,7 @@ def whole(task: Task) -> Built:
 
     context = head.encode(features)
     return Built(
-        {
-            "encode": lambda: head.encode(features),
-            "sample": lambda: sample(context),
-            "both": lambda: sample(head.encode(features)),
-        },
+        {"encode": lambda: head.encode(features), "sample": lambda: sample(context)},
         lambda: np.asarray(sample(head.encode(features))),
         notes=f"{head.nbytes / 1e9:.2f} GB of weights",
     )
