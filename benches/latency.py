@@ -1,0 +1,457 @@
+"""Latency as a user feels it: chunks on a busy machine, many callers, small heads, the least a call costs.
+
+    python -m benches.latency                       all sections; half an hour, most of it the first one
+    python -m benches.latency loaded --chunks 40    one of them: loaded, callers, small or overhead
+    python -m benches.latency report                prints what is in out/latency/results.json
+
+- `loaded`: chunks (encode and sample) at N1.5's size while as many other processes as cores keep busy,
+  beside lerobot's head. The fair share of the machine is then half of it: twice the quiet time.
+- `callers`: 8 Python threads that sample at the same time beside one that does all the work.
+- `small`: a head of the shipped policy's sizes beside torch.
+- `overhead`: a head so small that its arithmetic is nothing: what is left is dispatch and binding.
+
+Contenders live in processes of their own, as in `benches.peers`, and take turns. Run it on a machine that has
+nothing else to do. Results are kept as JSON: a section that runs again replaces its own, but `loaded` adds
+its chunks to those that are there, so that they can be measured in several sittings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import importlib.resources
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import saccade
+from benches.peers import inputs, machine
+from benches.peers.cases import Case
+from benches.peers.contenders import CONTENDERS
+from benches.peers.engines import Task
+
+SECTIONS = ("loaded", "callers", "small", "overhead")
+LOADED = ("saccade-float32", "saccade-bfloat16", "saccade-int8", "lerobot-bfloat16")
+SMALL = ("saccade-float32", "lerobot-float32", "lerobot-bfloat16", "torch-float32", "compile-float32")
+NUM_CALLERS = 8
+SETTLE = 0.3  # seconds until the scheduler has spread a new load
+
+Report = dict[str, Any]
+
+
+def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path) -> None:
+    """A contender's process: builds its head, then answers `(work, times)` with so many times in seconds."""
+    try:
+        arrays = inputs.inputs_of(case, saccade.HeadConfig.from_file(source / "config.json"))
+        arrays["expected"] = arrays["noise"]  # of the result's shape
+        engine = importlib.import_module(f"benches.peers.engines.{CONTENDERS[name].engine}")
+        works = engine.build(Task(case, dict(CONTENDERS[name].options), source, arrays, scratch)).works
+        for work in works.values():
+            work()
+        pipe.send("ready")
+        while (asked := pipe.recv()) is not None:
+            work, times = asked
+            pipe.send([timed(works[work]) for _ in range(times)])
+    except Exception as error:
+        pipe.send(RuntimeError(f"{name}: {type(error).__name__}: {error}"))
+
+
+def timed(work: Callable[[], Any]) -> float:
+    """Seconds of one call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+class Contenders:
+    """Processes that have built their heads; `ask` one of them for times."""
+
+    def __init__(self, names: list[str], case: Case, source: Path, scratch: Path) -> None:
+        self._pipes: dict[str, Connection] = {}
+        self._processes = []
+        spawn = multiprocessing.get_context("spawn")
+        for name in names:
+            note(f"building {name}, {case.threads} threads")
+            self._pipes[name], theirs = spawn.Pipe()
+            process = spawn.Process(target=worker, args=(theirs, name, case, source, scratch), daemon=True)
+            with environment({"OMP_NUM_THREADS": str(case.threads), "THP_MEM_ALLOC_ENABLE": "1"}):
+                process.start()
+            self._processes.append(process)
+            self._answer(name)
+
+    def _answer(self, name: str) -> Any:
+        answer = self._pipes[name].recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def ask(self, name: str, work: str, times: int) -> list[float]:
+        """Seconds of so many calls in a row."""
+        self._pipes[name].send((work, times))
+        return list(self._answer(name))
+
+    def __enter__(self) -> Contenders:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for pipe in self._pipes.values():
+            with contextlib.suppress(OSError):
+                pipe.send(None)
+        for process in self._processes:
+            process.join(timeout=10)
+            process.kill()
+
+
+@contextlib.contextmanager
+def environment(added: dict[str, str]) -> Iterator[None]:
+    """The environment of processes started within; torch reads its settings when it is imported."""
+    before = os.environ.copy()
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+@contextlib.contextmanager
+def busy_processes(count: int) -> Iterator[Callable[[bool], None]]:
+    """Processes that compute without end while `work(True)`, and stand still otherwise."""
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+
+    def work(on: bool) -> None:
+        for process in processes:
+            process.send_signal(signal.SIGCONT if on else signal.SIGSTOP)
+        time.sleep(SETTLE)
+
+    try:
+        time.sleep(SETTLE)
+        work(False)
+        yield work
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def rotated(names: list[str], turn: int) -> list[str]:
+    """Everybody once, another one first each time."""
+    turn %= len(names)
+    return names[turn:] + names[:turn]
+
+
+def loaded(args: argparse.Namespace, before: Report) -> Report:
+    """Chunks while other processes keep every core busy, and while they do not."""
+    case = Case("head", args.threads, size=args.size)
+    source = checkpoint(inputs.config_of(case), args.work / f"n15-{args.size}")
+    names = list(args.contenders or LOADED)
+    busy = args.busy or machine.describe()["cores"]
+    report: Report = {"case": case.as_dict(), "busy": busy, "seconds": {}}
+    if before and (before["case"], before["busy"]) == (report["case"], busy):
+        report = before
+    seconds: dict[str, dict[str, list[float]]] = report["seconds"]
+    for name in names:
+        seconds.setdefault(name, {"quiet": [], "loaded": []})
+    rounds = -(-args.chunks // args.chunks_a_turn)
+    with Contenders(names, case, source, args.work) as contenders, busy_processes(busy) as work:
+        for turn in range(rounds):
+            for name in rotated(names, turn):
+                note(f"loaded: round {turn + 1} of {rounds}, {name}")
+                quiet = max(2, args.chunks_a_turn // 3)
+                seconds[name]["quiet"] += contenders.ask(name, "both", quiet)
+                work(True)
+                seconds[name]["loaded"] += contenders.ask(name, "both", args.chunks_a_turn)
+                work(False)
+    return report
+
+
+def loaded_table(report: Report) -> list[str]:
+    """How many times as long a chunk takes under load."""
+    lines = [
+        f"N1.5, encode and sample, {report['case']['threads']} threads; "
+        f"{report['busy']} busy processes beside them.",
+        "",
+        "| contender | quiet p50, ms | loaded p50, ms | p50 to quiet | p90 to p50 | p99 to p50 | chunks |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, seconds in report["seconds"].items():
+        quiet, load = statistics.median(seconds["quiet"]), np.quantile(seconds["loaded"], (0.5, 0.9, 0.99))
+        lines.append(
+            f"| {CONTENDERS[name].label} | {1e3 * quiet:.0f} | {1e3 * load[0]:.0f} | {load[0] / quiet:.2f} "
+            f"| {load[1] / load[0]:.2f} | {load[2] / load[0]:.2f} | {len(seconds['loaded'])} |"
+        )
+    return lines
+
+
+def callers(args: argparse.Namespace, before: Report) -> Report:
+    """Chunks a second of one caller and of several, in turns; and whether all have the same bits."""
+    del before
+    whole = Case("head", args.threads, size=args.size)
+    heads = {
+        "the shipped policy's size": (policy_config(), "policy", 56, 40),
+        f"N1.5's size ({args.size})": (inputs.config_of(whole), f"n15-{args.size}", 296, 1),
+    }
+    cases = {}
+    for label, (config, name, num_vl_tokens, each) in heads.items():
+        case = Case("head", args.threads, num_vl_tokens=num_vl_tokens)
+        source = checkpoint(config, args.work / name)
+        head = saccade.ActionHead.load(source, num_threads=args.threads)
+        arrays = inputs.inputs_of(case, head.config)
+        context, noise = head.encode(arrays["features"]), arrays["noise"][:, 0]
+        expected = head.sample(context, arrays["state"], inputs.EMBODIMENT, noise=noise)
+        wrong: list[bool] = []
+
+        def sample(
+            times: int,
+            head: Any = head,
+            context: Any = context,
+            state: Any = arrays["state"],
+            noise: Any = noise,
+            expected: Any = expected,
+            wrong: list[bool] = wrong,
+        ) -> None:
+            out = np.empty_like(expected)
+            for _ in range(times):
+                head.sample(context, state, inputs.EMBODIMENT, noise=noise, out=out)
+                if out.tobytes() != expected.tobytes():
+                    wrong.append(True)
+
+        rates: dict[str, list[float]] = {"one": [], "several": []}
+        for turn in range(args.rounds + 1):
+            note(f"callers: {label}, round {turn} of {args.rounds}")
+            one = timed(lambda sample=sample, each=each: sample(NUM_CALLERS * each))  # type: ignore[misc]
+            threads = [threading.Thread(target=sample, args=(each,)) for _ in range(NUM_CALLERS)]
+            start = time.perf_counter()
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            several = time.perf_counter() - start
+            if turn > 0:  # the first one makes the workspaces
+                rates["one"].append(NUM_CALLERS * each / one)
+                rates["several"].append(NUM_CALLERS * each / several)
+        cases[label] = {"rates": rates, "wrong": len(wrong)}
+    return {"threads": args.threads, "cases": cases}
+
+
+def callers_table(report: Report) -> list[str]:
+    """Throughput of several callers over that of one."""
+    lines = [
+        f"`sample` on one held context, a head of {report['threads']} threads.",
+        "",
+        f"| head | chunks a second, 1 caller | {NUM_CALLERS} callers | ratio (least, most) | other bits |",
+        "|---|---|---|---|---|",
+    ]
+    for label, case in report["cases"].items():
+        one, several = case["rates"]["one"], case["rates"]["several"]
+        ratios = sorted(b / a for a, b in zip(one, several, strict=True))
+        lines.append(
+            f"| {label} | {statistics.median(one):.4g} | {statistics.median(several):.4g} "
+            f"| {statistics.median(ratios):.2f} ({ratios[0]:.2f}, {ratios[-1]:.2f}) | {case['wrong']} |"
+        )
+    return lines
+
+
+def small(args: argparse.Namespace, before: Report) -> Report:
+    """A head of the shipped policy's sizes beside torch."""
+    del before
+    runs = []
+    source = checkpoint(policy_config(), args.work / "policy")
+    names = list(args.contenders or SMALL)
+    for threads in sorted({1, args.threads}):
+        case = Case("head", threads, num_vl_tokens=56)
+        seconds: dict[str, dict[str, list[float]]] = {name: {"sample": [], "both": []} for name in names}
+        with Contenders(names, case, source, args.work) as contenders:
+            for turn in range(args.rounds):
+                for name in rotated(names, turn):
+                    for work in ("sample", "both"):
+                        # The first ones wake threads and caches.
+                        taken = contenders.ask(name, work, 25)[5:]
+                        seconds[name][work].append(statistics.median(taken))
+        runs.append({"threads": threads, "seconds": seconds})
+    return {"runs": runs}
+
+
+def small_table(report: Report) -> list[str]:
+    """Times a chunk, and the first contender's share of each."""
+    lines = ["The shipped policy's sizes: width 128, 4 blocks, T_vl 56, 4 Euler steps.", ""]
+    lines += ["| contender | threads | sample, ms | encode and sample, ms | sample, in saccade's |"]
+    lines += ["|---|---|---|---|---|"]
+    for run in report["runs"]:
+        first = next(iter(run["seconds"].values()))
+        for name, seconds in run["seconds"].items():
+            ratio = statistics.median(a / b for a, b in zip(seconds["sample"], first["sample"], strict=True))
+            middle = {work: 1e3 * statistics.median(taken) for work, taken in seconds.items()}
+            lines.append(
+                f"| {CONTENDERS[name].label} | {run['threads']} "
+                f"| {middle['sample']:.2f} | {middle['both']:.2f} | {ratio:.1f} |"
+            )
+    return lines
+
+
+def overhead(args: argparse.Namespace, before: Report) -> Report:
+    """Calls of a head of one block, width 8, without VL self-attention: some hundred multiply-adds."""
+    del before
+    config = policy_config()
+    config |= {"backbone_embedding_dim": 8, "hidden_size": 8, "input_embedding_dim": 8}
+    config |= {"num_target_vision_tokens": 1, "action_horizon": 1, "max_seq_len": 1, "use_vlln": False}
+    config["diffusion_model_cfg"] |= {
+        "num_layers": 1,
+        "num_attention_heads": 1,
+        "attention_head_dim": 8,
+        "cross_attention_dim": 8,
+        "output_dim": 8,
+    }
+    config["vl_self_attention_cfg"] |= {"num_layers": 0}
+    head = saccade.ActionHead.load(checkpoint(config, args.work / "tiny"), num_threads=args.threads)
+    case = Case("head", args.threads, num_vl_tokens=1)
+    arrays = inputs.inputs_of(case, head.config)
+    context, noise, state = head.encode(arrays["features"]), arrays["noise"][:, 0], arrays["state"]
+    out = head.sample(context, state, inputs.EMBODIMENT, noise=noise)
+    works: dict[str, Callable[[], Any]] = {
+        "sample, 1 step, noise and out given": lambda: head.sample(
+            context, state, inputs.EMBODIMENT, noise=noise, out=out, num_steps=1
+        ),
+        "sample, 4 steps, noise and out given": lambda: head.sample(
+            context, state, inputs.EMBODIMENT, noise=noise, out=out
+        ),
+        "sample, 1 step, an integer as seed": lambda: head.sample(
+            context, state, inputs.EMBODIMENT, seed=1, num_steps=1
+        ),
+        "encode": lambda: head.encode(arrays["features"]),
+    }
+    seconds = {}
+    for name, work in works.items():
+
+        def often(work: Callable[[], Any] = work) -> None:
+            for _ in range(100):
+                work()
+
+        often()
+        seconds[name] = [timed(often) / 100 for _ in range(20 * args.rounds)]
+    return {"seconds": seconds}
+
+
+def overhead_table(report: Report) -> list[str]:
+    """Microseconds a call."""
+    lines = ["A head of one block, width 8, one token each of observation, future and action.", ""]
+    lines += ["| call | median, us | 90 %, us |", "|---|---|---|"]
+    for name, seconds in report["seconds"].items():
+        median, high = 1e6 * np.quantile(seconds, (0.5, 0.9))
+        lines.append(f"| {name} | {median:.1f} | {high:.1f} |")
+    return lines
+
+
+def policy_config() -> dict[str, Any]:
+    """The shipped policy's head, with as many embodiments as the engines of `benches.peers` expect."""
+    file = importlib.resources.files("saccade") / "sim" / "demo" / "config.json"
+    config: dict[str, Any] = json.loads(file.read_text())["action_head_cfg"]
+    return config | {"max_num_embodiments": inputs.NUM_EMBODIMENTS}
+
+
+def checkpoint(config: dict[str, Any], folder: Path) -> Path:
+    """Random weights; written in a process of its own, so that this one stays small."""
+    if not folder.exists():
+        process = multiprocessing.get_context("spawn").Process(target=write, args=(config, folder))
+        process.start()
+        process.join()
+        if process.exitcode != 0:
+            raise SystemExit("latency: the weights could not be written")
+    return folder
+
+
+def write(config: dict[str, Any], folder: Path) -> None:
+    """The checkpoint itself, under another name until it is whole."""
+    import torch
+
+    from saccade.reference import random_weights
+
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    random_weights.write_checkpoint(part, config, 0, through=torch.bfloat16)
+    part.rename(folder)
+
+
+def note(message: str) -> None:
+    """Progress, beside the result."""
+    print(f"latency: {message}", file=sys.stderr, flush=True)
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benches.latency",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "sections", nargs="*", metavar="SECTION", help="of: " + ", ".join(SECTIONS) + "; or report"
+    )
+    parser.add_argument("--threads", type=int, default=2, help="threads of every head (default 2)")
+    parser.add_argument("--busy", type=int, help="busy processes (default: the cores)")
+    parser.add_argument("--chunks", type=int, default=200, help="loaded: chunks under load (default 200)")
+    parser.add_argument("--chunks-a-turn", type=int, default=10, help="loaded: in a row (default 10)")
+    parser.add_argument("--rounds", type=int, default=9, help="of the other sections (default 9)")
+    parser.add_argument("--contenders", nargs="+", choices=CONTENDERS, metavar="NAME", help="instead of all")
+    parser.add_argument("--size", choices=("full", "small"), default="full", help="small: to see it work")
+    parser.add_argument(
+        "--work", type=Path, default=Path("out/latency"), help="weights and results (default out/latency)"
+    )
+    args = parser.parse_args()
+    if args.sections == ["report"]:
+        args.sections = []
+    elif not args.sections:
+        args.sections = list(SECTIONS)
+    if unknown := set(args.sections) - set(SECTIONS):
+        parser.error(f"expected sections of {', '.join(SECTIONS)}, got {', '.join(sorted(unknown))}")
+    return args
+
+
+def main() -> None:
+    """Measures and prints."""
+    args = parse()
+    measures = {"loaded": loaded, "callers": callers, "small": small, "overhead": overhead}
+    tables = {
+        "loaded": loaded_table,
+        "callers": callers_table,
+        "small": small_table,
+        "overhead": overhead_table,
+    }
+    results = args.work / "results.json"
+    report: Report = json.loads(results.read_text()) if results.exists() else {}
+    for section in args.sections:
+        measured = measures[section](args, report.get(section, {}))
+        report |= {section: measured, "machine": machine.describe()}
+        part = results.with_suffix(".part")
+        part.write_text(json.dumps(report))
+        part.rename(results)
+    if not report:
+        raise SystemExit(f"latency: there is no {results} yet")
+    described = report["machine"]
+    print(
+        f"{described['cpu']} ({described['family']}), {described['cores']} cores, "
+        f"Linux {described['kernel']}; saccade at {described['commit']} ({described['isa']}), "
+        f"torch {described['versions']['torch']}."
+    )
+    for section in SECTIONS:
+        if section in report:
+            print("\n" + "\n".join(tables[section](report[section])))
+
+
+if __name__ == "__main__":
+    main()
