@@ -32,28 +32,46 @@ unsafe impl<T: sealed::Zeroable> Sync for AlignedBuffer<T> {}
 impl<T: sealed::Zeroable> AlignedBuffer<T> {
     pub(crate) fn zeroed(len: usize) -> Self {
         let layout = Self::layout(len);
+        if layout.size() != 0 && layout.align() == ALIGNMENT {
+            // SAFETY: the layout is not of size zero.
+            let memory = unsafe { alloc_zeroed(layout) };
+            let pointer = NonNull::new(memory.cast()).unwrap_or_else(|| handle_alloc_error(layout));
+            return Self { pointer, len };
+        }
+        // SAFETY: the memory is written at once.
+        unsafe {
+            let buffer = Self::unwritten(len);
+            buffer.pointer.as_ptr().write_bytes(0, len);
+            buffer
+        }
+    }
+
+    /// Memory that nothing was written to yet, so that whoever writes it first, maybe on several threads, also waits for its pages.
+    ///
+    /// # Safety
+    /// Every element is written, through [`AlignedBuffer::pointer`], before the buffer is used as a slice.
+    pub(crate) unsafe fn unwritten(len: usize) -> Self {
+        let layout = Self::layout(len);
         if layout.size() == 0 {
             return Self {
                 pointer: NonNull::dangling(),
                 len,
             };
         }
-        // SAFETY: the layout is not of size zero; memory that was not zeroed by the allocator is zeroed here.
-        let memory = unsafe {
-            if layout.align() == ALIGNMENT {
-                alloc_zeroed(layout)
-            } else {
-                let memory = alloc(layout);
-                if !memory.is_null() {
-                    // Before it is touched: pages are given at first touch.
-                    advise_huge_pages(memory, layout.size());
-                    memory.write_bytes(0, layout.size());
-                }
-                memory
-            }
-        };
+        // SAFETY: the layout is not of size zero.
+        let memory = unsafe { alloc(layout) };
         let pointer = NonNull::new(memory.cast()).unwrap_or_else(|| handle_alloc_error(layout));
+        if layout.align() == HUGE_PAGE {
+            // Before it is touched: pages are given at first touch.
+            // SAFETY: the memory was just allocated.
+            unsafe { advise_huge_pages(memory, layout.size()) };
+        }
         Self { pointer, len }
+    }
+
+    /// Where the first element is.
+    pub(crate) fn pointer(&mut self) -> *mut T {
+        self.pointer.as_ptr()
     }
 
     fn layout(len: usize) -> Layout {

@@ -1,7 +1,6 @@
 //! From weights as they are stored to panels.
 
 use faer::MatRef;
-use half::bf16;
 
 use super::{Element, WeightRef};
 use crate::aligned::AlignedBuffer;
@@ -23,19 +22,21 @@ pub(super) fn pack_panels(
     } else {
         0
     };
-    let mut words = AlignedBuffer::zeroed(num_panels * size);
+    // SAFETY: the tasks below write all of it.
+    let mut words = unsafe { AlignedBuffer::unwritten(num_panels * size) };
     let mut scales = AlignedBuffer::zeroed(int8_columns);
     let mut sums = AlignedBuffer::zeroed(int8_columns);
     let to = To {
-        words: words.as_mut_ptr(),
+        words: words.pointer(),
         scales: scales.as_mut_ptr(),
         sums: sums.as_mut_ptr(),
     };
     parallel_for(threads, num_panels, &|index| {
         let to = &to;
         let int8 = if element == Element::Int8 { columns } else { 0 };
-        // SAFETY: the buffers hold `num_panels` panels, and each task has its own.
+        // SAFETY: the buffers hold `num_panels` panels, and each task has its own, which is zero from here on.
         let mut panel = unsafe {
+            to.words.add(index * size).write_bytes(0, size);
             Panel {
                 element,
                 columns,
@@ -79,34 +80,30 @@ struct Panel<'a> {
 impl Panel<'_> {
     /// Writes the columns from `first` on, one for each row of `weight`.
     fn fill(&mut self, first: usize, weight: WeightRef<'_>) {
-        let columns = self.columns;
-        let words = &mut *self.words;
         match (self.element, weight) {
-            (Element::F32, WeightRef::F32(view)) => for_each(view, |row, k, value| {
-                words[k * columns + first + row] = value.to_bits();
-            }),
-            (Element::F32, WeightRef::Bf16(view)) => for_each(view, |row, k, value| {
-                words[k * columns + first + row] = value.to_f32().to_bits();
-            }),
-            (Element::F32, WeightRef::Int8 { values, scales }) => for_each(values, |row, k, value| {
-                words[k * columns + first + row] = (f32::from(value) * scales[row]).to_bits();
-            }),
-            (Element::Bf16, WeightRef::Bf16(view)) => for_each(view, |row, k, value| {
-                words[k / 2 * columns + first + row] |= half(value, k);
-            }),
-            (Element::Bf16, WeightRef::F32(view)) => for_each(view, |row, k, value| {
-                words[k / 2 * columns + first + row] |= half(bf16::from_f32(value), k);
-            }),
-            (Element::Bf16, WeightRef::Int8 { values, scales }) => for_each(values, |row, k, value| {
-                words[k / 2 * columns + first + row] |=
-                    half(bf16::from_f32(f32::from(value) * scales[row]), k);
-            }),
-            (Element::Int8, WeightRef::Int8 { values, scales }) => {
-                let sums = &mut *self.sums;
-                for_each(values, |row, k, value| {
-                    words[k / 4 * columns + first + row] |= u32::from(value.cast_unsigned()) << (8 * (k % 4));
-                    sums[first + row] += i32::from(value);
+            (Element::F32, WeightRef::F32(view)) => self.put::<_, 1>(first, view, |_, value| value.to_bits()),
+            (Element::F32, WeightRef::Bf16(view)) => {
+                self.put::<_, 1>(first, view, |_, value| u32::from(value.to_bits()) << 16);
+            }
+            (Element::F32, WeightRef::Int8 { values, scales }) => {
+                self.put::<_, 1>(first, values, |row, value| {
+                    (f32::from(value) * scales[row]).to_bits()
                 });
+            }
+            (Element::Bf16, WeightRef::Bf16(view)) => {
+                self.put::<_, 2>(first, view, |_, value| u32::from(value.to_bits()));
+            }
+            (Element::Bf16, WeightRef::F32(view)) => self.put::<_, 2>(first, view, |_, value| rounded(value)),
+            (Element::Bf16, WeightRef::Int8 { values, scales }) => {
+                self.put::<_, 2>(first, values, |row, value| {
+                    rounded(f32::from(value) * scales[row])
+                });
+            }
+            (Element::Int8, WeightRef::Int8 { values, scales }) => {
+                self.put::<_, 4>(first, values, |_, value| u32::from(value.cast_unsigned()));
+                for (row, sum) in self.sums[first..first + scales.len()].iter_mut().enumerate() {
+                    *sum = (0..values.ncols()).map(|k| i32::from(values[(row, k)])).sum();
+                }
                 self.scales[first..first + scales.len()].copy_from_slice(scales);
             }
             (Element::Int8, WeightRef::F32(_) | WeightRef::Bf16(_)) => {
@@ -119,27 +116,68 @@ impl Panel<'_> {
             }
         }
     }
-}
 
-/// Element `k` in its half of a word.
-fn half(value: bf16, k: usize) -> u32 {
-    u32::from(value.to_bits()) << (16 * (k % 2))
-}
-
-/// Visits all elements, `(row, k, element)`, in blocks, so that neither the reading nor the writing side jumps through memory at every one.
-fn for_each<T: Copy>(view: MatRef<'_, T>, mut visit: impl FnMut(usize, usize, T)) {
-    const BLOCK: usize = 16;
-    for row in (0..view.nrows()).step_by(BLOCK) {
-        let count = BLOCK.min(view.nrows() - row);
-        for first in (0..view.ncols()).step_by(BLOCK) {
-            let block = view.submatrix(row, first, count, BLOCK.min(view.ncols() - first));
-            for k in 0..block.ncols() {
-                for index in 0..count {
-                    visit(row + index, first + k, block[(index, k)]);
+    /// Writes `bits(row, element)` of all elements, `STEP` of which make a word, the first one lowest.
+    ///
+    /// In blocks, so that neither the reading nor the writing side jumps through memory at every element; what is in a block is known to the
+    /// compiler, which makes vectors of it.
+    fn put<T: Copy, const STEP: usize>(
+        &mut self,
+        first: usize,
+        view: MatRef<'_, T>,
+        bits: impl Fn(usize, T) -> u32,
+    ) {
+        /// Rows, and words of a row: a cache line of each.
+        const BLOCK: usize = 16;
+        let (rows, inputs) = (view.nrows(), view.ncols());
+        let words = inputs.div_ceil(STEP);
+        let word = |row: usize, elements: &[T]| {
+            let parts = elements.iter().enumerate();
+            parts.fold(0, |word, (part, &element)| {
+                word | bits(row, element) << (32 / STEP * part)
+            })
+        };
+        for first_row in (0..rows).step_by(BLOCK) {
+            let block_rows = BLOCK.min(rows - first_row);
+            for first_word in (0..words).step_by(BLOCK) {
+                let block_words = BLOCK.min(words - first_word);
+                let k = first_word * STEP;
+                let mut block = [[0; BLOCK]; BLOCK];
+                for (index, block) in block[..block_rows].iter_mut().enumerate() {
+                    let row = first_row + index;
+                    if view.col_stride() == 1 && k + BLOCK * STEP <= inputs {
+                        // SAFETY: the row has that many elements from `k` on, one beside the other.
+                        let elements =
+                            unsafe { std::slice::from_raw_parts(view.ptr_at(row, k), BLOCK * STEP) };
+                        for (to, elements) in block.iter_mut().zip(elements.chunks_exact(STEP)) {
+                            *to = word(row, elements);
+                        }
+                    } else {
+                        for (index, to) in block[..block_words].iter_mut().enumerate() {
+                            let k = k + index * STEP;
+                            let count = STEP.min(inputs - k);
+                            let elements: [T; STEP] =
+                                std::array::from_fn(|part| view[(row, k + part.min(count - 1))]);
+                            *to = word(row, &elements[..count]);
+                        }
+                    }
+                }
+                let to = &mut self.words[first_word * self.columns..];
+                for (index, to) in to.chunks_mut(self.columns).take(block_words).enumerate() {
+                    let column: [u32; BLOCK] = std::array::from_fn(|row| block[row][index]);
+                    to[first + first_row..][..block_rows].copy_from_slice(&column[..block_rows]);
                 }
             }
         }
     }
+}
+
+/// The bits of a float32 rounded to bf16, in the low half: as `bf16::from_f32`, without its branches.
+fn rounded(value: f32) -> u32 {
+    let bits = value.to_bits();
+    let nearest = bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16;
+    let quiet_nan = (bits >> 16) | 0x40;
+    if value.is_nan() { quiet_nan } else { nearest }
 }
 
 /// Quantises the rows of `weight (out_features, in_features)` to int8 as [`PackedLinear::pack`](super::PackedLinear::pack) does: `scale = max |w| / 127` of the row,
@@ -182,27 +220,63 @@ pub fn quantize_rows(weight: WeightRef<'_>, values: &mut [i8], scales: &mut [f32
     }
     let mut wide = vec![0.0f32; inputs];
     for (row, scale) in scales.iter_mut().enumerate() {
-        for (k, wide) in wide.iter_mut().enumerate() {
-            *wide = match &weight {
-                WeightRef::F32(view) => view[(row, k)],
-                WeightRef::Bf16(view) => view[(row, k)].to_f32(),
-                WeightRef::Int8 { .. } => unreachable!("copied above"),
-            };
+        match &weight {
+            WeightRef::F32(view) => widen(*view, row, &mut wide, |value| value),
+            WeightRef::Bf16(view) => widen(*view, row, &mut wide, |value| {
+                f32::from_bits(u32::from(value.to_bits()) << 16)
+            }),
+            WeightRef::Int8 { .. } => unreachable!("copied above"),
         }
-        // `max` passes over NaN; the sum of zeros times values does not.
-        let largest = wide
-            .iter()
-            .fold(0.0f32, |largest, value| largest.max(value.abs()));
-        let poison = wide.iter().fold(0.0f32, |poison, value| poison + 0.0 * value);
+        // Magnitudes are ordered as their bits are; NaN and infinity come last.
+        let magnitudes = wide.iter().map(|value| value.to_bits() & 0x7fff_ffff);
+        let largest = f32::from_bits(magnitudes.fold(0, u32::max));
         let to = &mut values[row * inputs..][..inputs];
         *scale = largest / 127.0;
-        if poison.is_nan() || *scale < f32::MIN_POSITIVE {
-            *scale = if poison.is_nan() { f32::NAN } else { 0.0 };
+        if !largest.is_finite() || *scale < f32::MIN_POSITIVE {
+            *scale = if largest.is_finite() { 0.0 } else { f32::NAN };
             to.fill(0);
             continue;
         }
         for (to, value) in to.iter_mut().zip(&wide) {
             *to = (value / *scale + ROUND).to_bits().wrapping_sub(ROUND.to_bits()) as i8;
+        }
+    }
+}
+
+/// Row `row` in float32.
+fn widen<T: Copy>(view: MatRef<'_, T>, row: usize, to: &mut [f32], convert: impl Fn(T) -> f32) {
+    if view.col_stride() == 1 {
+        // SAFETY: a row has as many elements as there are columns, here one beside the other.
+        let from = unsafe { std::slice::from_raw_parts(view.ptr_at(row, 0), view.ncols()) };
+        to.iter_mut()
+            .zip(from)
+            .for_each(|(to, &from)| *to = convert(from));
+    } else {
+        to.iter_mut()
+            .enumerate()
+            .for_each(|(k, to)| *to = convert(view[(row, k)]));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use half::bf16;
+
+    use super::*;
+
+    #[test]
+    fn rounding_is_that_of_half() {
+        let near_halves = (0..=u16::MAX).flat_map(|high| {
+            let high = u32::from(high) << 16;
+            [0, 1, 0x7fff, 0x8000, 0x8001, 0xffff].map(|low| high | low)
+        });
+        for bits in near_halves {
+            let value = f32::from_bits(bits);
+            assert_eq!(
+                rounded(value),
+                u32::from(bf16::from_f32(value).to_bits()),
+                "{bits:#x}"
+            );
         }
     }
 }
