@@ -17,7 +17,7 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyType};
 use saccade::{
     Array, Checkpoint, Elements, Error, Features, Group, Isa, Keep, LoadOptions, OwnedArray, Part, Patch,
-    Profile, Recorded, Sampling, Tokens, TraceOptions,
+    Profile, QuantizeOptions, Recorded, Sampling, Tokens, TraceOptions,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -38,7 +38,7 @@ fn raise(error: Error) -> PyErr {
         let class = match error {
             Error::NotFound { .. } => return PyFileNotFoundError::new_err(message),
             Error::Shape(_) => exception(py, &SHAPE, "ShapeError"),
-            Error::Checkpoint(_) => exception(py, &CHECKPOINT, "CheckpointError"),
+            Error::Checkpoint(_) | Error::Output(_) => exception(py, &CHECKPOINT, "CheckpointError"),
             _ => exception(py, &INPUT, "InputError"),
         };
         class.map_or_else(|error| error, |class| PyErr::from_type(class.clone(), message))
@@ -222,11 +222,13 @@ impl ActionHead {
         source: PathBuf,
         config: Option<String>,
         embodiment_ids: Option<Vec<i64>>,
+        precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = LoadOptions {
             config,
             embodiment_ids,
+            precision: precision.parse().map_err(raise)?,
             num_threads,
         };
         py.detach(|| saccade::ActionHead::load(&source, &options))
@@ -246,6 +248,11 @@ impl ActionHead {
     #[getter]
     fn num_threads(&self) -> usize {
         self.0.num_threads()
+    }
+
+    #[getter]
+    fn precision(&self) -> String {
+        self.0.precision().to_string()
     }
 
     #[getter]
@@ -425,14 +432,15 @@ struct CrossAttention(saccade::CrossAttention);
 #[pymethods]
 impl CrossAttention {
     #[new]
-    fn new(py: Python<'_>, tensors: &Bound<'_, PyDict>, num_heads: usize) -> PyResult<Self> {
+    fn new(py: Python<'_>, tensors: &Bound<'_, PyDict>, num_heads: usize, precision: &str) -> PyResult<Self> {
+        let precision = precision.parse().map_err(raise)?;
         let mut named = saccade::NamedTensors::new();
         for (name, array) in tensors {
             let array: PyReadonlyArrayDyn<'_, f32> = array.extract()?;
             let elements = Elements::F32(array.as_slice()?.to_vec());
             named.insert(name.extract()?, (array.shape().to_vec(), elements));
         }
-        py.detach(|| saccade::CrossAttention::new(&named, num_heads, None))
+        py.detach(|| saccade::CrossAttention::new(&named, num_heads, precision, None))
             .map(Self)
             .map_err(raise)
     }
@@ -450,6 +458,16 @@ impl CrossAttention {
     #[getter]
     fn num_heads(&self) -> usize {
         self.0.num_heads()
+    }
+
+    #[getter]
+    fn precision(&self) -> String {
+        self.0.precision().to_string()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
     }
 
     fn project(
@@ -536,6 +554,51 @@ fn read_tensors<'py>(py: Python<'py>, source: PathBuf, prefix: &str) -> PyResult
     Ok(dict)
 }
 
+/// `progress(done, total)` is called after each tensor; what it raises stops the work and is raised.
+#[pyfunction]
+#[allow(clippy::too_many_arguments)]
+fn quantize<'py>(
+    py: Python<'py>,
+    source: PathBuf,
+    out: PathBuf,
+    config: Option<String>,
+    head_only: bool,
+    force: bool,
+    metadata: BTreeMap<String, String>,
+    max_shard_bytes: Option<u64>,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let mut options = QuantizeOptions {
+        config,
+        head_only,
+        force,
+        metadata,
+        ..QuantizeOptions::default()
+    };
+    options.max_shard_bytes = max_shard_bytes.unwrap_or(options.max_shard_bytes);
+    let mut raised = None;
+    let report = py.detach(|| {
+        saccade::quantize(&source, &out, &options, |done, total| {
+            let told = Python::attach(|py| {
+                py.check_signals()?;
+                progress
+                    .as_ref()
+                    .map_or(Ok(()), |progress| progress.call1(py, (done, total)).map(|_| ()))
+            });
+            told.map_err(|error| raised = Some(error)).is_ok()
+        })
+    });
+    let report = report.map_err(|error| raised.unwrap_or_else(|| raise(error)))?;
+    let dict = PyDict::new(py);
+    dict.set_item("files", report.files)?;
+    dict.set_item("num_quantized", report.num_quantized)?;
+    dict.set_item("num_copied", report.num_copied)?;
+    dict.set_item("num_dropped", report.num_dropped)?;
+    dict.set_item("head_bytes_before", report.head_bytes_before)?;
+    dict.set_item("head_bytes_after", report.head_bytes_after)?;
+    Ok(dict)
+}
+
 #[pyfunction]
 fn available_isas() -> Vec<String> {
     Isa::available().iter().map(Isa::to_string).collect()
@@ -545,6 +608,13 @@ fn available_isas() -> Vec<String> {
 fn selected_isa() -> PyResult<String> {
     Isa::from_env()
         .map(|isa| isa.to_string())
+        .map_err(|error| raise(Error::Input(error.to_string())))
+}
+
+#[pyfunction]
+fn dot_products() -> PyResult<Vec<&'static str>> {
+    Isa::from_env()
+        .map(Isa::dot_products)
         .map_err(|error| raise(Error::Input(error.to_string())))
 }
 
@@ -562,8 +632,8 @@ mod _saccade {
     use super::{ActionHead, Context, CrossAttention, KeyValues};
     #[pymodule_export]
     use super::{
-        available_isas, default_num_threads, parse_config, read_tensors, selected_isa, start_profile,
-        take_profile, tensor_shapes,
+        available_isas, default_num_threads, dot_products, parse_config, quantize, read_tensors,
+        selected_isa, start_profile, take_profile, tensor_shapes,
     };
 
     #[pymodule_export]

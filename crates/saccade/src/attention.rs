@@ -1,7 +1,7 @@
 //! Multi-head attention with its projections, and the feed-forward: what VL blocks and DiT blocks share.
 
 use faer::MatRef;
-use saccade_kernels::{Element, Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
+use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
 
 use crate::error::Result;
 use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
@@ -99,9 +99,9 @@ impl Attention {
         num_heads: usize,
     ) -> Result<Self> {
         Ok(Self {
-            to_q: load_linear(source, engine.isa, &[&names.to_q])?,
-            to_kv: load_linear(source, engine.isa, &[&names.to_k, &names.to_v])?,
-            to_out: load_linear(source, engine.isa, &[&names.to_out])?,
+            to_q: load_linear(source, engine, &[&names.to_q])?,
+            to_kv: load_linear(source, engine, &[&names.to_k, &names.to_v])?,
+            to_out: load_linear(source, engine, &[&names.to_out])?,
             num_heads,
         })
     }
@@ -131,8 +131,12 @@ impl Attention {
         let len = keys.nrows() / groups;
         (0..groups)
             .map(|group| {
-                let mut packed =
-                    PackedKeyValues::new(engine.isa, Element::F32, self.num_heads, self.head_dim());
+                let mut packed = PackedKeyValues::new(
+                    engine.isa,
+                    engine.precision.keys_values(),
+                    self.num_heads,
+                    self.head_dim(),
+                );
                 pack(
                     engine.threads,
                     &mut packed,
@@ -243,7 +247,12 @@ impl Attention {
         };
         if packed.len() < places {
             packed.resize_with(places, || {
-                PackedKeyValues::new(engine.isa, Element::F32, self.num_heads, self.head_dim())
+                PackedKeyValues::new(
+                    engine.isa,
+                    engine.precision.keys_values(),
+                    self.num_heads,
+                    self.head_dim(),
+                )
             });
         }
         let logits = [self.num_heads, count, first + new];
@@ -316,8 +325,8 @@ pub(crate) struct FeedForward {
 impl FeedForward {
     pub(crate) fn load(source: &dyn TensorSource, engine: Engine, names: &FeedForwardNames) -> Result<Self> {
         Ok(Self {
-            proj: load_linear(source, engine.isa, &[&names.proj])?,
-            out: load_linear(source, engine.isa, &[&names.out])?,
+            proj: load_linear(source, engine, &[&names.proj])?,
+            out: load_linear(source, engine, &[&names.out])?,
         })
     }
 

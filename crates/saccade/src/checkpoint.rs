@@ -21,6 +21,9 @@ use crate::layout::TensorSpec;
 /// A longer header is hostile: the released head has 314 tensors in 40 kB.
 const MAX_HEADER_BYTES: u64 = 100_000_000;
 
+/// Bytes that are copied together.
+const PIECE: usize = 1 << 24;
+
 /// Where a head's tensors may stand in a checkpoint, longest first.
 const HEAD_PREFIXES: [&str; 2] = ["_groot_model.action_head.", "action_head."];
 
@@ -216,12 +219,7 @@ impl Checkpoint {
     /// # Errors
     /// [`Error::Checkpoint`] if there is no such tensor, its type is not F32, BF16, F16 or I8 with scales, or the file cannot be read.
     pub fn read(&self, name: &str) -> Result<Elements> {
-        let entry = self.entry(name)?;
-        if entry.info.dtype == Dtype::I8 {
-            return self.read_int8(name, entry);
-        }
-        let elements = entry.info.shape.iter().product();
-        self.read_elements(name, entry, 0, elements)
+        self.read_into(name, None, None)
     }
 
     /// Reads the slices `wanted` of the first axis of tensor `name`.
@@ -229,17 +227,59 @@ impl Checkpoint {
     /// # Errors
     /// As [`Checkpoint::read`], and if there are no such slices. int8 is read whole only.
     pub fn read_slices(&self, name: &str, wanted: Range<usize>) -> Result<Elements> {
+        self.read_into(name, Some(wanted), None)
+    }
+
+    /// Reads tensor `name`, or the slices `wanted` of its first axis, into the memory of `spare` if that has its type: fresh memory is
+    /// given page by page, which takes longer than the reading.
+    pub(crate) fn read_into(
+        &self,
+        name: &str,
+        wanted: Option<Range<usize>>,
+        spare: Option<Elements>,
+    ) -> Result<Elements> {
         let entry = self.entry(name)?;
+        let Some(wanted) = wanted else {
+            if entry.info.dtype == Dtype::I8 {
+                return self.read_int8(name, entry);
+            }
+            let elements = entry.info.shape.iter().product();
+            return self.read_elements(name, entry, 0, elements, spare);
+        };
         match entry.info.shape.split_first() {
             Some((&size, rest)) if wanted.start <= wanted.end && wanted.end <= size => {
                 let elements: usize = rest.iter().product();
-                self.read_elements(name, entry, wanted.start * elements, wanted.len() * elements)
+                let (first, count) = (wanted.start * elements, wanted.len() * elements);
+                self.read_elements(name, entry, first, count, spare)
             }
             _ => Err(Error::Checkpoint(format!(
                 "source: {name} has shape {} and no slices {wanted:?}",
                 show_shape(&entry.info.shape)
             ))),
         }
+    }
+
+    /// The type of tensor `name`.
+    pub(crate) fn dtype(&self, name: &str) -> Result<Dtype> {
+        Ok(self.entry(name)?.info.dtype)
+    }
+
+    /// Bytes of tensor `name` in its file.
+    pub(crate) fn nbytes(&self, name: &str) -> Result<u64> {
+        let (start, end) = self.entry(name)?.info.data_offsets;
+        Ok((end - start) as u64)
+    }
+
+    /// Gives the bytes of tensor `name`, of whatever type, to `take`, piece by piece.
+    pub(crate) fn read_bytes(&self, name: &str, mut take: impl FnMut(&[u8]) -> Result<()>) -> Result<()> {
+        let entry = self.entry(name)?;
+        let nbytes = self.nbytes(name)? as usize;
+        let mut piece: Vec<u8> = Vec::new();
+        for first in (0..nbytes).step_by(PIECE) {
+            piece = self.read_plain(name, entry, first, PIECE.min(nbytes - first), piece)?;
+            take(&piece)?;
+        }
+        Ok(())
     }
 
     fn entry(&self, name: &str) -> Result<&Entry> {
@@ -252,22 +292,37 @@ impl Checkpoint {
         }
     }
 
-    fn read_elements(&self, name: &str, entry: &Entry, first: usize, count: usize) -> Result<Elements> {
+    fn read_elements(
+        &self,
+        name: &str,
+        entry: &Entry,
+        first: usize,
+        count: usize,
+        spare: Option<Elements>,
+    ) -> Result<Elements> {
         match entry.info.dtype {
             Dtype::F32 => {
-                let mut values: Vec<f32> = self.read_plain(name, entry, first, count)?;
+                let spare = match spare {
+                    Some(Elements::F32(values)) => values,
+                    _ => Vec::new(),
+                };
+                let mut values: Vec<f32> = self.read_plain(name, entry, first, count, spare)?;
                 from_little_endian(&mut values, |value| f32::from_bits(u32::from_le(value.to_bits())));
                 Ok(Elements::F32(values))
             }
             Dtype::BF16 => {
-                let mut values: Vec<bf16> = self.read_plain(name, entry, first, count)?;
+                let spare = match spare {
+                    Some(Elements::Bf16(values)) => values,
+                    _ => Vec::new(),
+                };
+                let mut values: Vec<bf16> = self.read_plain(name, entry, first, count, spare)?;
                 from_little_endian(&mut values, |value| {
                     bf16::from_bits(u16::from_le(value.to_bits()))
                 });
                 Ok(Elements::Bf16(values))
             }
             Dtype::F16 => {
-                let halves: Vec<u16> = self.read_plain(name, entry, first, count)?;
+                let halves: Vec<u16> = self.read_plain(name, entry, first, count, Vec::new())?;
                 let widened = halves
                     .into_iter()
                     .map(|bits| f16::from_bits(u16::from_le(bits)).to_f32());
@@ -285,9 +340,10 @@ impl Checkpoint {
         if let Some(problem) = self.scale_problem(name, &scale, rows) {
             return Err(Error::Checkpoint(format!("source: {problem}")));
         }
-        let values: Vec<i8> = self.read_plain(name, entry, 0, entry.info.shape.iter().product())?;
+        let values: Vec<i8> =
+            self.read_plain(name, entry, 0, entry.info.shape.iter().product(), Vec::new())?;
         let scales = self
-            .read_elements(&scale, self.entry(&scale)?, 0, rows)?
+            .read_elements(&scale, self.entry(&scale)?, 0, rows, None)?
             .into_f32();
         let bad = |problem: String| Err(Error::Checkpoint(format!("source: {problem}")));
         if let Some(row) = scales
@@ -316,11 +372,18 @@ impl Checkpoint {
         Ok(Elements::Int8 { values, scales })
     }
 
-    /// `count` elements from number `first` on, as their bytes stand in the file.
-    fn read_plain<T: Pod>(&self, name: &str, entry: &Entry, first: usize, count: usize) -> Result<Vec<T>> {
+    /// `count` elements from number `first` on, as their bytes stand in the file, in the memory of `values`.
+    fn read_plain<T: Pod>(
+        &self,
+        name: &str,
+        entry: &Entry,
+        first: usize,
+        count: usize,
+        mut values: Vec<T>,
+    ) -> Result<Vec<T>> {
         let (path, file) = &self.files[entry.file];
         let mut file: &File = file;
-        let mut values = vec![T::zeroed(); count];
+        values.resize(count, T::zeroed());
         file.seek(SeekFrom::Start(entry.start + (first * size_of::<T>()) as u64))
             .and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)))
             .map_err(|error| {

@@ -12,6 +12,7 @@ use crate::error::{Error, Result, show_shape};
 use crate::head::engine;
 use crate::layers::{Engine, TensorSource};
 use crate::layout::{AttentionNames, TensorSpec};
+use crate::precision::Precision;
 
 /// A tensor given in memory: its shape and elements.
 pub type NamedTensors = BTreeMap<String, (Vec<usize>, Elements)>;
@@ -69,8 +70,13 @@ impl CrossAttention {
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown or misshaped; [`Error::Input`] if `num_heads` does not divide
     /// the width.
-    pub fn new(tensors: &NamedTensors, num_heads: usize, num_threads: Option<usize>) -> Result<Self> {
-        let engine = engine(num_threads)?;
+    pub fn new(
+        tensors: &NamedTensors,
+        num_heads: usize,
+        precision: Precision,
+        num_threads: Option<usize>,
+    ) -> Result<Self> {
+        let engine = engine(precision, num_threads)?;
         let axes = |name: &str| tensors.get(name).map(|(shape, _)| shape.as_slice());
         // The sizes come from two of the tensors; the others must agree with them.
         let width = axes("to_q.weight")
@@ -111,6 +117,18 @@ impl CrossAttention {
     #[must_use]
     pub fn context_dim(&self) -> usize {
         self.context_dim
+    }
+
+    /// What it computes in.
+    #[must_use]
+    pub fn precision(&self) -> Precision {
+        self.engine.precision
+    }
+
+    /// Bytes of weights in memory.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        self.attention.nbytes()
     }
 
     /// Attention heads.

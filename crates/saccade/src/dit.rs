@@ -117,7 +117,7 @@ impl Dit {
         config: &HeadConfig,
         names: &HeadNames,
     ) -> Result<Self> {
-        let linear = |names: &LinearNames| load_linear(tensors, engine.isa, &[names]);
+        let linear = |names: &LinearNames| load_linear(tensors, engine, &[names]);
         let block = |(index, names): (usize, &DitBlockNames)| {
             Ok(Block {
                 modulation: linear(&names.modulation)?,

@@ -18,6 +18,9 @@ pub enum Error {
     /// A checkpoint or its configuration is broken, incomplete or of another kind; all that is wrong is listed.
     #[error("{0}")]
     Checkpoint(String),
+    /// A file that cannot be written.
+    #[error("{0}")]
+    Output(String),
     /// A path that is not there.
     #[error("{what}: no such file or directory: {}", path.display())]
     NotFound {

@@ -16,6 +16,7 @@ use crate::error::{Error, Result, show_shape};
 use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, TensorSource, sized};
 use crate::layout::HeadNames;
+use crate::precision::Precision;
 use crate::reading::HeadTensors;
 use crate::tables::action_time;
 use crate::trace::{Keep, Recorded, Shapes, StepBlock, Trace, TraceOptions};
@@ -30,6 +31,8 @@ pub struct LoadOptions {
     pub config: Option<String>,
     /// Keep only these embodiments; default all.
     pub embodiment_ids: Option<Vec<i64>>,
+    /// What is computed in what.
+    pub precision: Precision,
     /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
     pub num_threads: Option<usize>,
 }
@@ -138,7 +141,7 @@ impl ActionHead {
     /// [`Error::NotFound`] for a path that is not there, [`Error::Checkpoint`] for a config or weights that are broken or do not fit each
     /// other (all that is wrong is listed), [`Error::Input`] for options out of range.
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
-        let engine = engine(options.num_threads)?;
+        let engine = engine(options.precision, options.num_threads)?;
         let checkpoint = Checkpoint::open(source)?;
         let config = match &options.config {
             Some(text) => HeadConfig::from_json(text)?,
@@ -163,7 +166,7 @@ impl ActionHead {
         embodiment_ids: Vec<usize>,
     ) -> Result<Self> {
         let ids = &embodiment_ids;
-        let category = |names| CategoryLinear::load(tensors, engine.isa, names, ids);
+        let category = |names| CategoryLinear::load(tensors, engine, names, ids);
         let [state_1, state_2] = &names.state_encoder;
         let [decoder_1, decoder_2] = &names.action_decoder;
         Ok(Self {
@@ -171,7 +174,7 @@ impl ActionHead {
             id: next_id(),
             vl: VlEncoder::load(tensors, engine, &config, names)?,
             state_encoder: [category(state_1)?, category(state_2)?],
-            action_encoder: ActionEncoder::load(tensors, engine.isa, &names.action_encoder, ids)?,
+            action_encoder: ActionEncoder::load(tensors, engine, &names.action_encoder, ids)?,
             future_tokens: match config.num_future_tokens {
                 0 => Vec::new(),
                 _ => tensors.tensor(&names.future_tokens.0)?.into_f32(),
@@ -205,6 +208,12 @@ impl ActionHead {
     #[must_use]
     pub fn num_threads(&self) -> usize {
         self.engine.threads
+    }
+
+    /// What it computes in.
+    #[must_use]
+    pub fn precision(&self) -> Precision {
+        self.engine.precision
     }
 
     /// The instruction set that the kernels use.
@@ -861,8 +870,8 @@ fn check_refresh(future_refresh: Option<usize>) -> Result<usize> {
     }
 }
 
-/// The engine that the environment and `num_threads` ask for.
-pub(crate) fn engine(num_threads: Option<usize>) -> Result<Engine> {
+/// The engine that the environment, `precision` and `num_threads` ask for.
+pub(crate) fn engine(precision: Precision, num_threads: Option<usize>) -> Result<Engine> {
     let isa = Isa::from_env().map_err(|error| Error::Input(error.to_string()))?;
     let threads = match num_threads {
         Some(threads) if (1..=MAX_THREADS).contains(&threads) => threads,
@@ -875,7 +884,11 @@ pub(crate) fn engine(num_threads: Option<usize>) -> Result<Engine> {
             .map_err(|error| Error::Input(error.to_string()))?
             .get(),
     };
-    Ok(Engine { isa, threads })
+    Ok(Engine {
+        isa,
+        threads,
+        precision,
+    })
 }
 
 fn next_id() -> u64 {
@@ -883,7 +896,7 @@ fn next_id() -> u64 {
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-fn read_config_beside(source: &Path) -> Result<String> {
+pub(crate) fn read_config_beside(source: &Path) -> Result<String> {
     let directory = if source.is_dir() {
         source
     } else {

@@ -2,25 +2,31 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
-use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
+use half::bf16;
+use saccade_kernels::{Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
 
 use crate::checkpoint::Elements;
 use crate::error::{Error, Result};
-use crate::layout::{CategoryLinearNames, LinearNames, NormNames};
+use crate::layout::{CategoryLinearNames, LinearNames, NormNames, Role};
+use crate::precision::Precision;
 use crate::profile::{Part, apply, layer_norm};
 use crate::reading::HeadTensors;
 
-/// Which instruction set and how many threads the kernels use.
+/// Which instruction set and how many threads the kernels use, and how precisely they compute.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Engine {
     pub isa: Isa,
     pub threads: usize,
+    pub precision: Precision,
 }
 
 /// Where layers get their tensors from.
 pub(crate) trait TensorSource {
     /// Tensor `name`, whole.
     fn tensor(&self, name: &str) -> Result<Elements>;
+
+    /// Takes back a tensor that is not needed any more.
+    fn give_back(&self, _used: Elements) {}
 }
 
 /// `data` as rows of `width`.
@@ -40,13 +46,17 @@ pub(crate) fn sized(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
     buffer
 }
 
-fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> WeightRef<'_> {
+/// `(out_features, in_features)` as they are stored.
+pub(crate) fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> WeightRef<'_> {
     match elements {
         Elements::F32(data) => WeightRef::F32(MatRef::from_row_major_slice(data, out_features, in_features)),
         Elements::Bf16(data) => {
             WeightRef::Bf16(MatRef::from_row_major_slice(data, out_features, in_features))
         }
-        Elements::Int8 { .. } => unreachable!("widened by the caller"),
+        Elements::Int8 { values, scales } => WeightRef::Int8 {
+            values: MatRef::from_row_major_slice(values, out_features, in_features),
+            scales,
+        },
     }
 }
 
@@ -55,27 +65,35 @@ fn in_major_view(elements: &Elements, in_features: usize, out_features: usize) -
     match weight_view(elements, in_features, out_features) {
         WeightRef::F32(view) => WeightRef::F32(view.transpose()),
         WeightRef::Bf16(view) => WeightRef::Bf16(view.transpose()),
-        WeightRef::Int8 { .. } => unreachable!("category-specific weights are not int8"),
+        WeightRef::Int8 { .. } => unreachable!("category-specific weights are checked to be floating point"),
     }
 }
 
-fn pack(isa: Isa, parts: &[(WeightRef<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
-    PackedLinear::pack(isa, Arithmetic::Float32, 1, parts)
+/// The weights of a layer of this role, rounded to bf16 where it computes in float32 but is to be held in bf16.
+fn held(engine: Engine, role: Role, weight: Elements) -> Elements {
+    match weight {
+        Elements::F32(values) if role == Role::Time && engine.precision.rounds_weights() => {
+            Elements::Bf16(values.into_iter().map(bf16::from_f32).collect())
+        }
+        as_stored => as_stored,
+    }
+}
+
+fn pack(engine: Engine, role: Role, parts: &[(WeightRef<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
+    let arithmetic = engine.precision.arithmetic(role);
+    PackedLinear::pack(engine.isa, arithmetic, engine.threads, parts)
         .map_err(|error| Error::Checkpoint(format!("source: {error}")))
 }
 
-/// Packs the layers `parts`, which have the same inputs, as one: their outputs stand side by side.
+/// Packs the layers `parts`, which have the same inputs and role, as one: their outputs stand side by side.
 pub(crate) fn load_linear(
     source: &dyn TensorSource,
-    isa: Isa,
+    engine: Engine,
     parts: &[&LinearNames],
 ) -> Result<PackedLinear> {
     let mut tensors = Vec::with_capacity(parts.len());
     for names in parts {
-        let weight = match source.tensor(&names.weight)? {
-            int8 @ Elements::Int8 { .. } => Elements::F32(int8.into_f32()),
-            float => float,
-        };
+        let weight = held(engine, names.role, source.tensor(&names.weight)?);
         tensors.push((weight, source.tensor(&names.bias)?.into_f32()));
     }
     let views: Vec<_> = parts
@@ -88,7 +106,13 @@ pub(crate) fn load_linear(
             )
         })
         .collect();
-    pack(isa, &views)
+    let layer = pack(engine, parts[0].role, &views)?;
+    for (names, (weight, _)) in parts.iter().zip(tensors) {
+        if names.role == Role::Block {
+            source.give_back(weight);
+        }
+    }
+    Ok(layer)
 }
 
 /// An affine layer norm's weight and bias.
@@ -132,7 +156,7 @@ pub(crate) struct CategoryLinear {
 impl CategoryLinear {
     pub(crate) fn load(
         tensors: &HeadTensors<'_>,
-        isa: Isa,
+        engine: Engine,
         names: &CategoryLinearNames,
         embodiment_ids: &[usize],
     ) -> Result<Self> {
@@ -140,7 +164,7 @@ impl CategoryLinear {
             let weight = tensors.slices(&names.weight, id..id + 1)?;
             let bias = tensors.slices(&names.bias, id..id + 1)?.into_f32();
             let view = in_major_view(&weight, names.in_features, names.out_features);
-            pack(isa, &[(view, Some(&bias))])
+            pack(engine, Role::Other, &[(view, Some(&bias))])
         })
     }
 
@@ -214,7 +238,7 @@ pub(crate) struct ActionEncoder {
 impl ActionEncoder {
     pub(crate) fn load(
         tensors: &HeadTensors<'_>,
-        isa: Isa,
+        engine: Engine,
         [w1, w2, w3]: &[CategoryLinearNames; 3],
         embodiment_ids: &[usize],
     ) -> Result<Self> {
@@ -237,19 +261,18 @@ impl ActionEncoder {
                 .enumerate()
                 .map(|(row, &b)| (f64::from(b) + bias[(row, 0)]) as f32)
                 .collect();
-            time.push(Some(pack(
-                isa,
-                &[(submatrix(second_view, width, width), Some(&constant))],
-            )?));
+            let second = held(engine, Role::Time, second);
+            let time_half = submatrix(in_major_view(&second, 2 * width, width), width, width);
+            time.push(Some(pack(engine, Role::Time, &[(time_half, Some(&constant))])?));
 
             let fused = Mat::from_fn(fused.nrows(), fused.ncols(), |i, j| fused[(i, j)] as f32);
-            pack(isa, &[(WeightRef::F32(fused.as_ref()), None)])
+            pack(engine, Role::Other, &[(WeightRef::F32(fused.as_ref()), None)])
         })?;
         let mut time = time.into_iter();
         let time = CategoryLinear::build(num_embodiments, embodiment_ids, |_| {
             Ok(time.next().flatten().expect("one per loaded embodiment"))
         })?;
-        let out = CategoryLinear::load(tensors, isa, w3, embodiment_ids)?;
+        let out = CategoryLinear::load(tensors, engine, w3, embodiment_ids)?;
         Ok(Self { action, time, out })
     }
 

@@ -11,8 +11,18 @@ pub(crate) struct LinearNames {
     pub bias: String,
     pub in_features: usize,
     pub out_features: usize,
-    /// Whether it is one of the layers that [`Precision::Int8`](crate::Precision::Int8) runs in int8: they do nearly all the work.
-    pub in_int8: bool,
+    pub role: Role,
+}
+
+/// What a layer is to the head's cost, which decides how precisely it is worth computing: see [`Precision`](crate::Precision).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Role {
+    /// Attention and feed-forward of the blocks: nearly all of the work.
+    Block,
+    /// Of time alone, so computed once a bucket.
+    Time,
+    /// Encoders, decoder and output: under one percent.
+    Other,
 }
 
 /// A tensor that a checkpoint must hold.
@@ -25,10 +35,12 @@ pub(crate) struct TensorSpec {
 }
 
 /// A tensor to read, or some slices of its first axis.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub(crate) struct Wanted {
     pub name: String,
     pub slices: Option<Range<usize>>,
+    /// Whether its memory comes back to be read into again: only what is not kept may be read into larger memory than it needs.
+    pub is_given_back: bool,
 }
 
 /// One linear layer per embodiment: `W (num_embodiments, in_features, out_features)` and `b (num_embodiments, out_features)`.
@@ -161,17 +173,23 @@ impl HeadNames {
             timestep_embedder: [
                 LinearNames::new(
                     "model.timestep_encoder.timestep_embedder.linear_1",
+                    Role::Time,
                     TIME_CHANNELS,
                     width,
                 ),
-                LinearNames::new("model.timestep_encoder.timestep_embedder.linear_2", width, width),
+                LinearNames::new(
+                    "model.timestep_encoder.timestep_embedder.linear_2",
+                    Role::Time,
+                    width,
+                    width,
+                ),
             ],
             blocks: (0..config.num_layers)
                 .map(|index| DitBlockNames::new(config, index))
                 .collect(),
             proj_out: [
-                LinearNames::new("model.proj_out_1", width, 2 * width),
-                LinearNames::new("model.proj_out_2", width, hidden),
+                LinearNames::new("model.proj_out_1", Role::Time, width, 2 * width),
+                LinearNames::new("model.proj_out_2", Role::Other, width, hidden),
             ],
         }
     }
@@ -212,7 +230,10 @@ impl HeadNames {
         let whole = |order: &mut Vec<Wanted>, list: &dyn Fn(&mut Vec<TensorSpec>)| {
             let mut tensors = Vec::new();
             list(&mut tensors);
-            order.extend(tensors.into_iter().map(|spec| Wanted::whole(spec.name)));
+            order.extend(tensors.into_iter().map(|spec| Wanted {
+                is_given_back: spec.may_be_int8,
+                ..Wanted::whole(spec.name)
+            }));
         };
         let slices = |order: &mut Vec<Wanted>, layers: &[CategoryLinearNames]| {
             for &id in embodiment_ids {
@@ -267,39 +288,36 @@ impl TensorSpec {
 
 impl Wanted {
     pub(crate) fn whole(name: String) -> Self {
-        Self { name, slices: None }
+        Self {
+            name,
+            slices: None,
+            is_given_back: false,
+        }
     }
 
     pub(crate) fn slices(name: &str, slices: Range<usize>) -> Self {
         Self {
             name: name.to_owned(),
             slices: Some(slices),
+            is_given_back: false,
         }
     }
 }
 
 impl LinearNames {
-    fn new(name: &str, in_features: usize, out_features: usize) -> Self {
+    fn new(name: &str, role: Role, in_features: usize, out_features: usize) -> Self {
         Self {
             weight: format!("{name}.weight"),
             bias: format!("{name}.bias"),
             in_features,
             out_features,
-            in_int8: false,
-        }
-    }
-
-    /// A layer that int8 runs in int8.
-    fn in_int8(name: &str, in_features: usize, out_features: usize) -> Self {
-        Self {
-            in_int8: true,
-            ..Self::new(name, in_features, out_features)
+            role,
         }
     }
 
     fn list(&self, tensors: &mut Vec<TensorSpec>) {
         tensors.push(TensorSpec {
-            may_be_int8: self.in_int8,
+            may_be_int8: self.role == Role::Block,
             ..TensorSpec::plain(&self.weight, &[self.out_features, self.in_features])
         });
         tensors.push(TensorSpec::plain(&self.bias, &[self.out_features]));
@@ -336,10 +354,10 @@ impl AttentionNames {
     /// `path` with its final dot, or empty for an attention on its own.
     pub(crate) fn new(path: &str, width: usize, context_dim: usize) -> Self {
         Self {
-            to_q: LinearNames::in_int8(&format!("{path}to_q"), width, width),
-            to_k: LinearNames::in_int8(&format!("{path}to_k"), context_dim, width),
-            to_v: LinearNames::in_int8(&format!("{path}to_v"), context_dim, width),
-            to_out: LinearNames::in_int8(&format!("{path}to_out.0"), width, width),
+            to_q: LinearNames::new(&format!("{path}to_q"), Role::Block, width, width),
+            to_k: LinearNames::new(&format!("{path}to_k"), Role::Block, context_dim, width),
+            to_v: LinearNames::new(&format!("{path}to_v"), Role::Block, context_dim, width),
+            to_out: LinearNames::new(&format!("{path}to_out.0"), Role::Block, width, width),
         }
     }
 
@@ -360,8 +378,8 @@ impl AttentionNames {
 impl FeedForwardNames {
     fn new(path: &str, width: usize) -> Self {
         Self {
-            proj: LinearNames::in_int8(&format!("{path}.ff.net.0.proj"), width, 4 * width),
-            out: LinearNames::in_int8(&format!("{path}.ff.net.2"), 4 * width, width),
+            proj: LinearNames::new(&format!("{path}.ff.net.0.proj"), Role::Block, width, 4 * width),
+            out: LinearNames::new(&format!("{path}.ff.net.2"), Role::Block, 4 * width, width),
         }
     }
 
@@ -400,7 +418,12 @@ impl DitBlockNames {
             config.width
         };
         Self {
-            modulation: LinearNames::new(&format!("{path}.norm1.linear"), config.width, 2 * config.width),
+            modulation: LinearNames::new(
+                &format!("{path}.norm1.linear"),
+                Role::Time,
+                config.width,
+                2 * config.width,
+            ),
             attention: AttentionNames::new(&format!("{path}.attn1."), config.width, keys_from),
             feed_forward: FeedForwardNames::new(&path, config.width),
         }

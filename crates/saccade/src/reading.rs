@@ -1,7 +1,7 @@
 //! Reading ahead: a thread reads the next tensor while the layers are made of the last one.
 
 use std::ops::Range;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::Builder;
 
 use crate::checkpoint::{Checkpoint, Elements};
@@ -15,6 +15,8 @@ pub(crate) struct HeadTensors<'a> {
     prefix: &'static str,
     /// What the thread has read, in the order given to [`HeadTensors::read_ahead`]; none where the system grants no thread.
     ahead: Option<Receiver<Read>>,
+    /// Memory of tensors that were used, for the thread.
+    spare: Sender<Elements>,
 }
 
 /// A tensor that was asked for, and what came of it.
@@ -34,8 +36,9 @@ impl HeadTensors<'_> {
         load: impl FnOnce(&HeadTensors<'_>) -> Result<R>,
     ) -> Result<R> {
         let (sender, receiver) = sync_channel(1);
+        let (spare, used) = channel();
         std::thread::scope(|scope| {
-            let read = move || read_all(checkpoint, prefix, wanted, &sender);
+            let read = move || read_all(checkpoint, prefix, wanted, &sender, &used);
             let thread = Builder::new()
                 .name("saccade-read".to_owned())
                 .spawn_scoped(scope, read);
@@ -44,6 +47,7 @@ impl HeadTensors<'_> {
                 checkpoint,
                 prefix,
                 ahead: thread.is_ok().then_some(receiver),
+                spare,
             })
         })
     }
@@ -55,11 +59,12 @@ impl HeadTensors<'_> {
 
     fn take(&self, wanted: Wanted) -> Result<Elements> {
         let Some(ahead) = &self.ahead else {
-            return read(self.checkpoint, self.prefix, &wanted);
+            return read(self.checkpoint, self.prefix, &wanted, None);
         };
         let read = ahead.recv().expect("the thread reads all that was wanted");
         assert_eq!(
-            read.wanted, wanted,
+            (&read.wanted.name, &read.wanted.slices),
+            (&wanted.name, &wanted.slices),
             "tensors are asked for in the order in which they are read"
         );
         read.elements
@@ -70,21 +75,29 @@ impl TensorSource for HeadTensors<'_> {
     fn tensor(&self, name: &str) -> Result<Elements> {
         self.take(Wanted::whole(name.to_owned()))
     }
+
+    fn give_back(&self, used: Elements) {
+        // Without a thread nobody takes it.
+        let _ = self.spare.send(used);
+    }
 }
 
-fn read_all(checkpoint: &Checkpoint, prefix: &str, wanted: Vec<Wanted>, sender: &SyncSender<Read>) {
+fn read_all(
+    checkpoint: &Checkpoint,
+    prefix: &str,
+    wanted: Vec<Wanted>,
+    sender: &SyncSender<Read>,
+    used: &Receiver<Elements>,
+) {
     for wanted in wanted {
-        let elements = read(checkpoint, prefix, &wanted);
+        let spare = wanted.is_given_back.then(|| used.try_recv().ok()).flatten();
+        let elements = read(checkpoint, prefix, &wanted, spare);
         if sender.send(Read { wanted, elements }).is_err() {
             return;
         }
     }
 }
 
-fn read(checkpoint: &Checkpoint, prefix: &str, wanted: &Wanted) -> Result<Elements> {
-    let name = format!("{prefix}{}", wanted.name);
-    match &wanted.slices {
-        None => checkpoint.read(&name),
-        Some(slices) => checkpoint.read_slices(&name, slices.clone()),
-    }
+fn read(checkpoint: &Checkpoint, prefix: &str, wanted: &Wanted, spare: Option<Elements>) -> Result<Elements> {
+    checkpoint.read_into(&format!("{prefix}{}", wanted.name), wanted.slices.clone(), spare)
 }

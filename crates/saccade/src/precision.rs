@@ -1,0 +1,71 @@
+//! How precisely a head computes.
+
+use std::fmt;
+use std::str::FromStr;
+
+use saccade_kernels::{Arithmetic, Element};
+
+use crate::error::{Error, Result};
+use crate::layout::Role;
+
+/// What weights are held in, and what the inputs of linear layers are rounded to. The residual stream, norms, softmax and all sums of
+/// floating-point products are float32 in each.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Precision {
+    /// Weights as they are stored, bf16 or float32, and float32 arithmetic.
+    #[default]
+    Float32,
+    /// Weights, inputs of linear layers, keys and values in bf16.
+    Bfloat16,
+    /// The linear layers of the blocks in int8: weights with one scale for each output, inputs with one for each row. The rest as in
+    /// [`Precision::Bfloat16`].
+    Int8,
+}
+
+const ALL: [Precision; 3] = [Precision::Float32, Precision::Bfloat16, Precision::Int8];
+
+impl Precision {
+    /// The arithmetic of a linear layer.
+    pub(crate) fn arithmetic(self, role: Role) -> Arithmetic {
+        match (self, role) {
+            (Self::Float32, _) | (_, Role::Time) => Arithmetic::Float32,
+            (Self::Int8, Role::Block) => Arithmetic::Int8,
+            (Self::Bfloat16, _) | (_, Role::Other) => Arithmetic::Bfloat16,
+        }
+    }
+
+    /// Whether weights that are stored as float32 are rounded to bf16.
+    pub(crate) fn rounds_weights(self) -> bool {
+        self != Self::Float32
+    }
+
+    /// What keys and values are held in.
+    pub(crate) fn keys_values(self) -> Element {
+        match self {
+            Self::Float32 => Element::F32,
+            Self::Bfloat16 | Self::Int8 => Element::Bf16,
+        }
+    }
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::Float32 => "float32",
+            Self::Bfloat16 => "bfloat16",
+            Self::Int8 => "int8",
+        })
+    }
+}
+
+impl FromStr for Precision {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        let known = ALL.into_iter().find(|precision| precision.to_string() == name);
+        known.ok_or_else(|| {
+            let names = ALL.map(|precision| format!("'{precision}'")).join(", ");
+            Error::Input(format!("precision: expected one of {names}, got '{name}'"))
+        })
+    }
+}
