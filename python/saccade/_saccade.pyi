@@ -1,5 +1,6 @@
 """The extension module: what the Python package calls. Arrays are C-contiguous."""
 
+from collections.abc import Callable
 from typing import Any, final
 
 import numpy as np
@@ -20,7 +21,9 @@ __all__ = [
     "__version__",
     "available_isas",
     "default_num_threads",
+    "dot_products",
     "parse_config",
+    "quantize",
     "read_tensors",
     "selected_isa",
     "start_profile",
@@ -45,13 +48,19 @@ class Context:
 class ActionHead:
     @staticmethod
     def load(
-        source: str, config: str | None, embodiment_ids: list[int] | None, num_threads: int | None
+        source: str,
+        config: str | None,
+        embodiment_ids: list[int] | None,
+        precision: str,
+        num_threads: int | None,
     ) -> ActionHead: ...
     def config(self) -> dict[str, Any]: ...
     @property
     def embodiment_ids(self) -> list[int]: ...
     @property
     def num_threads(self) -> int: ...
+    @property
+    def precision(self) -> str: ...
     @property
     def isa(self) -> str: ...
     @property
@@ -116,13 +125,17 @@ class KeyValues:
 
 @final
 class CrossAttention:
-    def __new__(cls, tensors: dict[str, _Float32], num_heads: int) -> CrossAttention: ...
+    def __new__(cls, tensors: dict[str, _Float32], num_heads: int, precision: str) -> CrossAttention: ...
     @property
     def width(self) -> int: ...
     @property
     def context_dim(self) -> int: ...
     @property
     def num_heads(self) -> int: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def nbytes(self) -> int: ...
     def project(self, encoder_hidden_states: _Float32) -> KeyValues: ...
     def attend(
         self,
@@ -136,8 +149,19 @@ class CrossAttention:
 
 def parse_config(text: str) -> dict[str, Any]: ...
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
+def quantize(
+    source: str,
+    out: str,
+    config: str | None,
+    head_only: bool,
+    force: bool,
+    metadata: dict[str, str],
+    max_shard_bytes: int | None,
+    progress: Callable[[int, int], object] | None,
+) -> dict[str, Any]: ...
 def available_isas() -> list[str]: ...
 def selected_isa() -> str: ...
+def dot_products() -> list[str]: ...
 def default_num_threads() -> int: ...
 def start_profile() -> None: ...
 def take_profile() -> dict[str, tuple[int, float, int, int]]: ...  # calls, seconds, multiply-adds, bytes

@@ -55,7 +55,7 @@ class CrossAttention:
             ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
             ``to_out.0.bias (width,)``.
         num_heads: A divisor of the width.
-        precision: ``"float32"``.
+        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in :meth:`saccade.ActionHead.load`.
 
     Raises:
         CheckpointError: tensors are missing, unknown or misshaped; all of them are listed.
@@ -84,7 +84,7 @@ class CrossAttention:
         for name, array in arrays.items():
             if not np.isfinite(array).all():
                 raise InputError(f"tensors[{name!r}]: expected finite values")
-        self._attention = _saccade.CrossAttention(arrays, integer("num_heads", num_heads))
+        self._attention = _saccade.CrossAttention(arrays, integer("num_heads", num_heads), precision)
 
     @property
     def num_heads(self) -> int:
@@ -100,6 +100,16 @@ class CrossAttention:
     def context_dim(self) -> int:
         """Width of the tokens attended to."""
         return self._attention.context_dim
+
+    @property
+    def precision(self) -> str:
+        """What it computes in: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
+        return self._attention.precision
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of weights in memory."""
+        return self._attention.nbytes
 
     def project(self, encoder_hidden_states: ArrayLike) -> KeyValues:
         """Projects tokens to keys and values, to be held over many calls.
@@ -181,6 +191,9 @@ class CrossAttention:
 
 
 def check_precision(precision: str) -> None:
-    """That the engine has this precision."""
-    if precision != "float32":
-        raise InputError(f"precision: expected 'float32', got {precision!r}")
+    """That it is text; which texts there are, the engine knows."""
+    if not isinstance(precision, str):
+        raise InputError(
+            "precision: expected one of 'float32', 'bfloat16', 'int8', got "
+            f"{precision!r} ({type(precision).__name__})"
+        )

@@ -17,8 +17,10 @@ def show_config(mode: Literal["dicts"]) -> dict[str, Any]: ...
 def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] | None:
     """Prints, or with ``mode="dicts"`` returns, what a head loaded now would use.
 
-    ``isa`` is the instruction set (``SACCADE_ISA`` forces one of ``available_isas``), ``num_threads`` the
-    default thread count (``SACCADE_NUM_THREADS``).
+    ``isa`` is the instruction set (``SACCADE_ISA`` forces one of ``available_isas``), ``dot_products`` what
+    it multiplies in one instruction on this CPU: ``bf16`` for the precision bfloat16, ``vnni`` for int8,
+    which run with what there is without them. ``num_threads`` is the default thread count
+    (``SACCADE_NUM_THREADS``).
 
     Raises:
         InputError: ``SACCADE_ISA`` or ``SACCADE_NUM_THREADS`` holds something that cannot be used here.
@@ -31,6 +33,7 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     config = {
         "saccade": _saccade.__version__,
         "isa": _saccade.selected_isa(),
+        "dot_products": _saccade.dot_products(),
         "available_isas": _saccade.available_isas(),
         "num_threads": _saccade.default_num_threads(),
         "numpy": np.__version__,
@@ -40,5 +43,5 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     if mode == "dicts":
         return config
     for name, value in config.items():
-        print(f"{name}: {', '.join(value) if isinstance(value, list) else value}")
+        print(f"{name}: {', '.join(value) or 'none' if isinstance(value, list) else value}")
     return None

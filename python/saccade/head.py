@@ -123,7 +123,7 @@ class ActionHead:
 
         Tensors are found under ``action_head.``, ``_groot_model.action_head.`` or no prefix. What lies
         outside the prefix is ignored; inside it every tensor must be known, present and of the right shape.
-        Weights stored as bfloat16 stay so in memory, which loses nothing; all arithmetic is float32.
+        Tensors that ``saccade quantize`` has stored as int8 are taken at every precision.
 
         Args:
             source: A directory (``config.json`` beside one or more ``.safetensors``, with or without an
@@ -132,7 +132,19 @@ class ActionHead:
                 or the head's own.
                 Default: ``config.json`` beside the weights.
             embodiment_ids: Keep only these embodiments' layers; ids keep their numbers. Default all.
-            precision: ``"float32"``.
+            precision: What is computed in what. The residual stream, norms, softmax and all sums of floating
+                point products are float32 in each.
+
+                - ``"float32"``: exact to rounding. Weights stored as bfloat16 stay so in memory, which loses
+                  nothing.
+                - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16,
+                  which keeps 8 bits. Half the memory of float32 weights, and faster where the CPU has a
+                  bfloat16 dot product.
+                - ``"int8"``: the attention and feed-forward layers of all blocks multiply 8-bit integers: a
+                  scale for each output of the weights, one for each row of the inputs. A quarter of the
+                  memory, and the fastest. The rest as in ``"bfloat16"``.
+
+                What each costs in accuracy is measured in ``docs/precision.md``.
             num_threads: Threads that a call uses. Default: the environment's ``SACCADE_NUM_THREADS``, else
                 the physical cores that the process may use (affinity and container quota counted).
 
@@ -147,7 +159,7 @@ class ActionHead:
         text = None if config is None else to_json(config)
         ids = None if embodiment_ids is None else int64("embodiment_ids", embodiment_ids).reshape(-1).tolist()
         threads = _optional_integer("num_threads", num_threads)
-        head = _saccade.ActionHead.load(path, text, ids, threads)
+        head = _saccade.ActionHead.load(path, text, ids, precision, threads)
         options = {"config": text, "embodiment_ids": ids, "precision": precision, "num_threads": threads}
         return cls(head, str(Path(path).absolute()), options)
 
@@ -167,8 +179,13 @@ class ActionHead:
         return self._head.num_threads
 
     @property
+    def precision(self) -> str:
+        """What it computes in: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
+        return self._head.precision
+
+    @property
     def isa(self) -> str:
-        """The instruction set that the kernels use: ``"avx512"``, ``"avx2"`` or ``"portable"``."""
+        """The instruction set that the kernels use, one of those that :func:`saccade.show_config` lists."""
         return self._head.isa
 
     @property
@@ -460,7 +477,8 @@ class ActionHead:
         config = self._config
         return (
             f"<saccade.ActionHead {config.version} width={config.width} num_layers={config.num_layers} "
-            f"num_future_tokens={config.num_future_tokens} isa={self.isa} num_threads={self.num_threads}>"
+            f"num_future_tokens={config.num_future_tokens} precision={self.precision} isa={self.isa} "
+            f"num_threads={self.num_threads}>"
         )
 
 

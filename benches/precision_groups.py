@@ -1,0 +1,145 @@
+"""What rounding each group of layers costs: the action chunk of the torch reference with that group alone in
+int8 or bfloat16, and everything else in float32.
+
+Run with the package and torch installed; prints a Markdown table, that of docs/precision.md:
+
+    python benches/precision_groups.py CHECKPOINT [--embodiment-id 0]
+    python benches/precision_groups.py --full               N1.5's size, seeded random weights; 4 GB of memory
+    python benches/precision_groups.py --full --outliers    the same with a few channels 20 times as large
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from saccade.reference import ActionHead, random_weights
+from saccade.reference.model import CategoryLinear
+
+VL, DIT = r"vl_self_attention\.transformer_blocks\.\d+\.", r"model\.transformer_blocks\.\d+\."
+EVEN, ODD = r"model\.transformer_blocks\.\d*[02468]\.", r"model\.transformer_blocks\.\d*[13579]\."
+INT8_GROUPS = {
+    "VL self-attention: q, k, v": VL + r"attn1\.to_[qkv]",
+    "VL self-attention: out": VL + r"attn1\.to_out\.0",
+    "VL feed-forward: first": VL + r"ff\.net\.0\.proj",
+    "VL feed-forward: second": VL + r"ff\.net\.2",
+    "cross-attention: q": EVEN + r"attn1\.to_q",
+    "cross-attention: k, v": EVEN + r"attn1\.to_[kv]",
+    "self-attention: q, k, v": ODD + r"attn1\.to_[qkv]",
+    "cross- and self-attention: out": DIT + r"attn1\.to_out\.0",
+    "feed-forward: first": DIT + r"ff\.net\.0\.proj",
+    "feed-forward: second": DIT + r"ff\.net\.2",
+    "all of the blocks (what int8 runs in int8)": rf"({VL}|{DIT})(attn1|ff)\..*",
+    "the last projection": r"model\.proj_out_2",
+    "state encoder": r"state_encoder\..*",
+    "action encoder: its last layer": r"action_encoder\.W3",
+    "action decoder": r"action_decoder\..*",
+    "modulations and timestep": rf"{DIT}norm1\.linear|model\.proj_out_1|model\.timestep_encoder\..*",
+}
+
+
+def int8_weight(weight: Tensor) -> Tensor:
+    """Rows `(out, in)` rounded to 255 steps of their largest magnitude."""
+    scale = weight.abs().amax(dim=-1, keepdim=True).clamp_min(1e-30) / 127
+    return (weight / scale).round() * scale
+
+
+def int8_rows(x: Tensor) -> Tensor:
+    """Rows rounded to 256 steps between their extremes, zero among them."""
+    low, high = x.amin(dim=-1, keepdim=True).clamp_max(0), x.amax(dim=-1, keepdim=True).clamp_min(0)
+    scale = ((high - low) / 255).clamp_min(1e-30)
+    zero = (-low / scale).round()
+    return (((x / scale).round() + zero).clamp(0, 255) - zero) * scale
+
+
+def bfloat16(x: Tensor) -> Tensor:
+    """Rounded to 8 bits."""
+    return x.bfloat16().to(x.dtype)
+
+
+def round_group(
+    head: ActionHead, pattern: str, weights: Callable[[Tensor], Tensor], rows: Callable[[Tensor], Tensor]
+) -> dict[Tensor, Tensor]:
+    """Rounds the weights of the layers that match, and what comes into them; returns the weights before."""
+    before: dict[Tensor, Tensor] = {}
+    for name, module in head.named_modules():
+        if not isinstance(module, nn.Linear | CategoryLinear) or not re.fullmatch(pattern, name):
+            continue
+        weight = module.weight if isinstance(module, nn.Linear) else module.W
+        before[weight] = weight.detach().clone()
+        with torch.no_grad():
+            if isinstance(module, nn.Linear):
+                weight.copy_(weights(weight))
+            else:
+                weight.copy_(weights(weight.transpose(1, 2)).transpose(1, 2))
+        module.register_forward_pre_hook(lambda _, args: (rows(args[0]), *args[1:]))
+    return before
+
+
+def add_outliers(head: ActionHead) -> None:
+    """Makes one input column and one output in 64 of every linear layer of the blocks larger."""
+    for name, module in head.named_modules():
+        if isinstance(module, nn.Linear) and re.fullmatch(rf"({VL}|{DIT})(attn1|ff)\..*", name):
+            with torch.no_grad():
+                module.weight[:, ::64] *= 20 / 64**0.5
+                module.weight[::64] *= 2
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("checkpoint", nargs="?", type=Path)
+    parser.add_argument("--full", action="store_true", help="random weights of N1.5's size")
+    parser.add_argument(
+        "--outliers", action="store_true", help="a few input channels and outputs much larger"
+    )
+    parser.add_argument("--embodiment-id", type=int, default=0)
+    parser.add_argument("--vl-tokens", type=int, default=296)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    if args.checkpoint is not None:
+        head = ActionHead.load(args.checkpoint)
+    else:
+        config = random_weights.n15_config(num_embodiments=1) if args.full else random_weights.small_config()
+        head = random_weights.random_head(config, args.seed)
+    if args.outliers:
+        add_outliers(head)
+    inputs = random_weights.random_inputs(head.config, args.seed + 1, batch=1, num_vl_tokens=args.vl_tokens)
+    inputs["embodiment_id"] = torch.tensor([args.embodiment_id])
+
+    def chunk() -> Tensor:
+        with torch.no_grad():
+            actions: Tensor = head(**inputs)
+            return actions.double()
+
+    exact = chunk()
+    print(
+        "| rounded | int8: largest | int8: rms | bfloat16: largest | bfloat16: rms |\n|---|---|---|---|---|"
+    )
+    for group, pattern in INT8_GROUPS.items():
+        cells = []
+        for weights, rows in ((int8_weight, int8_rows), (bfloat16, bfloat16)):
+            before = round_group(head, pattern, weights, rows)
+            if not before:
+                cells += ["", ""]
+                continue
+            error = chunk() - exact
+            cells += [
+                f"{float(error.abs().max() / exact.abs().max()):.1e}",
+                f"{float(error.square().mean().sqrt() / exact.square().mean().sqrt()):.1e}",
+            ]
+            with torch.no_grad():
+                for weight, values in before.items():
+                    weight.copy_(values)
+            for module in head.modules():
+                module._forward_pre_hooks.clear()
+        print(f"| {group} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

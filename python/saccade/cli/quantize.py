@@ -1,0 +1,64 @@
+"""`saccade quantize`: a copy of a checkpoint with int8 weights."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+from saccade.cli import EXIT_OK
+
+HELP = "write a copy of a checkpoint with int8 weights"
+
+EPILOG = """\
+The weights of the attention and feed-forward layers of all blocks become int8, X.weight, beside a float32
+scale for each output, X.weight_scale. All other tensors are copied bit for bit, those outside the head too
+unless --head-only. ActionHead.load(DIR, precision="int8") then gives the same bits as SOURCE at int8; other
+precisions load it too, with the weights that the integers stand for. docs/precision.md says what int8 costs.
+
+examples:
+  saccade quantize GR00T-N1.5-3B/ --out GR00T-N1.5-3B-int8
+  saccade quantize GR00T-N1.5-3B/ --out head-int8 --head-only --json
+  saccade quantize policy.safetensors --config config.json --out policy-int8 --force
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = EPILOG
+    parser.add_argument("source", type=Path, help="checkpoint: a directory or one .safetensors file")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory to write")
+    parser.add_argument("--config", type=Path, help="default: config.json beside the weights")
+    parser.add_argument("--head-only", action="store_true", help="leave out tensors outside the head")
+    parser.add_argument("--force", action="store_true", help="replace a checkpoint that is there")
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Writes the copy and reports what is in it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from saccade.checkpoints import quantize
+
+    columns = (TextColumn("quantizing"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("", total=None)
+        report = quantize(
+            args.source,
+            args.out,
+            config=args.config,
+            head_only=args.head_only,
+            force=args.force,
+            progress=lambda done, total: progress.update(bar, completed=done, total=total),
+        )
+    if args.json:
+        print(json.dumps({**dataclasses.asdict(report), "files": [str(file) for file in report.files]}))
+        return EXIT_OK
+    before, after = (size / 1e6 for size in (report.head_bytes_before, report.head_bytes_after))
+    print(
+        f"{args.out}: {report.num_quantized} weights in int8, {report.num_copied} tensors copied, "
+        f"{report.num_dropped} left out; the head's {before:.1f} MB are {after:.1f} MB"
+    )
+    return EXIT_OK
