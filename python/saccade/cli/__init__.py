@@ -19,6 +19,7 @@ COMMANDS: dict[str, str] = {
     "attention": "show what the rows of the action head look at",
     "study": "measure what the future tokens do, in closed loop and inside the head",
     "parity": "compare the Rust head with the reference in torch",
+    "quantize": "write a copy of a checkpoint with int8 weights",
 }
 
 # Which extra brings a module that a command may find missing.
