@@ -1,0 +1,142 @@
+"""How much there is to compute: multiply-adds and weights of one call, by part, from the head's sizes.
+
+The parts are those of the engine's profile; a test holds both to the same counts. Numbers of the
+specification are those of its section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from saccade.config import HeadConfig
+
+#: Parts whose operands are keys, values and probabilities rather than weights.
+ATTENTION = ("attention",)
+
+
+@dataclass(frozen=True)
+class Call:
+    """What is asked of a head: encode an observation, then sample from it.
+
+    Attributes:
+        num_vl_tokens: T_vl.
+        num_steps: Euler steps.
+        batch: observations.
+        num_samples: chunks of each.
+        future_refresh: as `ActionHead.sample` takes it, 1 where that is None.
+        num_future_tokens: N, which an intervention may have changed.
+    """
+
+    num_vl_tokens: int
+    num_steps: int
+    batch: int = 1
+    num_samples: int = 1
+    future_refresh: int = 1
+    num_future_tokens: int = 32
+
+    @classmethod
+    def of(cls, config: HeadConfig, num_vl_tokens: int, num_steps: int | None = None, **sizes: int) -> Call:
+        """A call with the config's steps and future tokens where none are given."""
+        sizes = {"num_future_tokens": config.num_future_tokens} | sizes
+        return cls(num_vl_tokens, config.num_steps if num_steps is None else num_steps, **sizes)
+
+
+@dataclass
+class Work:
+    """One part of a call.
+
+    Attributes:
+        multiply_adds: of its matrix products.
+        elements: weights, or held keys and values, that it reads at least once for each product.
+        rows: rows of activations, summed over its products.
+    """
+
+    multiply_adds: int = 0
+    elements: int = 0
+    rows: int = 0
+
+    def __add__(self, other: Work) -> Work:
+        return Work(
+            self.multiply_adds + other.multiply_adds,
+            self.elements + other.elements,
+            self.rows + other.rows,
+        )
+
+
+Works = dict[str, Work]
+
+
+def encode_work(config: HeadConfig, call: Call) -> Works:
+    """`ActionHead.encode`: the VL self-attention, and keys and values of every cross-attention block."""
+    rows, width = call.batch * call.num_vl_tokens, config.context_dim
+    works: Works = {}
+    for _ in range(config.vl_num_layers if config.use_vlln else 0):
+        add_linear(works, "to_q", rows, width, width)
+        add_linear(works, "to_kv", rows, width, 2 * width)
+        add_attention(works, call.batch, call.num_vl_tokens, call.num_vl_tokens, width)
+        add_linear(works, "to_out", rows, width, width)
+        add_feed_forward(works, rows, width)
+    for _ in filter(None, cross_blocks(config)):
+        add_linear(works, "context_to_kv", rows, width, 2 * config.width)
+    return works
+
+
+def sample_work(config: HeadConfig, call: Call) -> Works:
+    """`ActionHead.sample` on a held context, once what depends on the time alone is known.
+
+    In the last block, and at steps at which the rows of state and future tokens do not run, only the action
+    rows do.
+    """
+    width, hidden, horizon = config.width, config.hidden_dim, config.action_horizon
+    chunks = call.batch * call.num_samples
+    all_rows = 1 + call.num_future_tokens + horizon
+    works: Works = {}
+    state = config.state_history * config.state_dim
+    add_linear(works, "embodiment", call.batch, state, hidden)
+    add_linear(works, "embodiment", call.batch, hidden, width)
+    for step in range(call.num_steps):
+        running = all_rows if step % call.future_refresh == 0 else horizon
+        add_linear(works, "embodiment", chunks * horizon, config.encoder_action_dim, width)
+        add_linear(works, "embodiment", chunks * horizon, width, width)
+        for block, is_cross in enumerate(cross_blocks(config)):
+            queries = horizon if block == config.num_layers - 1 else running
+            add_linear(works, "to_q", chunks * queries, width, width)
+            if not is_cross:
+                add_linear(works, "to_kv", chunks * running, width, 2 * width)
+            keys = call.num_vl_tokens if is_cross else all_rows
+            add_attention(works, chunks, queries, keys, width)
+            add_linear(works, "to_out", chunks * queries, width, width)
+            add_feed_forward(works, chunks * queries, width)
+        add_linear(works, "output", chunks * horizon, width, hidden)
+        add_linear(works, "embodiment", chunks * horizon, hidden, hidden)
+        add_linear(works, "embodiment", chunks * horizon, hidden, config.action_dim)
+    return works
+
+
+def total(works: Works) -> Work:
+    """All parts together."""
+    return sum(works.values(), Work())
+
+
+def cross_blocks(config: HeadConfig) -> Iterator[bool]:
+    """For each block whether it reads the vision-language tokens."""
+    return (block % 2 == 0 or not config.interleave_self_attention for block in range(config.num_layers))
+
+
+def add_feed_forward(works: Works, rows: int, width: int) -> None:
+    """Two layers, four times as wide in between."""
+    add_linear(works, "feed_forward_in", rows, width, 4 * width)
+    add_linear(works, "feed_forward_out", rows, 4 * width, width)
+
+
+def add_linear(works: Works, part: str, rows: int, in_features: int, out_features: int) -> None:
+    """`rows` through one layer."""
+    weights = in_features * out_features
+    works[part] = works.get(part, Work()) + Work(rows * weights, weights, rows)
+
+
+def add_attention(works: Works, sequences: int, queries: int, keys: int, width: int) -> None:
+    """Scores and the sum of values of `sequences` sequences of so many queries."""
+    counted = Work(2 * sequences * queries * keys * width, 2 * sequences * keys * width, sequences * queries)
+    works["attention"] = works.get("attention", Work()) + counted

@@ -1,0 +1,337 @@
+"""`saccade bench`: how long a chunk takes here, beside what this machine allows."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.resources
+import json
+import statistics
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import saccade
+from saccade.bench import heads
+from saccade.bench.cost import (
+    PRECISIONS,
+    Machine,
+    arithmetic,
+    floor,
+    floors,
+    predict,
+)
+from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
+from saccade.bench.work import Call, Works, encode_work, sample_work, total
+from saccade.cli import UsageError
+
+HELP = "time the action head beside what this machine allows"
+EPILOG = """examples:
+  saccade bench                                   the shipped policy, every precision
+  saccade bench checkpoint/ --num-vl-tokens 559   a checkpoint with two camera views
+  saccade bench --size n1.5 --profile             random weights at N1.5's size, time by part
+  saccade bench --size n1.5 --model               measured beside expected times over N, T_vl, steps, samples
+  saccade bench --precision int8 --future-refresh 4 --json
+"""
+#: What `--model` varies, one at a time, from the call that is asked for.
+VARIED: dict[str, tuple[int, ...]] = {
+    "num_future_tokens": (0, 32, 64),
+    "num_vl_tokens": (64, 296, 559, 822),
+    "num_steps": (1, 2, 4, 8),
+    "num_samples": (1, 4, 8),
+    "future_refresh": (1, 2, 4),
+}
+DEFAULT_VL_TOKENS = 296  # one camera view of N1.5
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = EPILOG
+    parser.add_argument(
+        "checkpoint", nargs="?", type=Path, help="directory or .safetensors file; default: the shipped policy"
+    )
+    parser.add_argument(
+        "--size", choices=("n1.5", "small"), help="random weights of this size (n1.5: 1.5 GB of disk)"
+    )
+    parser.add_argument(
+        "--precision",
+        default=",".join(PRECISIONS),
+        help=f"of {', '.join(PRECISIONS)}, by commas (default all)",
+    )
+    parser.add_argument("--threads", type=int, help="threads of a call (default: the physical cores)")
+    parser.add_argument("--num-vl-tokens", type=int, help="T_vl (default: the shipped policy's, else 296)")
+    parser.add_argument("--num-steps", type=int, help="Euler steps (default: the checkpoint's)")
+    parser.add_argument("--num-samples", type=int, default=1, help="chunks of the observation (default 1)")
+    parser.add_argument(
+        "--future-refresh", type=int, default=1, help="as ActionHead.sample takes it (default 1: exact)"
+    )
+    parser.add_argument("--rounds", type=int, default=7, help="times each is measured (default 7)")
+    parser.add_argument("--profile", action="store_true", help="time by part beside its floor")
+    parser.add_argument("--model", action="store_true", help="measured times beside those of the cost model")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measures and prints."""
+    precisions = check(args)
+    with ExitStack() as stack:
+        source, name = stack.enter_context(head_source(args))
+        loaded = {}
+        for precision in precisions:
+            note(f"loading {name} in {precision}")
+            loaded[precision] = saccade.ActionHead.load(source, precision=precision, num_threads=args.threads)
+        head = next(iter(loaded.values()))
+        config = head.config
+        call = Call.of(
+            config,
+            args.num_vl_tokens or default_vl_tokens(source),
+            args.num_steps,
+            num_samples=args.num_samples,
+            future_refresh=args.future_refresh,
+        )
+        note("measuring the machine's peaks")
+        machine = Machine.measured(head.isa, head.num_threads)
+        report = {
+            "saccade": saccade.__version__,
+            "head": name,
+            "machine": asdict(machine),
+            "call": asdict(call),
+            "rounds": args.rounds,
+            "results": timed(loaded, call, machine, args.rounds),
+        }
+        if args.profile:
+            report["profile"] = [
+                profile(loaded[precision], precision, piece, call, machine, args.rounds)
+                for precision in loaded
+                for piece in ("encode", "sample")
+            ]
+        if args.model:
+            report["model"] = modelled(loaded, call, machine, args.rounds)
+    print(json.dumps(report, indent=1) if args.json else tables(report))
+    return 0
+
+
+def check(args: argparse.Namespace) -> list[str]:
+    """The precisions; refuses arguments that cannot be followed before anything long has run."""
+    if args.checkpoint is not None and args.size is not None:
+        raise UsageError("--size is about random weights: leave out the checkpoint")
+    if args.checkpoint is not None and not args.checkpoint.exists():
+        raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
+    for name in ("threads", "num_vl_tokens", "num_steps", "num_samples", "future_refresh", "rounds"):
+        value = getattr(args, name)
+        if value is not None and value < 1:
+            raise UsageError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
+    precisions: list[str] = args.precision.split(",")
+    for precision in precisions:
+        if precision not in PRECISIONS:
+            raise UsageError(f"--precision is {precision!r}, expected some of {', '.join(PRECISIONS)}")
+    return list(dict.fromkeys(precisions))
+
+
+@contextlib.contextmanager
+def head_source(args: argparse.Namespace) -> Iterator[tuple[Path, str]]:
+    """Where the head is loaded from, and what it is called."""
+    if args.checkpoint is not None:
+        yield args.checkpoint, str(args.checkpoint)
+    elif args.size is not None:
+        with tempfile.TemporaryDirectory(prefix="saccade-bench-") as folder:
+            note("writing random weights")
+            heads.write(Path(folder), heads.sized(args.size))
+            yield Path(folder), f"random weights, size {args.size}"
+    else:
+        with importlib.resources.as_file(importlib.resources.files("saccade") / "sim" / "demo") as demo:
+            yield demo, "the shipped policy"
+
+
+def default_vl_tokens(source: Path) -> int:
+    """As many as the backbone beside the head gives, if its config says so."""
+    try:
+        backbone = json.loads((source / "config.json").read_text())["backbone_cfg"]
+        patches = (backbone["image_size"] // backbone["patch_size"]) ** 2
+        return int(backbone["num_cameras"] * patches + backbone["text_length"])
+    except (OSError, KeyError, TypeError, ValueError):
+        return DEFAULT_VL_TOKENS
+
+
+def options(call: Call) -> dict[str, int]:
+    """The call as keyword arguments of `pieces`."""
+    return {
+        "num_steps": call.num_steps,
+        "num_samples": call.num_samples,
+        "future_refresh": call.future_refresh,
+        "num_future_tokens": call.num_future_tokens,
+    }
+
+
+def works_of(head: saccade.ActionHead, call: Call) -> dict[str, list[Works]]:
+    """What there is to do in each of `PIECES`."""
+    encode, sample = encode_work(head.config, call), sample_work(head.config, call)
+    return {"encode": [encode], "sample": [sample], "both": [encode, sample]}
+
+
+def timed(
+    loaded: dict[str, saccade.ActionHead], call: Call, machine: Machine, rounds: int
+) -> list[dict[str, Any]]:
+    """Every piece of work in every precision, by turns."""
+    calls: dict[tuple[str, str], Callable[[], Any]] = {}
+    for precision, head in loaded.items():
+        for piece, work in pieces(head, call.num_vl_tokens, **options(call)).items():
+            calls[precision, piece] = work
+    seconds = by_turns(calls, rounds, lambda done: note(f"round {done} of {rounds}"))
+    records = []
+    for (precision, piece), values in seconds.items():
+        head = loaded[precision]
+        works = works_of(head, call)[piece]
+        least = sum(sum(floors(machine, precision, each).values()) for each in works)
+        expected = predict(head.config, call, precision, machine)
+        median = statistics.median(values)
+        records.append(
+            {
+                "precision": precision,
+                "piece": piece,
+                "seconds": values,
+                "quartiles": list(quartiles(values)),
+                "multiply_adds": sum(total(each).multiply_adds for each in works),
+                "floor_seconds": least,
+                "share": least / median,
+                "expected_seconds": sum(expected.values()) if piece == "both" else expected[piece],
+            }
+        )
+    return records
+
+
+def profile(
+    head: saccade.ActionHead, precision: str, piece: str, call: Call, machine: Machine, rounds: int
+) -> dict[str, Any]:
+    """The run of median length, by part."""
+    note(f"profile of {piece} in {precision}")
+    work = pieces(head, call.num_vl_tokens, **options(call))[piece]
+    runs = sorted((profiled(work) for _ in range(rounds)), key=lambda one: one[0])
+    seconds, counters = runs[len(runs) // 2]
+
+    def part(name: str, counter: Counter) -> dict[str, Any]:
+        least = floor(machine, arithmetic(name, precision), counter.multiply_adds, counter.num_bytes)
+        return {
+            "part": name,
+            "calls": counter.calls,
+            "seconds": counter.seconds,
+            "multiply_adds": counter.multiply_adds,
+            "bytes": counter.num_bytes,
+            "floor_seconds": least,
+            "share": least / counter.seconds if counter.multiply_adds else None,
+        }
+
+    return {
+        "precision": precision,
+        "piece": piece,
+        "seconds": seconds,
+        "parts": [part(name, counter) for name, counter in counters.items()],
+        "other_seconds": seconds - sum(counter.seconds for counter in counters.values()),
+    }
+
+
+def modelled(
+    loaded: dict[str, saccade.ActionHead], call: Call, machine: Machine, rounds: int
+) -> list[dict[str, Any]]:
+    """Median times beside those of the cost model, one size after the other changed."""
+    records = []
+    for varied, values in VARIED.items():
+        for value in values:
+            note(f"{varied} {value}")
+            changed = replace(call, **{varied: value})
+            calls: dict[tuple[str, str], Callable[[], Any]] = {}
+            for precision, head in loaded.items():
+                made = pieces(head, changed.num_vl_tokens, **options(changed))
+                calls |= {(precision, piece): made[piece] for piece in ("encode", "sample")}
+            for (precision, piece), seconds in by_turns(calls, rounds).items():
+                expected = predict(loaded[precision].config, changed, precision, machine)[piece]
+                median = statistics.median(seconds)
+                records.append(
+                    {
+                        "varied": varied,
+                        "value": value,
+                        "precision": precision,
+                        "piece": piece,
+                        "seconds": median,
+                        "expected_seconds": expected,
+                        "ratio": median / expected,
+                    }
+                )
+    return records
+
+
+def note(message: str) -> None:
+    """Progress, beside the result."""
+    print(f"bench: {message} ...", file=sys.stderr, flush=True)
+
+
+def tables(report: dict[str, Any]) -> str:
+    """The report as text; times in milliseconds."""
+    machine, call = report["machine"], report["call"]
+    peaks = ", ".join(f"{name} {rate / 1e9:.0f}" for name, rate in machine["macs_per_second"].items())
+    lines = [
+        f"head      {report['head']}",
+        f"call      T_vl {call['num_vl_tokens']}, N {call['num_future_tokens']}, {call['num_steps']} steps, "
+        f"{call['num_samples']} samples, future_refresh {call['future_refresh']}",
+        f"machine   {machine['isa']}, {machine['num_threads']} threads; peak GMAC/s {peaks}; "
+        f"read {machine['read_bytes_per_second'] / 1e9:.1f} GB/s; saccade {report['saccade']}",
+        "",
+        f"median (quartiles) of {report['rounds']} rounds, ms",
+        f"{'':<20}{'time':>9}{'quartiles':>20}{'GMAC':>9}{'floor':>9}{'of it':>8}{'model':>9}",
+    ]
+    for record in report["results"]:
+        low, median, high = (1e3 * value for value in record["quartiles"])
+        expected, least = 1e3 * record["expected_seconds"], 1e3 * record["floor_seconds"]
+        name, gmac = f"{record['precision']} {record['piece']}", record["multiply_adds"] / 1e9
+        spread = f"({low:.2f}, {high:.2f})"
+        lines.append(
+            f"{name:<20}{median:>9.2f}{spread:>20}{gmac:>9.3f}{least:>9.2f}{record['share']:>8.0%}{expected:>9.2f}"
+        )
+    for one in report.get("profile", []):
+        lines += profile_table(one)
+    if "model" in report:
+        lines += model_table(report["model"])
+    return "\n".join(lines)
+
+
+def profile_table(one: dict[str, Any]) -> list[str]:
+    """Time by part of one piece of work."""
+    whole = one["seconds"]
+    lines = [
+        "",
+        f"{one['precision']} {one['piece']}, by part",
+        f"{'':<20}{'calls':>7}{'ms':>10}{'of all':>8}{'GMAC':>9}{'MB read':>10}{'floor':>9}{'of it':>8}",
+    ]
+    for part in one["parts"]:
+        seconds, least = part["seconds"], 1e3 * part["floor_seconds"]
+        gmac, megabytes = part["multiply_adds"] / 1e9, part["bytes"] / 1e6
+        reached = "" if part["share"] is None else f"{part['share']:.0%}"
+        lines.append(
+            f"{part['part']:<20}{part['calls']:>7}{1e3 * seconds:>10.3f}{seconds / whole:>8.1%}"
+            f"{gmac:>9.3f}{megabytes:>10.1f}{least:>9.3f}{reached:>8}"
+        )
+    other = one["other_seconds"]
+    lines.append(f"{'other':<20}{'':>7}{1e3 * other:>10.3f}{other / whole:>8.1%}")
+    lines.append(f"{'all':<20}{'':>7}{1e3 * whole:>10.3f}")
+    return lines
+
+
+def model_table(records: list[dict[str, Any]]) -> list[str]:
+    """Measured beside expected times."""
+    lines = [
+        "",
+        "one size changed at a time, ms",
+        f"{'':<24}{'precision':<12}{'piece':<8}{'measured':>10}{'model':>10}{'ratio':>8}",
+    ]
+    for record in records:
+        name = f"{record['varied']} {record['value']}"
+        seconds, expected = 1e3 * record["seconds"], 1e3 * record["expected_seconds"]
+        lines.append(
+            f"{name:<24}{record['precision']:<12}{record['piece']:<8}"
+            f"{seconds:>10.2f}{expected:>10.2f}{record['ratio']:>8.2f}"
+        )
+    return lines
