@@ -22,6 +22,7 @@ __all__ = [
     "available_isas",
     "default_num_threads",
     "dot_products",
+    "measure_peaks",
     "parse_config",
     "quantize",
     "read_tensors",
@@ -84,6 +85,7 @@ class ActionHead:
         embodiment_id: _Int64,
         noise: _Float32,
         num_steps: int | None,
+        integrator: str,
         num_samples: int | None,
         future_refresh: int | None,
         intervention: list[_Intervention],
@@ -163,6 +165,7 @@ def available_isas() -> list[str]: ...
 def selected_isa() -> str: ...
 def dot_products() -> list[str]: ...
 def default_num_threads() -> int: ...
+def measure_peaks(num_threads: int) -> dict[str, Any]: ...
 def start_profile() -> None: ...
 def take_profile() -> dict[str, tuple[int, float, int, int]]: ...  # calls, seconds, multiply-adds, bytes
 def tensor_shapes(text: str) -> list[tuple[str, list[int]]]: ...

@@ -28,6 +28,7 @@ from saccade._arrays import (
 from saccade.attention import check_precision
 from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError
+from saccade.integrator import check_integrator
 from saccade.intervention import Intervention, as_interventions
 from saccade.trace import Record, Trace, check_record
 
@@ -266,6 +267,7 @@ class ActionHead:
         noise: ArrayLike | None = None,
         seed: Any = None,
         num_steps: int | None = None,
+        integrator: str | None = None,
         num_samples: int | None = None,
         future_refresh: int | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
@@ -283,17 +285,21 @@ class ActionHead:
             seed: Whatever ``numpy.random.default_rng`` takes; the noise is its ``standard_normal`` in
                 float32. A ``Generator`` advances, an integer repeats the same noise at every call. With
                 neither ``noise`` nor ``seed``: fresh entropy.
-            num_steps: Euler steps, 1 to ``num_timestep_buckets``. Default the config's.
+            num_steps: Steps, 1 to ``num_timestep_buckets``. Default the config's.
+            integrator: What a step is: ``"euler"`` (the default, as the released sampler does), or
+                ``"midpoint"``, ``x + dt v(x + dt / 2 v(x, t), t + dt / 2)``, which evaluates the velocity
+                twice.
             num_samples: Chunks for each observation, from one context. None adds no axis to noise and
                 result; any integer adds one.
-            future_refresh: The rows of state and future tokens run at every so many Euler steps only: r runs
-                them at steps 0, r, 2 r, ... At the other steps only the action rows run, and self-attention
-                reads the keys and values of the other rows as they last were. None and 1 are exact and give
-                the same bits; r from 2 on is faster and an approximation. From ``num_steps`` on they run at
-                the first step only.
+            future_refresh: The rows of state and future tokens run at every so many evaluations of the
+                velocity only: r runs them at evaluations 0, r, 2 r, ... (of Euler's, steps). At the others
+                only the action rows run, and self-attention reads the keys and values of the other rows as
+                they last were. None and 1 are exact and give the same bits; r from 2 on is faster and an
+                approximation. From the number of evaluations on they run at the first one only.
             intervention: What to change inside the head; one, or several that act together. With
                 ``future_refresh`` cuts and biases act on the rows that run; a patch of state or future rows
-                at a step at which they do not run is an error.
+                at a step at which they do not always run is an error. All evaluations of a step are that
+                step.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
 
         Returns:
@@ -316,6 +322,7 @@ class ActionHead:
             int64("embodiment_id", embodiment_id),
             apart(start, output),
             _optional_integer("num_steps", num_steps),
+            check_integrator(integrator),
             samples,
             _optional_integer("future_refresh", future_refresh),
             _plain(intervention),
@@ -335,6 +342,7 @@ class ActionHead:
         noise: ArrayLike | None = None,
         seed: Any = None,
         num_steps: int | None = None,
+        integrator: str | None = None,
         num_samples: int | None = None,
         future_refresh: int | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
@@ -351,6 +359,7 @@ class ActionHead:
             noise=noise,
             seed=seed,
             num_steps=num_steps,
+            integrator=integrator,
             num_samples=num_samples,
             future_refresh=future_refresh,
             intervention=intervention,
@@ -414,7 +423,7 @@ class ActionHead:
         """Samples like :meth:`sample` and keeps what goes on inside.
 
         All rows are computed at every step in every block, the last included, where ``sample`` needs those of
-        the actions only; so there is no ``future_refresh``.
+        the actions only; so there is no ``future_refresh``. Steps are Euler's.
 
         Args:
             context, state, embodiment_id, noise, seed, num_steps, intervention: As in :meth:`sample`.

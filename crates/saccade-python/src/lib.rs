@@ -16,8 +16,8 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyType};
 use saccade::{
-    Array, Checkpoint, Elements, Error, Features, Group, Isa, Keep, LoadOptions, OwnedArray, Part, Patch,
-    Profile, QuantizeOptions, Recorded, Sampling, Tokens, TraceOptions,
+    Arithmetic, Array, Checkpoint, Elements, Error, Features, Group, Integrator, Isa, Keep, LoadOptions,
+    OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, Tokens, TraceOptions, peak,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -309,6 +309,7 @@ impl ActionHead {
         embodiment_id: PyReadonlyArrayDyn<'_, i64>,
         noise: PyReadonlyArrayDyn<'_, f32>,
         num_steps: Option<usize>,
+        integrator: &str,
         num_samples: Option<usize>,
         future_refresh: Option<usize>,
         intervention: Vec<PyIntervention<'_>>,
@@ -318,6 +319,7 @@ impl ActionHead {
         let (context, out) = (&context.0, out.as_slice_mut()?);
         let sampling = Sampling {
             num_steps,
+            integrator: Integrator::from_name(integrator).map_err(raise)?,
             num_samples,
             future_refresh,
             interventions: &interventions(intervention)?,
@@ -349,6 +351,7 @@ impl ActionHead {
         let context = &context.0;
         let sampling = Sampling {
             num_steps,
+            integrator: Integrator::Euler,
             num_samples: None,
             future_refresh: None,
             interventions: &interventions(intervention)?,
@@ -514,6 +517,37 @@ fn tensor_shapes(text: &str) -> PyResult<Vec<(String, Vec<usize>)>> {
     Ok(saccade::tensor_shapes(&config))
 }
 
+/// What this machine can do at most on `num_threads` threads; takes some tenths of a second for each instruction set.
+#[pyfunction]
+fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Bound<'_, PyDict>> {
+    if num_threads == 0 {
+        return Err(raise(Error::Input(
+            "num_threads: expected at least 1, got 0".to_owned(),
+        )));
+    }
+    let rates = PyDict::new(py);
+    for isa in Isa::available() {
+        let of_isa = PyDict::new(py);
+        for (name, arithmetic) in [
+            ("float32", Arithmetic::Float32),
+            ("bfloat16", Arithmetic::Bfloat16),
+            ("int8", Arithmetic::Int8),
+        ] {
+            let rate = py.detach(|| peak::macs_per_second(isa, arithmetic, num_threads));
+            of_isa.set_item(name, rate)?;
+        }
+        rates.set_item(isa.to_string(), of_isa)?;
+    }
+    let peaks = PyDict::new(py);
+    peaks.set_item("macs_per_second", rates)?;
+    peaks.set_item(
+        "read_bytes_per_second",
+        py.detach(|| peak::read_bytes_per_second(num_threads)),
+    )?;
+    peaks.set_item("clock_hz", py.detach(peak::clock_hz))?;
+    Ok(peaks)
+}
+
 /// Begins to count where the time of this thread's calls goes.
 #[pyfunction]
 fn start_profile() {
@@ -632,8 +666,8 @@ mod _saccade {
     use super::{ActionHead, Context, CrossAttention, KeyValues};
     #[pymodule_export]
     use super::{
-        available_isas, default_num_threads, dot_products, parse_config, quantize, read_tensors,
-        selected_isa, start_profile, take_profile, tensor_shapes,
+        available_isas, default_num_threads, dot_products, measure_peaks, parse_config, quantize,
+        read_tensors, selected_isa, start_profile, take_profile, tensor_shapes,
     };
 
     #[pymodule_export]

@@ -66,15 +66,51 @@ impl<'a> Features<'a> {
     }
 }
 
+/// How the velocity is followed from noise to actions in one step.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Integrator {
+    /// `x + dt v(x, t)`, as the released sampler does.
+    #[default]
+    Euler,
+    /// `x + dt v(x + dt / 2 v(x, t), t + dt / 2)`: two evaluations of the velocity.
+    Midpoint,
+}
+
+impl Integrator {
+    /// From its name: `euler` or `midpoint`.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for any other name.
+    pub fn from_name(name: &str) -> Result<Self> {
+        match name {
+            "euler" => Ok(Self::Euler),
+            "midpoint" => Ok(Self::Midpoint),
+            _ => Err(Error::Input(format!(
+                "integrator: expected euler or midpoint, got {name}"
+            ))),
+        }
+    }
+
+    /// Evaluations of the velocity in one step.
+    fn evaluations(self) -> usize {
+        match self {
+            Self::Euler => 1,
+            Self::Midpoint => 2,
+        }
+    }
+}
+
 /// How a chunk is sampled.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sampling<'a> {
-    /// Euler steps, 1 to `num_timestep_buckets`; default the config's.
+    /// Steps, 1 to `num_timestep_buckets`; default the config's.
     pub num_steps: Option<usize>,
+    /// What a step is. To the interventions all evaluations of a step are that step.
+    pub integrator: Integrator,
     /// Chunks for each observation; none adds no axis to noise and result.
     pub num_samples: Option<usize>,
-    /// The rows of state and future tokens run at every so many Euler steps, from the first one on. At the others only the action rows
-    /// run, and self-attention reads the others' keys and values as they last were. None and 1: at all steps, which is exact.
+    /// The rows of state and future tokens run at every so many evaluations of the velocity, from the first one on. At the others only the
+    /// action rows run, and self-attention reads the others' keys and values as they last were. None and 1: at all, which is exact.
     pub future_refresh: Option<usize>,
     /// What to change inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an error.
     pub interventions: &'a [Intervention],
@@ -107,6 +143,8 @@ struct Workspace {
     state_hidden: Vec<f32>,
     state: Vec<f32>,
     x: Vec<f32>,
+    /// `x` at the start of a step of two evaluations.
+    start: Vec<f32>,
     tokens: Vec<f32>,
     encoded: Vec<f32>,
     output: Vec<f32>,
@@ -124,6 +162,7 @@ impl Workspace {
             state_hidden: Vec::new(),
             state: Vec::new(),
             x: Vec::new(),
+            start: Vec::new(),
             tokens: Vec::new(),
             encoded: Vec::new(),
             output: Vec::new(),
@@ -295,7 +334,7 @@ impl ActionHead {
         let refresh = check_refresh(sampling.future_refresh)?;
         let extent = self.extent(sampling.interventions, context, num_steps)?;
         let changes = Changes::new(sampling.interventions, extent)?;
-        changes.check_refresh(refresh)?;
+        changes.check_refresh(refresh, sampling.integrator.evaluations())?;
         let pass = Pass {
             context,
             samples,
@@ -307,7 +346,8 @@ impl ActionHead {
             self.check_embodiments(embodiment_id, context.batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
             let nothing = &mut Recorded::default();
-            self.euler_steps(&pass, noise.data, num_steps, refresh, nothing, workspace);
+            let steps = (num_steps, sampling.integrator);
+            self.follow(&pass, noise.data, steps, refresh, nothing, workspace);
             out.copy_from_slice(&workspace.x);
             Ok(())
         })
@@ -316,7 +356,7 @@ impl ActionHead {
     /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last included.
     ///
     /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and `sampling.future_refresh` must
-    /// be none.
+    /// be none, and `sampling.integrator` Euler's.
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, and for a trace of more than `options.max_bytes`.
@@ -334,6 +374,12 @@ impl ActionHead {
             return Err(Error::Input(format!(
                 "num_samples: expected none, since a trace is of one chunk an observation, got {samples}"
             )));
+        }
+        if sampling.integrator != Integrator::Euler {
+            return Err(Error::Input(
+                "integrator: expected euler, since a trace has one evaluation a step, got midpoint"
+                    .to_owned(),
+            ));
         }
         if let Some(refresh) = sampling.future_refresh {
             return Err(Error::Input(format!(
@@ -368,7 +414,8 @@ impl ActionHead {
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
-            self.euler_steps(&pass, noise.data, num_steps, 1, &mut recorded, workspace);
+            let steps = (num_steps, Integrator::Euler);
+            self.follow(&pass, noise.data, steps, 1, &mut recorded, workspace);
             let shape = [batch, config.action_horizon, config.action_dim];
             let actions = OwnedArray::new(workspace.x.clone(), &shape);
             Ok(Trace {
@@ -511,42 +558,58 @@ impl ActionHead {
         )
     }
 
-    /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`. At steps that `refresh` does not divide only the
-    /// action rows run.
-    fn euler_steps(
+    /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`. At evaluations that `refresh` does not divide only
+    /// the action rows run.
+    fn follow(
         &self,
         pass: &Pass<'_>,
         noise: &[f32],
-        num_steps: usize,
+        (num_steps, integrator): (usize, Integrator),
         refresh: usize,
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) {
         sized(&mut workspace.x, noise.len()).copy_from_slice(noise);
         let dt = 1.0 / num_steps as f32;
-        let refreshes = |step: usize| step.is_multiple_of(refresh);
-        for step in 0..num_steps {
-            let bucket = self.bucket(step, num_steps);
+        let in_step = integrator.evaluations();
+        let refreshes = |evaluation: usize| evaluation.is_multiple_of(refresh);
+        for evaluation in 0..num_steps * in_step {
+            let step = evaluation / in_step;
+            let bucket = self.bucket(evaluation, num_steps * in_step);
             let times = &mut workspace.dit.times;
             times.clear();
             times.resize(pass.context.batch, self.dit.time(self.engine, bucket));
-            let rows = if !refreshes(step) {
+            let rows = if !refreshes(evaluation) {
                 Rows::Actions
-            } else if step + 1 < num_steps && !refreshes(step + 1) {
+            } else if evaluation + 1 < num_steps * in_step && !refreshes(evaluation + 1) {
                 Rows::NeededAndHeld
             } else {
                 pass.rows
             };
             self.step_velocity(&Pass { step, rows, ..*pass }, |_| bucket, recorded, workspace);
-            for (x, v) in workspace.x.iter_mut().zip(&workspace.velocity) {
-                *x += dt * v;
+            let Workspace {
+                x, start, velocity, ..
+            } = &mut *workspace;
+            let dt = match (integrator, evaluation % in_step) {
+                (Integrator::Euler, _) => dt,
+                (Integrator::Midpoint, 0) => {
+                    sized(start, x.len()).copy_from_slice(x);
+                    dt / 2.0
+                }
+                (Integrator::Midpoint, _) => {
+                    x.copy_from_slice(start);
+                    dt
+                }
+            };
+            for (x, v) in x.iter_mut().zip(velocity) {
+                *x += dt * *v;
             }
         }
     }
 
-    /// The bucket of Euler step `step`: float64, truncated, as the released sampler does.
-    fn bucket(&self, step: usize, num_steps: usize) -> usize {
-        (step as f64 / num_steps as f64 * self.config.num_timestep_buckets as f64) as usize
+    /// The bucket of evaluation number `index` of `count` at equal times: float64, truncated, as the released sampler does.
+    fn bucket(&self, index: usize, count: usize) -> usize {
+        (index as f64 / count as f64 * self.config.num_timestep_buckets as f64) as usize
     }
 
     /// One state row for each batch element, to `workspace.state (batch, width)`.

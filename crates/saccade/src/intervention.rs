@@ -246,20 +246,23 @@ impl<'a> Changes<'a> {
         Ok(changes)
     }
 
-    /// That no row is patched at a step at which it does not run: at steps that `refresh` does not divide only action rows do.
+    /// That no row is patched at a step at which it does not run: at evaluations of the velocity that `refresh` does not divide only
+    /// action rows do. A step has `in_step` evaluations.
     ///
     /// # Errors
     /// [`Error::Input`] for such a patch.
-    pub(crate) fn check_refresh(&self, refresh: usize) -> Result<()> {
+    pub(crate) fn check_refresh(&self, refresh: usize, in_step: usize) -> Result<()> {
         let actions = self.extent.groups.range(Group::Action).start;
         let stays = |patch: &&PatchedRows<'_>| {
-            !patch.step.is_multiple_of(refresh) && patch.rows.iter().any(|row| *row < actions)
+            let mut evaluations = patch.step * in_step..(patch.step + 1) * in_step;
+            patch.rows.iter().any(|row| *row < actions)
+                && evaluations.any(|evaluation| !evaluation.is_multiple_of(refresh))
         };
         match self.patches.iter().find(stays) {
             None => Ok(()),
             Some(PatchedRows { step, block, .. }) => Err(Error::Input(format!(
                 "patch[({step}, {block})]: expected action tokens, since with future_refresh {refresh} the rows of state and future tokens \
-                 do not run at step {step}"
+                 do not always run at step {step}"
             ))),
         }
     }

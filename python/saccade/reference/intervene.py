@@ -99,7 +99,9 @@ class Run:
         config: the head's.
         vl_embs: `(B, S, context_dim)`; its dtype and device are those of the run.
         num_steps: Euler steps.
-        future_refresh: the rows of state and future tokens run at every so many steps, from the first one on.
+        in_step: evaluations of the velocity in each step.
+        future_refresh: the rows of state and future tokens run at every so many evaluations, from the first
+            one on.
         intervention: one, several or none.
         drop_vl: bool `(B, S)`, True where a vision-language token is removed.
         stop_gradient: pairs as in `Intervention.cut`, cut in the backward pass only.
@@ -122,6 +124,7 @@ class Run:
         vl_embs: Tensor,
         *,
         num_steps: int,
+        in_step: int = 1,
         future_refresh: int = 1,
         intervention: Intervention | Sequence[Intervention] | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
@@ -132,6 +135,7 @@ class Run:
     ) -> None:
         self.config = config
         self.num_steps = num_steps
+        self.in_step = in_step
         self.future_refresh = future_refresh
         self.batch, num_vl_tokens, _ = vl_embs.shape
         self.dtype, self.device = vl_embs.dtype, vl_embs.device
@@ -164,18 +168,19 @@ class Run:
             self.check(edit)
         self.check_edges("stop_gradient", self.stopped)
 
-    def first_row(self, step: int) -> int:
-        """The first row that runs at this Euler step: 0, or the first of the actions."""
-        return 0 if step % self.future_refresh == 0 else self.rows["action"].start
+    def first_row(self, evaluation: int) -> int:
+        """The first row that runs at this evaluation of the velocity: 0, or the first of the actions."""
+        return 0 if evaluation % self.future_refresh == 0 else self.rows["action"].start
 
     def hold(self, block: int, y: Tensor) -> None:
         """Holds the rows of state and future tokens, of all rows `(B, R, width)`."""
         self.held[block] = y[:, : self.rows["action"].start]
 
-    def change(self, step: int, block: int) -> BlockChange:
-        """What happens in this block of this Euler step, to the rows that run."""
+    def change(self, evaluation: int, block: int) -> BlockChange:
+        """What happens in this block of this evaluation of the velocity, to the rows that run."""
+        step = evaluation // self.in_step
         place, cross = (step, block), is_cross(self.config, block)
-        first = self.first_row(step)
+        first = self.first_row(evaluation)
         holds = not cross and first == 0 and self.future_refresh > 1
         shown = self.kept.acts(step, block)
         attention, hidden = shown and self.keep_attention, shown and self.keep_hidden
@@ -266,10 +271,11 @@ class Run:
                 batch = (self.batch,) if rows.ndim == 3 else ()
                 count = self.count(name, chosen)
                 check_shape(f"{name}: {chosen[0]}", rows, (*batch, count, self.config.width))
-                if count and self.first_row(step) > 0 and chosen[0] != "action":
+                evaluations = range(step * self.in_step, (step + 1) * self.in_step)
+                if count and chosen[0] != "action" and any(map(self.first_row, evaluations)):
                     raise InputError(
                         f"{name}: {chosen[0]} tokens, expected action tokens, since with future_refresh "
-                        f"{self.future_refresh} the others do not run at step {step}"
+                        f"{self.future_refresh} the others do not always run at step {step}"
                     )
 
     def check_edges(self, name: str, edit: Edit) -> None:

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from saccade._arrays import integer
 from saccade.config import HeadConfig
 from saccade.errors import InputError
+from saccade.integrator import INTEGRATORS, check_integrator
 from saccade.intervention import Intervention, Tokens
 from saccade.reference import loading, tables
 from saccade.reference.checks import check_shape
@@ -507,14 +508,14 @@ class ActionHead(nn.Module):
     def velocity_in(
         self,
         run: Run,
-        step: int,
+        evaluation: int,
         vl_embs: Tensor,
         state: Tensor | np.ndarray,
         embodiment_id: int | Tensor | np.ndarray,
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
     ) -> Tensor:
-        """`velocity` at one Euler step of a run, of which only those rows run that the run says."""
+        """`velocity` number `evaluation` of a run, of which only those rows run that the run says."""
         config, horizon = self.config, self.config.action_horizon
         actions, state = self.as_input(actions), self.as_input(state)
         batch = vl_embs.shape[0]
@@ -533,8 +534,10 @@ class ActionHead(nn.Module):
             action_rows = action_rows + self.position_embedding.weight[:horizon]
         rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
 
-        changes = [run.change(step, block) for block in range(config.num_layers)]
-        hidden = self.model(rows[:, run.first_row(step) :], vl_embs, timestep, changes)  # (B, R', hidden_dim)
+        changes = [run.change(evaluation, block) for block in range(config.num_layers)]
+        hidden = self.model(
+            rows[:, run.first_row(evaluation) :], vl_embs, timestep, changes
+        )  # (B, R', hidden_dim)
         return self.action_decoder(hidden[:, -horizon:], embodiment_id)  # (B, T, action_dim)
 
     def sample(
@@ -545,6 +548,7 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
+        integrator: str | None = None,
         future_refresh: int | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
@@ -556,10 +560,12 @@ class ActionHead(nn.Module):
             vl_embs, state, embodiment_id: as in `velocity`.
             noise: `(B, T, encoder_action_dim)`, standard normal.
             num_steps: default as the config says.
-            future_refresh: the rows of state and future tokens run at every so many steps only, from the
-                first one on. At the others self-attention reads them as it last did. Default: at all steps.
-            drop_vl, intervention, stop_gradient: as in `trace`. A patch of rows at a step at which they do
-                not run is an error.
+            integrator: "euler" (default), or "midpoint", whose steps evaluate the velocity twice.
+            future_refresh: the rows of state and future tokens run at every so many evaluations of the
+                velocity only, from the first one on. At the others self-attention reads them as it last did.
+                Default: at all.
+            drop_vl, intervention, stop_gradient: as in `trace`. All evaluations of a step are that step. A
+                patch of rows at a step at which they do not always run is an error.
 
         Returns:
             Actions `(B, T, action_dim)`, normalised.
@@ -568,12 +574,13 @@ class ActionHead(nn.Module):
         run = self.run_of(
             vl_embs,
             num_steps,
+            in_step=INTEGRATORS[check_integrator(integrator)],
             future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
             drop_vl=drop_vl,
             intervention=intervention,
             stop_gradient=stop_gradient,
         )
-        return self.euler_steps(run, vl_embs, state, embodiment_id, noise)
+        return self.follow(run, vl_embs, state, embodiment_id, noise)
 
     def trace(
         self,
@@ -625,7 +632,7 @@ class ActionHead(nn.Module):
             blocks=blocks,
             steps=steps,
         )
-        actions = self.euler_steps(run, vl_embs, state, embodiment_id, noise)
+        actions = self.follow(run, vl_embs, state, embodiment_id, noise)
         return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
 
     def run_of(self, vl_embs: Tensor, num_steps: int | None, **options: Any) -> Run:
@@ -637,7 +644,7 @@ class ActionHead(nn.Module):
         check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
         return Run(config, vl_embs, num_steps=num_steps, **options)
 
-    def euler_steps(
+    def follow(
         self,
         run: Run,
         vl_embs: Tensor,
@@ -646,11 +653,18 @@ class ActionHead(nn.Module):
         noise: Tensor | np.ndarray,
     ) -> Tensor:
         """The steps of `sample`: actions `(B, T, action_dim)`."""
+
+        def velocity(evaluation: int, actions: Tensor) -> Tensor:
+            time = evaluation / (run.num_steps * run.in_step)
+            bucket = int(time * self.config.num_timestep_buckets)
+            return self.velocity_in(run, evaluation, vl_embs, state, embodiment_id, actions, bucket)
+
         actions = self.as_input(noise)
         for step in range(run.num_steps):
-            bucket = int(step / run.num_steps * self.config.num_timestep_buckets)
-            velocity = self.velocity_in(run, step, vl_embs, state, embodiment_id, actions, bucket)
-            actions = actions + velocity / run.num_steps
+            direction = velocity(step * run.in_step, actions)
+            if run.in_step == 2:  # the midpoint rule
+                direction = velocity(2 * step + 1, actions + direction / (2 * run.num_steps))
+            actions = actions + direction / run.num_steps
         return actions
 
     def forward(
@@ -661,6 +675,7 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
+        integrator: str | None = None,
         future_refresh: int | None = None,
         drop_vl: Tensor | np.ndarray | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
@@ -673,6 +688,7 @@ class ActionHead(nn.Module):
             embodiment_id,
             noise=noise,
             num_steps=num_steps,
+            integrator=integrator,
             future_refresh=future_refresh,
             drop_vl=drop_vl,
             intervention=intervention,
