@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "train": "train the policy on recorded demonstrations",
     "attention": "show what the rows of the action head look at",
     "study": "measure what the future tokens do, in closed loop and inside the head",
+    "bench": "time the action head beside what this machine allows",
     "parity": "compare the Rust head with the reference in torch",
     "quantize": "write a copy of a checkpoint with int8 weights",
 }
