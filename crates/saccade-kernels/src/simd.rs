@@ -645,7 +645,8 @@ mod x86 {
         const LANES: usize = 8;
         const REGISTERS: usize = 16;
         type Ints = __m256i;
-        // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates.
+        // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates. The other ways out cost more: 7 bits in the weights
+        // lose as much (0.018 instead of 0.011 of the result, beside 0.017), 16-bit products take the time of float32.
         const MAX_BYTE: u8 = 129;
 
         #[inline(always)]

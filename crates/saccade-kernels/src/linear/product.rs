@@ -6,11 +6,11 @@ use super::rows::Quantized;
 use super::tile::Panel;
 use crate::simd::{Dots, Vector};
 
-/// One way to multiply rows by a panel: a step takes a vector of 4-byte words of the panel, which are [`Self::STEP`] consecutive `k` of each
-/// column, and [`Self::ROW_WORDS`] words of each row.
 /// One running float32 sum over the 8192 inputs of a feed-forward loses five times as much as parts of 512 do (measured on the full head).
 const SUM_PART: usize = 512;
 
+/// One way to multiply rows by a panel: a step takes vectors of 4-byte words of the panel, which are [`Self::STEP`] consecutive `k` of each
+/// column, and as many `k` of each row.
 pub(super) trait Product<V: Vector> {
     /// Consecutive `k` in a word of the panel.
     const STEP: usize;
