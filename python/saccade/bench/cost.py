@@ -16,14 +16,12 @@ from saccade.config import HeadConfig
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 
-#: Bytes of a weight in memory. The weights of a float32 head stay as the checkpoint has them.
-WEIGHT_BYTES = {"float32": 4, "bfloat16": 2, "int8": 1}
+#: Bytes of a weight, or of a held key or value, in memory. A float32 head keeps weights that are stored as
+#: bfloat16 so: floors are then too high where reading sets them, as it may where only action rows run.
+ELEMENT_BYTES = {"float32": 4, "bfloat16": 2, "int8": 1}
 
-#: The arithmetic of the attention, and the bytes of a held key or value.
-ATTENTION_RUNS_IN = {"float32": ("float32", 4), "bfloat16": ("bfloat16", 2), "int8": ("bfloat16", 2)}
-
-#: What always runs in float32: layers of the embodiment, which are a thousandth of the work.
-FLOAT32_PARTS = ("embodiment",)
+#: What an int8 head runs in bfloat16: a hundredth of the work.
+NOT_INT8 = (*ATTENTION, "embodiment", "output")
 
 
 @dataclass(frozen=True)
@@ -85,16 +83,7 @@ EFFICIENCY = {
 
 def arithmetic(part: str, precision: str) -> str:
     """The arithmetic that a part runs in at this precision of the head."""
-    if part in FLOAT32_PARTS:
-        return "float32"
-    return ATTENTION_RUNS_IN[precision][0] if part in ATTENTION else precision
-
-
-def element_bytes(part: str, precision: str) -> int:
-    """Bytes of what a part reads: weights, or held keys and values."""
-    if part in FLOAT32_PARTS:
-        return 4
-    return ATTENTION_RUNS_IN[precision][1] if part in ATTENTION else WEIGHT_BYTES[precision]
+    return "bfloat16" if precision == "int8" and part in NOT_INT8 else precision
 
 
 def floor(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float) -> float:
@@ -107,8 +96,8 @@ def floor(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float
 
 def floor_of(machine: Machine, precision: str, part: str, work: Work) -> float:
     """`floor` of one part of the head."""
-    read = work.elements * element_bytes(part, precision)
-    return floor(machine, arithmetic(part, precision), work.multiply_adds, read)
+    runs_in = arithmetic(part, precision)
+    return floor(machine, runs_in, work.multiply_adds, work.elements * ELEMENT_BYTES[runs_in])
 
 
 def floors(machine: Machine, precision: str, works: Works) -> dict[str, float]:
