@@ -17,6 +17,7 @@ from reference_cases import small_config
 
 import saccade
 from saccade import InputError
+from saccade.bench import heads
 from saccade.cli import main
 from saccade.reference import ActionHead as Reference
 from saccade.reference import random_weights
@@ -86,6 +87,7 @@ def test_a_mode_has_the_name_that_it_was_read_from(name: str) -> None:
         "float32-euler-4-refresh",
         "float32-euler-4-refresh-0",
         "float32-heun-4-refresh-2",
+        "float32-times-4-refresh-2",
         "float32-euler-4-drop-100",
         "float32-euler-4-drop-1-drop-2",
         "float32-euler-4-skip-2",
@@ -100,7 +102,7 @@ def test_other_names_are_refused(name: str) -> None:
 
 
 def test_modes_ask_as_often_as_they_say() -> None:
-    for integrator in INTEGRATORS:
+    for integrator in set(INTEGRATORS) - {"midpoint"}:  # which the head does itself
         calls: list[float] = []
 
         def velocity(x: npt.NDArray[np.float32], time: float, calls: list[float] = calls) -> Any:
@@ -126,7 +128,7 @@ def test_integrators_have_the_order_that_their_names_promise() -> None:
         assert found[0, 0, 2] == 7.0
         return float(np.abs(found[..., :2] - exact).max())
 
-    for integrator, order in (("euler", 1), ("heun", 2), ("midpoint", 2), ("adams", 2)):
+    for integrator, order in (("euler", 1), ("heun", 2), ("adams", 2)):
         measured = math.log2(error(integrator, 16) / error(integrator, 32))
         assert measured == pytest.approx(order, abs=0.3), integrator
         assert start[0, 0, 0] == 0.5  # what was given stays
@@ -191,6 +193,21 @@ def test_integrators_against_the_reference_in_float64(checkpoint: Path, integrat
             x = x + 0.5 * first
             x = x + 0.5 * (1.5 * velocity(x, 500) - 0.5 * first)
     np.testing.assert_allclose(found, x, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+def test_a_mode_loads_its_precision(checkpoint: Path, precision: str) -> None:
+    exact, lower = (saccade.ActionHead.load(checkpoint, precision=one) for one in ("float32", precision))
+    features, state, _, noise = observation(exact)
+    engine = ModeEngine(str(checkpoint), Mode.parse(f"{precision}-euler-4"), PLAIN)
+    found = engine.sample(engine.encode(features), state, noise)
+    np.testing.assert_array_equal(
+        found, lower.sample(lower.encode(features), state, 0, noise=noise, num_steps=4)
+    )
+    change = np.abs(
+        found - np.asarray(exact.sample(exact.encode(features), state, 0, noise=noise, num_steps=4))
+    )
+    assert 0 < change.max() < 0.2
 
 
 @pytest.mark.parametrize("refresh", [2, 3])
@@ -365,8 +382,8 @@ def test_no_loss_is_the_interval_that_excludes_it() -> None:
 def test_one_episode_in_every_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = random_weights.small_config()
-    monkeypatch.setattr(random_weights, "n15_config", lambda num_embodiments: small)
+    sized = heads.sized
+    monkeypatch.setattr(heads, "sized", lambda size: sized("small"))
     monkeypatch.setattr(fast, "FULL_TOKENS", 7)
     monkeypatch.setattr(fast, "MOST_ROUNDS", 3)
     monkeypatch.setattr(fast, "CALIBRATION_EPISODES", 1)

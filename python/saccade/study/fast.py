@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
+from saccade.bench import heads
 from saccade.errors import InputError
 from saccade.head import ActionHead, Context
 from saccade.sim.policy import EMBODIMENT_ID, Float32Array, Policy
@@ -56,24 +57,19 @@ SCREENED = (
     *(f"{precision}-euler-{steps}" for precision in PRECISIONS for steps in (1, 2, 4, 8)),
     *(f"float32-{rest}" for rest in ("euler-3", "heun-1", "heun-2", "midpoint-1", "midpoint-2")),
     *(f"float32-{rest}" for rest in ("adams-2", "adams-3", "adams-4", "times-2", "times-3")),
+    *(f"{precision}-midpoint-1-refresh-2" for precision in ("float32", "int8")),
     *(f"{precision}-euler-4-refresh-{every}" for precision in ("float32", "int8") for every in (2, 4)),
     *(f"float32-euler-4-drop-{percent}" for percent in (25, 50, 75)),
 )
 # What runs in closed loop if nothing else is asked for; docs/fast.md says how it was chosen by the screening.
 JUDGED = (
-    BASELINE,
     ONE_STEP,
-    "float32-euler-2",
-    "float32-times-2",
-    "float32-midpoint-1",
-    "float32-euler-4-refresh-2",
-    "float32-euler-4-refresh-4",
-    "float32-euler-4-drop-50",
+    *(f"float32-{rest}" for rest in ("euler-2", "euler-3", "adams-2", "adams-3", "times-2", "midpoint-1")),
+    *(f"float32-euler-4-{rest}" for rest in ("refresh-2", "refresh-4", "drop-25", "drop-50")),
+    "float32-midpoint-1-refresh-2",
     "bfloat16-euler-4",
-    "bfloat16-euler-2",
-    "int8-euler-4",
-    "int8-euler-2",
-    "int8-euler-4-refresh-4",
+    *(f"int8-euler-{rest}" for rest in ("2", "4", "4-refresh-2", "4-refresh-4")),
+    *(f"int8-midpoint-1{rest}" for rest in ("", "-refresh-2")),
 )
 CALIBRATION_EPISODES = 8  # of each task, on seeds that are kept for choosing; as many observations of a file
 FEWEST_ROUNDS, MOST_ROUNDS = 3, 40
@@ -81,9 +77,9 @@ ROUNDS_SECONDS = 120.0  # that are not exceeded once there are the fewest
 
 EPILOG = f"""\
 A mode is PRECISION-INTEGRATOR-STEPS, then -refresh-NUMBER (state and future rows computed anew at every so
-many steps) and -drop-PERCENT (vision-language tokens removed, those with the least attention). Precisions:
-{", ".join(PRECISIONS)}. Integrators: euler, heun, midpoint, adams, and times (Euler at step times that
-are optimised on other episodes first). All are compared with {BASELINE}.
+many evaluations) and -drop-PERCENT (vision-language tokens removed, those with the least attention).
+Precisions: {", ".join(PRECISIONS)}. Integrators: euler, midpoint, heun, adams, and times (Euler at step
+times that are optimised on other episodes first). All are compared with {BASELINE}.
 
 Parts: chunks (the error of each mode's chunk, on what the unchanged policy saw), episodes (closed loop,
 paired by episode), time (of a chunk, on an idle machine if the numbers are to be kept; also at N1.5's size
@@ -131,8 +127,10 @@ class Simulated:
 
     checkpoint: str
     tasks: tuple[str, ...]
-    config = None
-    num_threads = 1  # of the head, for studies spread out over processes
+
+    def head(self, precision: str) -> ActionHead:
+        """Its head, on one thread: episodes are spread out over processes."""
+        return head_of(self.checkpoint, None, precision, 1)
 
     def looks(self, task: str, seed: int) -> list[Given]:
         """All looks of an episode of the unchanged policy."""
@@ -177,20 +175,12 @@ class FromFile:
 
     recording: Recording
 
-    @property
-    def checkpoint(self) -> str:
-        """Whatever `ActionHead.load` reads."""
-        return self.recording.checkpoint
-
-    @property
-    def config(self) -> str | None:
-        """Path of its config, or None."""
-        return self.recording.config
-
-    @property
-    def num_threads(self) -> int | None:
-        """Of the head; None is the engine's own choice."""
-        return self.recording.num_threads
+    def head(self, precision: str) -> ActionHead:
+        """The head; in float32 the one that the file was checked against."""
+        one = self.recording
+        if precision == "float32":
+            return features.head_of(one)
+        return head_of(one.checkpoint, one.config, precision, one.num_threads)
 
     def looks(self, task: str, seed: int) -> list[Given]:
         """One observation of the file; `seed` is its row."""
@@ -300,7 +290,11 @@ def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int
         calibrates = True
     modes = {
         part: [Mode.parse(name) for name in dict.fromkeys((BASELINE, *(settings.modes or defaults)))]
-        for part, defaults in ((CHUNKS, SCREENED), (EPISODES, (ONE_STEP, *JUDGED)), (TIME, SCREENED))
+        for part, defaults in (
+            (CHUNKS, (*SCREENED, *JUDGED)),
+            (EPISODES, JUDGED),
+            (TIME, (*SCREENED, *JUDGED)),
+        )
         if part in settings.parts
     }
     if not calibrates:
@@ -377,7 +371,7 @@ class CalibrationWork:
 
     def __call__(self, cell: Cell) -> Rows:
         """A row for each step time but the first and the last, or for each position."""
-        head = head_of(self.source.checkpoint, self.source.config, "float32", self.source.num_threads)
+        head = self.source.head("float32")
         looks = calibration_looks(self.source)
         contexts = [head.encode(one.features, drop_vl=one.removed) for one in looks]
         if cell.key[1] == "mass":
@@ -454,7 +448,7 @@ class Work:
 
     def chunks(self, task: str, seed: int, mode: Mode) -> dict[str, Any]:
         """How far the mode's chunks are from those of the baseline, and from those of many steps."""
-        head = head_of(self.source.checkpoint, self.source.config, mode.precision, self.source.num_threads)
+        head = self.source.head(mode.precision)
         changes, errors, scales = [], [], []
         for known in compared(self.source, task, seed):
             one = known.given
@@ -478,27 +472,21 @@ class Work:
         """The checkpoint's own head, on one of the observations."""
         source = self.source
         one = calibration_looks(source)[0] if isinstance(source, Simulated) else source.looks("", 0)[0]
-        heads = {
-            precision: head_of(source.checkpoint, source.config, precision, source.num_threads)
+        loaded = {
+            precision: source.head(precision)
             for precision in dict.fromkeys(mode.precision for mode in self.timed)
         }
-        return times_of(self.timed, heads, self.calibration, one)
+        return times_of(self.timed, loaded, self.calibration, one)
 
     def time_full(self) -> Rows:
         """A head of N1.5's size with random weights. Which tokens are dropped does not matter to the time."""
-        import torch
-
-        from saccade.reference import random_weights
-
         with tempfile.TemporaryDirectory() as name:
-            random_weights.write_checkpoint(
-                Path(name), random_weights.n15_config(num_embodiments=1), 0, dtype=torch.bfloat16
-            )
-            heads = {
+            heads.write(Path(name), heads.sized(FULL))
+            loaded = {
                 precision: ActionHead.load(name, precision=precision)
                 for precision in dict.fromkeys(mode.precision for mode in self.timed)
             }
-        config = next(iter(heads.values())).config
+        config = next(iter(loaded.values())).config
         rng = np.random.default_rng(0)
 
         def normal(*shape: int) -> Float32Array:
@@ -513,7 +501,7 @@ class Work:
             None,
         )
         mass = Calibration(self.calibration.times, tuple(rng.random(FULL_TOKENS)))
-        return times_of(self.timed, heads, mass, one)
+        return times_of(self.timed, loaded, mass, one)
 
 
 @functools.lru_cache(maxsize=64)
@@ -545,10 +533,7 @@ class Compared:
 @functools.lru_cache(maxsize=1)
 def compared(source: Source, task: str, seed: int) -> list[Compared]:
     """The looks of an episode, or an observation of a file; kept for the next mode."""
-    mode, head = (
-        Mode.parse(BASELINE),
-        head_of(source.checkpoint, source.config, "float32", source.num_threads),
-    )
+    mode, head = Mode.parse(BASELINE), source.head("float32")
     found = []
     for one in source.looks(task, seed):
         context = head.encode(one.features, drop_vl=one.removed)
@@ -564,7 +549,7 @@ def compared(source: Source, task: str, seed: int) -> list[Compared]:
 
 
 def times_of(
-    modes: Sequence[Mode], heads: Mapping[str, ActionHead], calibration: Calibration, one: Given
+    modes: Sequence[Mode], loaded: Mapping[str, ActionHead], calibration: Calibration, one: Given
 ) -> Rows:
     """Milliseconds of `encode` and `sample` in each mode, round by round, in another order in each.
 
@@ -573,7 +558,7 @@ def times_of(
     """
 
     def timed(mode: Mode) -> tuple[float, float]:
-        head = heads[mode.precision]
+        head = loaded[mode.precision]
         start = time.perf_counter()
         context = encode(head, mode, calibration, one.features, one.removed)
         encoded = time.perf_counter()
@@ -602,8 +587,8 @@ def times_of(
                 "chunk_ms_low": float(low),
                 "chunk_ms_high": float(high),
                 "rounds": len(each),
-                "num_threads": heads[mode.precision].num_threads,
-                "isa": heads[mode.precision].isa,
+                "num_threads": loaded[mode.precision].num_threads,
+                "isa": loaded[mode.precision].isa,
                 "num_vl_tokens": one.features.shape[1],
             }
         )

@@ -260,7 +260,7 @@ def summary(table: pd.DataFrame, provenance: Provenance, results: Mapping[str, M
         )
     lines.append(
         "A mode is precision-integrator-steps, then refresh (state and future rows computed anew at every so "
-        "many steps) and drop (percent of the vision-language tokens removed, those with the least "
+        "many evaluations) and drop (percent of the vision-language tokens removed, those with the least "
         f"attention). All are compared with {BASELINE}, what the released code does."
     )
     if not chunks.empty:
