@@ -5,7 +5,7 @@ Run with the package and torch installed; prints a Markdown table, that of docs/
 
     python benches/precision_groups.py CHECKPOINT [--embodiment-id 0]
     python benches/precision_groups.py --full               N1.5's size, seeded random weights; 4 GB of memory
-    python benches/precision_groups.py --full --outliers    the same with a few channels 20 times as large
+    python benches/precision_groups.py --full --outliers    the same with a few channels 2.5 times as large
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def add_outliers(head: ActionHead) -> None:
     for name, module in head.named_modules():
         if isinstance(module, nn.Linear) and re.fullmatch(rf"({VL}|{DIT})(attn1|ff)\..*", name):
             with torch.no_grad():
-                module.weight[:, ::64] *= 20 / 64**0.5
+                module.weight[:, ::64] *= 2.5
                 module.weight[::64] *= 2
 
 
