@@ -68,6 +68,7 @@ JUDGED = (
     *(f"float32-euler-4-{rest}" for rest in ("refresh-2", "refresh-4", "drop-25", "drop-50")),
     "float32-midpoint-1-refresh-2",
     "bfloat16-euler-4",
+    "bfloat16-midpoint-1",
     *(f"int8-euler-{rest}" for rest in ("2", "4", "4-refresh-2", "4-refresh-4")),
     *(f"int8-midpoint-1{rest}" for rest in ("", "-refresh-2")),
 )
