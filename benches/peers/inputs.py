@@ -44,13 +44,13 @@ def config_of(case: Case) -> dict[str, Any]:
 
 def checkpoint(case: Case, folder: Path) -> Path:
     """The checkpoint of the case's piece under `folder`, float32; written if it is not there."""
-    import torch
-
-    from saccade.reference import random_weights
-
     piece = {"cost": "head", "linear": "cross"}.get(case.piece, case.piece)
     path = folder / f"{case.size}-{piece}-n{case.num_future_tokens}"
     if not path.exists():
+        import torch
+
+        from saccade.reference import random_weights
+
         part = path.with_name(path.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)

@@ -199,9 +199,12 @@ def machine(results: Results) -> str:
         f"{held['cpu']} ({held['family']}), {held['cores']} cores, {held['memory_gb']} GB, "
         f"Linux {held['kernel']}; flags {', '.join(held['flags'])}. {versions}; commit {held['commit']}.",
     ]
+    forced = {
+        one.environment["SACCADE_ISA"] for one in CONTENDERS.values() if "SACCADE_ISA" in one.environment
+    }
     rows = []
     for threads in sorted({entry["threads"] for entry in results.data["peaks"]}):
-        for isa in held["isas"]:
+        for isa in (held["isa"], *sorted(forced)):
             kinds = ("float32", "bfloat16", "int8")
             cells = [results.peak(threads, isa, kind) for kind in kinds]
             if any(cells):
