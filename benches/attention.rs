@@ -8,8 +8,19 @@ use saccade_benches::random::Random;
 use saccade_benches::report::Report;
 use saccade_kernels::{Arithmetic, Element, Isa, LogitBias, PackedKeyValues, attention};
 
-/// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, self-attention of a VL block.
-const SHAPES: [(usize, usize, usize, usize); 3] = [(49, 296, 32, 48), (49, 49, 32, 48), (296, 296, 32, 64)];
+/// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, with one camera and with three, the same of the action
+/// rows alone; self-attention of a VL block; a head of width 128.
+const SHAPES: [(usize, usize, usize, usize); 9] = [
+    (49, 296, 32, 48),
+    (49, 822, 32, 48),
+    (49, 49, 32, 48),
+    (16, 296, 32, 48),
+    (16, 49, 32, 48),
+    (296, 296, 32, 64),
+    (822, 822, 32, 64),
+    (49, 296, 4, 32),
+    (49, 49, 4, 32),
+];
 
 struct Shape {
     queries: usize,
@@ -29,7 +40,7 @@ impl Shape {
 
 fn main() {
     let options = Options::from_args();
-    let mut report = Report::begin("attention, float32 arithmetic", &options);
+    let mut report = Report::begin("attention", &options);
     for (queries, keys, num_heads, head_dim) in SHAPES {
         let name = format!("{queries} queries, {keys} keys, {num_heads} heads x {head_dim}");
         if !options.wants(&name) {
@@ -56,7 +67,10 @@ fn main() {
         for &threads in &options.threads {
             for isa in Isa::available() {
                 contenders.push(Contender::peak(isa, Arithmetic::Float32, threads));
-                saccade(&shape, isa, threads, &bias, &mut contenders);
+                contenders.push(Contender::peak(isa, Arithmetic::Bfloat16, threads));
+                for element in [Element::F32, Element::Bf16] {
+                    saccade(&shape, isa, element, threads, &bias, &mut contenders);
+                }
             }
         }
         if options.threads.contains(&1) {
@@ -70,22 +84,26 @@ fn main() {
 fn saccade<'a>(
     shape: &'a Shape,
     isa: Isa,
+    element: Element,
     threads: usize,
     bias: &'a [f32],
     contenders: &mut Vec<Contender<'a>>,
 ) {
     let width = shape.width();
     let scale = 1.0 / (shape.head_dim as f32).sqrt();
-    let mut held = PackedKeyValues::new(isa, Element::F32, shape.num_heads, shape.head_dim);
+    let mut held = PackedKeyValues::new(isa, element, shape.num_heads, shape.head_dim);
     let (k, v) = (rows(&shape.k, width), rows(&shape.v, width));
     held.pack(threads, k, v);
-    let base = if isa == Isa::Portable { Isa::best() } else { isa };
+    let arithmetic = match element {
+        Element::Bf16 => Arithmetic::Bfloat16,
+        _ => Arithmetic::Float32,
+    };
     let mut add = |what: &str, run: Box<dyn FnMut() + 'a>| {
         contenders.push(Contender {
-            name: format!("saccade {isa}{what}"),
+            name: format!("saccade {isa} {element:?}{what}"),
             threads,
             work: macs(shape),
-            relative_to: Some(Contender::peak_name(base, Arithmetic::Float32)),
+            relative_to: Some(Contender::peak_name(isa, arithmetic)),
             run,
         });
     };

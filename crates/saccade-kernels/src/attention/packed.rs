@@ -1,15 +1,15 @@
 //! Keys and values in the layout that the tiles read, and how they get there.
 
+use std::marker::PhantomData;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use faer::MatRef;
-use half::bf16;
 
 use crate::aligned::AlignedBuffer;
 use crate::isa::Isa;
 use crate::linear::Element;
 use crate::pool::parallel_for;
-use crate::simd::lanes;
+use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots, lanes, load};
 
 /// Elements from which packing on a second thread pays.
 const ELEMENTS_FOR_THREADS: usize = 1 << 16;
@@ -123,10 +123,9 @@ impl PackedKeyValues {
             first,
             keys_to: self.keys.as_mut_ptr(),
             values_to: self.values.as_mut_ptr(),
-            lanes: lanes(self.isa),
             head_dim: self.head_dim,
         };
-        let element = self.element;
+        let (isa, element) = (self.isa, self.element);
         let threads = if 2 * rows * width < ELEMENTS_FOR_THREADS {
             1
         } else {
@@ -134,11 +133,20 @@ impl PackedKeyValues {
         };
         parallel_for(threads, self.num_heads, &|head| {
             // SAFETY: heads write their own parts of the two buffers, which have room for all of them.
-            let head_is_finite = unsafe {
-                match element {
-                    Element::Bf16 => job.head::<bf16>(head, keys_size, values_size),
-                    _ => job.head::<f32>(head, keys_size, values_size),
+            let head = unsafe {
+                Head {
+                    job: &job,
+                    head,
+                    keys_to: std::slice::from_raw_parts_mut(job.keys_to.add(head * keys_size), keys_size),
+                    values_to: std::slice::from_raw_parts_mut(
+                        job.values_to.add(head * values_size),
+                        values_size,
+                    ),
                 }
+            };
+            let head_is_finite = match element {
+                Element::Bf16 => dispatch_dots(isa, head),
+                _ => dispatch(isa, head),
             };
             if !head_is_finite {
                 finite.store(false, Ordering::Relaxed);
@@ -236,55 +244,6 @@ fn reserve(buffer: &mut AlignedBuffer<u32>, elements: usize) {
     }
 }
 
-/// An element as it is held: `STEP` of them in a word.
-trait Held {
-    const STEP: usize;
-
-    /// The bits of `x`, to be shifted to its place in a word.
-    fn bits(x: f32) -> u32;
-
-    /// Whether `bits` are a finite number's.
-    fn is_finite(bits: u32) -> bool;
-}
-
-impl Held for f32 {
-    const STEP: usize = 1;
-
-    #[inline(always)]
-    fn bits(x: f32) -> u32 {
-        x.to_bits()
-    }
-
-    #[inline(always)]
-    fn is_finite(bits: u32) -> bool {
-        bits & 0x7f80_0000 != 0x7f80_0000
-    }
-}
-
-impl Held for bf16 {
-    const STEP: usize = 2;
-
-    #[inline(always)]
-    fn bits(x: f32) -> u32 {
-        u32::from(bf16::from_f32(x).to_bits())
-    }
-
-    #[inline(always)]
-    fn is_finite(bits: u32) -> bool {
-        bits & 0x7f80 != 0x7f80
-    }
-}
-
-/// Puts `bits` where element number `index` of the word's belongs; the other one stays.
-#[inline(always)]
-fn put<E: Held>(word: &mut u32, index: usize, bits: u32) {
-    *word = match (E::STEP, index) {
-        (1, _) => bits,
-        (_, 0) => *word & 0xffff_0000 | bits,
-        _ => *word & 0xffff | bits << 16,
-    };
-}
-
 struct Pack<'a> {
     keys: MatRef<'a, f32>,
     values: MatRef<'a, f32>,
@@ -292,68 +251,209 @@ struct Pack<'a> {
     first: usize,
     keys_to: *mut u32,
     values_to: *mut u32,
-    lanes: usize,
     head_dim: usize,
 }
 
 // SAFETY: tasks read the views and write different heads of the buffers.
 unsafe impl Sync for Pack<'_> {}
 
-impl Pack<'_> {
-    /// Packs one head; returns whether its values are all finite.
-    ///
+/// One head to pack; the result is whether its values are all finite.
+struct Head<'a> {
+    job: &'a Pack<'a>,
+    head: usize,
+    keys_to: &'a mut [u32],
+    values_to: &'a mut [u32],
+}
+
+/// As float32.
+impl Kernel for Head<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    unsafe fn run<V: Vector>(self) -> bool {
+        // SAFETY: the caller has the instruction set.
+        unsafe { self.pack::<V, Words>() }
+    }
+}
+
+/// As pairs of bfloat16.
+impl DotKernel for Head<'_> {
+    type Output = bool;
+
+    const DOT: Dot = Dot::Bf16;
+
+    #[inline(always)]
+    unsafe fn run<V: Vector, D: Dots<V>>(self) -> bool {
+        // SAFETY: the caller has the instruction set and the dot product.
+        unsafe { self.pack::<V, Pairs<D>>() }
+    }
+}
+
+/// Lanes of the widest vector.
+const MAX_LANES: usize = 16;
+
+/// How elements become words.
+///
+/// # Safety
+/// Every method needs a CPU that has the instruction set of `V`, pointers to as many elements as they name, and room for a vector of words.
+trait Store<V: Vector> {
+    /// Elements in a word.
+    const STEP: usize;
+
+    /// The first `count` elements of a row, at most `LANES * STEP`, as a vector of words, with zeros for the rest.
+    unsafe fn along(row: *const f32, count: usize, to: *mut u32);
+
+    /// Element `i` of each of `STEP` rows, or of those that are there, in word `i`: the first `count` elements, at most `LANES`, with zeros
+    /// for the rest. Bits in `kept` stay as they are.
+    unsafe fn across(rows: [Option<*const f32>; 2], count: usize, kept: u32, to: *mut u32);
+
+    /// Whether all elements of a word are finite.
+    fn is_finite(word: u32) -> bool;
+}
+
+/// float32.
+struct Words;
+
+impl<V: Vector> Store<V> for Words {
+    const STEP: usize = 1;
+
+    #[inline(always)]
+    unsafe fn along(row: *const f32, count: usize, to: *mut u32) {
+        // SAFETY: the trait's contract; so throughout.
+        unsafe { load::<V>(row, count).store(to.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn across(rows: [Option<*const f32>; 2], count: usize, _: u32, to: *mut u32) {
+        if let Some(row) = rows[0] {
+            // SAFETY: as above.
+            unsafe { <Self as Store<V>>::along(row, count, to) }
+        }
+    }
+
+    #[inline(always)]
+    fn is_finite(word: u32) -> bool {
+        word & 0x7f80_0000 != 0x7f80_0000
+    }
+}
+
+/// Pairs of bfloat16.
+struct Pairs<D>(PhantomData<D>);
+
+impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
+    const STEP: usize = 2;
+
+    #[inline(always)]
+    unsafe fn along(row: *const f32, count: usize, to: *mut u32) {
+        // SAFETY: as above.
+        unsafe {
+            let first = load::<V>(row, V::LANES.min(count));
+            let second = load::<V>(row.wrapping_add(V::LANES), count.saturating_sub(V::LANES));
+            D::store_bf16(first, second, to.cast());
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn across(rows: [Option<*const f32>; 2], count: usize, kept: u32, to: *mut u32) {
+        let mut halves = [0_u16; 2 * MAX_LANES];
+        // SAFETY: as above; two vectors of half the width fit.
+        let to = unsafe {
+            let [first, second] = rows.map(|row| match row {
+                Some(row) => load::<V>(row, count),
+                None => V::splat(0.0),
+            });
+            D::store_bf16(first, second, halves.as_mut_ptr());
+            std::slice::from_raw_parts_mut(to, V::LANES)
+        };
+        let (low, high) = halves[..2 * V::LANES].split_at(V::LANES);
+        for ((word, &low), &high) in to.iter_mut().zip(low).zip(high) {
+            *word = *word & kept | u32::from(low) | u32::from(high) << 16;
+        }
+    }
+
+    #[inline(always)]
+    fn is_finite(word: u32) -> bool {
+        word & 0x7f80 != 0x7f80 && word & 0x7f80_0000 != 0x7f80_0000
+    }
+}
+
+impl Head<'_> {
+    /// Columns of this head in a row of `of`.
+    fn row(&self, of: MatRef<'_, f32>, index: usize) -> *const f32 {
+        of.as_ptr()
+            .wrapping_offset(index as isize * of.row_stride())
+            .wrapping_add(self.head * self.job.head_dim)
+    }
+
     /// # Safety
-    /// The buffers have room for `head + 1` heads of the given sizes, and nobody else touches this one.
-    unsafe fn head<E: Held>(&self, head: usize, keys_size: usize, values_size: usize) -> bool {
+    /// The CPU has the instruction set of `V`, and what `S` needs.
+    #[inline(always)]
+    unsafe fn pack<V: Vector, S: Store<V>>(mut self) -> bool {
         // SAFETY: the caller's promise.
-        let (keys_to, values_to) = unsafe {
-            (
-                std::slice::from_raw_parts_mut(self.keys_to.add(head * keys_size), keys_size),
-                std::slice::from_raw_parts_mut(self.values_to.add(head * values_size), values_size),
-            )
-        };
-        let (lanes, head_dim) = (self.lanes, self.head_dim);
-        let row = |of: MatRef<'_, f32>, key: usize| {
-            // SAFETY: the row is in the view, its columns are contiguous, and the head's are among them.
-            unsafe {
-                let start = of
-                    .as_ptr()
-                    .offset(key as isize * of.row_stride())
-                    .add(head * head_dim);
-                std::slice::from_raw_parts(start, head_dim)
-            }
-        };
-        let len = self.first + self.keys.nrows();
-        let panel_size = lanes * head_dim.div_ceil(E::STEP);
-        for key in self.first..len.next_multiple_of(lanes) {
-            let panel = &mut keys_to[key / lanes * panel_size..][..panel_size];
-            let to = panel[key % lanes..].iter_mut().step_by(lanes);
-            if key < len {
-                for (to, from) in to.zip(row(self.keys, key - self.first).chunks(E::STEP)) {
-                    *to = E::bits(from[0]);
-                    if let Some(&second) = from.get(1) {
-                        *to |= E::bits(second) << 16;
+        unsafe {
+            self.pack_keys::<V, S>();
+            self.pack_values::<V, S>()
+        }
+    }
+
+    /// # Safety
+    /// As [`Self::pack`].
+    #[inline(always)]
+    unsafe fn pack_keys<V: Vector, S: Store<V>>(&mut self) {
+        let (first, head_dim) = (self.job.first, self.job.head_dim);
+        let len = first + self.job.keys.nrows();
+        let steps = head_dim.div_ceil(S::STEP);
+        for panel in first / V::LANES..len.div_ceil(V::LANES) {
+            let keys = panel * V::LANES..(panel + 1) * V::LANES;
+            // Lanes before the first key given stay.
+            let (start, end) = (first.saturating_sub(keys.start), V::LANES.min(len - keys.start));
+            // Words of as many keys, a row a key, to be turned over; zeros for keys beyond the last one.
+            let mut square = [[0; MAX_LANES]; MAX_LANES];
+            for step in (0..steps).step_by(V::LANES) {
+                for (lane, to) in square.iter_mut().enumerate().take(end).skip(start) {
+                    let row = self.row(self.job.keys, keys.start + lane - first);
+                    let (from, most) = (step * S::STEP, V::LANES * S::STEP);
+                    let (row, count) = (row.wrapping_add(from), most.min(head_dim - from));
+                    // SAFETY: the row has these elements; the caller has the instruction set.
+                    unsafe { S::along(row, count, to.as_mut_ptr()) };
+                }
+                let to = &mut self.keys_to[(panel * steps + step) * V::LANES..];
+                let count = V::LANES.min(steps - step);
+                for (word, to) in to.chunks_exact_mut(V::LANES).take(count).enumerate() {
+                    for (to, row) in to.iter_mut().zip(&square).skip(start) {
+                        *to = row[word];
                     }
                 }
-            } else {
-                to.for_each(|to| *to = 0);
             }
         }
+    }
+
+    /// # Safety
+    /// As [`Self::pack`].
+    #[inline(always)]
+    unsafe fn pack_values<V: Vector, S: Store<V>>(&mut self) -> bool {
+        let (first, head_dim) = (self.job.first, self.job.head_dim);
+        let len = first + self.job.values.nrows();
+        let width = head_dim.next_multiple_of(V::LANES);
         let mut finite = true;
-        let width = head_dim.next_multiple_of(lanes);
-        for key in self.first..len {
-            let to = &mut values_to[key / E::STEP * width..][..width];
-            for (to, &from) in to.iter_mut().zip(row(self.values, key - self.first)) {
-                let bits = E::bits(from);
-                finite &= E::is_finite(bits);
-                put::<E>(to, key % E::STEP, bits);
-            }
-            to[head_dim..].fill(0);
-        }
-        if !len.is_multiple_of(E::STEP) {
-            // The last word's other half belongs to no key.
-            for to in &mut values_to[len / E::STEP * width..] {
-                *to &= 0xffff;
+        for step in first / S::STEP..len.div_ceil(S::STEP) {
+            let row = |part: usize| {
+                let key = step * S::STEP + part;
+                (part < S::STEP && first <= key && key < len).then(|| self.row(self.job.values, key - first))
+            };
+            let rows = [row(0), row(1)];
+            // The key before the first one given may share its words: it stays.
+            let kept = if step * S::STEP < first { 0xffff } else { 0 };
+            for column in (0..head_dim).step_by(V::LANES) {
+                let rows = rows.map(|row| row.map(|row| row.wrapping_add(column)));
+                let count = V::LANES.min(head_dim - column);
+                let to = &mut self.values_to[step * width + column..][..V::LANES];
+                // SAFETY: the rows have these elements, and a vector of words fits; the caller has the instruction set.
+                unsafe { S::across(rows, count, kept, to.as_mut_ptr()) };
+                let infinite = to
+                    .iter()
+                    .fold(0, |infinite, &word| infinite | u32::from(!S::is_finite(word)));
+                finite &= infinite == 0;
             }
         }
         finite
