@@ -20,6 +20,8 @@ from saccade import Intervention
 from saccade.reference import ActionHead as Reference
 from saccade.reference.random_weights import random_head, random_inputs
 
+PRECISIONS = ("float32", "bfloat16", "int8")
+
 #: The action rows read no other rows: what the others hold cannot matter.
 BLIND = Intervention(cut=[("action", "state"), ("action", "future")])
 
@@ -105,9 +107,11 @@ def test_one_step_has_nothing_to_hold(head: saccade.ActionHead, inputs: dict[str
 
 
 @pytest.mark.parametrize("refresh", [2, 3])
-def test_exact_where_action_rows_read_no_others(
-    head: saccade.ActionHead, inputs: dict[str, Any], refresh: int
-) -> None:
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_exact_where_action_rows_read_no_others(inputs: dict[str, Any], refresh: int, precision: str) -> None:
+    released = load_released("n15_tiny")
+    head = saccade.ActionHead.load(released.path, config=released.config, precision=precision)
+    inputs["context"] = head.encode(np.asarray(inputs["context"].vl_embs))
     blind = head.sample(**inputs, num_steps=5, intervention=BLIND)
     assert same(head.sample(**inputs, num_steps=5, future_refresh=refresh, intervention=BLIND), blind)
     sighted = Intervention(cut=[("action", "future")])  # the state's row is still read
@@ -169,10 +173,13 @@ def test_the_reference_holds_what_was_read() -> None:
         )
 
 
-def test_bits_do_not_depend_on_batch_samples_or_threads(isa: str) -> None:
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_bits_do_not_depend_on_batch_samples_or_threads(isa: str, precision: str) -> None:
     released = load_released("n15_tiny")
     heads = [
-        saccade.ActionHead.load(released.path, config=released.config, num_threads=threads)
+        saccade.ActionHead.load(
+            released.path, config=released.config, precision=precision, num_threads=threads
+        )
         for threads in (1, 3)
     ]
     head = heads[0]
