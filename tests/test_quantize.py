@@ -191,6 +191,17 @@ def test_the_source_is_never_replaced(source: Path) -> None:
         quantize(source, source / "model.safetensors", force=True)
 
 
+def test_files_that_the_source_links_to_are_never_replaced(source: Path, tmp_path: Path) -> None:
+    view = tmp_path / "view"  # as a cache of models lies on the disk: names that link to files elsewhere
+    view.mkdir()
+    for path in source.iterdir():
+        (view / path.name).symlink_to(path.resolve())
+    before = (source / "model.safetensors").read_bytes()
+    with pytest.raises(InputError, match="holds the source"):
+        quantize(view, source, force=True)
+    assert (source / "model.safetensors").read_bytes() == before
+
+
 def test_an_empty_directory_is_taken(source: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     quantize(source, tmp_path / "out")
@@ -260,7 +271,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
     ),
 }
 
-
+    """All weights at their ends: sums of pairs, held in 16 bits by some instruction sets, do not saturate."""
 @pytest.mark.parametrize("case", HOSTILE)
 @pytest.mark.parametrize("precision", ["float32", "int8"])
 def test_hostile_files(case: str, precision: str, quantized: Path) -> None:
@@ -271,7 +282,7 @@ def test_hostile_files(case: str, precision: str, quantized: Path) -> None:
 
 
 def test_extreme_integers_do_not_overflow(isa: str, quantized: Path) -> None:
-    """All weights at their ends: sums of pairs, held in 16 bits by some instruction sets, must not saturate."""
+    """All weights at their ends: sums of pairs, which some instruction sets hold in 16 bits, do not saturate."""
 
     def extreme(tensors: dict[str, Tensor]) -> None:
         for name, values in tensors.items():

@@ -107,6 +107,11 @@ impl Checkpoint {
         Ok(checkpoint)
     }
 
+    /// The files that tensors are read from.
+    pub(crate) fn files(&self) -> impl Iterator<Item = &Path> {
+        self.files.iter().map(|(path, _)| path.as_path())
+    }
+
     /// The names of all tensors, sorted.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.entries.keys().map(String::as_str)

@@ -99,7 +99,7 @@ pub fn quantize(
         )));
     }
     checkpoint.check(prefix, &specs)?;
-    check_apart(source, out)?;
+    check_apart(source, checkpoint.files(), out)?;
 
     let is_kept = |name: &&str| !options.head_only || name.starts_with(prefix);
     let names: Vec<&str> = checkpoint.names().filter(is_kept).collect();
@@ -194,13 +194,17 @@ fn write_quantized(
     writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)
 }
 
-/// That the source is not in what would be replaced.
-fn check_apart(source: &Path, out: &Path) -> Result<()> {
-    match (source.canonicalize(), out.canonicalize()) {
-        (Ok(from), Ok(to)) if from.starts_with(&to) => Err(Error::Input(format!(
+/// That neither the source nor a file that it links to is in what would be replaced.
+fn check_apart<'a>(source: &'a Path, files: impl Iterator<Item = &'a Path>, out: &Path) -> Result<()> {
+    let Ok(to) = out.canonicalize() else {
+        return Ok(());
+    };
+    let is_inside = |path: &Path| path.canonicalize().is_ok_and(|from| from.starts_with(&to));
+    if std::iter::once(source).chain(files).any(is_inside) {
+        return Err(Error::Input(format!(
             "out: {} holds the source, expected another directory",
             out.display()
-        ))),
-        _ => Ok(()),
+        )));
     }
+    Ok(())
 }
