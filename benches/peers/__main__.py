@@ -44,10 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
     if args.command == "report":
         return report.command(results, args)
     machine_now = machine.describe()
-    before = results.data["machine"]
-    if before and before["cpu"] != machine_now["cpu"]:
-        raise SystemExit(f"bench-peers: {args.results} is of another machine: {before['cpu']}")
-    results.data["machine"] = machine_now
+    if results.begin(machine_now):
+        note(f"{args.results} was of another machine or build; it is set aside, and all is measured anew")
     measure_all(results, args)
     if not args.prepare:
         report.write(results, args.results.parent)

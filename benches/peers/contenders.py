@@ -107,7 +107,6 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
             ("blocks", "head"),
             2.0,
             {"arithmetic": "bfloat16"},
-            usual=False,
         ),
         "torch-autocast": Contender(
             "torch bfloat16 autocast", "pytorch", ALL, 2.2, {"arithmetic": "autocast"}, usual=False

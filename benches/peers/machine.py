@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -20,7 +21,7 @@ PACKAGES = ("saccade", "torch", "lerobot", "diffusers", "onnxruntime", "openvino
 
 
 def describe() -> dict[str, Any]:
-    """CPU, its flags that matter here, cores, memory, and the versions of all engines."""
+    """CPU, its flags that matter here, cores, memory, versions of all engines, the build of saccade."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpuinfo = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
     flags = set(cpuinfo.get("flags", "").split())
@@ -40,7 +41,8 @@ def describe() -> dict[str, Any]:
             **{name: version(name) for name in PACKAGES},
             "ggml": os.environ.get("SACCADE_PEERS_GGML_VERSION", ""),
         },
-        "commit": said("git", "rev-parse", "--short", "HEAD"),
+        "build": hashlib.sha256(Path(saccade._saccade.__file__).read_bytes()).hexdigest()[:12],
+        "commit": said("git", "describe", "--always", "--dirty", "--exclude", "*"),
     }
 
 

@@ -42,6 +42,7 @@ README_ROWS = (
     "saccade-int8-refresh4",
     "lerobot-float32",
     "lerobot-bfloat16",
+    "lerobot-bfloat16-pure",
     "torch-float32",
     "torch-bfloat16",
     "compile-float32",
@@ -90,14 +91,17 @@ GOALS = (
         1.2,
     ),
     Goal("int8, encode + sample", "head", "both", LEROBOT_BF16, "saccade-int8", 3.2, 3.6),
-    Goal(
-        "int8, future_refresh=4, sample on a held context",
-        "head",
-        "sample",
-        LEROBOT_BF16,
-        "saccade-int8-refresh4",
-        7.0,
-        9.0,
+    *(
+        Goal(
+            f"int8, future_refresh={refresh}, sample on a held context",
+            "head",
+            "sample",
+            LEROBOT_BF16,
+            f"saccade-int8-refresh{refresh}",
+            7.0,
+            9.0,
+        )
+        for refresh in (2, 4)
     ),
 )
 LINEAR_GOALS = {1: ((0.86, 0.94), (0.90, 0.97)), 2: ((0.82, 0.91), (0.90, 0.97))}
@@ -237,6 +241,7 @@ def goals(results: Results) -> str:
                         f"{goal.what}, beside {CONTENDERS[peer].label}",
                         plural(case.threads),
                         f"{goal.least} x ({goal.beyond} x)",
+                        f"{'' if results.ratios(case, peer, goal.ours, goal.work) else '~'}"
                         f"{measured[1]:.2f} x ({measured[0]:.2f}–{measured[2]:.2f})",
                         verdict(measured[1], goal.least, goal.beyond),
                     ]
@@ -323,7 +328,8 @@ def section(results: Results, case: Case) -> str:
             cells.append(f"{number(median)} ({number(low)}–{number(high)})" if seconds else "")
         ours = f"saccade-{arithmetic(name)}"
         compared = results.ratio(case, name, ours, "both") if ours in results.names(case) else None
-        cells.append("" if compared is None else f"{compared[1]:.2f}")
+        in_turn = bool(results.ratios(case, name, ours, "both"))
+        cells.append("" if compared is None else f"{'' if in_turn else '~'}{compared[1]:.2f}")
         cells.append(floor_share(results, case, name, macs["both"] / calls(case)))
         cells.append(error_cell(results, case, name))
         rows.append(cells)

@@ -32,6 +32,18 @@ class Results:
         if self.data["format"] != FORMAT:
             raise SystemExit(f"bench-peers: {path} has format {self.data['format']}, expected {FORMAT}")
 
+    def begin(self, machine: dict[str, Any]) -> bool:
+        """Names the machine of what is measured from now on. Measurements of another CPU, build or version of
+        an engine are set aside under another name: no table mixes them. Whether there were any.
+        """
+        before = self.data["machine"]
+        other = bool(before) and any(before[key] != machine[key] for key in ("cpu", "build", "versions"))
+        if other:
+            self.path.replace(self.path.with_name(f"{self.path.stem}-{before['build']}{self.path.suffix}"))
+            self.data = {"format": FORMAT, "machine": {}, "peaks": [], "linear": [], "records": []}
+        self.data["machine"] = machine
+        return other
+
     def save(self) -> None:
         """Writes the file; renamed when it is whole."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
