@@ -271,7 +271,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
     ),
 }
 
-    """All weights at their ends: sums of pairs, held in 16 bits by some instruction sets, do not saturate."""
+
 @pytest.mark.parametrize("case", HOSTILE)
 @pytest.mark.parametrize("precision", ["float32", "int8"])
 def test_hostile_files(case: str, precision: str, quantized: Path) -> None:
@@ -282,7 +282,7 @@ def test_hostile_files(case: str, precision: str, quantized: Path) -> None:
 
 
 def test_extreme_integers_do_not_overflow(isa: str, quantized: Path) -> None:
-    """All weights at their ends: sums of pairs, which some instruction sets hold in 16 bits, do not saturate."""
+    """All weights at their ends: sums of pairs, held in 16 bits by some instruction sets, do not saturate."""
 
     def extreme(tensors: dict[str, Tensor]) -> None:
         for name, values in tensors.items():
