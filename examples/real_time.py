@@ -1,7 +1,7 @@
 """A real-time loop on a CPU: System 2 slow, System 1 fast, and how punctual it is.
 
     python examples/real_time.py                          the shipped policy's head, 50 chunks a second
-    python examples/real_time.py --size n1.5 --rate 0.5   GR00T N1.5's size, 1.1 GB of random weights
+    python examples/real_time.py --size n1.5 --rate 0.5   GR00T N1.5's size, 1.5 GB of random weights
 
 Two threads share one head. The slow one (System 2) sees: it gets features from the vision-language backbone
 and encodes them, as often as it can. The fast one (System 1) acts: at control rate it samples a chunk of
@@ -24,10 +24,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from n15_size import write_checkpoint
 from numpy.typing import NDArray
 
 import saccade
+from saccade.bench import heads
 
 Float32Array = NDArray[np.float32]
 EMBODIMENT_ID = 0
@@ -148,7 +148,7 @@ def load(args: argparse.Namespace) -> saccade.ActionHead:
         with importlib.resources.as_file(importlib.resources.files("saccade") / "sim" / "demo") as folder:
             return saccade.ActionHead.load(folder, num_threads=args.threads)
     with tempfile.TemporaryDirectory(prefix="saccade-real-time-") as name:
-        write_checkpoint(Path(name))
+        heads.write(Path(name), heads.sized("n1.5"))
         return saccade.ActionHead.load(name, num_threads=args.threads)
 
 
@@ -165,6 +165,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.rate <= 0 or args.seconds <= 0 or args.backbone_ms < 0:
         parser.error("--rate, --seconds: expected more than 0; --backbone-ms: expected at least 0")
+    if args.threads is not None and args.threads < 1:
+        parser.error(f"--threads: expected at least 1, got {args.threads}")
 
     num_vl_tokens = 296 if args.size == "n1.5" else 56
     head = load(args)

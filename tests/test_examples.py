@@ -38,7 +38,9 @@ def test_real_time_counts_every_tick() -> None:
         assert sum(lengths) == chunks, title
 
 
-@pytest.mark.parametrize("arguments", [["--rate", "0"], ["--seconds", "-1"], ["--size", "n2"]])
+@pytest.mark.parametrize(
+    "arguments", [["--rate", "0"], ["--seconds", "-1"], ["--size", "n2"], ["--threads", "0"]]
+)
 def test_real_time_refuses_nonsense(arguments: list[str]) -> None:
     finished = run("real_time.py", *arguments)
     assert finished.returncode == 2
