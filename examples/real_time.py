@@ -168,7 +168,7 @@ def main() -> None:
     if args.threads is not None and args.threads < 1:
         parser.error(f"--threads: expected at least 1, got {args.threads}")
 
-    num_vl_tokens = 296 if args.size == "n1.5" else 56
+    num_vl_tokens = 296 if args.size == "n1.5" else 57
     head = load(args)
     # Memory is claimed and threads are started before the robot moves.
     head.warmup(num_vl_tokens)

@@ -276,11 +276,11 @@ def test_json_has_times_profile_and_model(
 
 
 def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -> None:
-    """Its T_vl is what its backbone gives: three cameras of sixteen patches, and eight words."""
+    """Its T_vl is what its backbone gives: three cameras of sixteen patches, eight words, a register."""
     assert main(["bench", "--precision", "float32", "--rounds", "1", "--profile"]) == 0
     text = capsys.readouterr().out
     assert "the shipped policy" in text
-    assert "T_vl 56, N 32, 4 steps, 1 samples, future_refresh 1" in text
+    assert "T_vl 57, N 32, 4 steps, 1 samples, future_refresh 1" in text
     assert "float32 sample, by part" in text
     assert "feed_forward_out" in text
 

@@ -152,7 +152,7 @@ def default_vl_tokens(source: Path) -> int:
     try:
         backbone = json.loads((source / "config.json").read_text())["backbone_cfg"]
         patches = (backbone["image_size"] // backbone["patch_size"]) ** 2
-        return int(backbone["num_cameras"] * patches + backbone["text_length"])
+        return int(backbone["num_cameras"] * patches + backbone["text_length"] + 1)  # the register
     except (OSError, KeyError, TypeError, ValueError):
         return DEFAULT_VL_TOKENS
 
