@@ -36,6 +36,10 @@ pub struct LogitBias<'a> {
 /// `queries` and `out` are `(queries, num_heads * head_dim)`, row-major with any row stride. A query with no key left gets zeros. `weights`,
 /// if given, is `(num_heads, queries, len)` and receives the probabilities; otherwise they are never in memory together.
 ///
+/// Sums and the softmax are float32. Where the CPU multiplies pairs of bfloat16 and `kv` holds them, queries and probabilities are rounded to
+/// bfloat16 too, the sum of a query's probabilities is that of the rounded ones, and denormals may count as zero; elsewhere nothing but
+/// `kv` is rounded.
+///
 /// # Panics
 /// If a shape does not fit, or columns are not contiguous.
 ///

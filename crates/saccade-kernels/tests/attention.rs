@@ -253,6 +253,31 @@ fn logits_that_would_overflow_are_stable() {
     }
 }
 
+/// A native product of bfloat16 may take denormals for zero: what is lost is smaller than the smallest normal number.
+#[test]
+fn denormals_are_as_good_as_zero() {
+    let scaled = |seed, rows: usize| Strided::new(&numbers(seed, rows * 96, 1e-39), rows, 96, 1);
+    let mut case = Case::new(15, 5, 37, 2, 48, 0);
+    case.queries = scaled(16, 5);
+    case.keys = scaled(17, 37);
+    for values in [
+        scaled(18, 37),
+        Strided::new(&numbers(19, 37 * 96, 1.0), 37, 96, 0),
+    ] {
+        case.values = values;
+        for kind in kinds() {
+            let (out, mut bounds, weights, weight_bounds) = case.exact(kind.element, |_, _, _| 0.0);
+            bounds
+                .iter_mut()
+                .for_each(|bound| *bound += f64::from(f32::MIN_POSITIVE));
+            let mut given = vec![f32::NAN; 2 * 5 * 37];
+            let plain = case.run(kind, 1, None, Some(&mut given));
+            assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
+            assert_close(&format!("{kind}, weight"), &given, &weights, &weight_bounds);
+        }
+    }
+}
+
 #[test]
 fn a_query_with_no_key_left_gets_zeros() {
     let case = Case::new(3, 9, 130, 2, 48, 0);
@@ -287,7 +312,8 @@ fn a_query_with_no_key_left_gets_zeros() {
 
 #[test]
 fn a_removed_key_has_no_influence_whatever_it_holds() {
-    for poison in [f32::NAN, f32::INFINITY, 3e38] {
+    // The largest float32 is infinite in bfloat16.
+    for poison in [f32::NAN, f32::INFINITY, 3e38, f32::MAX] {
         let clean = Case::new(5, 9, 130, 2, 48, 0);
         let mut poisoned = Case::new(5, 9, 130, 2, 48, 0);
         let mut bias = vec![0.0; 130];
