@@ -360,10 +360,11 @@ def test_verdicts_and_the_frontier() -> None:
     assert [one.p_value for one in results.values() if one.p_value is not None] == holm(p_values)
     lines = fast_report.verdict_lines(results)
     assert any(
-        line.startswith("int8-euler-4: no loss, 0.0 (") and "0.20 of the time" in line for line in lines
+        line.startswith("int8-euler-4: loses less than 5 points, 0.0 (") and "0.20 of the time" in line
+        for line in lines
     )
     assert any(line.startswith("float32-euler-2: success is lower by 10.0 points") for line in lines)
-    assert lines[-1].endswith(f"by precision: int8-euler-4, bfloat16-euler-4, {BASELINE}.")
+    assert lines[-1].endswith(f"lose less than 5 points: int8-euler-4, bfloat16-euler-4, {BASELINE}.")
 
 
 def test_no_loss_is_the_interval_that_excludes_it() -> None:
