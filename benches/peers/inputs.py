@@ -42,10 +42,10 @@ def config_of(case: Case) -> dict[str, Any]:
     return config
 
 
-def checkpoint(case: Case, folder: Path) -> Path:
-    """The checkpoint of the case's piece under `folder`, float32; written if it is not there."""
+def checkpoint(case: Case, folder: Path, dtype: str = "float32") -> Path:
+    """The checkpoint of the piece under `folder`, `float32` or `bfloat16`; written if it is not there."""
     piece = {"cost": "head", "linear": "cross"}.get(case.piece, case.piece)
-    path = folder / f"{case.size}-{piece}-n{case.num_future_tokens}"
+    path = folder / f"{case.size}-{piece}-n{case.num_future_tokens}-{dtype}"
     if not path.exists():
         import torch
 
@@ -54,7 +54,8 @@ def checkpoint(case: Case, folder: Path) -> Path:
         part = path.with_name(path.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        random_weights.write_checkpoint(part, config_of(case), 0, through=torch.bfloat16)
+        stored = getattr(torch, dtype)
+        random_weights.write_checkpoint(part, config_of(case), 0, dtype=stored, through=torch.bfloat16)
         part.rename(path)
     return path
 
@@ -89,10 +90,12 @@ def inputs_of(case: Case, config: HeadConfig) -> Arrays:
 def expected_of(case: Case, folder: Path) -> Arrays:
     """The inputs of the case, and as `expected` what `saccade.reference` in float32 makes of them.
 
-    Of four blocks `rows` is what enters the first one; the noise is that of one Euler step.
+    `time0`, `modulations0`, ... are what depends on the time alone, as `pieces.times` gives it. Of four
+    blocks `rows` is what enters the first one; the noise is that of one Euler step.
     """
     import torch
 
+    from benches.peers.pieces import times
     from saccade.reference import ActionHead
 
     path = folder / f"expected-{_slug(case)}.npz"
@@ -103,6 +106,8 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     arrays = inputs_of(case, HeadConfig.from_file(source / "config.json"))
     with torch.inference_mode():
         head: Any = ActionHead.load(source)
+        for step, (time, modulations) in enumerate(times(head, EMBODIMENT, case.steps)):
+            arrays |= {f"time{step}": time.numpy(), f"modulations{step}": modulations.numpy()}
         if case.piece == "linear":
             products = [arrays[f"x{i}"] @ arrays[f"w{i}"].T for i in range(len(LINEAR_SHAPES))]
             arrays["expected"] = np.concatenate([product.ravel() for product in products])

@@ -428,32 +428,41 @@ def faster_peers(results: Results) -> str:
 
 
 def linear(results: Results) -> list[str]:
-    """Linear layers: peers timed as all else, saccade's by `cargo bench --bench linear` in the same runs."""
+    benched = {
+        rate["threads"]
+        for bench in results.data["linear"]
+        for case in bench["cases"]
+        for rate in case["rates"]
+    }
     parts = []
-    for case in usual(results, "linear"):
+    shapes = Case("linear", 1).works
+    benched = {
+        rate["threads"]
+        for bench in results.data["linear"]
+        for case in bench["cases"]
+        for rate in case["rates"]
+    }
+    for threads in sorted(benched | {case.threads for case in usual(results, "linear")}):
+        case = Case("linear", threads)
+        rows = [[name, *cells] for name, cells in benched_linear(results, threads).items()]
         macs = exact_macs(config(case), case)
-        rows = [[name, *cells] for name, cells in saccade_linear(results, case.threads).items()]
         for name in sorted(results.names(case), key=list(CONTENDERS).index):
-            rates = [
-                macs[work] / quartiles(results.seconds(case, name, work))[1] / 1e9 for work in case.works
-            ]
+            rates = [macs[work] / quartiles(results.seconds(case, name, work))[1] / 1e9 for work in shapes]
             error = "" if results.is_correct(case, name) else ": **not correct**"
             rows.append([CONTENDERS[name].label + error, *(f"{rate:.0f}" for rate in rates)])
-        parts += [
-            f"### {plural(case.threads)}",
-            table(["GMAC/s, rows x inputs x outputs", *case.works], rows),
-        ]
-    return ["## Linear layers, weights from memory", *parts] if parts else []
+        parts += [f"### {plural(threads)}", table(["GMAC/s, rows x inputs x outputs", *shapes], rows)]
+    how = "`cargo bench --bench linear`; in brackets the share of the peak of the same arithmetic."
+    return ["## Linear layers, weights from memory", how, *parts] if parts else []
 
 
-def saccade_linear(results: Results, threads: int) -> dict[str, list[str]]:
-    """Rate and share of the peak of saccade's linear layers, by name and shape."""
+def benched_linear(results: Results, threads: int) -> dict[str, list[str]]:
+    """Rate and share of the peak of the linear layers that `cargo bench` measured, by name and shape."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for bench in results.data["linear"]:
         for case in bench["cases"]:
             for rate in case["rates"]:
                 if (
-                    rate["name"].startswith("saccade")
+                    not rate["name"].startswith("peak")
                     and rate["threads"] == threads
                     and rate["of_peak"]["samples"]
                 ):

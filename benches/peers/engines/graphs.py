@@ -14,6 +14,7 @@ from benches.peers import pieces
 from benches.peers.cases import LINEAR_SHAPES
 from benches.peers.engines import Built, Task
 from benches.peers.inputs import EMBODIMENT
+from saccade import HeadConfig
 from saccade.reference import ActionHead
 
 WEIGHT_BYTES = 160 << 20  # of linear layers, in float32: several times any cache
@@ -81,7 +82,7 @@ def cross(engine: Engine, task: Task, loaded: Callable[[], ActionHead]) -> Built
     features, rows = tensors(task, "features", "rows")
     rows = rows.flatten(1, 2)
     project = engine.graph("project", lambda: pieces.Project(attentions()), (features,))
-    held = examples_of_held(task, loaded)
+    held = examples_of_held(task)
     attend = engine.graph("attend", lambda: pieces.CrossAttentions(attentions()), (rows, *held))
     own_features, own_rows = engine.array(features), engine.array(rows)
     own_held = project(own_features)
@@ -106,8 +107,8 @@ def blocks(engine: Engine, task: Task, loaded: Callable[[], ActionHead]) -> Buil
         return [block.attn1 for block in modules() if block.is_cross]
 
     features, rows = tensors(task, "features", "rows")
-    modulations = pieces.times(loaded(), EMBODIMENT, 1)[0][1][:-1]
-    held = examples_of_held(task, loaded)
+    modulations = torch.from_numpy(task.arrays["modulations0"])[:-1]
+    held = examples_of_held(task)
     project = engine.graph("project", lambda: pieces.Project(attentions()), (features,))
     run = engine.graph("blocks", lambda: pieces.Blocks(modules()), (rows, modulations, *held))
     own_features, own_rows, own_modulations = (engine.array(each) for each in (features, rows, modulations))
@@ -127,17 +128,16 @@ def whole(engine: Engine, task: Task, loaded: Callable[[], ActionHead]) -> Built
     features, state, noise = tensors(task, "features", "state", "noise")
     state = state[:, None].repeat_interleave(case.samples, dim=0)  # (B S, 1, state_dim)
     noise = noise.flatten(0, 1)  # (B S, T, A)
-    times = [tuple(map(engine.array, pair)) for pair in pieces.times(loaded(), EMBODIMENT, case.steps)]
-    held = examples_of_held(task, loaded)
-    width = loaded().config.width
-    time_inputs = (torch.zeros(width), torch.zeros(loaded().config.num_layers + 1, 2, width))
+    pairs = [tensors(task, f"time{step}", f"modulations{step}") for step in range(case.steps)]
+    times = [tuple(map(engine.array, pair)) for pair in pairs]
+    held = examples_of_held(task)
     encode = engine.graph("encode", lambda: pieces.Encode(loaded()), (features,))
     state_row = engine.graph("state", lambda: pieces.State(loaded(), EMBODIMENT), (state,))
-    row = torch.zeros(noise.shape[0], 1, width)
+    row = torch.zeros(noise.shape[0], 1, pairs[0][0].shape[-1])
     step = engine.graph(
         "step",
         lambda: pieces.Step(loaded(), EMBODIMENT, case.samples),
-        (noise, row, *time_inputs, *held),
+        (noise, row, *pairs[0], *held),
     )
     own_features, own_state, own_noise = (engine.array(each) for each in (features, state, noise))
     own_held = encode(own_features)
@@ -165,9 +165,9 @@ def tensors(task: Task, *names: str) -> list[Tensor]:
     return [torch.from_numpy(task.arrays[name]) for name in names]
 
 
-def examples_of_held(task: Task, loaded: Callable[[], ActionHead]) -> list[Tensor]:
+def examples_of_held(task: Task) -> list[Tensor]:
     """Zeros of the shapes of the keys and values that a context holds."""
-    config = loaded().config
+    config = HeadConfig.from_file(task.source / "config.json")
     num_cross = sum(index % 2 == 0 for index in range(config.num_layers))
     shape = (task.case.batch, config.num_heads, task.case.num_vl_tokens, config.head_dim)
     return [torch.zeros(shape) for _ in range(2 * num_cross)]

@@ -20,14 +20,13 @@ def build(task: Task) -> Built:
     torch.set_num_threads(task.case.threads)
     config = json.loads((task.source / "config.json").read_text())
     head: Any = lerobot_head.build(config, device="meta")
-    head.load_state_dict(ActionHead.load(task.source).state_dict(), assign=True)
-    head.requires_grad_(False)
     arithmetic = task.options["arithmetic"]
+    dtype = torch.float32 if arithmetic == "float32" else torch.bfloat16
+    head.load_state_dict(ActionHead.load(task.source, dtype=dtype).state_dict(), assign=True)
+    head.requires_grad_(False)
     # In memory of its own: that of a mapped file has no huge pages.
     for parameter in head.parameters():
-        parameter.data = parameter.data.to(
-            torch.float32 if arithmetic == "float32" else torch.bfloat16, copy=True
-        )
+        parameter.data = parameter.data.clone()
 
     def run(work: Callable[[], Any]) -> Callable[[], Any]:
         def timed() -> Any:
