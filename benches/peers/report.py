@@ -428,12 +428,7 @@ def faster_peers(results: Results) -> str:
 
 
 def linear(results: Results) -> list[str]:
-    benched = {
-        rate["threads"]
-        for bench in results.data["linear"]
-        for case in bench["cases"]
-        for rate in case["rates"]
-    }
+    """Linear layers as `cargo bench --bench linear` measured them, then the engines that are timed from here."""
     parts = []
     shapes = Case("linear", 1).works
     benched = {
