@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 import saccade
+from saccade.errors import CheckpointError
 from saccade.reference import ActionHead, TimeDistribution, tables
 from saccade.reference.model import Attention
 from saccade.reference.random_weights import N15_CONFIG, random_head, random_inputs
@@ -379,6 +380,34 @@ def test_load_lists_all_that_is_wrong(tmp_path: Path) -> None:
         assert part in message
     with pytest.raises(FileNotFoundError):
         ActionHead.load(tmp_path / "nothing")
+
+
+def test_load_reads_int8_weights_as_what_they_stand_for(tmp_path: Path) -> None:
+    config = small_config()
+    tensors = {
+        f"action_head.{name}": tensor.contiguous()
+        for name, tensor in random_head(config, 0).state_dict().items()
+    }
+    name = "action_head.model.transformer_blocks.0.attn1.to_k.weight"
+    integers = torch.randint(-127, 128, tensors[name].shape, dtype=torch.int8)
+    scales = torch.rand(len(integers))
+    quantised = {**tensors, name: integers, f"{name}_scale": scales}
+
+    def load(tensors: dict[str, torch.Tensor]) -> ActionHead:
+        save_file(tensors, tmp_path / "model.safetensors")
+        return ActionHead.load(tmp_path, config=config, dtype=torch.float64)
+
+    expected = load(tensors).state_dict()
+    expected[name.removeprefix("action_head.")] = integers.double() * scales.double()[:, None]
+    found = load(quantised).state_dict()
+    assert all(torch.equal(found[key], value) for key, value in expected.items())
+    for broken in (
+        {**tensors, name: integers},
+        {**tensors, f"{name}_scale": scales},
+        {**quantised, f"{name}_scale": scales[1:]},
+    ):
+        with pytest.raises(CheckpointError, match=r"to_k\.weight: expected an int8 matrix beside"):
+            load(broken)
 
 
 def test_modules_are_only_those_of_the_config() -> None:

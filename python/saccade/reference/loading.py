@@ -15,6 +15,9 @@ from saccade.errors import CheckpointError
 
 PREFIXES = ("action_head.", "_groot_model.action_head.", "")
 
+# Added to the name of an int8 weight: the scales of its rows.
+SCALE_SUFFIX = "_scale"
+
 
 def tensor_files(source: str | PathLike[str]) -> list[Path]:
     """The `.safetensors` files of a directory, or the one file itself."""
@@ -57,7 +60,8 @@ def parse(path: Path) -> Mapping[str, Any]:
 def read_tensors(
     source: str | PathLike[str], expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """The head's tensors without their prefix, in `dtype`.
+    """The head's tensors without their prefix, in `dtype`; int8 weights as what they stand for, the integers
+    of each row times its scale.
 
     Raises:
         CheckpointError: listing all that is missing, unknown inside the prefix, or of another shape.
@@ -68,12 +72,17 @@ def read_tensors(
             place.update(dict.fromkeys(opened.keys(), file))
     prefix = next(prefix for prefix in PREFIXES if any(name.startswith(prefix) for name in [*place, ""]))
 
-    tensors, problems = {}, []
+    tensors, scales, problems = {}, {}, []
+    integers = set()
     for file in sorted(set(place.values())):
         with safe_open(file, framework="pt") as opened:
             for full_name in opened.keys():  # noqa: SIM118  (a safetensors handle is no dict)
                 name = full_name.removeprefix(prefix)
                 if not full_name.startswith(prefix):
+                    continue
+                scaled = name.removesuffix(SCALE_SUFFIX)
+                if scaled != name and scaled in expected:
+                    scales[scaled] = opened.get_tensor(full_name)
                     continue
                 if name not in expected:
                     problems.append(f"{name}: unknown")
@@ -82,7 +91,16 @@ def read_tensors(
                 if shape != tuple(expected[name]):
                     problems.append(f"{name}: shape {shape}, expected {tuple(expected[name])}")
                     continue
-                tensors[name] = opened.get_tensor(full_name).to(dtype)
+                tensor = opened.get_tensor(full_name)
+                if tensor.dtype == torch.int8:
+                    integers.add(name)
+                tensors[name] = tensor.to(dtype)
+    for name in integers | scales.keys():
+        scale, rows = scales.get(name), tuple(expected[name][:1])
+        if name in integers and scale is not None and tuple(scale.shape) == rows and tensors[name].ndim == 2:
+            tensors[name] *= scale.to(dtype)[:, None]
+        else:
+            problems.append(f"{name}: expected an int8 matrix beside {name}{SCALE_SUFFIX} {rows}, or neither")
     for name, shape in expected.items():
         if shape.numel() == 0:  # no future tokens: their empty table need not be stored
             tensors.setdefault(name, torch.empty(shape, dtype=dtype))
