@@ -428,7 +428,7 @@ def faster_peers(results: Results) -> str:
 
 
 def linear(results: Results) -> list[str]:
-    """Linear layers as `cargo bench --bench linear` measured them, then the engines that are timed from here."""
+    """Linear layers as `cargo bench --bench linear` measured them, then the engines timed from here."""
     parts = []
     shapes = Case("linear", 1).works
     benched = {
