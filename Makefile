@@ -18,13 +18,14 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize setup-rollout setup-test clean
 
 help:
 	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
 	@echo "make test      every test, Rust and Python"
 	@echo "make bench-peers   saccade beside every engine that runs the same head; report in out/peers"
 	@echo "make lint      what .ci/run checks besides the tests"
+	@echo "make sanitize  kernel tests under AddressSanitizer (nightly Rust) and valgrind"
 	@echo "make format    formats all Rust and Python files"
 	@echo "make clean     removes the virtual environment and what was built"
 
@@ -60,6 +61,20 @@ format: setup-test
 	cargo fmt --all
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Memory errors of the only crate with unsafe code. AddressSanitizer runs its tests on every instruction set of this CPU; a toolchain's own
+# target directory, since everything is built with it. Valgrind shows programs a CPU without AVX-512, so that it runs the portable and the AVX2
+# paths; it is slow, and leaves out the tests that try many sizes.
+ASAN_TARGET := x86_64-unknown-linux-gnu
+VALGRIND_TESTS := attention layer_norm linear
+
+sanitize:
+	@cargo +nightly --version >/dev/null 2>&1 || { echo "make sanitize: AddressSanitizer needs a nightly Rust: rustup toolchain install nightly"; exit 1; }
+	@command -v valgrind >/dev/null || { echo "make sanitize: valgrind is missing: install the package of that name"; exit 1; }
+	RUSTFLAGS=-Zsanitizer=address cargo +nightly test --locked --quiet -p saccade-kernels --lib --tests \
+		--target $(ASAN_TARGET) --target-dir target/sanitize
+	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER="valgrind --quiet --error-exitcode=1" \
+		cargo test --locked --quiet -p saccade-kernels $(VALGRIND_TESTS:%=--test %) -- --test-threads 1 --skip float64
 
 # One after the other, in this order, also under `make -j`.
 setup-rollout:
