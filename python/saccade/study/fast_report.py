@@ -518,7 +518,7 @@ def pictures(results: Mapping[str, ModeResult]) -> list[Figure]:
 def scattered(
     points: Mapping[str, tuple[Estimate, Estimate]], x_label: str, y_label: str, *, falling: bool = False
 ) -> Picture:
-    """Named points with whiskers over a logarithmic time; a line joins the frontier.
+    """Points with whiskers over a logarithmic time, numbered by it; names beside; a line joins the frontier.
 
     Args:
         points: by name, time and value.
@@ -534,8 +534,9 @@ def scattered(
         "-",
         color="0.8",
     )
-    for name, (x, y) in points.items():
-        precision, _, rest = name.partition("-")
+    by_time = sorted(points.items(), key=lambda point: point[1][0].value)
+    for rank, (name, (x, y)) in enumerate(by_time, 1):
+        precision = name.partition("-")[0]
         whiskers = [[[one.value - one.low], [one.high - one.value]] for one in (x, y)]
         axes.errorbar(
             x.value,
@@ -547,16 +548,26 @@ def scattered(
             markersize=4,
             linewidth=1,
         )
-        axes.annotate(rest, (x.value, y.value), (4, 3), textcoords="offset points", fontsize=7)
-    for precision, colour in colours.items():
-        if any(name.startswith(precision) for name in points):
-            axes.plot([], [], "o", color=colour, label=precision)
+        axes.annotate(str(rank), (x.value, y.value), (3, 3), textcoords="offset points", fontsize=7)
+        # Names at the points would lie upon each other where modes are alike.
+        axes.text(
+            1.03,
+            1 - rank / (len(by_time) + 1),
+            f"{rank}  {name}",
+            transform=axes.transAxes,
+            fontsize=8,
+            color=colours[precision],
+            fontweight="bold" if name in best else "normal",
+            verticalalignment="center",
+        )
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
+    axes.tick_params(axis="x", which="both", labelsize=7)
     if falling:
         axes.set_yscale("log")
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
-    axes.legend(frameon=False, fontsize="small")
     return picture
