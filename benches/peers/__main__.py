@@ -179,14 +179,18 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
     )
     parser.add_argument(
-        "--results", type=Path, help="the JSON file (default results.json in the folder of --work)"
+        "--results",
+        type=Path,
+        help="the JSON file (default results.json in the folder of --work; report --readme and --write: the "
+        "committed one)",
     )
     parser.add_argument("--readme", action="store_true", help="report: print the README's table only")
     parser.add_argument(
         "--write", action="store_true", help="report: write README.md and docs/performance.md"
     )
     args = parser.parse_args(arguments)
-    args.results = args.results or args.work / "results.json"
+    committed = args.command == "report" and (args.readme or args.write)
+    args.results = args.results or (report.COMMITTED if committed else args.work / "results.json")
     if args.contenders is None:
         args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]
     if args.rounds < 1 or min(args.threads) < 1:

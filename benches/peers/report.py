@@ -110,6 +110,8 @@ LINEAR_GOALS = {1: ((0.86, 0.94), (0.90, 0.97)), 2: ((0.82, 0.91), (0.90, 0.97))
 
 def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report`."""
+    if not results.data["machine"]:
+        raise SystemExit(f"bench-peers: {args.results} holds no measurement; `make bench-peers` makes some")
     if args.readme:
         print(readme(results))
     elif args.write:
@@ -142,8 +144,8 @@ def document(results: Results, images: str) -> str:
     """The whole report; `images` is the folder of the figures as seen from it."""
     parts = [
         "# Performance",
-        "Written by `python -m benches.peers report --write` from `benches/peers/results.json`, which "
-        "`make bench-peers` fills.",
+        "Written by `python -m benches.peers report --write` from `benches/peers/results.json`: what "
+        "`make bench-peers` left in `out/peers/results.json` on the machine below.",
         readme(results),
         machine(results),
         NOTES.read_text().strip(),
