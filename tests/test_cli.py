@@ -128,6 +128,11 @@ def test_arguments_that_do_not_parse_are_one_line(
         (FileNotFoundError("config: no such file: a.json"), "config: no such file: a.json"),
         (PermissionError(13, "Permission denied", "/proc/out"), "/proc/out: Permission denied"),
         (
+            MemoryError("Unable to allocate 48 GiB"),
+            "too large for this machine's memory: Unable to allocate 48 GiB",
+        ),
+        (MemoryError(), "too large for this machine's memory"),
+        (
             ModuleNotFoundError("No module named 'mujoco'", name="mujoco"),
             "mujoco is not installed: pip install 'saccade[sim]'",
         ),

@@ -194,6 +194,8 @@ def dispatch(argv: list[str]) -> int:
         return load_command(args.command).run(args)
     except (UsageError, SaccadeError, *PATH_ERRORS) as error:
         return refuse(describe(error))
+    except MemoryError as error:
+        return refuse(f"too large for this machine's memory: {error}".removesuffix(": "))
     except ModuleNotFoundError as error:
         advice = missing_extra(error)
         if advice is None:
