@@ -203,6 +203,9 @@ class ActionHead:
     ) -> None:
         """Allocates and touches all that calls of this size need, so that the first one is not slow.
 
+        What depends on time alone is computed for the config's own Euler steps. Another ``num_steps``, or
+        ``integrator="midpoint"``, asks for other times: make one call with it as well.
+
         Args:
             num_vl_tokens: T_vl of the calls to come.
             batch: Their batch.
