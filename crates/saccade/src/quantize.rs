@@ -196,7 +196,8 @@ fn write_quantized(
 
 /// That neither the source nor a file that it links to is in what would be replaced.
 fn check_apart<'a>(source: &'a Path, files: impl Iterator<Item = &'a Path>, out: &Path) -> Result<()> {
-    let Ok(to) = out.canonicalize() else {
+    // Of what is not a directory the writer says so.
+    let Some(to) = out.canonicalize().ok().filter(|to| to.is_dir()) else {
         return Ok(());
     };
     let is_inside = |path: &Path| path.canonicalize().is_ok_and(|from| from.starts_with(&to));
