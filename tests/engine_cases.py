@@ -7,9 +7,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hypothesis import strategies as st
 from reference_cases import small_config
+from released import load_released
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -73,3 +75,26 @@ def both(
 
 def arrays(inputs: dict[str, Tensor]) -> dict[str, Any]:
     return {name: tensor.numpy() for name, tensor in inputs.items()}
+
+
+def same(first: Any, second: Any) -> bool:
+    """Whether two results have the same bits."""
+    return bool(np.array_equal(np.asarray(first), np.asarray(second)))
+
+
+def tiny_head() -> saccade.ActionHead:
+    """The released head of a few layers."""
+    released = load_released("n15_tiny")
+    return saccade.ActionHead.load(released.path, config=released.config)
+
+
+def three_observations(head: saccade.ActionHead) -> dict[str, Any]:
+    """A context of three observations, and what a chunk starts from."""
+    rng = np.random.default_rng(7)
+    config = head.config
+    return {
+        "context": head.encode(rng.standard_normal((3, 8, config.context_dim), np.float32)),
+        "state": rng.standard_normal((3, config.state_dim), np.float32),
+        "embodiment_id": [1, 0, 1],
+        "noise": rng.standard_normal((3, config.action_horizon, config.encoder_action_dim), np.float32),
+    }

@@ -22,7 +22,8 @@ from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS
 from benches.peers.engines import Task
 from benches.peers.processes import difference
-from benches.peers.results import Results, quartiles
+from benches.peers.results import Results
+from saccade.bench.timing import quartiles
 from saccade.reference.random_weights import n15_config
 
 ROOT = Path(__file__).resolve().parent.parent

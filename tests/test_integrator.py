@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from engine_cases import TAME, TOLERANCE, arrays
+from engine_cases import TAME, TOLERANCE, arrays, same, three_observations, tiny_head
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from reference_cases import relative_error, small_config
@@ -17,10 +17,6 @@ from test_intervention import Case, cases, everything, per_isa
 import saccade
 from saccade import Intervention
 from saccade.reference.random_weights import random_head, random_inputs
-
-
-def same(first: Any, second: Any) -> bool:
-    return bool(np.array_equal(np.asarray(first), np.asarray(second)))
 
 
 def without_patches(case: Case) -> list[Intervention]:
@@ -49,21 +45,12 @@ def test_random_configurations_equal_the_reference(isa: str, case: Case, refresh
 
 @pytest.fixture
 def head() -> saccade.ActionHead:
-    released = load_released("n15_tiny")
-    return saccade.ActionHead.load(released.path, config=released.config)
+    return tiny_head()
 
 
 @pytest.fixture
 def inputs(head: saccade.ActionHead) -> dict[str, Any]:
-    """A context of three observations, and what a chunk starts from."""
-    rng = np.random.default_rng(7)
-    config = head.config
-    return {
-        "context": head.encode(rng.standard_normal((3, 8, config.context_dim), np.float32)),
-        "state": rng.standard_normal((3, config.state_dim), np.float32),
-        "embodiment_id": [1, 0, 1],
-        "noise": rng.standard_normal((3, config.action_horizon, config.encoder_action_dim), np.float32),
-    }
+    return three_observations(head)
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 3, 7])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from engine_cases import TAME, TOLERANCE, arrays, both
+from engine_cases import TAME, TOLERANCE, arrays, both, same, three_observations, tiny_head
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from reference_cases import relative_error, small_config
@@ -46,10 +46,6 @@ def patched(place: tuple[int, int], tokens: Any, rows: Any) -> Intervention:
     return Intervention(patch={place: {tokens: rows}})
 
 
-def same(first: Any, second: Any) -> bool:
-    return bool(np.array_equal(np.asarray(first), np.asarray(second)))
-
-
 @per_isa
 @given(case=cases(max_steps=5), refresh=st.integers(1, 5), bare=st.booleans())
 def test_random_configurations_equal_the_reference(isa: str, case: Case, refresh: int, bare: bool) -> None:
@@ -69,21 +65,12 @@ def test_random_configurations_equal_the_reference(isa: str, case: Case, refresh
 
 @pytest.fixture
 def head() -> saccade.ActionHead:
-    released = load_released("n15_tiny")
-    return saccade.ActionHead.load(released.path, config=released.config)
+    return tiny_head()
 
 
 @pytest.fixture
 def inputs(head: saccade.ActionHead) -> dict[str, Any]:
-    """Features of three observations, and what a chunk starts from."""
-    rng = np.random.default_rng(7)
-    config = head.config
-    return {
-        "context": head.encode(rng.standard_normal((3, 8, config.context_dim), np.float32)),
-        "state": rng.standard_normal((3, config.state_dim), np.float32),
-        "embodiment_id": [1, 0, 1],
-        "noise": rng.standard_normal((3, config.action_horizon, config.encoder_action_dim), np.float32),
-    }
+    return three_observations(head)
 
 
 def test_one_is_exact_and_two_is_not(isa: str) -> None:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from saccade import HeadConfig
+from saccade.bench.work import Call, encode_work, sample_work, total
 
 NUM_BLOCKS = 4  # of the piece "blocks": cross, self, cross, self
 LINEAR_SHAPES = ((49, 1536, 6144), (49, 6144, 1536), (49, 1536, 1536), (296, 2048, 1536))
@@ -115,27 +116,19 @@ def exact_macs(config: HeadConfig, case: Case) -> dict[str, float]:
         return dict(zip(case.works, products, strict=True))
     if case.piece == "cost":
         return {work: exact_macs(config, case_of_cost(case, work))[work.split(",")[0]] for work in case.works}
-    vl, width, hidden, horizon = case.num_vl_tokens, config.width, config.hidden_dim, config.action_horizon
-    rows = 1 + case.num_future_tokens + horizon
+    vl, width = case.num_vl_tokens, config.width
+    rows = 1 + case.num_future_tokens + config.action_horizon
     cross = [index % 2 == 0 or not config.interleave_self_attention for index in range(config.num_layers)]
     key_values = sum(cross) * 2 * vl * config.context_dim * width
     if case.piece == "cross":
         attention = sum(cross) * (2 * rows * width**2 + 2 * rows * vl * width)
         return _works(case.batch * key_values, case.batch * case.samples * attention)
     if case.piece == "blocks":
-        blocks = sum(_block(config, rows, rows, vl, is_cross) for is_cross in cross)
+        blocks = sum(_block(config, rows, vl, is_cross) for is_cross in cross)
         return _works(case.batch * key_values, case.batch * blocks)
-    encode = config.vl_num_layers * (12 * vl * config.context_dim**2 + 2 * vl * vl * config.context_dim)
-    encode += key_values
-    step = 0
-    for index, is_cross in enumerate(cross):
-        queries = horizon if index == config.num_layers - 1 and not is_cross else rows
-        step += _block(config, queries, rows, vl, is_cross)
-    step += horizon * (config.encoder_action_dim * width + width**2)  # action encoder, two layers made one
-    step += horizon * (width * hidden + hidden**2 + hidden * config.action_dim)  # output and decoder
-    state = config.state_history * config.state_dim * hidden + hidden * width
-    sample = case.batch * (case.samples * case.steps * step + state)
-    return {"encode": case.batch * encode, "sample": sample, "both": case.batch * encode + sample}
+    call = Call(vl, case.steps, case.batch, case.samples, num_future_tokens=case.num_future_tokens)
+    encode, sample = (float(total(work(config, call)).multiply_adds) for work in (encode_work, sample_work))
+    return {"encode": encode, "sample": sample, "both": encode + sample}
 
 
 def case_of_cost(case: Case, work: str) -> Case:
@@ -149,8 +142,8 @@ def _works(key_values: float, held: float) -> dict[str, float]:
     return {"held": held, "both": key_values + held}
 
 
-def _block(config: HeadConfig, queries: int, rows: int, vl: int, is_cross: bool) -> int:
+def _block(config: HeadConfig, rows: int, vl: int, is_cross: bool) -> int:
     """One DiT block's: query, output, feed-forward; scores, values; a self block's keys and values."""
     width = config.width
     keys = vl if is_cross else rows
-    return queries * 10 * width**2 + 2 * queries * keys * width + (0 if is_cross else rows * 2 * width**2)
+    return rows * 10 * width**2 + 2 * rows * keys * width + (0 if is_cross else rows * 2 * width**2)

@@ -11,8 +11,9 @@ from pathlib import Path
 from benches.peers import inputs
 from benches.peers.cases import COST, LINEAR_SHAPES, Case, exact_macs
 from benches.peers.contenders import CONTENDERS
-from benches.peers.results import Results, quartiles
+from benches.peers.results import Results
 from saccade import HeadConfig
+from saccade.bench.timing import quartiles
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTES = Path(__file__).with_name("notes.md")

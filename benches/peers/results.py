@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from benches.peers.cases import Case
+from saccade.bench.timing import quartiles
 
 FORMAT = 1
 TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
@@ -140,15 +141,6 @@ def times(entry: dict[str, Any], work: str) -> list[float]:
     if work == "both" and "encode" in seconds:
         return [sum(pair) for pair in zip(seconds["encode"], seconds["sample"], strict=True)]
     return list(seconds.get(work, []))
-
-
-def quartiles(values: Iterable[float]) -> tuple[float, float, float]:
-    """First quartile, median, third quartile."""
-    held = list(values)
-    if len(held) == 1:
-        return held[0], held[0], held[0]
-    first, median, third = statistics.quantiles(held, n=4, method="inclusive")
-    return first, median, third
 
 
 def rounded(value: Any) -> Any:

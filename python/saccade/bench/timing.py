@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,9 +107,10 @@ def profiled(work: Callable[[], Any]) -> tuple[float, dict[str, Counter]]:
     return seconds, {part: counter for part, counter in counters.items() if counter.calls}
 
 
-def quartiles(values: list[float]) -> tuple[float, float, float]:
+def quartiles(values: Iterable[float]) -> tuple[float, float, float]:
     """First quartile, median, third quartile."""
-    if len(values) == 1:
-        return values[0], values[0], values[0]
-    first, median, third = statistics.quantiles(values, n=4, method="inclusive")
+    held = list(values)
+    if len(held) == 1:
+        return held[0], held[0], held[0]
+    first, median, third = statistics.quantiles(held, n=4, method="inclusive")
     return first, median, third
