@@ -149,10 +149,9 @@ def n16_head() -> Config:
 
 
 def head_config(layout: str) -> Config:
-    """The head's config of a layout, in released keys: what `saccade.ActionHead.load` may be given as `config`."""
-    config = {"n1": n1_head, "n16": n16_head, "n17": n17_head, "lerobot-n17": n17_head}.get(
-        layout, n15_head
-    )()
+    """The head's config of a layout, in released keys: what `ActionHead.load` may be given as `config`."""
+    heads = {"n1": n1_head, "n16": n16_head, "n17": n17_head, "lerobot-n17": n17_head}
+    config = heads.get(layout, n15_head)()
     if layout == "fork":
         config |= {"use_multi_action_heads": True, "action_arm_dim": 4, "action_claw_dim": 2}
         config |= {"action_dim": 6, "pretrained_action_dim": 8, "use_learnable_loss_weights": True}
