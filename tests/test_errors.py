@@ -444,7 +444,7 @@ KEYS_VALUES = ATTENTION.project(np.ones((2, 4, 5), np.float32))
     [
         (
             saccade.CheckpointError,
-            "to_q.bias is missing; .*x is unknown",
+            r"to_q.bias is missing, expected \(12,\)\n  x is unknown",
             {"to_q.bias": None, "x": np.ones(1)},
             3,
         ),

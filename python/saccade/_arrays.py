@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import sys
-from collections.abc import Collection, Set
+from collections.abc import Collection, Mapping, Set
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 LARGEST_RANGE = 1 << 20
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
+#: A tensor as the engine takes it: float32, or what 16 bits are and the bits.
+StoredTensor: TypeAlias = "Float32Array | tuple[str, npt.NDArray[np.uint16]]"
 #: What array arguments may be: NumPy arrays of any strides, torch CPU tensors, or nested sequences of floats.
 ArrayLike: TypeAlias = "npt.ArrayLike | Tensor"
 #: What results are: float32, NumPy or torch like the features they come from.
@@ -55,6 +57,51 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
         raise DtypeError(f"{name}: expected floating point values, got {array.dtype}")
     with np.errstate(over="ignore"):
         return np.require(array, np.float32, ["C", "A"])
+
+
+def as_stored(tensors: Mapping[str, ArrayLike]) -> dict[str, StoredTensor]:
+    """Tensors in the type that they have, C-contiguous, without a copy of those that are so already.
+
+    Raises:
+        DtypeError: ``tensors`` is not a mapping of names to arrays of float32, bfloat16 or float16 on the
+            CPU; all that is wrong is listed.
+    """
+    if not isinstance(tensors, Mapping):
+        raise DtypeError(f"tensors: expected a mapping of names to arrays, got {type(tensors).__name__}")
+    found, problems = {}, []
+    for name, tensor in tensors.items():
+        try:
+            if not isinstance(name, str):
+                raise DtypeError(f"{name!r}: expected a name, got {type(name).__name__}")
+            found[name] = _as_stored(name, tensor)
+        except DtypeError as error:
+            problems.append(str(error))
+    if problems:
+        raise DtypeError("tensors: " + "\n  ".join(problems))
+    return found
+
+
+def _as_stored(name: str, tensor: Any) -> StoredTensor:
+    if is_torch(tensor):
+        dtype = str(tensor.dtype).removeprefix("torch.")
+    elif isinstance(tensor, np.ndarray):
+        dtype = tensor.dtype.name
+    else:
+        raise DtypeError(f"{name}: expected an array, got {type(tensor).__name__}")
+    if dtype not in ("float32", "bfloat16", "float16"):
+        raise DtypeError(f"{name}: expected float32, bfloat16 or float16, got {dtype}")
+    if is_torch(tensor):
+        torch = sys.modules["torch"]
+        if tensor.layout != torch.strided:
+            raise DtypeError(f"{name}: expected a dense tensor, got one of layout {tensor.layout}")
+        tensor = tensor.detach()
+        # NumPy has no bfloat16: its bits pass as integers.
+        tensor = _torch_memory(name, tensor.view(torch.int16) if dtype == "bfloat16" else tensor)
+    if dtype == "bfloat16":
+        return dtype, np.require(tensor, requirements=["C", "A"]).view(np.uint16)
+    if dtype == "float16":
+        return dtype, np.require(tensor, np.float16, ["C", "A"]).view(np.uint16)
+    return np.require(tensor, np.float32, ["C", "A"])
 
 
 def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:

@@ -6,6 +6,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from saccade._arrays import StoredTensor
+
 _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
@@ -51,6 +53,14 @@ class ActionHead:
     def load(
         source: str,
         config: str | None,
+        embodiment_ids: list[int] | None,
+        precision: str,
+        num_threads: int | None,
+    ) -> ActionHead: ...
+    @staticmethod
+    def from_tensors(
+        tensors: dict[str, StoredTensor],
+        config: str,
         embodiment_ids: list[int] | None,
         precision: str,
         num_threads: int | None,

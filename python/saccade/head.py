@@ -16,6 +16,7 @@ from saccade._arrays import (
     ArrayLike,
     Float32Array,
     apart,
+    as_stored,
     boolean,
     float32,
     indices,
@@ -81,7 +82,8 @@ class Context:
 
 
 class ActionHead:
-    """A loaded action head. Made by :meth:`load`; immutable, for any number of threads.
+    """A loaded action head. Made by :meth:`load` or :meth:`from_tensors`; immutable, for any number of
+    threads.
 
     A row's result has the same bits in any batch, with any ``num_samples``, at any thread count.
 
@@ -104,7 +106,9 @@ class ActionHead:
         (2, 4, 16, 4)
     """
 
-    def __init__(self, head: _saccade.ActionHead, source: str, options: dict[str, Any]) -> None:
+    def __init__(
+        self, head: _saccade.ActionHead, source: str | None = None, options: dict[str, Any] | None = None
+    ) -> None:
         self._head = head
         self._source = source
         self._options = options
@@ -158,11 +162,49 @@ class ActionHead:
         check_precision(precision)
         path = _path("source", source)
         text = None if config is None else to_json(config)
-        ids = None if embodiment_ids is None else int64("embodiment_ids", embodiment_ids).reshape(-1).tolist()
-        threads = _optional_integer("num_threads", num_threads)
+        ids, threads = _embodiment_ids(embodiment_ids), _optional_integer("num_threads", num_threads)
         head = _saccade.ActionHead.load(path, text, ids, precision, threads)
         options = {"config": text, "embodiment_ids": ids, "precision": precision, "num_threads": threads}
         return cls(head, str(Path(path).absolute()), options)
+
+    @classmethod
+    def from_tensors(
+        cls,
+        tensors: Mapping[str, ArrayLike],
+        *,
+        config: Mapping[str, Any] | str | os.PathLike[str],
+        embodiment_ids: Sequence[int] | None = None,
+        precision: str = "float32",
+        num_threads: int | None = None,
+    ) -> ActionHead:
+        """Makes a head of tensors in memory: bit for bit the one that :meth:`load` reads from a file of them.
+
+        Nothing of the caller's memory is kept: what happens to the tensors afterwards does not reach the
+        head. They are packed one at a time where they lie, and of layers for each embodiment only the wanted
+        ones are read; tensors that are not C-contiguous are copied first, whole. Such a head cannot be
+        pickled, since there is nothing to load it from.
+
+        Args:
+            tensors: The head's tensors by their names in a checkpoint, without a prefix (the state dict of
+                a released head), as NumPy arrays or torch CPU tensors. float32 and bfloat16 stay what they
+                are, float16 is widened, which is exact. Every tensor of the config must be there and no
+                other, but what only training uses (``task_log_sigma.*``, ``mask_token``,
+                ``dropout_prob_by_embodiment``) may be.
+            config: The head's config or a whole checkpoint's, as for :meth:`load`.
+            embodiment_ids, precision, num_threads: As for :meth:`load`.
+
+        Raises:
+            DtypeError: a tensor of another type, or not on the CPU.
+            ShapeError: shapes do not fit the config.
+            CheckpointError: tensors are missing or unknown; the config is broken. Each of the three lists
+                all that is wrong.
+            FileNotFoundError: the config is not there.
+            InputError: an option is out of range.
+        """
+        check_precision(precision)
+        text = to_json(config)
+        ids, threads = _embodiment_ids(embodiment_ids), _optional_integer("num_threads", num_threads)
+        return cls(_saccade.ActionHead.from_tensors(as_stored(tensors), text, ids, precision, threads))
 
     @property
     def config(self) -> HeadConfig:
@@ -483,6 +525,11 @@ class ActionHead:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
+        if self._source is None:
+            raise TypeError(
+                "a head made by ActionHead.from_tensors cannot be pickled or copied: it has no file to be "
+                "loaded from again; write its tensors to a checkpoint and use ActionHead.load"
+            )
         return _load, (self._source, self._options)
 
     def __repr__(self) -> str:
@@ -498,6 +545,10 @@ def _load(source: str, options: dict[str, Any]) -> ActionHead:
     """Unpickles a head: the weights are loaded anew."""
     config, rest = options["config"], {name: value for name, value in options.items() if name != "config"}
     return ActionHead.load(source, config=None if config is None else json.loads(config), **rest)
+
+
+def _embodiment_ids(given: Sequence[int] | None) -> list[int] | None:
+    return None if given is None else int64("embodiment_ids", given).reshape(-1).tolist()
 
 
 def _path(name: str, value: str | os.PathLike[str]) -> str:

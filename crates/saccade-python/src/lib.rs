@@ -16,8 +16,9 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyType};
 use saccade::{
-    Arithmetic, Array, Checkpoint, Elements, Error, Features, Group, Integrator, Isa, Keep, LoadOptions,
-    OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, Tokens, TraceOptions, peak,
+    Arithmetic, Array, Checkpoint, ElementsRef, Error, Features, Group, Integrator, Isa, Keep, LoadOptions,
+    OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, TensorView, TensorViews, Tokens,
+    TraceOptions, peak,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -172,6 +173,39 @@ fn config_dict<'py>(py: Python<'py>, config: &saccade::HeadConfig) -> PyResult<B
     Ok(dict)
 }
 
+/// A tensor as the Python package gives it: float32, or 16 bits with the name of what they are.
+#[derive(FromPyObject)]
+enum PyTensor<'py> {
+    Float32(PyReadonlyArrayDyn<'py, f32>),
+    Half((String, PyReadonlyArrayDyn<'py, u16>)),
+}
+
+fn held_tensors<'py>(tensors: &Bound<'py, PyDict>) -> PyResult<Vec<(String, PyTensor<'py>)>> {
+    let held = tensors
+        .iter()
+        .map(|(name, tensor)| Ok((name.extract()?, tensor.extract()?)));
+    held.collect()
+}
+
+fn tensor_views<'a>(held: &'a [(String, PyTensor<'_>)]) -> PyResult<TensorViews<'a>> {
+    let view = |tensor: &'a PyTensor<'_>| {
+        Ok::<_, PyErr>(match tensor {
+            PyTensor::Float32(array) => TensorView::new(array.shape(), ElementsRef::F32(array.as_slice()?)),
+            PyTensor::Half((dtype, array)) => {
+                let bits = array.as_slice()?;
+                let elements = match dtype.as_str() {
+                    "bfloat16" => ElementsRef::Bf16(bits),
+                    _ => ElementsRef::F16(bits),
+                };
+                TensorView::new(array.shape(), elements)
+            }
+        })
+    };
+    held.iter()
+        .map(|(name, tensor)| Ok((name.clone(), view(tensor)?)))
+        .collect()
+}
+
 #[pyclass(frozen, module = "saccade._saccade")]
 struct Context(Arc<saccade::Context>);
 
@@ -232,6 +266,28 @@ impl ActionHead {
             num_threads,
         };
         py.detach(|| saccade::ActionHead::load(&source, &options))
+            .map(Self)
+            .map_err(raise)
+    }
+
+    #[staticmethod]
+    fn from_tensors(
+        py: Python<'_>,
+        tensors: &Bound<'_, PyDict>,
+        config: String,
+        embodiment_ids: Option<Vec<i64>>,
+        precision: &str,
+        num_threads: Option<usize>,
+    ) -> PyResult<Self> {
+        let options = LoadOptions {
+            config: Some(config),
+            embodiment_ids,
+            precision: precision.parse().map_err(raise)?,
+            num_threads,
+        };
+        let held = held_tensors(tensors)?;
+        let views = tensor_views(&held)?;
+        py.detach(|| saccade::ActionHead::from_tensors(&views, &options))
             .map(Self)
             .map_err(raise)
     }
@@ -437,13 +493,9 @@ impl CrossAttention {
     #[new]
     fn new(py: Python<'_>, tensors: &Bound<'_, PyDict>, num_heads: usize, precision: &str) -> PyResult<Self> {
         let precision = precision.parse().map_err(raise)?;
-        let mut named = saccade::NamedTensors::new();
-        for (name, array) in tensors {
-            let array: PyReadonlyArrayDyn<'_, f32> = array.extract()?;
-            let elements = Elements::F32(array.as_slice()?.to_vec());
-            named.insert(name.extract()?, (array.shape().to_vec(), elements));
-        }
-        py.detach(|| saccade::CrossAttention::new(&named, num_heads, precision, None))
+        let held = held_tensors(tensors)?;
+        let views = tensor_views(&held)?;
+        py.detach(|| saccade::CrossAttention::new(&views, num_heads, precision, None))
             .map(Self)
             .map_err(raise)
     }

@@ -15,8 +15,10 @@ use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
 
+use crate::config::HeadConfig;
 use crate::error::{Error, Result, show_shape};
-use crate::layout::TensorSpec;
+use crate::fit::{self, Problem};
+use crate::layout::{HeadNames, is_unused};
 
 /// A longer header is hostile: the released head has 314 tensors in 40 kB.
 const MAX_HEADER_BYTES: u64 = 100_000_000;
@@ -140,83 +142,38 @@ impl Checkpoint {
         }
     }
 
-    /// That exactly the `expected` tensors stand under `prefix`, each of the right shape and a readable type.
+    /// That exactly the tensors of a head of this config stand under `prefix`, each of the right shape and a readable type; what only
+    /// training uses may be there too.
     ///
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
-    pub(crate) fn check(&self, prefix: &str, expected: &[TensorSpec]) -> Result<()> {
-        let mut problems = Vec::new();
-        let mut known = BTreeSet::new();
-        for spec in expected {
-            let name = format!("{prefix}{}", spec.name);
-            let scale = format!("{name}{SCALE_SUFFIX}");
-            match self.entries.get(&name) {
-                // A tensor without elements carries nothing, and some writers leave it out.
-                None if spec.shape.contains(&0) => {}
-                None => problems.push(format!("{name} is missing, expected {}", show_shape(&spec.shape))),
-                Some(entry) if entry.info.shape != spec.shape => problems.push(format!(
-                    "{name} has shape {}, expected {}",
-                    show_shape(&entry.info.shape),
-                    show_shape(&spec.shape)
-                )),
-                Some(entry) if spec.may_be_int8 && entry.info.dtype == Dtype::I8 => {
-                    problems.extend(self.scale_problem(&name, &scale, spec.shape[0]));
-                    known.insert(scale);
-                }
-                Some(entry) if !is_readable(entry.info.dtype) => {
-                    let int8 = if spec.may_be_int8 {
-                        ", or I8 with its scale"
-                    } else {
-                        ""
-                    };
-                    problems.push(format!(
-                        "{name} is {:?}, expected F32, BF16 or F16{int8}",
-                        entry.info.dtype
-                    ));
-                }
-                Some(entry) if spec.may_be_int8 && self.entries.contains_key(&scale) => {
-                    problems.push(format!(
-                        "{scale} stands beside {name} of {:?}, expected I8",
-                        entry.info.dtype
-                    ));
-                    known.insert(scale);
-                }
-                Some(_) => {}
-            }
-            known.insert(name);
-        }
+    pub(crate) fn check(&self, prefix: &str, config: &HeadConfig) -> Result<()> {
+        let expected = HeadNames::new(config).tensors();
+        let is_known = |name: &str, shape: &[usize]| is_unused(config, name, shape);
+        let mut problems = fit::problems(
+            self.names(),
+            |name| self.describe(name),
+            prefix,
+            &expected,
+            is_known,
+        );
         let twice = self
             .duplicates
             .iter()
             .filter(|(name, _)| name.starts_with(prefix));
-        problems.extend(twice.map(|(_, problem)| problem.clone()));
-        let unknown = self
-            .names()
-            .filter(|name| name.starts_with(prefix) && !known.contains(*name));
-        problems.extend(unknown.map(|name| format!("{name} is unknown")));
+        problems.extend(twice.map(|(_, problem)| Problem::Other(problem.clone())));
         if problems.is_empty() {
             return Ok(());
         }
         Err(Error::Checkpoint(format!(
-            "source: {} tensors do not fit the config:\n  {}",
-            problems.len(),
-            problems.join("\n  ")
+            "source: {}",
+            fit::list(&problems, "the config")
         )))
     }
 
-    /// What is wrong with the scales of the int8 tensor `name` of `rows` rows, by the header.
-    fn scale_problem(&self, name: &str, scale: &str, rows: usize) -> Option<String> {
-        match self.entries.get(scale) {
-            None => Some(format!("{name} is I8 and {scale} is missing, expected ({rows},)")),
-            Some(entry) if entry.info.shape != [rows] => Some(format!(
-                "{scale} has shape {}, expected ({rows},)",
-                show_shape(&entry.info.shape)
-            )),
-            Some(entry) if entry.info.dtype != Dtype::F32 => {
-                Some(format!("{scale} is {:?}, expected F32", entry.info.dtype))
-            }
-            Some(_) => None,
-        }
+    fn describe(&self, name: &str) -> Option<(Dtype, &[usize])> {
+        let entry = self.entries.get(name)?;
+        Some((entry.info.dtype, &entry.info.shape))
     }
 
     /// Reads tensor `name` whole; int8 with its scales.
@@ -342,8 +299,8 @@ impl Checkpoint {
     fn read_int8(&self, name: &str, entry: &Entry) -> Result<Elements> {
         let scale = format!("{name}{SCALE_SUFFIX}");
         let rows = entry.info.shape.first().copied().unwrap_or(1);
-        if let Some(problem) = self.scale_problem(name, &scale, rows) {
-            return Err(Error::Checkpoint(format!("source: {problem}")));
+        if let Some(problem) = fit::scale_problem(|name| self.describe(name), name, &scale, rows) {
+            return Err(Error::Checkpoint(format!("source: {}", problem.text())));
         }
         let values: Vec<i8> =
             self.read_plain(name, entry, 0, entry.info.shape.iter().product(), Vec::new())?;
@@ -460,10 +417,6 @@ fn from_little_endian<T: Copy>(values: &mut [T], convert: impl Fn(T) -> T) {
     if cfg!(target_endian = "big") {
         values.iter_mut().for_each(|value| *value = convert(*value));
     }
-}
-
-fn is_readable(dtype: Dtype) -> bool {
-    matches!(dtype, Dtype::F32 | Dtype::BF16 | Dtype::F16)
 }
 
 /// The `.safetensors` files of a directory, and what its index promises of them.

@@ -7,9 +7,8 @@ use saccade_kernels::PackedKeyValues;
 use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward};
 use crate::config::HeadConfig;
 use crate::error::Result;
-use crate::layers::{Engine, Norm, sized};
+use crate::layers::{Engine, Norm, TensorSource, sized};
 use crate::layout::{HeadNames, VlBlockNames};
-use crate::reading::HeadTensors;
 use crate::trace::{Keep, Recorded, Shapes};
 
 /// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate
@@ -121,7 +120,7 @@ const MAX_RECORDED_BYTES: u64 = 1 << 31;
 
 impl VlEncoder {
     pub(crate) fn load(
-        tensors: &HeadTensors<'_>,
+        tensors: &dyn TensorSource,
         engine: Engine,
         config: &HeadConfig,
         names: &HeadNames,

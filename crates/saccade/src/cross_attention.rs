@@ -1,29 +1,18 @@
 //! Cross-attention alone: the layer in which state, future and action rows look at the vision-language tokens.
 
-use std::collections::BTreeMap;
 use std::sync::Mutex;
 
 use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
 
 use crate::array::Array;
 use crate::attention::{Attention, AttentionBuffers, Bias};
-use crate::checkpoint::Elements;
 use crate::error::{Error, Result, show_shape};
+use crate::fit;
 use crate::head::engine;
-use crate::layers::{Engine, TensorSource};
-use crate::layout::{AttentionNames, TensorSpec};
+use crate::layers::Engine;
+use crate::layout::AttentionNames;
+use crate::memory::{self, MemorySource, TensorViews};
 use crate::precision::Precision;
-
-/// A tensor given in memory: its shape and elements.
-pub type NamedTensors = BTreeMap<String, (Vec<usize>, Elements)>;
-
-impl TensorSource for NamedTensors {
-    fn tensor(&self, name: &str) -> Result<Elements> {
-        self.get(name)
-            .map(|(_, elements)| elements.clone())
-            .ok_or_else(|| Error::Checkpoint(format!("tensors: {name} is missing")))
-    }
-}
 
 /// Projected keys and values of a batch: immutable, for any number of calls.
 pub struct KeyValues {
@@ -71,22 +60,26 @@ impl CrossAttention {
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown or misshaped; [`Error::Input`] if `num_heads` does not divide
     /// the width.
     pub fn new(
-        tensors: &NamedTensors,
+        tensors: &TensorViews<'_>,
         num_heads: usize,
         precision: Precision,
         num_threads: Option<usize>,
     ) -> Result<Self> {
         let engine = engine(precision, num_threads)?;
-        let axes = |name: &str| tensors.get(name).map(|(shape, _)| shape.as_slice());
+        let axes = |name: &str| memory::shape_of(tensors, name);
         // The sizes come from two of the tensors; the others must agree with them.
         let width = axes("to_q.weight")
             .and_then(|shape| shape.first().copied())
-            .unwrap_or(0);
+            .unwrap_or(1);
         let context_dim = axes("to_k.weight")
             .and_then(|shape| shape.get(1).copied())
-            .unwrap_or(0);
+            .unwrap_or(1);
         let names = AttentionNames::new("", width, context_dim);
-        check_tensors(tensors, &names.tensors())?;
+        let problems = memory::problems(tensors, &names.tensors(), |_, _| false);
+        if !problems.is_empty() {
+            let listed = fit::list(&problems, "the widths of to_q and to_k");
+            return Err(Error::Checkpoint(format!("tensors: {listed}")));
+        }
         if width == 0 || context_dim == 0 {
             return Err(Error::Checkpoint(format!(
                 "tensors: expected at least one input and output feature, got width {width} and context_dim {context_dim}"
@@ -97,7 +90,7 @@ impl CrossAttention {
                 "num_heads: expected a divisor of the width {width}, got {num_heads}"
             )));
         }
-        let attention = Attention::load(tensors, engine, &names, num_heads)?;
+        let attention = Attention::load(&MemorySource::new(tensors), engine, &names, num_heads)?;
         Ok(Self {
             attention,
             engine,
@@ -264,29 +257,4 @@ fn logit_bias(
         }
     }
     Ok(Some(values))
-}
-
-fn check_tensors(tensors: &NamedTensors, expected: &[TensorSpec]) -> Result<()> {
-    let mut problems = Vec::new();
-    for TensorSpec { name, shape, .. } in expected {
-        match tensors.get(name) {
-            None => problems.push(format!("{name} is missing")),
-            Some((given, _)) if given != shape => {
-                problems.push(format!(
-                    "{name} has shape {}, expected {}",
-                    show_shape(given),
-                    show_shape(shape)
-                ));
-            }
-            Some(_) => {}
-        }
-    }
-    let unknown = tensors
-        .keys()
-        .filter(|name| !expected.iter().any(|known| known.name == **name));
-    problems.extend(unknown.map(|name| format!("{name} is unknown")));
-    if problems.is_empty() {
-        return Ok(());
-    }
-    Err(Error::Checkpoint(format!("tensors: {}", problems.join("; "))))
 }

@@ -10,10 +10,9 @@ use crate::config::HeadConfig;
 use crate::context::Context;
 use crate::error::Result;
 use crate::intervention::{Changes, Group, Groups};
-use crate::layers::{Engine, load_linear, rows, rows_mut, sized};
+use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
 use crate::profile::{Part, apply, layer_norm};
-use crate::reading::HeadTensors;
 use crate::tables::{TIME_CHANNELS, embedding_time};
 use crate::trace::{Recorded, StepBlock};
 
@@ -112,7 +111,7 @@ impl DitBuffers {
 
 impl Dit {
     pub(crate) fn load(
-        tensors: &HeadTensors<'_>,
+        tensors: &dyn TensorSource,
         engine: Engine,
         config: &HeadConfig,
         names: &HeadNames,

@@ -13,9 +13,11 @@ use crate::config::HeadConfig;
 use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
 use crate::dit::{Dit, DitBuffers, Pass, Rows};
 use crate::error::{Error, Result, show_shape};
+use crate::fit::{self, Problem};
 use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, TensorSource, sized};
-use crate::layout::HeadNames;
+use crate::layout::{HeadNames, is_unused};
+use crate::memory::{self, MemorySource, TensorViews};
 use crate::precision::Precision;
 use crate::reading::HeadTensors;
 use crate::tables::action_time;
@@ -189,16 +191,52 @@ impl ActionHead {
         let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
         let names = HeadNames::new(&config);
         let prefix = checkpoint.head_prefix()?;
-        checkpoint.check(prefix, &names.tensors())?;
+        checkpoint.check(prefix, &config)?;
         let wanted = names.reading_order(&config, &embodiment_ids);
         HeadTensors::read_ahead(&checkpoint, prefix, wanted, |tensors| {
-            Self::from_tensors(tensors, engine, config, &names, embodiment_ids)
+            Self::build(tensors, engine, config, &names, embodiment_ids)
         })
     }
 
+    /// A head from `tensors` in memory, by their names in a checkpoint without a prefix, with the sizes of the config in `options`, which must
+    /// be there: bit for bit the head that [`Self::load`] reads from a file of them. The tensors are borrowed for the call only, and of
+    /// layers for each embodiment only the wanted slices are touched.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] for a broken config and for tensors that are missing or unknown, [`Error::Shape`] if shapes alone are wrong (all
+    /// that is wrong is listed in both), [`Error::Input`] for options out of range.
+    pub fn from_tensors(tensors: &TensorViews<'_>, options: &LoadOptions) -> Result<Self> {
+        let engine = engine(options.precision, options.num_threads)?;
+        let config = options.config.as_deref().ok_or_else(|| {
+            Error::Input("config: expected one, since tensors in memory bring none".to_owned())
+        })?;
+        let config = HeadConfig::from_json(config)?;
+        let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
+        let names = HeadNames::new(&config);
+        let problems = memory::problems(tensors, &names.tensors(), |name, shape| {
+            is_unused(&config, name, shape)
+        });
+        if !problems.is_empty() {
+            let message = format!("tensors: {}", fit::list(&problems, "the config"));
+            let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
+            return Err(if problems.iter().all(is_shape) {
+                Error::Shape(message)
+            } else {
+                Error::Checkpoint(message)
+            });
+        }
+        Self::build(
+            &MemorySource::new(tensors),
+            engine,
+            config,
+            &names,
+            embodiment_ids,
+        )
+    }
+
     /// Asks for tensors in the order of [`HeadNames::reading_order`].
-    fn from_tensors(
-        tensors: &HeadTensors<'_>,
+    fn build(
+        tensors: &dyn TensorSource,
         engine: Engine,
         config: HeadConfig,
         names: &HeadNames,

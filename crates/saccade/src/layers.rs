@@ -1,5 +1,7 @@
 //! The layers that the head is made of: loaded by name, run by the kernels.
 
+use std::ops::Range;
+
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 use half::bf16;
@@ -10,7 +12,6 @@ use crate::error::{Error, Result};
 use crate::layout::{CategoryLinearNames, LinearNames, NormNames, Role};
 use crate::precision::Precision;
 use crate::profile::{Part, apply, layer_norm};
-use crate::reading::HeadTensors;
 
 /// Which instruction set and how many threads the kernels use, and how precisely they compute.
 #[derive(Clone, Copy, Debug)]
@@ -24,6 +25,9 @@ pub(crate) struct Engine {
 pub(crate) trait TensorSource {
     /// Tensor `name`, whole.
     fn tensor(&self, name: &str) -> Result<Elements>;
+
+    /// Slices `slices` of the first axis of tensor `name`.
+    fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements>;
 
     /// Takes back a tensor that is not needed any more.
     fn give_back(&self, _used: Elements) {}
@@ -155,7 +159,7 @@ pub(crate) struct CategoryLinear {
 
 impl CategoryLinear {
     pub(crate) fn load(
-        tensors: &HeadTensors<'_>,
+        tensors: &dyn TensorSource,
         engine: Engine,
         names: &CategoryLinearNames,
         embodiment_ids: &[usize],
@@ -237,7 +241,7 @@ pub(crate) struct ActionEncoder {
 
 impl ActionEncoder {
     pub(crate) fn load(
-        tensors: &HeadTensors<'_>,
+        tensors: &dyn TensorSource,
         engine: Engine,
         [w1, w2, w3]: &[CategoryLinearNames; 3],
         embodiment_ids: &[usize],

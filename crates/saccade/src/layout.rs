@@ -121,6 +121,16 @@ pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
         .collect()
 }
 
+/// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
+/// logarithms of loss weights, what N1.6 puts in place of a state that it hides, how often N1.7 hides one.
+pub(crate) fn is_unused(config: &HeadConfig, name: &str, shape: &[usize]) -> bool {
+    match name {
+        "mask_token" => shape == [1, 1, config.width],
+        "dropout_prob_by_embodiment" => shape == [config.num_embodiments],
+        _ => name.starts_with("task_log_sigma.") && shape.iter().all(|&size| size == 1),
+    }
+}
+
 /// Width of the sinusoidal table of the time embedding.
 pub(crate) const TIME_CHANNELS: usize = 256;
 

@@ -83,7 +83,8 @@ pub fn quantize(
         Some(text) => text.clone(),
         None => read_config_beside(source)?,
     };
-    let specs = HeadNames::new(&HeadConfig::from_json(&config)?).tensors();
+    let head_config = HeadConfig::from_json(&config)?;
+    let specs = HeadNames::new(&head_config).tensors();
     let prefix = checkpoint.head_prefix()?;
     let int8: BTreeMap<String, &TensorSpec> = specs
         .iter()
@@ -98,7 +99,7 @@ pub fn quantize(
             "source: it is quantised already: {name} is I8, expected F32, BF16 or F16"
         )));
     }
-    checkpoint.check(prefix, &specs)?;
+    checkpoint.check(prefix, &head_config)?;
     check_apart(source, checkpoint.files(), out)?;
 
     let is_kept = |name: &&str| !options.head_only || name.starts_with(prefix);

@@ -52,11 +52,6 @@ impl HeadTensors<'_> {
         })
     }
 
-    /// Slices `slices` of the first axis of tensor `name`.
-    pub(crate) fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements> {
-        self.take(Wanted::slices(name, slices))
-    }
-
     fn take(&self, wanted: Wanted) -> Result<Elements> {
         let Some(ahead) = &self.ahead else {
             return read(self.checkpoint, self.prefix, &wanted, None);
@@ -74,6 +69,10 @@ impl HeadTensors<'_> {
 impl TensorSource for HeadTensors<'_> {
     fn tensor(&self, name: &str) -> Result<Elements> {
         self.take(Wanted::whole(name.to_owned()))
+    }
+
+    fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements> {
+        self.take(Wanted::slices(name, slices))
     }
 
     fn give_back(&self, used: Elements) {

@@ -1,0 +1,126 @@
+//! Whether tensors fit what a head needs, by their names, shapes and types alone.
+
+use std::collections::BTreeSet;
+
+use safetensors::Dtype;
+
+use crate::checkpoint::SCALE_SUFFIX;
+use crate::error::show_shape;
+use crate::layout::TensorSpec;
+
+/// One thing that is wrong.
+pub(crate) enum Problem {
+    /// A tensor of another shape.
+    Shape(String),
+    /// A tensor that is missing, unknown or of another type.
+    Other(String),
+}
+
+impl Problem {
+    pub(crate) fn text(&self) -> &str {
+        match self {
+            Self::Shape(text) | Self::Other(text) => text,
+        }
+    }
+}
+
+/// All that is wrong with the tensors `names`, of which `describe` tells type and shape: exactly the `expected` ones must stand under
+/// `prefix`, and those that `is_unused`, given a name without the prefix and a shape, knows may.
+pub(crate) fn problems<'a>(
+    names: impl Iterator<Item = &'a str>,
+    describe: impl Fn(&str) -> Option<(Dtype, &'a [usize])>,
+    prefix: &str,
+    expected: &[TensorSpec],
+    is_unused: impl Fn(&str, &[usize]) -> bool,
+) -> Vec<Problem> {
+    let mut problems = Vec::new();
+    let mut known = BTreeSet::new();
+    for spec in expected {
+        let name = format!("{prefix}{}", spec.name);
+        let scale = format!("{name}{SCALE_SUFFIX}");
+        match describe(&name) {
+            // A tensor without elements carries nothing, and some writers leave it out.
+            None if spec.shape.contains(&0) => {}
+            None => problems.push(Problem::Other(format!(
+                "{name} is missing, expected {}",
+                show_shape(&spec.shape)
+            ))),
+            Some((_, shape)) if shape != spec.shape => problems.push(Problem::Shape(format!(
+                "{name} has shape {}, expected {}",
+                show_shape(shape),
+                show_shape(&spec.shape)
+            ))),
+            Some((Dtype::I8, _)) if spec.may_be_int8 => {
+                problems.extend(scale_problem(&describe, &name, &scale, spec.shape[0]));
+                known.insert(scale);
+            }
+            Some((dtype, _)) if !is_readable(dtype) => {
+                let int8 = if spec.may_be_int8 {
+                    ", or I8 with its scale"
+                } else {
+                    ""
+                };
+                problems.push(Problem::Other(format!(
+                    "{name} is {dtype:?}, expected F32, BF16 or F16{int8}"
+                )));
+            }
+            Some((dtype, _)) if spec.may_be_int8 && describe(&scale).is_some() => {
+                problems.push(Problem::Other(format!(
+                    "{scale} stands beside {name} of {dtype:?}, expected I8"
+                )));
+                known.insert(scale);
+            }
+            Some(_) => {}
+        }
+        known.insert(name);
+    }
+    for name in names.filter(|name| name.starts_with(prefix) && !known.contains(*name)) {
+        let shape = describe(name).map_or(&[] as &[usize], |(_, shape)| shape);
+        if !is_unused(&name[prefix.len()..], shape) {
+            problems.push(Problem::Other(format!("{name} is unknown")));
+        }
+    }
+    problems
+}
+
+/// What is wrong with the tensor `scale`, the scales of the int8 tensor `name` of `rows` rows.
+pub(crate) fn scale_problem<'a>(
+    describe: impl Fn(&str) -> Option<(Dtype, &'a [usize])>,
+    name: &str,
+    scale: &str,
+    rows: usize,
+) -> Option<Problem> {
+    match describe(scale) {
+        None => Some(Problem::Other(format!(
+            "{name} is I8 and {scale} is missing, expected ({rows},)"
+        ))),
+        Some((_, shape)) if shape != [rows] => Some(Problem::Shape(format!(
+            "{scale} has shape {}, expected ({rows},)",
+            show_shape(shape)
+        ))),
+        Some((dtype, _)) if dtype != Dtype::F32 => {
+            Some(Problem::Other(format!("{scale} is {dtype:?}, expected F32")))
+        }
+        Some(_) => None,
+    }
+}
+
+/// Whether a tensor of this type holds numbers as they are.
+pub(crate) fn is_readable(dtype: Dtype) -> bool {
+    matches!(dtype, Dtype::F32 | Dtype::BF16 | Dtype::F16)
+}
+
+/// The problems, one on a line, of tensors that should fit `what`.
+pub(crate) fn list(problems: &[Problem], what: &str) -> String {
+    let lines: Vec<&str> = problems.iter().map(Problem::text).collect();
+    let noun = if problems.len() == 1 {
+        "tensor does"
+    } else {
+        "tensors do"
+    };
+    format!(
+        "{} {noun} not fit {what}:\n  {}",
+        problems.len(),
+        lines.join("\n  ")
+    )
+}
