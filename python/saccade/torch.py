@@ -1,0 +1,341 @@
+"""The cross-attention as a torch module: takes the place of diffusers' ``Attention`` in GR00T's blocks.
+
+The module holds its weights as torch parameters and gives them to a custom operator, so that
+``torch.compile`` and ``torch.export`` see tensors and nothing else. What the engine packs from them is kept
+beside, for as long as the weights live. Needs torch 2.4 or newer.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+import saccade
+from saccade.errors import DtypeError, InputError, ShapeError
+
+__all__ = ["CrossAttention"]
+
+#: The weights as the operator takes them.
+NAMES = tuple(
+    f"{layer}.{kind}" for layer in ("to_q", "to_k", "to_v", "to_out.0") for kind in ("weight", "bias")
+)
+#: What diffusers' Attention can do beside and GR00T does not use: attribute and the value that turns it off.
+UNUSED: dict[str, Any] = {
+    "group_norm": None,
+    "spatial_norm": None,
+    "norm_cross": None,
+    "norm_q": None,
+    "norm_k": None,
+    "added_kv_proj_dim": None,
+    "fused_projections": False,
+    "is_causal": False,
+    "pre_only": False,
+    "residual_connection": False,
+    "rescale_output_factor": 1.0,
+    "scale_qk": True,
+}
+#: The processors that compute the plain softmax(q k^T / sqrt(head_dim)) v.
+PROCESSORS = ("AttnProcessor", "AttnProcessor2_0")
+#: Elements that are compared in every row and every column of a weight, at the least.
+SAMPLES = 4
+
+
+class CrossAttention(nn.Module):
+    """Multi-head attention with its projections: ``to_out(softmax(q k^T / sqrt(head_dim)) v)``.
+
+    Drop-in for diffusers' ``Attention`` as GR00T uses it: the same parameter names, the same call. Computes
+    in float32 (or ``precision``) whatever the dtype of the inputs, on the CPU, without gradients or dropout.
+    Keys and values are projected at every call, as diffusers does; :class:`saccade.CrossAttention` holds them
+    over many calls.
+
+    The parameters are ordinary torch memory, shared with ``state_dict``; the engine has a packed copy.
+    Every call compares the weights with what was packed, and packs them anew if they have changed, be it in
+    a way that torch does not count (through ``.data`` or NumPy). This reads the weights once.
+
+    Args:
+        state_dict: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
+            ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
+            ``to_out.0.bias (width,)``; floating point, on the CPU.
+        heads: Attention heads, a divisor of the width.
+        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in :meth:`saccade.ActionHead.load`.
+        dropout: Probability after ``to_out.0`` in training. It is not applied: a module in training mode with
+            a dropout other than 0 refuses the call.
+
+    Raises:
+        CheckpointError: tensors are missing, unknown or misshaped; all of them are listed.
+        DtypeError: a tensor is not floating point or not on the CPU.
+        InputError: ``heads`` does not divide the width, the precision is unknown, a weight is not finite.
+
+    Example:
+        >>> import torch
+        >>> from saccade.torch import CrossAttention
+        >>> shapes = {"to_q": (64, 64), "to_k": (64, 32), "to_v": (64, 32), "to_out.0": (64, 64)}
+        >>> weights = {f"{name}.weight": torch.randn(shape) / 8 for name, shape in shapes.items()}
+        >>> weights |= {f"{name}.bias": torch.zeros(64) for name in shapes}
+        >>> attn = CrossAttention(weights, heads=4).eval()
+        >>> attn(torch.randn(2, 5, 64), torch.randn(2, 10, 32)).shape
+        torch.Size([2, 5, 64])
+    """
+
+    def __init__(
+        self,
+        state_dict: Mapping[str, torch.Tensor],
+        heads: int,
+        *,
+        precision: str = "float32",
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        # The engine says what is wrong with the tensors, and what it packs serves the first call.
+        engine = saccade.CrossAttention(state_dict, heads, precision=precision)
+        self.heads, self.precision = engine.num_heads, engine.precision
+        width, context_dim = engine.width, engine.context_dim
+        self.to_q = nn.Linear(width, width, device="meta")
+        self.to_k = nn.Linear(context_dim, width, device="meta")
+        self.to_v = nn.Linear(context_dim, width, device="meta")
+        self.to_out = nn.ModuleList([nn.Linear(width, width, device="meta"), nn.Dropout(dropout)])
+        self.requires_grad_(False)
+        # Detached tensors share memory and the count of changes with the caller's.
+        self.load_state_dict({name: state_dict[name].detach() for name in NAMES}, assign=True)
+        weights = self._weights()
+        _PACKED.put(weights, self.heads, self.precision, engine, _fingerprint(weights))
+
+    @classmethod
+    def from_attention(cls, attention: nn.Module, *, precision: str = "float32") -> CrossAttention:
+        """Takes the place of a diffusers ``Attention``: shares its weights, and is in its training mode.
+
+        Raises:
+            InputError: ``attention`` does something that GR00T's does not; all of it is listed.
+            CheckpointError, DtypeError: its weights do not fit, as for the class.
+        """
+        state_dict = attention.state_dict()
+        wrong = [
+            f"{name} {getattr(attention, name)!r}"
+            for name, off in UNUSED.items()
+            if getattr(attention, name, off) != off
+        ]
+        processor = type(getattr(attention, "processor", None)).__name__
+        if processor not in PROCESSORS:
+            wrong.append(f"processor {processor}")
+        if wrong:
+            raise InputError(f"attention: expected what GR00T uses of Attention, got {', '.join(wrong)}")
+        dropout = attention.to_out[1].p  # type: ignore[index,union-attr]
+        module = cls(state_dict, attention.heads, precision=precision, dropout=dropout)  # type: ignore[arg-type]
+        return module.train(attention.training)
+
+    def forward(
+        self,
+        hidden_states: torch.Tensor,
+        encoder_hidden_states: torch.Tensor | None = None,
+        attention_mask: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Attends from ``hidden_states`` to ``encoder_hidden_states``.
+
+        Args:
+            hidden_states: ``(batch, queries, width)``, any floating dtype.
+            encoder_hidden_states: ``(batch, T_vl, context_dim)``; None for self-attention.
+            attention_mask: ``(batch, T_vl)``, or with axes of 1 between: bool, True = attended, or floating
+                point, added to the logits (minus infinity removes a key). A query with no key left gets
+                ``to_out``'s bias.
+
+        Returns:
+            ``(batch, queries, width)`` in the dtype of ``hidden_states``.
+
+        Raises:
+            ShapeError, DtypeError: an argument does not fit, or is not on the CPU.
+            InputError: an input is NaN or infinite; a gradient is asked for; training mode with dropout.
+        """
+        encoder = hidden_states if encoder_hidden_states is None else encoder_hidden_states
+        weights = self._weights()
+        if torch.is_grad_enabled() and any(t.requires_grad for t in (hidden_states, encoder, *weights)):
+            raise InputError(
+                "CrossAttention has no gradient: call it under torch.no_grad(), or use saccade.reference"
+            )
+        if self.training and self.to_out[1].p > 0:  # type: ignore[operator]
+            raise InputError("CrossAttention has no dropout: expected evaluation mode, call eval()")
+        for name, value in (("hidden_states", hidden_states), ("encoder_hidden_states", encoder)):
+            if value.device.type != "cpu":
+                raise DtypeError(f"{name}: expected a tensor on the CPU, got one on {value.device}")
+        mask = _key_mask(attention_mask, encoder)
+        return cross_attention(hidden_states, encoder, mask, weights, self.heads, self.precision)  # type: ignore[no-any-return]
+
+    def extra_repr(self) -> str:
+        """Heads and precision, for ``print(module)``."""
+        return f"heads={self.heads}, precision={self.precision!r}"
+
+    def _weights(self) -> list[torch.Tensor]:
+        layers = (self.to_q, self.to_k, self.to_v, self.to_out[0])
+        return [tensor for layer in layers for tensor in (layer.weight, layer.bias)]  # type: ignore[misc]
+
+    def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> CrossAttention:
+        # What .to() and its kind go through; refused before anything has moved.
+        device = fn(self.to_q.bias.detach()[:0]).device
+        if device.type != "cpu":
+            raise DtypeError(f"CrossAttention runs on the CPU, it cannot be moved to {device}")
+        return super()._apply(fn, recurse)  # type: ignore[no-any-return,no-untyped-call]
+
+
+def _key_mask(mask: torch.Tensor | None, encoder: torch.Tensor) -> torch.Tensor | None:
+    """A mask in the forms that diffusers takes for all queries alike, as ``(batch, T_vl)``."""
+    if mask is None:
+        return None
+    if mask.dtype != torch.bool and not mask.dtype.is_floating_point:
+        raise DtypeError(f"attention_mask: expected booleans or floating point values, got {mask.dtype}")
+    batch, keys = encoder.shape[0], encoder.shape[1]
+    if mask.ndim not in (2, 3, 4) or mask.shape != (batch, *[1] * (mask.ndim - 2), keys):
+        raise ShapeError(
+            f"attention_mask: expected (batch, T_vl) = ({batch}, {keys}), perhaps with axes of 1 between ("
+            f"one mask for all queries and heads), got {tuple(mask.shape)}"
+        )
+    return mask.reshape(batch, keys)
+
+
+def _new_output(
+    hidden_states: torch.Tensor,
+    encoder_hidden_states: torch.Tensor,
+    attention_mask: torch.Tensor | None,
+    weights: Sequence[torch.Tensor],
+    heads: int,
+    precision: str,
+) -> torch.Tensor:
+    """Where the result goes; all that a tracing compiler needs to know of the operator."""
+    inputs = (
+        ("hidden_states", hidden_states, "batch, queries", weights[0].shape[1]),
+        ("encoder_hidden_states", encoder_hidden_states, "batch, T_vl", weights[2].shape[1]),
+    )
+    for name, value, axes, width in inputs:
+        if not value.dtype.is_floating_point:
+            raise DtypeError(f"{name}: expected floating point values, got {value.dtype}")
+        if value.ndim != 3 or value.shape[2] != width:
+            raise ShapeError(f"{name}: expected ({axes}, {width}), got {tuple(value.shape)}")
+    if hidden_states.shape[0] != encoder_hidden_states.shape[0]:
+        raise ShapeError(
+            f"encoder_hidden_states: expected the batch of hidden_states, {hidden_states.shape[0]}, "
+            f"got {encoder_hidden_states.shape[0]}"
+        )
+    return hidden_states.new_empty(hidden_states.shape)
+
+
+@torch.library.custom_op(
+    "saccade::cross_attention",
+    mutates_args=(),
+    device_types="cpu",
+    schema="(Tensor hidden_states, Tensor encoder_hidden_states, Tensor? attention_mask, Tensor[] weights, "
+    "int heads, str precision) -> Tensor",
+)
+def cross_attention(
+    hidden_states: torch.Tensor,
+    encoder_hidden_states: torch.Tensor,
+    attention_mask: torch.Tensor | None,
+    weights: Sequence[torch.Tensor],
+    heads: int,
+    precision: str,
+) -> torch.Tensor:
+    """The operator ``saccade::cross_attention``: what :class:`CrossAttention` calls, without its checks.
+
+    Args:
+        hidden_states: ``(batch, queries, width)``.
+        encoder_hidden_states: ``(batch, T_vl, context_dim)``.
+        attention_mask: ``(batch, T_vl)``, bool or added to the logits.
+        weights: Weight and bias of ``to_q``, ``to_k``, ``to_v`` and ``to_out.0``.
+        heads: A divisor of the width.
+        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``.
+
+    Returns:
+        ``(batch, queries, width)`` in the dtype of ``hidden_states``, contiguous.
+    """
+    expected = _new_output(hidden_states, encoder_hidden_states, attention_mask, weights, heads, precision)
+    output = torch.empty(expected.shape, dtype=torch.float32)
+    if output.numel() == 0:
+        pass
+    elif encoder_hidden_states.shape[1] == 0:
+        output.copy_(weights[-1])  # no key: attention is zero, and to_out adds its bias
+    else:
+        engine = _PACKED.get(weights, heads, precision)
+        is_bool = attention_mask is not None and attention_mask.dtype == torch.bool
+        key_mask, key_bias = (attention_mask, None) if is_bool else (None, attention_mask)
+        kv = engine.project(encoder_hidden_states)
+        engine(hidden_states, kv, key_mask=key_mask, key_bias=key_bias, out=output)
+    return output.to(hidden_states.dtype)
+
+
+cross_attention.register_fake(_new_output)
+
+
+class _Packed:
+    """What the engine made of weights, kept until the memory of one of them is gone."""
+
+    def __init__(self) -> None:
+        self._held: dict[tuple[Any, ...], tuple[bytes, saccade.CrossAttention]] = {}
+
+    def get(self, weights: Sequence[torch.Tensor], heads: int, precision: str) -> saccade.CrossAttention:
+        """The weights packed; anew if they have changed."""
+        key = _place(weights, heads, precision)
+        fingerprint = _fingerprint(weights)
+        held, engine = self._held.get(key, (None, None))
+        if engine is None or held != fingerprint:
+            tensors = {name: weight.detach() for name, weight in zip(NAMES, weights, strict=True)}
+            engine = saccade.CrossAttention(tensors, heads, precision=precision)
+            self.put(weights, heads, precision, engine, fingerprint)
+        return engine
+
+    def put(
+        self,
+        weights: Sequence[torch.Tensor],
+        heads: int,
+        precision: str,
+        engine: saccade.CrossAttention,
+        fingerprint: bytes,
+    ) -> None:
+        """Keeps what was made of weights that had this fingerprint."""
+        key = _place(weights, heads, precision)
+        if key not in self._held:
+            for weight in weights:
+                weakref.finalize(weight.untyped_storage(), self._held.pop, key, None).atexit = False
+        self._held[key] = fingerprint, engine
+
+
+_PACKED = _Packed()
+
+
+def _place(weights: Sequence[torch.Tensor], heads: int, precision: str) -> tuple[Any, ...]:
+    """Where in memory the weights lie, and how they are used."""
+    places = ((w.untyped_storage()._cdata, w.storage_offset(), w.shape, w.stride(), w.dtype) for w in weights)
+    return heads, precision, *places
+
+
+def _fingerprint(weights: Sequence[torch.Tensor]) -> bytes:
+    """Differs where the weights do: torch's count of changes, the xor of each column's bits, and samples.
+
+    A change that torch does not count shows in the xor, unless changes in one column cancel there (two rows
+    swapped, an even number of signs turned). Samples in every row and every column see those, too, if they
+    touch a row, a column or a larger block.
+    """
+    parts = []
+    for weight in weights:
+        # A tensor made under torch.inference_mode has no count.
+        parts.append(b"" if weight.is_inference() else weight._version.to_bytes(8, "little"))
+        bits = weight.detach().view(_INTEGERS[weight.element_size()]).numpy()
+        bits = bits.reshape(len(bits), -1)
+        parts.append(np.bitwise_xor.reduce(bits, axis=0).tobytes())
+        parts.append(bits[_samples(bits.shape)].tobytes())
+    return b"".join(parts)
+
+
+_INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+
+
+@cache
+def _samples(shape: tuple[int, int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns of some elements of a matrix: `SAMPLES` or more in every row and every column."""
+    rng = np.random.default_rng(0)
+    k = np.arange(max(shape))
+    columns = [rng.permutation(shape[1])[k % shape[1]] for _ in range(SAMPLES)]
+    return np.tile(k % shape[0], SAMPLES), np.concatenate(columns)
