@@ -7,6 +7,8 @@ from saccade.environment import show_config
 from saccade.errors import CheckpointError, DtypeError, InputError, SaccadeError, ShapeError
 from saccade.head import ActionHead, Context
 from saccade.intervention import Intervention
+from saccade.normalizer import Normalizer
+from saccade.policy import Policy
 from saccade.trace import Record, Trace
 
 __all__ = [
@@ -19,6 +21,8 @@ __all__ = [
     "InputError",
     "Intervention",
     "KeyValues",
+    "Normalizer",
+    "Policy",
     "Record",
     "SaccadeError",
     "ShapeError",
