@@ -4,24 +4,29 @@
 //! Nothing is mapped: a file that changes later cannot reach a running head.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use bytemuck::Pod;
 use half::{bf16, f16};
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
-use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, show_shape};
 use crate::fit::{self, Problem};
 use crate::layout::{HeadNames, is_unused};
 
-/// A longer header is hostile: the released head has 314 tensors in 40 kB.
+/// A longer header, index or config is hostile: the released head has 314 tensors in 40 kB.
 const MAX_HEADER_BYTES: u64 = 100_000_000;
+
+/// What a safetensors header calls its notes.
+const METADATA: &str = "__metadata__";
 
 /// Bytes that are copied together.
 const PIECE: usize = 1 << 24;
@@ -74,9 +79,35 @@ struct Entry {
     start: u64,
 }
 
+/// A file that tensors are read from.
+struct Source {
+    path: PathBuf,
+    file: File,
+    /// What it was when its header was read.
+    stamp: Stamp,
+}
+
+/// What changes when a file is written to.
+#[derive(PartialEq)]
+struct Stamp {
+    length: u64,
+    /// None where the system does not tell.
+    modified: Option<SystemTime>,
+}
+
+impl Stamp {
+    fn of(file: &File) -> std::io::Result<Self> {
+        let metadata = file.metadata()?;
+        Ok(Self {
+            length: metadata.len(),
+            modified: metadata.modified().ok(),
+        })
+    }
+}
+
 /// The tensors of one checkpoint, by name.
 pub struct Checkpoint {
-    files: Vec<(PathBuf, File)>,
+    files: Vec<Source>,
     entries: BTreeMap<String, Entry>,
     /// Names that stand in more than one file, with what to say of them: fatal only where the tensor is wanted.
     duplicates: BTreeMap<String, String>,
@@ -111,7 +142,7 @@ impl Checkpoint {
 
     /// The files that tensors are read from.
     pub(crate) fn files(&self) -> impl Iterator<Item = &Path> {
-        self.files.iter().map(|(path, _)| path.as_path())
+        self.files.iter().map(|source| source.path.as_path())
     }
 
     /// The names of all tensors, sorted.
@@ -343,39 +374,39 @@ impl Checkpoint {
         count: usize,
         mut values: Vec<T>,
     ) -> Result<Vec<T>> {
-        let (path, file) = &self.files[entry.file];
-        let mut file: &File = file;
-        values.resize(count, T::zeroed());
-        file.seek(SeekFrom::Start(entry.start + (first * size_of::<T>()) as u64))
-            .and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)))
-            .map_err(|error| {
-                Error::Checkpoint(format!(
-                    "source: {name} cannot be read from {}: {error}",
-                    path.display()
-                ))
-            })?;
+        let source = &self.files[entry.file];
+        let mut file = &source.file;
+        let mut read = || {
+            // A file with holes is as long as it likes: more than there is memory for is an error, not the end of the process.
+            values.try_reserve_exact(count.saturating_sub(values.len()))?;
+            values.resize(count, T::zeroed());
+            file.seek(SeekFrom::Start(entry.start + (first * size_of::<T>()) as u64))?;
+            file.read_exact(bytemuck::cast_slice_mut(&mut values))?;
+            // Half of one file and half of another must not become a head.
+            if Stamp::of(file)? != source.stamp {
+                return Err(std::io::Error::other("it changed while it was read"));
+            }
+            Ok(())
+        };
+        read().map_err(|error: std::io::Error| {
+            Error::Checkpoint(format!(
+                "source: {name} cannot be read from {}: {error}",
+                source.path.display()
+            ))
+        })?;
         Ok(values)
     }
 
     fn add_file(&mut self, path: &Path) -> Result<()> {
         let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
-        let mut file = File::open(path).map_err(|error| Error::from_io("source", path, &error))?;
-        let length = file
-            .metadata()
-            .and_then(|metadata| {
-                if metadata.is_file() {
-                    Ok(metadata.len())
-                } else {
-                    Err(std::io::ErrorKind::InvalidInput.into())
-                }
-            })
-            .map_err(|_| bad("not a regular file".to_owned()))?;
-        let (header, data_start) = read_header(&mut file, length).map_err(bad)?;
+        let mut file = open_regular(path).map_err(|error| Error::from_io("source", path, &error))?;
+        let stamp = Stamp::of(&file).map_err(|error| Error::from_io("source", path, &error))?;
+        let (header, data_start) = read_header(&mut file, stamp.length).map_err(bad)?;
         let index = self.files.len();
         for (name, info) in header {
             let start = data_start + info.data_offsets.0 as u64;
             if let Some(other) = self.entries.get(&name) {
-                let other = self.files[other.file].0.display();
+                let other = self.files[other.file].path.display();
                 let problem = format!("{name} is also in {other}, beside {}", path.display());
                 self.duplicates.insert(name, problem);
                 continue;
@@ -389,7 +420,11 @@ impl Checkpoint {
                 },
             );
         }
-        self.files.push((path.to_owned(), file));
+        self.files.push(Source {
+            path: path.to_owned(),
+            file,
+            stamp,
+        });
         Ok(())
     }
 
@@ -412,6 +447,35 @@ impl Checkpoint {
     }
 }
 
+/// Opens a file that may be read to its end: opening a pipe would wait for somebody to write to it, and a device has no end.
+fn open_regular(path: &Path) -> std::io::Result<File> {
+    let is_file = |metadata: std::io::Result<std::fs::Metadata>| match metadata?.is_file() {
+        true => Ok(()),
+        false => Err(std::io::Error::other("not a regular file")),
+    };
+    is_file(std::fs::metadata(path))?;
+    let file = File::open(path)?;
+    is_file(file.metadata())?;
+    Ok(file)
+}
+
+/// The text of the file `path`, an index or a config, which `what` names in errors.
+pub(crate) fn read_text(what: &'static str, path: &Path) -> Result<String> {
+    let read = || {
+        let mut text = String::new();
+        // One byte more than is allowed shows that there are more.
+        open_regular(path)?
+            .take(MAX_HEADER_BYTES + 1)
+            .read_to_string(&mut text)?;
+        if text.len() as u64 > MAX_HEADER_BYTES {
+            let problem = format!("more than {MAX_HEADER_BYTES} bytes");
+            return Err(std::io::Error::other(problem));
+        }
+        Ok(text)
+    };
+    read().map_err(|error| Error::from_io(what, path, &error))
+}
+
 /// Puts the bytes of each value in this machine's order; on most machines there is nothing to do, and no code.
 fn from_little_endian<T: Copy>(values: &mut [T], convert: impl Fn(T) -> T) {
     if cfg!(target_endian = "big") {
@@ -428,16 +492,20 @@ struct Listing {
 impl Listing {
     fn of(directory: &Path) -> Result<Self> {
         let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", directory.display()));
-        let mut names: Vec<String> = std::fs::read_dir(directory)
-            .and_then(|entries| {
-                entries
-                    .map(|entry| Ok(entry?.file_name()))
-                    .collect::<std::io::Result<Vec<_>>>()
-            })
-            .map_err(|error| Error::from_io("source", directory, &error))?
-            .into_iter()
-            .filter_map(|name| name.into_string().ok())
-            .collect();
+        let all: Vec<OsString> = std::fs::read_dir(directory)
+            .and_then(|entries| entries.map(|entry| Ok(entry?.file_name())).collect())
+            .map_err(|error| Error::from_io("source", directory, &error))?;
+        let mut names = Vec::new();
+        for name in all {
+            match name.into_string() {
+                Ok(name) => names.push(name),
+                // Left out in silence, its tensors would be missing for no reason that anybody sees.
+                Err(name) if name.to_string_lossy().contains(".safetensors") => {
+                    return Err(bad(format!("the name {} is not UTF-8", name.to_string_lossy())));
+                }
+                Err(_) => {}
+            }
+        }
         names.sort();
         let mut indexes = names
             .iter()
@@ -464,7 +532,7 @@ impl Listing {
             weight_map: UniqueMap<String>,
         }
         let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
-        let text = std::fs::read_to_string(path).map_err(|error| Error::from_io("source", path, &error))?;
+        let text = read_text("source", path)?;
         let index: Index = serde_json::from_str(&text).map_err(|error| bad(error.to_string()))?;
         let mut files = BTreeSet::new();
         let mut weight_map = Vec::new();
@@ -502,31 +570,28 @@ fn read_header(
             "not safetensors or truncated: header of {size} bytes in a file of {length}"
         ));
     }
+    // At most `MAX_HEADER_BYTES`.
     let mut header = vec![0; size as usize];
     file.read_exact(&mut header)
         .map_err(|error| format!("header cannot be read: {error}"))?;
-    let header: UniqueMap<serde_json::Value> =
+    let UniqueMap::<TensorInfo>(mut tensors) =
         serde_json::from_slice(&header).map_err(|error| format!("header: {error}"))?;
-    let mut tensors = Vec::new();
-    for (name, value) in header.0 {
-        if name != "__metadata__" {
-            let info = TensorInfo::deserialize(value).map_err(|error| format!("header: {name}: {error}"))?;
-            tensors.push((name, info));
-        }
-    }
     // The library's own rules: offsets in order, without gaps or overlaps, each of the size that shape and type give.
     tensors.sort_by_key(|(_, info)| info.data_offsets);
     let metadata = Metadata::new(None, tensors.clone()).map_err(|error| format!("header: {error}"))?;
-    let expected = 8 + size + metadata.data_len() as u64;
-    if expected != length {
+    // The sizes of all tensors together may be more than a number holds.
+    let promised = metadata.data_len() as u64;
+    if promised != length - 8 - size {
         return Err(format!(
-            "truncated or with trailing bytes: {length} bytes, the header promises {expected}"
+            "truncated or with trailing bytes: {} bytes of data, the header promises {promised}",
+            length - 8 - size
         ));
     }
     Ok((tensors, 8 + size))
 }
 
-/// A JSON object whose keys are all different: the usual map types keep the last of two equal keys in silence.
+/// A JSON object from names of tensors, all different (the usual map types keep the last of two equal keys in silence) and printable, to
+/// values. What a file says of itself, `__metadata__`, is left out.
 struct UniqueMap<T>(Vec<(String, T)>);
 
 impl<'de, T: Deserialize<'de>> Deserialize<'de> for UniqueMap<T> {
@@ -542,15 +607,102 @@ impl<'de, T: Deserialize<'de>> Deserialize<'de> for UniqueMap<T> {
             fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Self::Value, A::Error> {
                 let mut seen = BTreeSet::new();
                 let mut entries = Vec::new();
-                while let Some((key, value)) = map.next_entry::<String, T>()? {
+                while let Some(key) = map.next_key::<String>()? {
+                    let bad = |problem: String| Err(serde::de::Error::custom(problem));
                     if !seen.insert(key.clone()) {
-                        return Err(serde::de::Error::custom(format!("{key} stands there twice")));
+                        return bad(format!("{key} stands there twice"));
                     }
-                    entries.push((key, value));
+                    if key.chars().any(char::is_control) {
+                        return bad(format!("the name {key:?} holds control characters"));
+                    }
+                    if key == METADATA {
+                        map.next_value::<IgnoredAny>()?;
+                        continue;
+                    }
+                    match map.next_value() {
+                        Ok(value) => entries.push((key, value)),
+                        Err(error) => return bad(format!("{key}: {error}")),
+                    }
                 }
                 Ok(UniqueMap(entries))
             }
         }
         deserializer.deserialize_map(Entries(std::marker::PhantomData))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    /// Two float32, `a`, in the file `name` of the temporary folder.
+    fn two_numbers(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("saccade-{}-{name}", std::process::id()));
+        let header = r#"{"a":{"dtype":"F32","shape":[2],"data_offsets":[0,8]}}"#;
+        let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+        bytes.extend(header.as_bytes());
+        bytes.extend([1.0f32, 2.0].iter().flat_map(|value| value.to_le_bytes()));
+        std::fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    #[test]
+    fn a_file_that_changes_after_it_was_opened_is_an_error() {
+        type Change = fn(&Path) -> std::io::Result<()>;
+        let changes: [(&str, &str, Change); 4] = [
+            ("shrinks", "fill whole buffer", |path| {
+                File::options().write(true).open(path)?.set_len(10)
+            }),
+            ("grows", "changed while it was read", |path| {
+                File::options().append(true).open(path)?.write_all(b"more")
+            }),
+            ("rewritten", "changed while it was read", |path| {
+                // The clock of a file moves in steps of some milliseconds.
+                std::thread::sleep(std::time::Duration::from_millis(30));
+                let length = std::fs::metadata(path)?.len();
+                std::fs::write(path, vec![0; length as usize])
+            }),
+            ("emptied", "fill whole buffer", |path| {
+                File::create(path).map(|_| ())
+            }),
+        ];
+        for (name, expected, change) in changes {
+            let path = two_numbers(name);
+            let checkpoint = Checkpoint::open(&path).unwrap();
+            assert!(checkpoint.read("a").is_ok());
+            change(&path).unwrap();
+            let error = checkpoint.read("a").unwrap_err().to_string();
+            assert!(error.contains(expected), "{name}: {error}");
+            std::fs::remove_file(&path).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_removed_or_replaced_stays_what_it_was() {
+        let path = two_numbers("removed");
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        let other = two_numbers("other");
+        std::fs::write(&other, b"something else").unwrap();
+        std::fs::rename(&other, &path).unwrap();
+        assert_eq!(checkpoint.read("a").unwrap(), Elements::F32(vec![1.0, 2.0]));
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(checkpoint.read("a").unwrap(), Elements::F32(vec![1.0, 2.0]));
+    }
+
+    #[test]
+    fn slices_are_those_that_are_there() {
+        let path = two_numbers("slices");
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        assert_eq!(
+            checkpoint.read_slices("a", 1..2).unwrap(),
+            Elements::F32(vec![2.0])
+        );
+        #[allow(clippy::reversed_empty_ranges)]
+        for wanted in [0..3, 3..3, 2..1, 0..usize::MAX] {
+            assert!(checkpoint.read_slices("a", wanted).is_err());
+        }
+        std::fs::remove_file(&path).unwrap();
     }
 }

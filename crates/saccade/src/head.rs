@@ -8,7 +8,7 @@ use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, read_text};
 use crate::config::HeadConfig;
 use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
 use crate::dit::{Dit, DitBuffers, Pass, Rows};
@@ -1004,7 +1004,7 @@ pub(crate) fn read_config_beside(source: &Path) -> Result<String> {
         source.parent().unwrap_or(Path::new(""))
     };
     let path: PathBuf = directory.join("config.json");
-    std::fs::read_to_string(&path).map_err(|error| Error::from_io("config", &path, &error))
+    read_text("config", &path)
 }
 
 fn chosen_embodiments(ids: Option<&[i64]>, num_embodiments: usize) -> Result<Vec<usize>> {
