@@ -8,6 +8,8 @@ ROLLOUT_ARGS ?= --episodes 3 --video
 
 PEERS_VENV ?= .venv-peers
 PEERS_ARGS ?=
+WHEEL_VENV ?= .venv-wheel
+WHEEL_ARGS ?=
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
@@ -18,7 +20,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel setup-rollout setup-test clean
 
 help:
 	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
@@ -26,6 +28,8 @@ help:
 	@echo "make bench-peers   saccade beside every engine that runs the same head; report in out/peers"
 	@echo "make lint      what .ci/run checks besides the tests"
 	@echo "make sanitize  kernel tests under AddressSanitizer (nightly Rust) and valgrind"
+	@echo "make wheel     a manylinux wheel in dist, from the last commit"
+	@echo "make test-wheel   the wheel under every CPython, old and new NumPy, emulated old CPUs; writes docs/wheels.md"
 	@echo "make format    formats all Rust and Python files"
 	@echo "make clean     removes the virtual environment and what was built"
 
@@ -138,6 +142,21 @@ $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
 	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report goes without it"
 	@touch $@
 
+wheel:
+	@$(PYTHON) .ci/needs.py python rust
+	@$(MAKE) -s $(WHEEL_VENV)/.tools
+	$(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist $(WHEEL_ARGS)
+
+test-wheel: wheel
+	@$(PYTHON) .ci/needs.py opengl
+	$(WHEEL_VENV)/bin/python .ci/wheels/test.py dist --page docs/wheels.md
+
+$(WHEEL_VENV)/.tools: .ci/wheels/requirements.txt
+	@test "$$($(WHEEL_VENV)/bin/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(WHEEL_VENV))" || $(PYTHON) -m venv --clear $(WHEEL_VENV)
+	@echo "setting up: maturin and zig"
+	@$(WHEEL_VENV)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --requirement $<
+	@touch $@
+
 clean:
-	rm -rf $(VENV) $(PEERS_VENV) target out
+	rm -rf $(VENV) $(PEERS_VENV) $(WHEEL_VENV) .venv-compat-* target out dist
 	find python -name '*.so' -delete
