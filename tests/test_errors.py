@@ -203,15 +203,8 @@ def test_paths_that_are_not_there(tmp_path: Path) -> None:
 REQUIRED = [
     "action_dim",
     "action_horizon",
-    "add_pos_embed",
-    "backbone_embedding_dim",
-    "hidden_size",
-    "input_embedding_dim",
     "max_state_dim",
     "num_inference_timesteps",
-    "num_target_vision_tokens",
-    "num_timestep_buckets",
-    "use_vlln",
     "diffusion_model_cfg",
     "vl_self_attention_cfg",
 ]

@@ -2,6 +2,7 @@
 
 from saccade._saccade import __version__
 from saccade.attention import CrossAttention, KeyValues
+from saccade.chunking import Chunking
 from saccade.config import HeadConfig
 from saccade.environment import show_config
 from saccade.errors import CheckpointError, DtypeError, InputError, SaccadeError, ShapeError
@@ -14,6 +15,7 @@ from saccade.trace import Record, Trace
 __all__ = [
     "ActionHead",
     "CheckpointError",
+    "Chunking",
     "Context",
     "CrossAttention",
     "DtypeError",

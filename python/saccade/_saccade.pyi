@@ -98,6 +98,8 @@ class ActionHead:
         integrator: str,
         num_samples: int | None,
         future_refresh: int | None,
+        previous_chunk: _Float32 | None,
+        chunking: tuple[int, int, float, int | None] | None,
         intervention: list[_Intervention],
         out: _Float32,
     ) -> None: ...

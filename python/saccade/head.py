@@ -27,6 +27,7 @@ from saccade._arrays import (
     result,
 )
 from saccade.attention import check_precision
+from saccade.chunking import Chunking
 from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError
 from saccade.integrator import check_integrator
@@ -274,13 +275,18 @@ class ActionHead:
         record: Sequence[str] = (),
     ) -> Context:
         """Runs what depends on the observation alone: ``vlln``, the VL self-attention, every cross block's
-        keys and values.
+        keys and values, each where the head has them. A block's keys and values are made for the positions
+        that it may see, and for no others.
 
         Args:
             backbone_features: ``(batch, T_vl, context_dim)``.
-            attention_mask: bool ``(batch, T_vl)``, True = attended. GR00T N1.5 ignores padding, as released:
-                only an all-true mask is taken.
-            image_mask: bool ``(batch, T_vl)``, True = image token; kept in the context for maps.
+            attention_mask: bool ``(batch, T_vl)``, True = attended; None stands for all. It acts in the
+                cross-attention blocks of heads whose ``config.mask_mode`` is ``"alternate"`` (GR00T N1.6 and
+                N1.7), and not in the VL self-attention. The others (N1 and N1.5) ignore padding, as
+                released, and take an all-true mask only.
+            image_mask: bool ``(batch, T_vl)``, True = image token; kept in the context for maps. With
+                ``mask_mode`` ``"alternate"`` it must be given: some blocks see text only, some images only,
+                so that each observation needs an attended token of either kind.
             drop_vl: bool ``(batch, T_vl)``, True = removed before the VL self-attention and everywhere
                 after, as if it had not been there.
             record: What to keep in ``context.record``, ``"attention"`` and ``"hidden"``: the probabilities of
@@ -316,14 +322,16 @@ class ActionHead:
         num_samples: int | None = None,
         future_refresh: int | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
+        previous_chunk: ArrayLike | None = None,
+        chunking: Chunking | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
         """Samples a chunk of actions: Euler steps from noise.
 
         Args:
             context: From this head's :meth:`encode`.
-            state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``, already normalised and
-                padded.
+            state: ``(batch, state_history, state_dim)``, or ``(batch, state_dim)`` where the history is of
+                one; already normalised and padded.
             embodiment_id: An integer, or ``(batch,)`` integers.
             noise: ``(batch, action_horizon, encoder_action_dim)``; with ``num_samples`` an axis of that size
                 after batch.
@@ -345,6 +353,10 @@ class ActionHead:
                 ``future_refresh`` cuts and biases act on the rows that run; a patch of state or future rows
                 at a step at which they do not always run is an error. All evaluations of a step are that
                 step.
+            previous_chunk: The chunk before, ``(batch, rows, action_dim)`` as it left the head (or
+                ``encoder_action_dim`` wide), of at least ``chunking.horizon`` rows. All samples of an
+                observation begin with the same.
+            chunking: How much of it is taken over; see :class:`saccade.Chunking`. Both or neither.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
 
         Returns:
@@ -353,7 +365,7 @@ class ActionHead:
 
         Raises:
             ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; both ``noise`` and
-            ``seed``.
+            ``seed``; one of ``previous_chunk`` and ``chunking`` without the other.
         """
         held = _held(context)
         samples = _optional_integer("num_samples", num_samples)
@@ -370,6 +382,7 @@ class ActionHead:
             check_integrator(integrator),
             samples,
             _optional_integer("future_refresh", future_refresh),
+            *_chunking(previous_chunk, chunking, output),
             _plain(intervention),
             output,
         )
@@ -391,6 +404,8 @@ class ActionHead:
         num_samples: int | None = None,
         future_refresh: int | None = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
+        previous_chunk: ArrayLike | None = None,
+        chunking: Chunking | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
         """:meth:`encode`, then :meth:`sample`."""
@@ -408,6 +423,8 @@ class ActionHead:
             num_samples=num_samples,
             future_refresh=future_refresh,
             intervention=intervention,
+            previous_chunk=previous_chunk,
+            chunking=chunking,
             out=out,
         )
 
@@ -425,9 +442,10 @@ class ActionHead:
 
         Args:
             context: From this head's :meth:`encode`.
-            state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``.
+            state: As in :meth:`sample`.
             embodiment_id: An integer, or ``(batch,)`` integers.
-            actions: Noisy actions, ``(batch, action_horizon, encoder_action_dim)``.
+            actions: Noisy actions, ``(batch, action_horizon, encoder_action_dim)``, taken as they are: what
+                ``sample`` holds at zero is whatever is given.
             timestep: The bucket, 0 to ``num_timestep_buckets - 1``: an integer, or ``(batch,)`` integers.
             intervention: As in :meth:`sample`; this is step 0.
 
@@ -581,6 +599,21 @@ def _plain(given: Intervention | Sequence[Intervention] | None) -> list[dict[str
         return {**vars(one), "key_bias": list((one.key_bias or {}).items()), "patch": patches}
 
     return [plain(one) for one in as_interventions(given)]
+
+
+def _chunking(
+    previous_chunk: ArrayLike | None, chunking: Chunking | None, output: Float32Array
+) -> tuple[Float32Array | None, tuple[int, int, float, int | None] | None]:
+    """The chunk before and the numbers that say how it is taken over, in the form that the engine takes."""
+    if previous_chunk is None and chunking is None:
+        return None, None
+    if previous_chunk is None or chunking is None:
+        given, missing = ("chunking", "previous_chunk") if chunking else ("previous_chunk", "chunking")
+        raise InputError(f"previous_chunk, chunking: expected both or neither, got {given} without {missing}")
+    if not isinstance(chunking, Chunking):
+        raise InputError(f"chunking: expected a saccade.Chunking, got {type(chunking).__name__}")
+    numbers = (chunking.overlap, chunking.frozen, chunking.ramp_rate, chunking.horizon)
+    return apart(float32("previous_chunk", previous_chunk), output), numbers
 
 
 def _converted(arrays: dict[Any, Float32Array], use_torch: bool) -> dict[Any, Array]:

@@ -14,11 +14,11 @@ use numpy::{
 use pyo3::exceptions::PyFileNotFoundError;
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
-use pyo3::types::{PyDict, PyType};
+use pyo3::types::{PyDict, PyTuple, PyType};
 use saccade::{
-    Arithmetic, Array, Checkpoint, ElementsRef, Error, Features, Group, Integrator, Isa, Keep, LoadOptions,
-    OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, TensorView, TensorViews, Tokens,
-    TraceOptions, peak,
+    Arithmetic, Array, Checkpoint, Chunking, ElementsRef, Error, Features, Group, Integrator, Isa, Keep,
+    LoadOptions, OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, TensorView,
+    TensorViews, Tokens, TraceOptions, peak,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -140,6 +140,12 @@ fn recorded<'py, Place: IntoPyObject<'py>>(
 fn config_dict<'py>(py: Python<'py>, config: &saccade::HeadConfig) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("version", &config.version)?;
+    dict.set_item("mask_mode", config.mask_mode())?;
+    let decoders = config.decoders.iter().map(|(name, width)| (name, *width));
+    dict.set_item("decoders", PyTuple::new(py, decoders)?)?;
+    let future_key_bias = config.future_key_bias.as_ref();
+    let future_key_bias = future_key_bias.map(|bias| PyTuple::new(py, bias)).transpose()?;
+    dict.set_item("future_key_bias", future_key_bias)?;
     for (name, flag) in [
         ("interleave_self_attention", config.interleave_self_attention),
         ("use_vlln", config.use_vlln),
@@ -153,6 +159,7 @@ fn config_dict<'py>(py: Python<'py>, config: &saccade::HeadConfig) -> PyResult<B
         ("num_heads", config.num_heads),
         ("head_dim", config.head_dim),
         ("context_dim", config.context_dim),
+        ("attend_text_every_n_blocks", config.attend_text_every_n_blocks),
         ("vl_num_layers", config.vl_num_layers),
         ("vl_num_heads", config.vl_num_heads),
         ("vl_head_dim", config.vl_head_dim),
@@ -368,6 +375,8 @@ impl ActionHead {
         integrator: &str,
         num_samples: Option<usize>,
         future_refresh: Option<usize>,
+        previous_chunk: Option<PyReadonlyArrayDyn<'_, f32>>,
+        chunking: Option<(usize, usize, f64, Option<usize>)>,
         intervention: Vec<PyIntervention<'_>>,
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
@@ -378,6 +387,15 @@ impl ActionHead {
             integrator: Integrator::from_name(integrator).map_err(raise)?,
             num_samples,
             future_refresh,
+            chunking: optional_view(&previous_chunk)?.zip(chunking).map(
+                |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
+                    previous_chunk,
+                    overlap,
+                    frozen,
+                    ramp_rate,
+                    horizon,
+                },
+            ),
             interventions: &interventions(intervention)?,
         };
         py.detach(|| {
@@ -407,10 +425,8 @@ impl ActionHead {
         let context = &context.0;
         let sampling = Sampling {
             num_steps,
-            integrator: Integrator::Euler,
-            num_samples: None,
-            future_refresh: None,
             interventions: &interventions(intervention)?,
+            ..Sampling::default()
         };
         let options = TraceOptions {
             record: Keep { attention, hidden },

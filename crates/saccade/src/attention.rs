@@ -22,6 +22,7 @@ pub(crate) struct AttentionBuffers {
     kv: Vec<f32>,
     mix: Vec<f32>,
     bias: Vec<f32>,
+    weights: Vec<f32>,
     packed: Vec<PackedKeyValues>,
     /// For the linear layers around the attention too: none of them runs beside another.
     pub linear: LinearScratch,
@@ -42,10 +43,20 @@ impl AttentionBuffers {
             kv: Vec::new(),
             mix: Vec::new(),
             bias: Vec::new(),
+            weights: Vec::new(),
             packed: Vec::new(),
             linear: LinearScratch::new(),
         }
     }
+}
+
+/// The keys that each group of queries has, where these are not all.
+#[derive(Clone, Copy)]
+pub(crate) struct Subset<'a> {
+    /// By group, ascending.
+    pub positions: &'a [Vec<usize>],
+    /// How many there are to choose from: biases that are shared, and probabilities, are over all of them.
+    pub all: usize,
 }
 
 /// What is added to the logits of an attention over several groups of keys.
@@ -58,6 +69,27 @@ pub(crate) struct Bias<'a> {
 }
 
 impl Bias<'_> {
+    /// The shared bias of `[heads, queries, keys]` logits at `positions` of the keys that it is over; `chosen` is memory for it.
+    fn at<'s>(
+        &self,
+        positions: &[usize],
+        [heads, queries, keys]: [usize; 3],
+        chosen: &'s mut Vec<f32>,
+    ) -> Option<LogitBias<'s>> {
+        let shared = self.shared?;
+        let heads = if shared.head_stride == 0 { 1 } else { heads };
+        chosen.clear();
+        for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
+            let row = &shared.values[head * shared.head_stride + query * shared.query_stride..];
+            chosen.extend(positions.iter().map(|&position| row[position]));
+        }
+        Some(LogitBias {
+            values: chosen,
+            head_stride: if heads == 1 { 0 } else { queries * keys },
+            query_stride: keys,
+        })
+    }
+
     /// The bias of `[heads, queries, keys]` logits of one group; `sum` is memory for the sum of both kinds.
     fn of<'s>(
         &'s self,
@@ -118,19 +150,20 @@ impl Attention {
         self.width() / self.num_heads
     }
 
-    /// Keys and values of `source`, whose rows are equally many for each of `groups`: one [`PackedKeyValues`] a group.
+    /// Keys and values of `source`, whose rows are those of one group after the other, `counts` of each: one [`PackedKeyValues`] a group.
     pub(crate) fn project(
         &self,
         engine: Engine,
         source: &[f32],
-        groups: usize,
+        counts: &[usize],
         buffer: &mut Vec<f32>,
         scratch: &mut LinearScratch,
     ) -> Vec<PackedKeyValues> {
         let (keys, values) = self.keys_values(engine, Part::ContextToKv, source, buffer, scratch);
-        let len = keys.nrows() / groups;
-        (0..groups)
-            .map(|group| {
+        let mut first = 0;
+        counts
+            .iter()
+            .map(|&count| {
                 let mut packed = PackedKeyValues::new(
                     engine.isa,
                     engine.precision.keys_values(),
@@ -141,9 +174,10 @@ impl Attention {
                     engine.threads,
                     &mut packed,
                     0,
-                    keys.subrows(group * len, len),
-                    values.subrows(group * len, len),
+                    keys.subrows(first, count),
+                    values.subrows(first, count),
                 );
+                first += count;
                 packed
             })
             .collect()
@@ -173,7 +207,8 @@ impl Attention {
     }
 
     /// `x += out(attention(y, held keys and values))`; `y` and `x` have `samples` sequences of equally many rows for each of `kv`.
-    /// `weights`, where asked for, is `(sequences, heads, queries, keys)`; it takes one sequence for each of `kv`.
+    /// `weights`, where asked for, is `(sequences, heads, queries, keys)`; it takes one sequence for each of `kv`. Where keys and values are those
+    /// of a `subset`, a shared bias and `weights` are over all that it is chosen from, and `weights` is zero before.
     #[allow(clippy::too_many_arguments)] // Buffers and views of one equation; a struct would only rename them.
     pub(crate) fn add_cross(
         &self,
@@ -181,6 +216,7 @@ impl Attention {
         y: &[f32],
         kv: &[PackedKeyValues],
         samples: usize,
+        subset: Option<Subset<'_>>,
         bias: Bias<'_>,
         mut weights: Option<&mut [f32]>,
         epilogue: Epilogue,
@@ -197,15 +233,32 @@ impl Attention {
             let (group, kv) = (call / calls, &kv[call / calls]);
             let range = call * count * width..(call + 1) * count * width;
             let logits = [self.num_heads, count, kv.len()];
+            let q = rows(&buffers.q[range.clone()], width);
+            let mix = rows_mut(&mut mix[range], width);
+            let Some(Subset { positions, all }) = subset else {
+                let bias = bias.of(group, logits, &mut buffers.bias);
+                let weights = weights_of(&mut weights, call, logits);
+                attention(engine.threads, q, kv, self.scale(), bias, weights, mix);
+                continue;
+            };
+            let positions = &positions[group];
+            let bias = bias.at(positions, logits, &mut buffers.bias);
+            let mut chosen = weights
+                .is_some()
+                .then(|| sized(&mut buffers.weights, logits.iter().product()));
             attention(
                 engine.threads,
-                rows(&buffers.q[range.clone()], width),
+                q,
                 kv,
                 self.scale(),
-                bias.of(group, logits, &mut buffers.bias),
-                weights_of(&mut weights, call, logits),
-                rows_mut(&mut mix[range], width),
+                bias,
+                chosen.as_deref_mut(),
+                mix,
             );
+            let all_weights = weights_of(&mut weights, call, [self.num_heads, count, all]);
+            if let (Some(all_weights), Some(chosen)) = (all_weights, chosen) {
+                spread(chosen, positions, all_weights, all);
+            }
         }
         apply(
             Part::ToOut,
@@ -302,6 +355,21 @@ impl Attention {
 
     fn scale(&self) -> f32 {
         1.0 / (self.head_dim() as f32).sqrt()
+    }
+}
+
+/// Rows over keys at `positions` among `all`, written to rows over all of them.
+fn spread(chosen: &[f32], positions: &[usize], all_weights: &mut [f32], all: usize) {
+    if positions.is_empty() {
+        return;
+    }
+    for (chosen, row) in chosen
+        .chunks_exact(positions.len())
+        .zip(all_weights.chunks_exact_mut(all))
+    {
+        for (&weight, &position) in chosen.iter().zip(positions) {
+            row[position] = weight;
+        }
     }
 }
 

@@ -5,7 +5,7 @@ use std::ops::Range;
 use saccade_kernels::PackedKeyValues;
 
 use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward};
-use crate::config::HeadConfig;
+use crate::config::{HeadConfig, Reads};
 use crate::error::Result;
 use crate::layers::{Engine, Norm, TensorSource, sized};
 use crate::layout::{HeadNames, VlBlockNames};
@@ -21,10 +21,10 @@ pub struct Context {
     pub(crate) batch: usize,
     pub(crate) num_vl_tokens: usize,
     pub(crate) vl_embs: Vec<f32>,
-    /// By block, empty for self-attention; within it by batch element.
+    /// By block, empty for self-attention; within it by batch element. Of the positions that are seen there only.
     pub(crate) keys_values: Vec<Vec<PackedKeyValues>>,
-    /// Logit biases that take away what `drop_vl` named, `(batch, num_vl_tokens)`.
-    pub(crate) removed: Option<Vec<f32>>,
+    /// One for each kind of cross-attention block.
+    pub(crate) seen: Vec<Seen>,
     pub(crate) image_mask: Option<Vec<bool>>,
     pub(crate) recorded: Recorded<usize>,
 }
@@ -69,7 +69,57 @@ impl Context {
             .flatten()
             .map(PackedKeyValues::nbytes)
             .sum();
-        4 * self.vl_embs.len() + keys_values
+        let seen: usize = self.seen.iter().map(Seen::nbytes).sum();
+        4 * self.vl_embs.len() + keys_values + seen + self.image_mask.as_ref().map_or(0, Vec::len)
+    }
+
+    /// The positions that blocks of this kind see, by batch element; none if they see all.
+    pub(crate) fn positions(&self, reads: Reads) -> Option<&[Vec<usize>]> {
+        let seen = self.seen.iter().find(|seen| seen.reads == reads)?;
+        seen.positions.as_deref()
+    }
+}
+
+/// The vision-language tokens that one kind of cross-attention block sees.
+pub(crate) struct Seen {
+    pub reads: Reads,
+    /// Ascending, by batch element; none if all are seen.
+    pub positions: Option<Vec<Vec<usize>>>,
+}
+
+impl Seen {
+    /// How many are seen in each of these batch elements.
+    fn counts(&self, elements: Range<usize>, num_vl_tokens: usize) -> Vec<usize> {
+        match &self.positions {
+            None => vec![num_vl_tokens; elements.len()],
+            Some(positions) => positions[elements].iter().map(Vec::len).collect(),
+        }
+    }
+
+    /// The rows of these batch elements that are seen, one element's after the other's; `gathered` is memory for them.
+    fn rows<'a>(
+        &self,
+        elements: Range<usize>,
+        vl: &'a [f32],
+        context_dim: usize,
+        gathered: &'a mut Vec<f32>,
+    ) -> &'a [f32] {
+        let Some(positions) = &self.positions else {
+            return vl;
+        };
+        gathered.clear();
+        let element = vl.len() / elements.len();
+        for (vl, positions) in vl.chunks_exact(element).zip(&positions[elements]) {
+            for &position in positions {
+                gathered.extend_from_slice(&vl[position * context_dim..][..context_dim]);
+            }
+        }
+        gathered
+    }
+
+    fn nbytes(&self) -> usize {
+        let positions = self.positions.iter().flatten();
+        positions.map(|positions| size_of_val(positions.as_slice())).sum()
     }
 }
 
@@ -99,6 +149,7 @@ struct VlBlock {
 /// Memory of one `encode` that is kept for the next.
 pub(crate) struct EncodeBuffers {
     y: Vec<f32>,
+    gathered: Vec<f32>,
     hidden: Vec<f32>,
     attention: AttentionBuffers,
 }
@@ -107,6 +158,7 @@ impl EncodeBuffers {
     pub(crate) fn new() -> Self {
         Self {
             y: Vec::new(),
+            gathered: Vec::new(),
             hidden: Vec::new(),
             attention: AttentionBuffers::new(),
         }
@@ -173,16 +225,17 @@ impl VlEncoder {
 
     /// The tokens that the cross-attention blocks see, and their keys and values in each of `cross` blocks.
     ///
-    /// `features` is `(batch, num_vl_tokens, context_dim)`, `removed` what is added to the logits of its tokens. What `recorded` has places
-    /// for is kept.
+    /// `features` is `(batch, num_vl_tokens, context_dim)`, `removed` what is added to the logits of its tokens in the VL self-attention, `seen`
+    /// has every kind of the blocks. What `recorded` has places for is kept.
     #[allow(clippy::too_many_arguments)] // An observation, what is wanted of it, and memory.
     pub(crate) fn encode(
         &self,
         engine: Engine,
-        cross: &[Option<&Attention>],
+        cross: &[Option<(Reads, &Attention)>],
         features: &[f32],
         num_vl_tokens: usize,
         removed: Option<&[f32]>,
+        seen: &[Seen],
         recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,
     ) -> (Vec<f32>, Vec<Vec<PackedKeyValues>>) {
@@ -197,20 +250,27 @@ impl VlEncoder {
                 engine,
                 features,
                 num_vl_tokens,
-                elements,
+                elements.clone(),
                 removed,
                 recorded,
                 buffers,
                 vl,
             );
-            for (attention, keys_values) in cross.iter().zip(&mut keys_values) {
-                if let Some(attention) = attention {
-                    let EncodeBuffers {
-                        hidden,
-                        attention: own,
-                        ..
-                    } = &mut *buffers;
-                    keys_values.extend(attention.project(engine, vl, groups, hidden, &mut own.linear));
+            let EncodeBuffers {
+                gathered,
+                hidden,
+                attention: AttentionBuffers { linear, .. },
+                ..
+            } = &mut *buffers;
+            for seen in seen {
+                let counts = seen.counts(elements.clone(), num_vl_tokens);
+                let rows = seen.rows(elements.clone(), vl, self.context_dim, gathered);
+                for (block, keys_values) in cross.iter().zip(&mut keys_values) {
+                    if let Some((reads, attention)) = block
+                        && *reads == seen.reads
+                    {
+                        keys_values.extend(attention.project(engine, rows, &counts, hidden, linear));
+                    }
                 }
             }
         }

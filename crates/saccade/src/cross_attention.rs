@@ -140,7 +140,7 @@ impl CrossAttention {
         let packed = self.attention.project(
             self.engine,
             encoder_hidden_states.data,
-            batch,
+            &vec![num_vl_tokens; batch],
             &mut Vec::new(),
             &mut LinearScratch::new(),
         );
@@ -198,6 +198,7 @@ impl CrossAttention {
             y,
             &kv.packed,
             1,
+            None,
             bias,
             weights,
             Epilogue::Store,

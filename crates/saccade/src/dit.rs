@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues, PackedLinear};
 
-use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward, Held};
+use crate::attention::{Attention, AttentionBuffers, Bias, FeedForward, Held, Subset};
 use crate::cache::Cache;
-use crate::config::HeadConfig;
+use crate::config::{HeadConfig, Reads};
 use crate::context::Context;
 use crate::error::Result;
 use crate::intervention::{Changes, Group, Groups};
@@ -37,7 +37,8 @@ struct Block {
     /// `norm1.linear`.
     modulation: PackedLinear,
     attention: Attention,
-    is_cross: bool,
+    /// What it sees of the vision-language tokens; none if it is self-attention.
+    reads: Option<Reads>,
     feed_forward: FeedForward,
 }
 
@@ -121,7 +122,7 @@ impl Dit {
             Ok(Block {
                 modulation: linear(&names.modulation)?,
                 attention: Attention::load(tensors, engine, &names.attention, config.num_heads)?,
-                is_cross: config.is_cross(index),
+                reads: config.reads(index),
                 feed_forward: FeedForward::load(tensors, engine, &names.feed_forward)?,
             })
         };
@@ -155,11 +156,11 @@ impl Dit {
             + self.output.nbytes()
     }
 
-    /// By block: the attention over the vision-language tokens, if it is one.
-    pub(crate) fn cross_attentions(&self) -> Vec<Option<&Attention>> {
+    /// By block: the attention over the vision-language tokens and what it sees of them, if it is one.
+    pub(crate) fn cross_attentions(&self) -> Vec<Option<(Reads, &Attention)>> {
         self.blocks
             .iter()
-            .map(|block| block.is_cross.then_some(&block.attention))
+            .map(|block| block.reads.map(|reads| (reads, &block.attention)))
             .collect()
     }
 
@@ -310,14 +311,26 @@ impl Dit {
         let first_row = changes.extent.groups.num_rows() - x.len() / self.width / groups;
         let shared = changes.bias(step, index, first_row);
         let weights = recorded.attention((step, index));
-        if block.is_cross {
-            let (keys, kv) = (context.removed.as_deref(), &context.keys_values[index]);
-            let bias = Bias { keys, shared };
-            block
-                .attention
-                .add_cross(engine, y, kv, samples, bias, weights, Epilogue::Add, attention, x);
+        let bias = Bias { keys: None, shared };
+        if let Some(reads) = block.reads {
+            let kv = &context.keys_values[index];
+            let all = context.num_vl_tokens;
+            let subset = context
+                .positions(reads)
+                .map(|positions| Subset { positions, all });
+            block.attention.add_cross(
+                engine,
+                y,
+                kv,
+                samples,
+                subset,
+                bias,
+                weights,
+                Epilogue::Add,
+                attention,
+                x,
+            );
         } else {
-            let bias = Bias { keys: None, shared };
             let source: &[f32] = match all {
                 None => y,
                 Some(h) => {

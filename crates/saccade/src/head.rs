@@ -9,8 +9,9 @@ use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
 use crate::checkpoint::{Checkpoint, read_text};
-use crate::config::HeadConfig;
-use crate::context::{Context, EncodeBuffers, VlEncoder, removed_keys};
+use crate::chunking::{Chunking, Seam};
+use crate::config::{HeadConfig, Reads};
+use crate::context::{Context, EncodeBuffers, Seen, VlEncoder, removed_keys};
 use crate::dit::{Dit, DitBuffers, Pass, Rows};
 use crate::error::{Error, Result, show_shape};
 use crate::fit::{self, Problem};
@@ -44,9 +45,10 @@ pub struct LoadOptions {
 pub struct Features<'a> {
     /// `(batch, num_vl_tokens, context_dim)`.
     pub backbone_features: Array<'a>,
-    /// `(batch, num_vl_tokens)`, true = attended. N1.5 ignores padding: only an all-true mask is taken.
+    /// `(batch, num_vl_tokens)`, true = attended. None: all are. A head that ignores padding takes an all-true mask only.
     pub attention_mask: Option<Array<'a, bool>>,
-    /// `(batch, num_vl_tokens)`, true = image token; kept for maps.
+    /// `(batch, num_vl_tokens)`, true = image token. A head whose blocks alternate between text and images needs it; every head keeps it, for
+    /// maps.
     pub image_mask: Option<Array<'a, bool>>,
     /// `(batch, num_vl_tokens)`, true = as if the position were not there.
     pub drop_vl: Option<Array<'a, bool>>,
@@ -114,6 +116,8 @@ pub struct Sampling<'a> {
     /// The rows of state and future tokens run at every so many evaluations of the velocity, from the first one on. At the others only the
     /// action rows run, and self-attention reads the others' keys and values as they last were. None and 1: at all, which is exact.
     pub future_refresh: Option<usize>,
+    /// The chunk before, and how this one begins with its end; none starts from noise alone.
+    pub chunking: Option<Chunking<'a>>,
     /// What to change inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an error.
     pub interventions: &'a [Intervention],
 }
@@ -132,7 +136,8 @@ pub struct ActionHead {
     /// Its first `action_horizon` rows; none without `add_pos_embed`.
     position_embedding: Option<Vec<f32>>,
     dit: Dit,
-    action_decoder: [CategoryLinear; 2],
+    /// Their outputs stand side by side.
+    decoders: Vec<[CategoryLinear; 2]>,
     brackets: Cache<(usize, usize), Vec<f32>>,
     workspaces: Mutex<Vec<Workspace>>,
 }
@@ -147,10 +152,13 @@ struct Workspace {
     x: Vec<f32>,
     /// `x` at the start of a step of two evaluations.
     start: Vec<f32>,
+    /// What the velocity of each action of a chunk is multiplied by.
+    strength: Vec<f32>,
     tokens: Vec<f32>,
     encoded: Vec<f32>,
     output: Vec<f32>,
     decoder_hidden: Vec<f32>,
+    decoded: Vec<f32>,
     velocity: Vec<f32>,
     linear: LinearScratch,
 }
@@ -165,10 +173,12 @@ impl Workspace {
             state: Vec::new(),
             x: Vec::new(),
             start: Vec::new(),
+            strength: Vec::new(),
             tokens: Vec::new(),
             encoded: Vec::new(),
             output: Vec::new(),
             decoder_hidden: Vec::new(),
+            decoded: Vec::new(),
             velocity: Vec::new(),
             linear: LinearScratch::new(),
         }
@@ -245,7 +255,6 @@ impl ActionHead {
         let ids = &embodiment_ids;
         let category = |names| CategoryLinear::load(tensors, engine, names, ids);
         let [state_1, state_2] = &names.state_encoder;
-        let [decoder_1, decoder_2] = &names.action_decoder;
         Ok(Self {
             engine,
             id: next_id(),
@@ -261,7 +270,11 @@ impl ActionHead {
                 Some((name, _)) => Some(tensors.slices(name, 0..config.action_horizon)?.into_f32()),
             },
             dit: Dit::load(tensors, engine, &config, names)?,
-            action_decoder: [category(decoder_1)?, category(decoder_2)?],
+            decoders: names
+                .decoders
+                .iter()
+                .map(|[layer1, layer2]| Ok([category(layer1)?, category(layer2)?]))
+                .collect::<Result<_>>()?,
             brackets: Cache::new(CACHED_BRACKETS),
             workspaces: Mutex::new(Vec::new()),
             embodiment_ids,
@@ -308,7 +321,7 @@ impl ActionHead {
             + self.action_encoder.nbytes()
             + 4 * (self.future_tokens.len() + self.position_embedding.as_ref().map_or(0, Vec::len))
             + self.dit.nbytes()
-            + category(&self.action_decoder)
+            + self.decoders.iter().map(|layers| category(layers)).sum::<usize>()
     }
 
     /// Encodes observations: `vlln`, the VL self-attention, and the keys and values of every cross-attention block.
@@ -321,6 +334,7 @@ impl ActionHead {
             .drop_vl
             .filter(|mask| mask.data.contains(&true))
             .map(|mask| removed_keys(mask.data));
+        let seen = self.seen(features, batch, num_vl_tokens)?;
         let mut recorded = self.vl.recorded(features.record, batch, num_vl_tokens)?;
         let cross = self.dit.cross_attentions();
         let (vl_embs, keys_values) = self.with_workspace(|workspace| {
@@ -332,6 +346,7 @@ impl ActionHead {
                 data,
                 num_vl_tokens,
                 removed.as_deref(),
+                &seen,
                 &mut recorded,
                 buffers,
             )
@@ -342,7 +357,7 @@ impl ActionHead {
             num_vl_tokens,
             vl_embs,
             keys_values,
-            removed,
+            seen,
             image_mask: features.image_mask.map(|mask| mask.data.to_vec()),
             recorded,
         })
@@ -350,7 +365,7 @@ impl ActionHead {
 
     /// Samples a chunk of actions: Euler steps from `noise` (spec 1.8).
     ///
-    /// `state` is `(batch, state_dim)` or `(batch, state_history, state_dim)`, `embodiment_id` a scalar or `(batch)`, `noise`
+    /// `state` is `(batch, state_history, state_dim)`, or `(batch, state_dim)` where the history is of one; `embodiment_id` a scalar or `(batch)`, `noise`
     /// `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with `num_samples`.
     /// `out` has the shape of the noise, with `action_dim` for its last axis.
     ///
@@ -369,6 +384,7 @@ impl ActionHead {
         let state = self.check_state(state, context.batch)?;
         let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, context.batch, sampling.num_samples)?;
+        let seam = self.check_chunking(sampling, context.batch)?;
         let refresh = check_refresh(sampling.future_refresh)?;
         let extent = self.extent(sampling.interventions, context, num_steps)?;
         let changes = Changes::new(sampling.interventions, extent)?;
@@ -385,8 +401,9 @@ impl ActionHead {
             self.encode_state(state, workspace);
             let nothing = &mut Recorded::default();
             let steps = (num_steps, sampling.integrator);
-            self.follow(&pass, noise.data, steps, refresh, nothing, workspace);
-            out.copy_from_slice(&workspace.x);
+            self.begin(noise.data, seam.as_ref(), samples, workspace);
+            self.follow(&pass, steps, refresh, nothing, workspace);
+            self.copy_actions(&workspace.x, out);
             Ok(())
         })
     }
@@ -428,6 +445,7 @@ impl ActionHead {
         let state = self.check_state(state, batch)?;
         let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, batch, None)?;
+        let seam = self.check_chunking(sampling, batch)?;
         let extent = self.extent(sampling.interventions, context, num_steps)?;
         let groups = extent.groups;
         let shapes = |place: StepBlock| {
@@ -453,13 +471,15 @@ impl ActionHead {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace);
             let steps = (num_steps, Integrator::Euler);
-            self.follow(&pass, noise.data, steps, 1, &mut recorded, workspace);
+            self.begin(noise.data, seam.as_ref(), samples, workspace);
+            self.follow(&pass, steps, 1, &mut recorded, workspace);
             let shape = [batch, config.action_horizon, config.action_dim];
-            let actions = OwnedArray::new(workspace.x.clone(), &shape);
+            let mut actions = vec![0.0; shape.iter().product()];
+            self.copy_actions(&workspace.x, &mut actions);
             Ok(Trace {
                 recorded,
                 groups,
-                actions,
+                actions: OwnedArray::new(actions, &shape),
             })
         })
     }
@@ -552,8 +572,21 @@ impl ActionHead {
         }
         let features = vec![0.0; batch * num_vl_tokens * config.context_dim];
         let shape = [batch, num_vl_tokens, config.context_dim];
-        let context = self.encode(&Features::new(Array::new(&features, &shape)))?;
-        let (state, state_shape) = (vec![0.0; batch * config.state_dim], [batch, config.state_dim]);
+        // One kind of block sees all but one token: no call of this size gathers more at a time.
+        let kinds = self.kinds();
+        if kinds.len() > num_vl_tokens {
+            return Err(Error::Input(format!(
+                "num_vl_tokens: expected at least 2, one of text and one of an image, got {num_vl_tokens}"
+            )));
+        }
+        let is_image = |token: usize| kinds.contains(&Reads::Images) && !token.is_multiple_of(num_vl_tokens);
+        let image_mask: Vec<_> = (0..batch * num_vl_tokens).map(is_image).collect();
+        let context = self.encode(&Features {
+            image_mask: Some(Array::new(&image_mask, &shape[..2])),
+            ..Features::new(Array::new(&features, &shape))
+        })?;
+        let state_shape = [batch, config.state_history, config.state_dim];
+        let state = vec![0.0; state_shape.iter().product()];
         let state = Array::new(&state, &state_shape);
         let chunk = [config.action_horizon, config.encoder_action_dim];
         let shape: Vec<usize> = [batch].into_iter().chain(num_samples).chain(chunk).collect();
@@ -596,18 +629,42 @@ impl ActionHead {
         )
     }
 
-    /// Follows the velocity from `noise` to the actions in equal steps, to `workspace.x`. At evaluations that `refresh` does not divide only
-    /// the action rows run.
+    /// What a chunk starts from, to `workspace.x (batch, samples, action_horizon, encoder_action_dim)`: noise, and where there was a chunk before
+    /// its end. What no decoder moves is zero.
+    fn begin(&self, noise: &[f32], seam: Option<&Seam<'_>>, samples: usize, workspace: &mut Workspace) {
+        let Workspace { x, strength, .. } = workspace;
+        let (horizon, width) = (self.config.action_horizon, self.config.encoder_action_dim);
+        sized(x, noise.len()).copy_from_slice(noise);
+        sized(strength, horizon).fill(1.0);
+        if let Some(seam) = seam {
+            seam.begin(samples, horizon, width, x);
+            for (index, strength) in strength.iter_mut().enumerate() {
+                *strength = seam.strength(index);
+            }
+        }
+        for row in x.chunks_exact_mut(width) {
+            row[self.config.action_dim..].fill(0.0);
+        }
+    }
+
+    /// The actions as they are returned: without what no decoder moves.
+    fn copy_actions(&self, x: &[f32], out: &mut [f32]) {
+        let (width, action_dim) = (self.config.encoder_action_dim, self.config.action_dim);
+        for (row, out) in x.chunks_exact(width).zip(out.chunks_exact_mut(action_dim)) {
+            out.copy_from_slice(&row[..action_dim]);
+        }
+    }
+
+    /// Follows the velocity from `workspace.x` to the actions in equal steps, in place. At evaluations that `refresh` does not divide only the
+    /// action rows run.
     fn follow(
         &self,
         pass: &Pass<'_>,
-        noise: &[f32],
         (num_steps, integrator): (usize, Integrator),
         refresh: usize,
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) {
-        sized(&mut workspace.x, noise.len()).copy_from_slice(noise);
         let dt = 1.0 / num_steps as f32;
         let in_step = integrator.evaluations();
         let refreshes = |evaluation: usize| evaluation.is_multiple_of(refresh);
@@ -626,7 +683,11 @@ impl ActionHead {
             };
             self.step_velocity(&Pass { step, rows, ..*pass }, |_| bucket, recorded, workspace);
             let Workspace {
-                x, start, velocity, ..
+                x,
+                start,
+                strength,
+                velocity,
+                ..
             } = &mut *workspace;
             let dt = match (integrator, evaluation % in_step) {
                 (Integrator::Euler, _) => dt,
@@ -639,8 +700,13 @@ impl ActionHead {
                     dt
                 }
             };
-            for (x, v) in x.iter_mut().zip(velocity) {
-                *x += dt * *v;
+            let rows = x
+                .chunks_exact_mut(self.config.encoder_action_dim)
+                .zip(velocity.chunks_exact(self.config.action_dim));
+            for ((x, v), strength) in rows.zip(strength.iter().cycle()) {
+                for (x, v) in x.iter_mut().zip(v) {
+                    *x += dt * v * strength;
+                }
             }
         }
     }
@@ -688,33 +754,43 @@ impl ActionHead {
             embodiment_ids,
             output,
             decoder_hidden,
+            decoded,
             velocity,
             linear,
             ..
         } = workspace;
         self.dit.forward(self.engine, pass, recorded, dit, output);
-        let [layer1, layer2] = &self.action_decoder;
+        let action_dim = self.config.action_dim;
+        let rows = output.len() / self.config.hidden_dim;
         let hidden = sized(decoder_hidden, output.len());
-        layer1.apply(
-            self.engine,
-            embodiment_ids,
-            output,
-            Epilogue::Relu,
-            hidden,
-            linear,
-        );
-        let velocity = sized(
-            velocity,
-            output.len() / self.config.hidden_dim * self.config.action_dim,
-        );
-        layer2.apply(
-            self.engine,
-            embodiment_ids,
-            hidden,
-            Epilogue::Store,
-            velocity,
-            linear,
-        );
+        let velocity = sized(velocity, rows * action_dim);
+        let mut first = 0; // column of the decoder's first output
+        for ([layer1, layer2], (_, width)) in self.decoders.iter().zip(&self.config.decoders) {
+            let decoded = sized(decoded, rows * width);
+            layer1.apply(
+                self.engine,
+                embodiment_ids,
+                output,
+                Epilogue::Relu,
+                hidden,
+                linear,
+            );
+            layer2.apply(
+                self.engine,
+                embodiment_ids,
+                hidden,
+                Epilogue::Store,
+                decoded,
+                linear,
+            );
+            for (row, decoded) in velocity
+                .chunks_exact_mut(action_dim)
+                .zip(decoded.chunks_exact(*width))
+            {
+                row[first..first + width].copy_from_slice(decoded);
+            }
+            first += width;
+        }
     }
 
     /// Action rows from noisy actions (spec 1.3 with I12), to `workspace.encoded (batch, samples, action_horizon, width)`.
@@ -845,17 +921,84 @@ impl ActionHead {
                 mask.check_shape(name, "(batch, num_vl_tokens)", &[batch, num_vl_tokens])?;
             }
         }
-        if features
-            .attention_mask
-            .is_some_and(|mask| mask.data.contains(&false))
+        let ignores_masks = self.config.attend_text_every_n_blocks == 0;
+        if ignores_masks
+            && features
+                .attention_mask
+                .is_some_and(|mask| mask.data.contains(&false))
         {
+            return Err(Error::Input(format!(
+                "attention_mask: this head (GR00T {}) ignores padding masks, so a mask with a false entry would promise what it does not do; \
+                 pass None to reproduce the released code (padding is attended), or drop_vl=~attention_mask to remove these positions",
+                self.config.version.to_uppercase()
+            )));
+        }
+        if !ignores_masks && features.image_mask.is_none() {
             return Err(Error::Input(
-                "attention_mask: GR00T N1.5 ignores padding masks, so a mask with a false entry would promise what the head does not do; \
-                 pass None to reproduce the released code (padding is attended), or drop_vl=~attention_mask to remove these positions"
+                "image_mask: expected (batch, num_vl_tokens) booleans, True = image token, since this head's blocks alternate between text \
+                 and images, got None"
                     .to_owned(),
             ));
         }
         Ok((batch, num_vl_tokens))
+    }
+
+    /// What each kind of the head's blocks sees of the features.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if a kind that alternates with another sees nothing of an observation: its softmax is not defined (spec 5.3).
+    fn seen(&self, features: &Features<'_>, batch: usize, num_vl_tokens: usize) -> Result<Vec<Seen>> {
+        let is = |mask: Option<Array<'_, bool>>, token: usize| mask.is_some_and(|mask| mask.data[token]);
+        let is_left = |token| {
+            let attended = features.attention_mask.is_none() || is(features.attention_mask, token);
+            attended && !is(features.drop_vl, token)
+        };
+        let all_are_left = (0..batch * num_vl_tokens).all(is_left);
+        let mut seen = Vec::new();
+        for reads in self.kinds() {
+            let is_seen = |token: usize| {
+                is_left(token)
+                    && match reads {
+                        Reads::All => true,
+                        Reads::Text => !is(features.image_mask, token),
+                        Reads::Images => is(features.image_mask, token),
+                    }
+            };
+            let of_element = |element: usize| {
+                let first = element * num_vl_tokens;
+                (0..num_vl_tokens)
+                    .filter(|position| is_seen(first + position))
+                    .collect::<Vec<_>>()
+            };
+            let positions = match reads {
+                Reads::All if all_are_left => None,
+                _ => Some((0..batch).map(of_element).collect::<Vec<_>>()),
+            };
+            let nothing = positions.iter().flatten().position(Vec::is_empty);
+            if let Some(element) = nothing.filter(|_| reads != Reads::All) {
+                let (kind, what) = match reads {
+                    Reads::Images => ("image", "True"),
+                    _ => ("text", "False"),
+                };
+                return Err(Error::Input(format!(
+                    "image_mask: expected at least one {kind} token ({what}) in each observation that is attended and not dropped, since some \
+                     of this head's blocks see nothing else, got none in observation {element}"
+                )));
+            }
+            seen.push(Seen { reads, positions });
+        }
+        Ok(seen)
+    }
+
+    /// The kinds of cross-attention blocks that there are.
+    fn kinds(&self) -> Vec<Reads> {
+        let mut kinds = Vec::new();
+        for reads in (0..self.config.num_layers).filter_map(|block| self.config.reads(block)) {
+            if !kinds.contains(&reads) {
+                kinds.push(reads);
+            }
+        }
+        kinds
     }
 
     fn check_context(&self, context: &Context) -> Result<()> {
@@ -869,6 +1012,14 @@ impl ActionHead {
 
     fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
         let (history, width) = (self.config.state_history, self.config.state_dim);
+        if history > 1 && state.shape != [batch, history, width] {
+            return Err(Error::Shape(format!(
+                "state: expected (batch, state_history, state_dim) = {}, since this head takes {history} states, each normalised and \
+                 zero-padded to state_dim as the checkpoint's normaliser does, got {}",
+                show_shape(&[batch, history, width]),
+                show_shape(state.shape)
+            )));
+        }
         if state.shape != [batch, width] && state.shape != [batch, history, width] {
             return Err(Error::Shape(format!(
                 "state: expected (batch, state_dim) = {} or (batch, state_history, state_dim) = {}, normalised and zero-padded to state_dim \
@@ -908,6 +1059,13 @@ impl ActionHead {
         }
         noise.check_finite("noise")?;
         Ok(num_samples.unwrap_or(1))
+    }
+
+    fn check_chunking<'a>(&self, sampling: &Sampling<'a>, batch: usize) -> Result<Option<Seam<'a>>> {
+        let chunking = sampling.chunking.as_ref();
+        chunking
+            .map(|chunking| chunking.check(&self.config, batch))
+            .transpose()
     }
 
     fn check_embodiments(&self, ids: Array<'_, i64>, batch: usize, checked: &mut Vec<usize>) -> Result<()> {

@@ -163,6 +163,8 @@ pub(crate) struct Extent<'a> {
     pub num_steps: usize,
     /// `(groups.future, width)`: the learned ones, or those in their place.
     pub future_tokens: &'a [f32],
+    /// What is added to the logits of these keys, with or without an intervention.
+    pub future_key_bias: Option<&'a [f32]>,
     pub groups: Groups,
 }
 
@@ -176,12 +178,19 @@ impl<'a> Extent<'a> {
         context: &Context,
         num_steps: usize,
     ) -> Result<Self> {
-        let future_tokens = replaced_future_tokens(interventions, config.width)?.unwrap_or(learned);
+        let replaced = replaced_future_tokens(interventions, config.width)?;
+        let future_tokens = replaced.unwrap_or(learned);
+        // The config's biases are those of the learned tokens.
+        let future_key_bias = match replaced {
+            None => config.future_key_bias.as_deref(),
+            Some(_) => None,
+        };
         Ok(Self {
             config,
             batch: context.batch,
             num_steps,
             future_tokens,
+            future_key_bias,
             groups: Groups {
                 future: future_tokens.len() / config.width,
                 action: config.action_horizon,
@@ -240,7 +249,7 @@ impl<'a> Changes<'a> {
             }
         }
         let adds = |one: &Intervention| !one.cut.is_empty() || !one.key_bias.is_empty();
-        if interventions.iter().any(adds) {
+        if extent.future_key_bias.is_some() || interventions.iter().any(adds) {
             changes.find_biases(interventions)?;
         }
         Ok(changes)
@@ -277,7 +286,8 @@ impl<'a> Changes<'a> {
                 let acting: Vec<usize> = (0..interventions.len())
                     .filter(|&index| interventions[index].acts(step, block, is_cross))
                     .collect();
-                let index = if acting.is_empty() {
+                let has_own = !is_cross && self.extent.future_key_bias.is_some();
+                let index = if acting.is_empty() && !has_own {
                     None
                 } else {
                     Some(match known.entry((is_cross, acting)) {
@@ -296,7 +306,7 @@ impl<'a> Changes<'a> {
         Ok(())
     }
 
-    /// The sum of what `acting` add in blocks of one kind.
+    /// The sum of what `acting` add in blocks of one kind, and of what these have of their own.
     fn sum(&self, acting: &[&Intervention], is_cross: bool) -> Result<DenseBias> {
         let Extent { groups, config, .. } = self.extent;
         let rows = groups.num_rows();
@@ -317,6 +327,11 @@ impl<'a> Changes<'a> {
             rows,
             keys,
         };
+        if let Some(own) = self.extent.future_key_bias.filter(|_| !is_cross) {
+            for row in bias.values.chunks_exact_mut(keys) {
+                row[groups.range(Group::Future)].copy_from_slice(own);
+            }
+        }
         for intervention in acting {
             intervention.add(&groups, is_cross, &mut bias);
         }
@@ -569,7 +584,7 @@ mod tests {
             num_vl_tokens: 5,
             vl_embs: Vec::new(),
             keys_values: Vec::new(),
-            removed: None,
+            seen: Vec::new(),
             image_mask: None,
             recorded: Recorded::default(),
         };

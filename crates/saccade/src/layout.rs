@@ -101,7 +101,8 @@ pub(crate) struct HeadNames {
     pub vl_blocks: Vec<VlBlockNames>,
     pub state_encoder: [CategoryLinearNames; 2],
     pub action_encoder: [CategoryLinearNames; 3],
-    pub action_decoder: [CategoryLinearNames; 2],
+    /// One for each of [`HeadConfig::decoders`].
+    pub decoders: Vec<[CategoryLinearNames; 2]>,
     /// `(num_future_tokens, width)`.
     pub future_tokens: (String, Vec<usize>),
     /// `(max_positions, width)`.
@@ -166,10 +167,16 @@ impl HeadNames {
                 category("action_encoder", "W2", 2 * width, width),
                 category("action_encoder", "W3", width, width),
             ],
-            action_decoder: [
-                category("action_decoder", "layer1", hidden, hidden),
-                category("action_decoder", "layer2", hidden, config.action_dim),
-            ],
+            decoders: config
+                .decoders
+                .iter()
+                .map(|(name, width)| {
+                    [
+                        category(name, "layer1", hidden, hidden),
+                        category(name, "layer2", hidden, *width),
+                    ]
+                })
+                .collect(),
             future_tokens: (
                 "future_tokens.weight".to_owned(),
                 vec![config.num_future_tokens, width],
@@ -220,7 +227,7 @@ impl HeadNames {
             .state_encoder
             .iter()
             .chain(&self.action_encoder)
-            .chain(&self.action_decoder)
+            .chain(self.decoders.iter().flatten())
         {
             layer.list(&mut tensors);
         }
@@ -279,7 +286,7 @@ impl HeadNames {
         for layer in &self.proj_out {
             whole(&mut order, &|tensors| layer.list(tensors));
         }
-        for layer in &self.action_decoder {
+        for layer in self.decoders.iter().flatten() {
             slices(&mut order, std::slice::from_ref(layer));
         }
         order

@@ -12,6 +12,7 @@ mod array;
 mod attention;
 mod cache;
 mod checkpoint;
+mod chunking;
 mod config;
 mod context;
 mod cross_attention;
@@ -33,6 +34,7 @@ mod writer;
 
 pub use array::{Array, OwnedArray};
 pub use checkpoint::{Checkpoint, Elements};
+pub use chunking::Chunking;
 pub use config::HeadConfig;
 pub use context::Context;
 pub use cross_attention::{CrossAttention, KeyValues};
