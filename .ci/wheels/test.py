@@ -1,0 +1,295 @@
+"""Tries the wheel as a user meets it, prints what came of it, and writes a page about it.
+
+    python .ci/wheels/test.py dist --page docs/wheels.md
+
+Fresh environments with the wheel and one NumPy, for each CPython and NumPy; one of them with each instruction
+set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with what the extra `sim`
+brings. What fails is named in its row; the exit status is then 1. Needs the environment that built the wheel,
+the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from elftools.elf.elffile import ELFFile
+
+CHECK = Path(__file__).resolve().with_name("check.py")
+PAGE = CHECK.with_name("page.md")  # with places for what is found
+#: CPython -> NumPy: the oldest that saccade accepts and that has a wheel for it, 1.26, 2.0, the newest.
+MATRIX = {
+    "3.10": ("1.24.0", "1.26.4", "newest"),
+    "3.11": ("1.24.0", "1.26.4", "newest"),
+    "3.12": ("1.26.4", "2.0.0", "newest"),
+    "3.13": ("2.1.0", "newest"),
+}
+#: CPUs that qemu models; the first is x86-64-v2 and no more.
+CPUS = {"Nehalem": "no AVX", "Haswell": "AVX2, FMA", "max": "all that qemu has"}
+#: How far actions may be from those of the portable path, by precision: int8 may round to a neighbour.
+TOLERANCE = {"float32": 1e-5, "bfloat16": 0.05, "int8": 0.1}
+#: Dies of an illegal instruction where there is no AVX2: shows that the emulated CPU refuses what it lacks.
+AVX2_PROGRAM = """
+#include <immintrin.h>
+int main(int count, char **arguments) {
+    volatile __m256i ones = _mm256_set1_epi32(count);
+    return _mm256_extract_epi32(_mm256_add_epi32(ones, ones), 7) != 2 * count;
+}
+"""
+
+Actions = dict[str, npt.NDArray[np.float32]]
+
+
+class Failed(Exception):
+    """One row's check did not hold; the text is for the table."""
+
+
+def run(command: Iterable[str | Path], folder: Path, **environment: str) -> str:
+    """What a command prints.
+
+    Raises:
+        Failed: its exit status is not 0; with the last line it wrote.
+    """
+    # Nothing of this process's own packages, nor of the checkout.
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "SACCADE"))}
+    done = subprocess.run(
+        [str(word) for word in command], cwd=folder, env=kept | environment, capture_output=True, text=True
+    )
+    if done.returncode:
+        lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
+        raise Failed(f"exit status {done.returncode}: {lines[-1] if lines else 'nothing said'}")
+    return done.stdout
+
+
+def find_python(version: str) -> Path:
+    """An interpreter of that version, on PATH or among pyenv's.
+
+    Raises:
+        Failed: there is none.
+    """
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"), "versions")
+    candidates: list[str | Path] = [f"python{version}", *pyenv.glob(f"{version}.*/bin/python")]
+    for candidate in candidates:
+        try:
+            said = run(
+                [candidate, "-c", "import sys; print(sys.executable, *sys.version_info[:2])"], Path.cwd()
+            )
+        except (Failed, FileNotFoundError):
+            continue
+        executable, *found = said.split()
+        if ".".join(found) == version:
+            return Path(executable)
+    raise Failed(f"no CPython {version} on PATH or in pyenv")
+
+
+def environment(version: str, folder: Path, *requirements: str | Path) -> Path:
+    """A fresh environment; returns its interpreter."""
+    run([find_python(version), "-m", "venv", "--clear", "--without-pip", folder], Path.cwd())
+    python = folder / "bin" / "python"
+    pip: list[str | Path] = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python]
+    run([*pip, "install", "--quiet", "--only-binary", ":all:", *requirements], Path.cwd())
+    return python
+
+
+def check(python: Path, folder: Path, *prefix: str, **variables: str) -> tuple[dict[str, Any], Actions]:
+    """Runs check.py with an interpreter; what it printed and the actions it wrote."""
+    out = folder / "actions.npz"
+    said = run([*prefix, python, "-I", CHECK, out], folder, **variables)
+    with np.load(out) as actions:
+        return json.loads(said.splitlines()[-1]), dict(actions)
+
+
+def contents(wheel: Path, folder: Path) -> dict[str, Any]:
+    """What is in the wheel.
+
+    Raises:
+        Failed: something is missing, or does not belong there.
+    """
+    with zipfile.ZipFile(wheel) as archive:
+        sizes = {item.filename: item.file_size for item in archive.infolist() if not item.is_dir()}
+        archive.extract("saccade/_saccade.abi3.so", folder)
+    library = folder / "saccade" / "_saccade.abi3.so"
+    (info,) = {name.split("/")[0] for name in sizes if ".dist-info/" in name}
+    wanted = {
+        "saccade/py.typed",
+        "saccade/_saccade.pyi",
+        "saccade/sim/demo/config.json",
+        "saccade/sim/demo/model.safetensors",
+        f"{info}/licenses/LICENSE-MIT",
+        f"{info}/licenses/LICENSE-APACHE",
+        f"{info}/entry_points.txt",
+    }
+    if missing := wanted - set(sizes):
+        raise Failed(f"not in the wheel: {', '.join(sorted(missing))}")
+    if foreign := {name for name in sizes if name.split("/")[0] not in ("saccade", info) or "test" in name}:
+        raise Failed(f"should not be in the wheel: {', '.join(sorted(foreign))}")
+    if b"/home/" in library.read_bytes() or str(Path.home()).encode() in library.read_bytes():
+        raise Failed("the library names a home directory of the machine that built it")
+    with library.open("rb") as file:
+        needs = ELFFile(file).get_section_by_name(".gnu.version_r")
+        names = [version.name for _, versions in needs.iter_versions() for version in versions]
+    glibc = max((tuple(map(int, n[6:].split("."))) for n in names if n.startswith("GLIBC_")), default=())
+    return {
+        "files": len(sizes),
+        "library": sizes["saccade/_saccade.abi3.so"],
+        "demo": sizes["saccade/sim/demo/model.safetensors"],
+        "wheel": wheel.stat().st_size,
+        "glibc": ".".join(map(str, glibc)),
+    }
+
+
+def try_versions(wheel: Path, work: Path) -> list[list[str]]:
+    """A row for each CPython and NumPy."""
+    rows = []
+    bits: dict[str, Actions] = {}
+    for version, numpys in MATRIX.items():
+        for numpy in numpys:
+            row = [version, numpy]
+            try:
+                pin = "numpy" if numpy == "newest" else f"numpy=={numpy}"
+                python = environment(version, work / f"{version}-{numpy}", wheel, pin)
+                result, actions = check(python, work)
+                if any(np.any(actions[key] != value) for key, value in bits.get(result["isa"], {}).items()):
+                    raise Failed("other actions than in the rows above")
+                bits[result["isa"]] = actions
+                row = [result["python"], result["numpy"], f"{result['cross_attention_error']:.1e}", "passed"]
+            except Failed as error:
+                row += ["", f"FAILED: {error}"]
+            rows.append(row)
+            print("  ", *row, flush=True)
+    return rows
+
+
+def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
+    """A row for each instruction set of this CPU, and for each emulated one."""
+    python = environment("3.12", work / "cpus", wheel, "numpy")
+    native: dict[str, Actions] = {}
+    portable: Actions = {}
+    available = check(python, work)[0]["available_isas"]
+    arms: list[tuple[str, tuple[str, ...], dict[str, str]]] = [
+        (f"this one, `SACCADE_ISA={isa}`", (), {"SACCADE_ISA": isa}) for isa in available
+    ]
+    qemu = shutil.which("qemu-x86_64") or "qemu-x86_64"
+    arms += [(f"qemu {cpu} ({has})", (qemu, "-cpu", cpu), {}) for cpu, has in CPUS.items()]
+    rows = []
+    for name, prefix, variables in arms:
+        row = [name]
+        try:
+            result, actions = check(python, work, *prefix, **variables)
+            isa = result["isa"]
+            portable = portable or actions  # the first arm
+            apart = {key: float(np.abs(actions[key] - portable[key]).max()) for key in actions}
+            if far := [key for key in apart if apart[key] > TOLERANCE[key]]:
+                raise Failed(f"{', '.join(far)} differ from the portable path by {apart}")
+            native = native if prefix else native | {isa: actions}
+            same = isa in native and all(np.array_equal(native[isa][key], actions[key]) for key in actions)
+            row += [f"`{isa}`", *(f"{apart[key]:.1e}" for key in TOLERANCE)]
+            row += [("yes" if same else "no") if prefix and isa in native else "", "passed"]
+        except (Failed, FileNotFoundError) as error:
+            row += ["", "", "", "", "", f"FAILED: {error}"]
+        rows.append(row)
+        print("  ", *row, flush=True)
+    rows.append(["qemu Nehalem refuses AVX2", "", "", "", "", refuses_avx2(qemu, work)])
+    return rows
+
+
+def refuses_avx2(qemu: str, work: Path) -> str:
+    """Whether the oldest emulated CPU stops at an AVX2 instruction; else its row would mean nothing."""
+    program = work / "avx2"
+    program.with_suffix(".c").write_text(AVX2_PROGRAM)
+    try:
+        run(["cc", "-mavx2", "-O1", "-o", program, program.with_suffix(".c")], work)
+        run([qemu, "-cpu", "Haswell", program], work)
+    except (Failed, FileNotFoundError) as error:
+        return f"FAILED: {error}"
+    stopped = subprocess.run([qemu, "-cpu", "Nehalem", program], capture_output=True, cwd=work).returncode
+    return "passed" if stopped in (-4, 132) else f"FAILED: exit status {stopped}"
+
+
+def try_rollouts(wheel: Path, work: Path) -> list[list[str]]:
+    """A row for each CPython: the shipped policy drives the simulated robot for one episode."""
+    rows = []
+    for version in MATRIX:
+        row = [version]
+        try:
+            python = environment(version, work / f"rollout-{version}", f"{wheel}[sim]")
+            names = ("numpy", "mujoco", "metaworld")
+            code = f"import importlib.metadata as m; print(*map(m.version, {names}))"
+            versions = run([python, "-I", "-c", code], work).split()
+            command: list[str | Path] = [
+                python.parent / "saccade",
+                "rollout",
+                "--tasks",
+                "reach",
+                "--episodes",
+                "1",
+            ]
+            said = run([*command, "--out", work / f"out-{version}", "--json"], work)
+            row += [
+                *versions,
+                "reached" if json.loads(said)["episodes"][0]["success"] else "not reached",
+                "passed",
+            ]
+        except Failed as error:
+            row += ["", "", "", "", f"FAILED: {error}"]
+        rows.append(row)
+        print("  ", *row, flush=True)
+    return rows
+
+
+def table(header: str, rows: list[list[str]]) -> str:
+    """A table in Markdown; the columns of `header` are separated by bars."""
+    columns = [column.strip() for column in header.split("|")]
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def main() -> int:
+    """Tries all, prints all, writes the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("wheel", type=Path, help="the wheel, or a folder that holds one")
+    parser.add_argument("--page", type=Path, help="where the page goes")
+    args = parser.parse_args()
+    wheels = sorted(args.wheel.resolve().glob("*.whl")) if args.wheel.is_dir() else [args.wheel.resolve()]
+    if len(wheels) != 1:
+        parser.error(f"expected one wheel in {args.wheel}, got {len(wheels)}")
+    (wheel,) = wheels
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        try:
+            inside = contents(wheel, work)
+        except Failed as error:
+            parser.exit(1, f"{wheel}: {error}\n")
+        megabytes = {key: f"{inside[key] / 1e6:.1f}" for key in ("library", "demo", "wheel")}
+        page = PAGE.read_text().format(
+            glibc=inside["glibc"],
+            **megabytes,
+            versions=table("CPython | NumPy | cross-attention | ", try_versions(wheel, work)),
+            cpus=table(
+                "CPU | instruction set | float32 | bfloat16 | int8 | equal bits | ", try_cpus(wheel, work)
+            ),
+            rollouts=table("CPython | NumPy | mujoco | metaworld | goal | ", try_rollouts(wheel, work)),
+            machine=f"{wheel.name}, on {platform.system()} {platform.release()}",
+        )
+    print(page)
+    if args.page is not None:
+        args.page.write_text(page)
+    return 1 if "FAILED" in page else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
