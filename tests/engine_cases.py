@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from hypothesis import strategies as st
-from reference_cases import small_config
+from reference_cases import KINDS, small_config, variant_config
 from released import load_released
 from safetensors.torch import save_file
 from torch import Tensor
@@ -52,6 +52,56 @@ def configs(draw: st.DrawFn) -> dict[str, Any]:
         num_steps=draw(st.integers(1, 6)),
         add_pos_embed=draw(st.booleans()),
     )
+
+
+@st.composite
+def variant_configs(draw: st.DrawFn) -> dict[str, Any]:
+    """Heads of every kind, small and of odd sizes."""
+    kind = draw(st.sampled_from(KINDS))
+    num_heads, vl_num_heads = draw(st.integers(1, 3)), draw(st.integers(1, 2))
+    action_dim = draw(st.integers(3, 9))
+    return variant_config(
+        kind,
+        attend_text_every_n_blocks=draw(st.integers(1, 3)),
+        state_history=draw(st.integers(1, 3)),
+        encoder_action_dim=action_dim + draw(st.integers(0, 5)),
+        num_layers=draw(st.integers(1, 9)),
+        num_heads=num_heads,
+        head_dim=draw(st.sampled_from([6, 10, 16] if num_heads % 2 else [7, 8, 20])),
+        context_dim=vl_num_heads * draw(st.sampled_from([7, 17])),
+        vl_num_layers=draw(st.integers(0, 2)),
+        vl_num_heads=vl_num_heads,
+        use_vlln=True if kind == "n1" else draw(st.booleans()),
+        num_future_tokens=draw(st.sampled_from([0, 1, 5, 32])),
+        action_horizon=draw(st.integers(1, 17)),
+        action_dim=action_dim,
+        state_dim=draw(st.integers(1, 17)),
+        hidden_dim=draw(st.integers(1, 30)),
+        num_embodiments=draw(st.integers(1, 4)),
+        num_steps=draw(st.integers(1, 4)),
+    )
+
+
+def random_masks(
+    config: saccade.HeadConfig, rng: np.random.Generator, batch: int, num_vl_tokens: int
+) -> dict[str, Any]:
+    """Masks that leave an attended text and an attended image token in every observation, in any places.
+
+    Returns:
+        `drop_vl`, `attention_mask` and `image_mask` for a head with alternate masks, else `drop_vl` alone;
+        bool `(batch, num_vl_tokens)`.
+    """
+    shape = (batch, num_vl_tokens)
+    drop_vl = rng.random(shape) < 0.2
+    if config.mask_mode == "none":
+        return {"drop_vl": drop_vl}
+    attended, image = rng.random(shape) < 0.7, rng.random(shape) < rng.choice([0.1, 0.5, 0.9])
+    for row in range(batch):
+        text_token, image_token = rng.choice(num_vl_tokens, 2, replace=False)
+        attended[row, [text_token, image_token]] = True
+        drop_vl[row, [text_token, image_token]] = False
+        image[row, text_token], image[row, image_token] = False, True
+    return {"drop_vl": drop_vl, "attention_mask": attended, "image_mask": image}
 
 
 def save(

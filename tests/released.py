@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
 
+from saccade import Chunking
+
 DATA = Path(__file__).parent / "data"
 NAMES = ("n15_tiny", "n15_single_view", "n15_bf16")
+VARIANTS = ("n17_tiny", "n17_rtc", "fork_two_decoders")
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,22 @@ class Released:
     backbone_features: NDArray[np.float32]  # (batch, T_vl, context_dim)
     state: NDArray[np.float32]  # (batch, 1, state_dim)
     embodiment_id: NDArray[np.int64]  # (batch,)
-    noise: NDArray[np.float32]  # (batch, horizon, action_dim)
+    noise: NDArray[np.float32]  # (batch, horizon, encoder_action_dim)
     vl_embs: NDArray[np.float32]  # (batch, T_vl, context_dim)
     actions_f32: NDArray[np.float32]  # (batch, horizon, action_dim)
     actions_f64: NDArray[np.float64]  # the same in float64
+    options: dict[str, Any]  # the rest of what a head is called with: masks, real-time chunking
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """All that a head is called with."""
+        return {
+            "backbone_features": self.backbone_features,
+            "state": self.state,
+            "embodiment_id": self.embodiment_id,
+            "noise": self.noise,
+            **self.options,
+        }
 
     @property
     def tolerance(self) -> NDArray[np.float64]:
@@ -43,14 +58,24 @@ def load_released(name: str) -> Released:
     """The file of that name; read-only arrays, since all tests share them."""
     path = DATA / f"{name}.safetensors"
     with safe_open(path, framework="np") as file:
-        config = json.loads(file.metadata()["config"])
+        metadata = file.metadata()
         arrays = {key: file.get_tensor(key) for key in file.keys() if key.startswith("_")}  # noqa: SIM118
     for array in arrays.values():
         array.flags.writeable = False
+    optional = ("attention_mask", "image_mask", "previous_chunk")
+    options: dict[str, Any] = {name: arrays[f"_in.{name}"] for name in optional if f"_in.{name}" in arrays}
+    if "rtc" in metadata:
+        rtc = json.loads(metadata["rtc"])
+        options["chunking"] = Chunking(
+            overlap=rtc["rtc_overlap_steps"],
+            frozen=rtc["rtc_frozen_steps"],
+            ramp_rate=rtc["rtc_ramp_rate"],
+            horizon=rtc["action_horizon"],
+        )
     return Released(
         name=name,
         path=path,
-        config=config,
+        config=json.loads(metadata["config"]),
         backbone_features=arrays["_in.backbone_features"],
         state=arrays["_in.state"],
         embodiment_id=arrays["_in.embodiment_id"],
@@ -58,4 +83,5 @@ def load_released(name: str) -> Released:
         vl_embs=arrays["_out.vl_embs"],
         actions_f32=arrays["_out.f32"],
         actions_f64=arrays["_out.f64"],
+        options=options,
     )

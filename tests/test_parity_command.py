@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from released import Released
+from released import NAMES, load_released
 from safetensors.torch import save_file
 
 import saccade
 from saccade import cli
 from saccade.cli import parity
+from saccade.reference.random_weights import CONFIGS
 
 SMALL = ["parity", "--vl-tokens", "5"]
 
@@ -26,6 +27,16 @@ def test_a_small_random_head_passes(capsys: pytest.CaptureFixture[str]) -> None:
     assert "torch float32" in printed.out
     assert "within the tolerance" in printed.out
     assert "reference in float64" in printed.err  # progress
+
+
+@pytest.mark.parametrize("version", CONFIGS)
+def test_every_version(version: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*SMALL, "--version", version, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["head"] == f"random {version} small"
+
+
+def test_versions_are_those_of_the_random_weights() -> None:
+    assert tuple(CONFIGS) == parity.VERSIONS
 
 
 def test_json_has_every_engine(capsys: pytest.CaptureFixture[str]) -> None:
@@ -44,7 +55,9 @@ def test_json_has_every_engine(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(0 < result["actions"]["max_rel"] < 1e-5 for result in report["results"])
 
 
-def test_a_checkpoint_with_recorded_inputs(released: Released, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", [*NAMES, "n17_tiny", "fork_two_decoders"])
+def test_a_checkpoint_with_recorded_inputs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    released = load_released(name)
     # The recorded files carry weights, config and inputs in one.
     assert cli.main(["parity", str(released.path), "--inputs", str(released.path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -74,6 +87,8 @@ def test_isa_of_the_environment_is_left_as_it_was(monkeypatch: pytest.MonkeyPatc
         (["--inputs", "nowhere"], "nowhere"),
         ([".", "--full"], "leave out the checkpoint"),
         ([".", "--bf16"], "leave out the checkpoint"),
+        ([".", "--version", "n1"], "leave out the checkpoint"),
+        (["--version", "n1.7", "--vl-tokens", "1"], "--vl-tokens is 1"),
         (["--full", "--bf16", "--batch", "0"], "--batch is 0"),
         (["--vl-tokens", "-3"], "--vl-tokens is -3"),
         (["--num-steps", "0"], "--num-steps is 0"),

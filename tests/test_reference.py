@@ -12,35 +12,50 @@ import numpy as np
 import pytest
 import torch
 from reference_cases import relative_error, small_config
-from released import DATA, Released
+from released import DATA, NAMES, VARIANTS, Released, load_released
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
 import saccade
+from saccade import _saccade
 from saccade.errors import CheckpointError
 from saccade.reference import ActionHead, TimeDistribution, tables
 from saccade.reference.model import Attention
-from saccade.reference.random_weights import N15_CONFIG, random_head, random_inputs
+from saccade.reference.random_weights import (
+    CONFIGS,
+    random_head,
+    random_inputs,
+    sized_config,
+    unused_parameters,
+    whole_config,
+)
+
+
+@pytest.fixture(params=[*NAMES, *VARIANTS])
+def released(request: pytest.FixtureRequest) -> Released:
+    """Each file of tests/data in turn, those of the variants too."""
+    return load_released(request.param)
 
 
 def test_float64_equals_the_released_code(released: Released) -> None:
-    head = ActionHead.load(released.path, dtype=torch.float64)
     with torch.no_grad():
-        actions = head(
-            released.backbone_features, released.state, released.embodiment_id, noise=released.noise
-        )
+        actions = ActionHead.load(released.path, dtype=torch.float64)(**released.arguments)
     assert actions.dtype == torch.float64
     assert relative_error(actions, released.actions_f64) <= 1e-6
 
 
 def test_float32_is_as_close_as_the_released_code(released: Released) -> None:
-    head = ActionHead.load(released.path)
     with torch.no_grad():
-        actions = head(
-            released.backbone_features, released.state, released.embodiment_id, noise=released.noise
-        )
+        actions = ActionHead.load(released.path)(**released.arguments)
     assert actions.dtype == torch.float32
     assert (np.abs(actions.numpy() - released.actions_f64) <= released.tolerance).all()
+
+
+def test_state_dict_has_the_names_of_the_file(released: Released) -> None:
+    with safe_open(released.path, framework="np") as file:
+        names = {name.removeprefix("action_head.") for name in file.keys() if name[0] != "_"}  # noqa: SIM118
+    assert ActionHead.load(released.path).state_dict().keys() == names
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -55,10 +70,48 @@ def test_full_size_state_dict_has_the_released_names_and_shapes() -> None:
     for line in (DATA / "groot_n15_tensors.tsv").read_text().splitlines()[2:]:
         name, shape = line.split("\t")
         expected[name.removeprefix("action_head.")] = tuple(int(size) for size in shape.split("x"))
-    with torch.device("meta"):
-        head = ActionHead(saccade.HeadConfig.from_dict(N15_CONFIG))
+    head = full_size("n1.5")
     assert {name: tuple(t.shape) for name, t in head.state_dict().items()} == expected
-    assert sum(parameter.numel() for parameter in head.parameters()) == 1_068_806_144
+
+
+def full_size(kind: str, **sizes: int) -> ActionHead:
+    """A head of the published size, without memory."""
+    config = sized_config(kind, **sizes)
+    with torch.device("meta"):
+        return ActionHead(saccade.HeadConfig.from_dict(config), unused=unused_parameters(config))
+
+
+def count(head: ActionHead) -> int:
+    return sum(parameter.numel() for parameter in head.parameters())
+
+
+@pytest.mark.parametrize(
+    ("kind", "transformer", "one_embodiment", "all_embodiments"),
+    [
+        ("n1.5", 550_386_688, 763_300_896, 1_068_806_144),
+        ("n1.6", 1_091_722_240, 1_103_465_600, 1_418_624_000),
+        ("n1.7", 1_091_722_240, 1_304_913_028, 1_620_515_968),
+        ("fork", 550_386_688, None, 1_101_868_546),
+    ],
+)
+def test_full_size_parameter_counts(
+    kind: str, transformer: int, one_embodiment: int | None, all_embodiments: int
+) -> None:
+    """Counts of the published heads, by the reference and by the Rust head's list of tensors."""
+    head = full_size(kind)
+    assert count(head) == all_embodiments
+    assert sum(parameter.numel() for parameter in head.model.parameters()) == transformer
+    if one_embodiment is not None:
+        assert count(full_size(kind, num_embodiments=1)) == one_embodiment
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_the_rust_head_lists_the_same_tensors(kind: str) -> None:
+    names = {name: list(tensor.shape) for name, tensor in full_size(kind).state_dict().items()}
+    listed = dict(_saccade.tensor_shapes(json.dumps(whole_config(CONFIGS[kind]))))
+    if kind in ("n1", "n1.6", "n1.7"):
+        assert listed.pop("future_tokens.weight", [0, 1536]) == [0, 1536]  # none, and not stored
+    assert names == listed | {name: [] for name in unused_parameters(CONFIGS[kind])}
 
 
 def test_new_head_starts_as_released() -> None:
@@ -193,11 +246,10 @@ def test_one_embodiment_for_all_equals_one_per_row() -> None:
 def test_other_shapes_are_refused_by_name(name: str) -> None:
     head = random_head(small_config(), seed=1)
     inputs = random_inputs(head.config, seed=2, batch=2, num_vl_tokens=6)
-    said = "actions" if name == "noise" else name
     for wrong in (inputs[name][:1], inputs[name][..., :1], inputs[name][None]):
         if name == "backbone_features" and wrong.shape[0] == 1 and wrong.ndim == 3:
             continue  # another batch: then it is the others that do not fit
-        with pytest.raises(saccade.ShapeError, match=said):
+        with pytest.raises(saccade.ShapeError, match=name):
             head(**(inputs | {name: wrong}))
 
 

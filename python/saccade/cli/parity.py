@@ -34,11 +34,16 @@ EPILOG = """examples:
   saccade parity checkpoint/ --embodiment-id 31   a checkpoint, on random inputs
   saccade parity checkpoint/ --inputs step.safetensors
                                                   on recorded features, state, embodiment_id and noise
+  saccade parity --version n1.7                   a small random head of another version
   saccade parity --full                           N1.5's full size; 3 GB of disk, 8 GB of memory
-  saccade parity --full --json                    the same, for programs
+  saccade parity --full --version n1.7 --bf16     N1.7's; 3 GB of disk, 14 GB of memory
+  saccade parity --full --json                    as a program reads it
   saccade parity checkpoint/ --precision int8     how far int8 is from float64; no verdict
 """
 INPUTS = ("backbone_features", "state", "embodiment_id", "noise")
+MASKS = ("attention_mask", "image_mask")  # beside them where the head reads text and images in turn
+VERSIONS = ("n1", "n1.5", "n1.6", "n1.7", "fork", "split-arms")
+DEFAULT_VERSION = "n1.5"
 
 EXIT_DIFFERENT = 1
 
@@ -76,11 +81,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "checkpoint", nargs="?", type=Path, help="directory or .safetensors file; default: a random head"
     )
     parser.add_argument(
-        "--full", action="store_true", help="a random head of N1.5's full width and depth (two embodiments)"
+        "--full", action="store_true", help="a random head of the full width and depth (two embodiments)"
+    )
+    parser.add_argument(
+        "--version", choices=VERSIONS, help="of the random head (default n1.5); the last two are a fork's"
     )
     parser.add_argument("--bf16", action="store_true", help="store the random weights in bfloat16")
     parser.add_argument(
-        "--inputs", type=Path, help="safetensors file with " + ", ".join(INPUTS) + " (or _in.NAME)"
+        "--inputs",
+        type=Path,
+        help="safetensors file with " + ", ".join((*INPUTS, *MASKS)) + " (or _in.NAME), masks where needed",
     )
     parser.add_argument("--embodiment-id", type=int, help="for random inputs; default: random ids")
     parser.add_argument("--batch", type=int, default=1, help="rows of random inputs (default 1)")
@@ -130,8 +140,9 @@ def run(args: argparse.Namespace) -> int:
     # How far is too far for a lower precision, the task decides.
     judged = rust if args.precision == "float32" else []
     passed = all(result.actions.max_rel <= args.tolerance for result in judged)
+    random = f"random {args.version or DEFAULT_VERSION} {'full size' if args.full else 'small'}"
     report = {
-        "head": "random N1.5 full size" if args.full else str(args.checkpoint or "random small"),
+        "head": str(args.checkpoint or random),
         "precision": args.precision,
         "inputs": describe(inputs),
         "machine": cpu_model(),
@@ -147,8 +158,8 @@ def run(args: argparse.Namespace) -> int:
 
 def check(args: argparse.Namespace) -> None:
     """Refuses arguments that contradict each other before anything long has run."""
-    if args.checkpoint is not None and (args.full or args.bf16):
-        raise UsageError("--full and --bf16 are about random weights: leave out the checkpoint")
+    if args.checkpoint is not None and (args.full or args.bf16 or args.version is not None):
+        raise UsageError("--full, --bf16 and --version are about random weights: leave out the checkpoint")
     if args.checkpoint is not None and not args.checkpoint.exists():
         raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
     if args.inputs is not None and not args.inputs.is_file():
@@ -167,7 +178,10 @@ def write_random(folder: Path, args: argparse.Namespace) -> None:
 
     from saccade.reference import random_weights
 
-    config = random_weights.n15_config(num_embodiments=2) if args.full else random_weights.small_config()
+    version = args.version or DEFAULT_VERSION
+    config = random_weights.small_config(version)
+    if args.full:
+        config = random_weights.sized_config(version, num_embodiments=2)
     note("writing random weights")
     random_weights.write_checkpoint(
         folder, config, args.seed, dtype=torch.bfloat16 if args.bf16 else torch.float32
@@ -179,6 +193,8 @@ def random_inputs(source: Path, args: argparse.Namespace) -> dict[str, NDArray[A
     from saccade.reference import loading, random_weights
 
     config = saccade.HeadConfig.from_dict(loading.read_config(source))
+    if config.mask_mode == "alternate" and args.vl_tokens < 2:
+        raise UsageError("--vl-tokens is 1, expected at least 2: this head reads text and images in turn")
     drawn = random_weights.random_inputs(
         config, args.seed + 1, batch=args.batch, num_vl_tokens=args.vl_tokens
     )
@@ -189,7 +205,7 @@ def random_inputs(source: Path, args: argparse.Namespace) -> dict[str, NDArray[A
 
 
 def read_inputs(path: Path) -> dict[str, NDArray[Any]]:
-    """Recorded inputs, under their names or with `_in.` before them.
+    """Recorded inputs, under their names or with `_in.` before them, with the masks that are there.
 
     Raises:
         UsageError: one is missing.
@@ -207,6 +223,10 @@ def read_inputs(path: Path) -> dict[str, NDArray[Any]]:
         if tensor is None:
             raise UsageError(f"{path}: no tensor {name}, expected " + ", ".join(INPUTS))
         inputs[name] = (tensor.long() if name == "embodiment_id" else tensor.float()).numpy()
+    for name in MASKS:
+        mask = tensors.get(name, tensors.get(f"_in.{name}"))
+        if mask is not None:
+            inputs[name] = mask.numpy()
     return inputs
 
 
@@ -232,9 +252,8 @@ def run_reference(
     head = ActionHead.load(source, dtype=kind)
     with torch.no_grad():
         vl_embs = head.encode(inputs["backbone_features"])
-        actions = head.sample(
-            vl_embs, inputs["state"], inputs["embodiment_id"], noise=inputs["noise"], num_steps=num_steps
-        )
+        rest: dict[str, Any] = {name: array for name, array in inputs.items() if name != "backbone_features"}
+        actions = head.sample(vl_embs, **rest, num_steps=num_steps)
     return vl_embs.numpy(), actions.numpy()
 
 
@@ -249,7 +268,8 @@ def run_rust(source: Path, inputs: dict[str, NDArray[Any]], args: argparse.Names
             precision=args.precision,
             num_threads=args.threads,
         )
-        context = head.encode(inputs["backbone_features"])
+        masks: dict[str, Any] = {name: inputs[name] for name in MASKS if name in inputs}
+        context = head.encode(inputs["backbone_features"], **masks)
         actions = head.sample(
             context, inputs["state"], inputs["embodiment_id"], noise=inputs["noise"], num_steps=args.num_steps
         )

@@ -8,7 +8,7 @@ tokens in a cross-attention block, the rows themselves in a self-attention block
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS, Chosen, Intervention, Tokens, as_interventions
 from saccade.reference.checks import check_indices, check_shape
 from saccade.trace import check_record
+
+Mask: TypeAlias = "Tensor | np.ndarray | None"
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Run:
         future_refresh: the rows of state and future tokens run at every so many evaluations, from the first
             one on.
         intervention: one, several or none.
-        drop_vl: bool `(B, S)`, True where a vision-language token is removed.
+        drop_vl, attention_mask, image_mask: as in `forbidden_tokens`.
         stop_gradient: pairs as in `Intervention.cut`, cut in the backward pass only.
         record: any of "attention" and "hidden".
         blocks, steps: where it is recorded; default everywhere.
@@ -127,7 +129,9 @@ class Run:
         in_step: int = 1,
         future_refresh: int = 1,
         intervention: Intervention | Sequence[Intervention] | None = None,
-        drop_vl: Tensor | np.ndarray | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
         record: Iterable[str] = (),
         blocks: Sequence[int] | int | None = None,
@@ -158,8 +162,10 @@ class Run:
         }
         self.num_rows = ends[-1]
 
-        removed = removed_tokens(drop_vl, vl_embs)
-        self.removed_bias = None if removed is None else removal_bias(removed, vl_embs.dtype)
+        self.forbidden = forbidden_tokens(
+            config, vl_embs, drop_vl=drop_vl, attention_mask=attention_mask, image_mask=image_mask
+        )
+        self.future_bias = self.bias_of_learned_tokens()
         self.keep_attention, self.keep_hidden = check_record(record)
         self.held: dict[int, Tensor] = {}
         self.attention: dict[tuple[int, int], Tensor] = {}
@@ -196,8 +202,12 @@ class Run:
         )
 
     def logit_bias(self, step: int, block: int, cross: bool) -> Tensor | None:
-        """The sum of all biases, broadcast to `(B, heads, Q, K)`; None where nothing is changed."""
-        biases = [] if self.removed_bias is None or not cross else [self.removed_bias]  # (B, 1, 1, S)
+        """The sum of all biases, broadcast to `(B, heads, Q, K)`; None where there is none."""
+        biases = []
+        if cross and (forbidden := self.forbidden[block]) is not None:
+            biases.append(removal_bias(forbidden, self.dtype))  # (B, 1, 1, S)
+        if not cross and self.future_bias is not None:
+            biases.append(self.future_bias)  # (1, 1, 1, R)
         for edit in self.edits:
             if not edit.acts(step, block):
                 continue
@@ -242,6 +252,16 @@ class Run:
     def num_keys(self, cross: bool) -> int:
         """K of such a block."""
         return self.sizes["vl"] if cross else self.num_rows
+
+    def bias_of_learned_tokens(self) -> Tensor | None:
+        """`future_key_bias` on the keys of the rows, `(1, 1, 1, R)`; other tokens come without it."""
+        if self.config.future_key_bias is None or self.future_tokens is not None:
+            return None
+        bias = torch.zeros(self.num_rows, dtype=self.dtype, device=self.device)
+        bias[self.rows["future"]] = torch.tensor(
+            self.config.future_key_bias, dtype=self.dtype, device=self.device
+        )
+        return bias[None, None, None]
 
     def replaced_tokens(self, interventions: Sequence[Intervention]) -> Tensor | None:
         """The future tokens of the one intervention that has some, `(N', width)`."""
@@ -304,19 +324,78 @@ def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
         raise InputError(f"stop_gradient: {error}") from None
 
 
-def removed_tokens(drop_vl: Tensor | np.ndarray | None, tokens: Tensor) -> Tensor | None:
-    """`drop_vl` as a bool tensor `(B, S)` for `tokens (B, S, context_dim)`, or None.
+def reads_images(config: HeadConfig, block: int) -> bool:
+    """Whether this cross-attention block of a head with alternate masks reads the image tokens; the others
+    read the rest."""
+    return block % (2 * config.attend_text_every_n_blocks) != 0
+
+
+def forbidden_tokens(
+    config: HeadConfig, tokens: Tensor, *, drop_vl: Mask, attention_mask: Mask, image_mask: Mask
+) -> list[Tensor | None]:
+    """Which vision-language tokens no row reads, block by block.
+
+    Args:
+        config: the head's.
+        tokens: `(B, S, context_dim)`.
+        drop_vl: bool `(B, S)`, True where a token is removed.
+        attention_mask: bool `(B, S)`, True where a token is attended; None for all of them.
+        image_mask: bool `(B, S)`, True where a token is of an image; asked for with alternate masks.
+
+    Returns:
+        For every block bool `(B, S)`, or None where all are read.
+
+    Raises:
+        DtypeError, ShapeError: a mask of another dtype or shape.
+        InputError: padding for a head that ignores it; a mask missing; an observation in which a block has
+            nothing left to read.
+    """
+    removed = token_mask("drop_vl", drop_vl, tokens)
+    attended = token_mask("attention_mask", attention_mask, tokens)
+    image = token_mask("image_mask", image_mask, tokens)
+    if config.mask_mode == "none":
+        if attended is not None and not attended.all():
+            raise InputError(
+                "attention_mask: a false entry, expected all true: this head ignores padding, as released "
+                "(None); drop_vl removes tokens"
+            )
+        return [removed] * config.num_layers
+    if image is None:
+        raise InputError(
+            "image_mask: None, expected bool (batch, T_vl): blocks of this head read either text or images"
+        )
+    permitted = torch.ones_like(image) if attended is None else attended
+    if removed is not None:
+        permitted = permitted & ~removed
+    forbidden: list[Tensor | None] = []
+    for block in range(config.num_layers):
+        if not is_cross(config, block):
+            forbidden.append(None)
+            continue
+        kind, chosen = ("image", image) if reads_images(config, block) else ("text", ~image)
+        read = permitted & chosen  # (B, S)
+        if not read.any(dim=1).all():
+            row = int(read.any(dim=1).int().argmin())
+            raise InputError(
+                f"image_mask: observation {row} has no {kind} token left for block {block} to read"
+            )
+        forbidden.append(~read)
+    return forbidden
+
+
+def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
+    """A mask as a bool tensor `(B, S)` for `tokens (B, S, context_dim)`, or None.
 
     Raises:
         DtypeError: it is not boolean.
         ShapeError: it is of another shape.
     """
-    mask = boolean("drop_vl", drop_vl)
-    if mask is None:
+    array = boolean(name, given)
+    if array is None:
         return None
-    removed = torch.tensor(mask, device=tokens.device)
-    check_shape("drop_vl", removed, tuple(tokens.shape[:2]))
-    return removed
+    mask = torch.tensor(array, device=tokens.device)
+    check_shape(name, mask, tuple(tokens.shape[:2]))
+    return mask
 
 
 def removal_bias(removed: Tensor, dtype: torch.dtype) -> Tensor:

@@ -57,6 +57,21 @@ def parse(path: Path) -> Mapping[str, Any]:
     return dict(json.loads(read_json(path)))
 
 
+def tensor_places(source: str | PathLike[str]) -> tuple[dict[str, Path], str]:
+    """The file that each tensor is in, by its full name, and the head's prefix."""
+    place = {}
+    for file in tensor_files(source):
+        with safe_open(file, framework="pt") as opened:
+            place.update(dict.fromkeys(opened.keys(), file))
+    return place, next(prefix for prefix in PREFIXES if any(name.startswith(prefix) for name in [*place, ""]))
+
+
+def tensor_names(source: str | PathLike[str]) -> list[str]:
+    """The names of the head's tensors, without their prefix."""
+    place, prefix = tensor_places(source)
+    return [name.removeprefix(prefix) for name in place if name.startswith(prefix)]
+
+
 def read_tensors(
     source: str | PathLike[str], expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
@@ -66,12 +81,7 @@ def read_tensors(
     Raises:
         CheckpointError: listing all that is missing, unknown inside the prefix, or of another shape.
     """
-    place = {}  # name in the file -> the file
-    for file in tensor_files(source):
-        with safe_open(file, framework="pt") as opened:
-            place.update(dict.fromkeys(opened.keys(), file))
-    prefix = next(prefix for prefix in PREFIXES if any(name.startswith(prefix) for name in [*place, ""]))
-
+    place, prefix = tensor_places(source)
     tensors, scales, problems = {}, {}, []
     integers = set()
     for file in sorted(set(place.values())):

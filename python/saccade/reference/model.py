@@ -1,6 +1,7 @@
-"""The GR00T N1.5 action head as one torch module that reads from top to bottom.
+"""The GR00T action heads as one torch module that reads from top to bottom: N1, N1.5, N1.6, N1.7 and a fork.
 
-Module names follow the checkpoint, so that `state_dict()` has the released tensor names. Shapes in comments:
+They are one head with other sizes and switches. Module names follow the checkpoint, so that `state_dict()`
+has the released tensor names. Shapes in comments:
 B is the batch, R the rows of the query sequence (one state row, N future rows, T action rows), S the
 vision-language tokens.
 """
@@ -20,19 +21,25 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade._arrays import integer
+from saccade.chunking import Chunking
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.integrator import INTEGRATORS, check_integrator
 from saccade.intervention import Intervention, Tokens
 from saccade.reference import loading, tables
 from saccade.reference.checks import check_shape
-from saccade.reference.intervene import BlockChange, Run, is_cross, removal_bias, removed_tokens
+from saccade.reference.intervene import BlockChange, Mask, Run, is_cross, removal_bias, token_mask
 from saccade.trace import Trace
 
 NORM_EPS = 1e-5  # every LayerNorm but the last
 OUTPUT_NORM_EPS = 1e-6  # the last one
 TABLE_STD = 0.02  # initial scale of learned tokens, positions and category-specific weights
+SLOWEST_RAMP = 1e-9  # a ramp of this rate is a straight line to nine digits, and a slower one could underflow
 UNCHANGED = BlockChange()
+
+MASK_TOKEN = "mask_token"  # N1.6: what stands in for a state that is left out in training
+DROPOUT_PROB = "dropout_prob_by_embodiment"  # of the state, in a fine-tune of N1.7
+LOG_SIGMA = "task_log_sigma."  # the fork: learned weights of its decoders' losses
 
 
 class Attention(nn.Module):
@@ -363,15 +370,18 @@ class TimeDistribution:
 
 
 class ActionHead(nn.Module):
-    """The N1.5 action head in torch.
+    """A GR00T action head in torch.
 
     Runs in the dtype of its parameters (`.double()` for float64) and is differentiable throughout; inputs are
     converted to that dtype, and may be NumPy arrays. Wrap calls in `torch.no_grad()` where no gradient is
-    wanted. A new head has the released code's initial distribution. There is no dropout.
+    wanted. A new head has the released code's initial distribution. There is no dropout, and no state is left
+    out or made noisy in training.
 
     Args:
         config: sizes and switches.
         time_distribution: how `sample_time` draws.
+        unused: names of parameters to hold that only the released training uses, `task_log_sigma.NAME`,
+            `mask_token` and `dropout_prob_by_embodiment`, so that a checkpoint stays whole.
 
     Example:
         >>> from saccade.reference import random_weights
@@ -388,7 +398,13 @@ class ActionHead(nn.Module):
         torch.Size([2, 2, 16, 32])
     """
 
-    def __init__(self, config: HeadConfig, *, time_distribution: TimeDistribution | None = None) -> None:
+    def __init__(
+        self,
+        config: HeadConfig,
+        *,
+        time_distribution: TimeDistribution | None = None,
+        unused: Iterable[str] = (),
+    ) -> None:
         super().__init__()
         self.config = config
         self.time_distribution = time_distribution or TimeDistribution()
@@ -396,13 +412,18 @@ class ActionHead(nn.Module):
         self.model = DiffusionTransformer(config)
         self.state_encoder = CategoryMlp(categories, config.state_history * config.state_dim, hidden, width)
         self.action_encoder = ActionEncoder(categories, config.encoder_action_dim, width)
-        self.action_decoder = CategoryMlp(categories, hidden, hidden, config.action_dim)
-        self.future_tokens = token_table(config.num_future_tokens, width)
+        for name, decoded in config.decoders:
+            self.add_module(name, CategoryMlp(categories, hidden, hidden, decoded))
+        if config.version == "n1.5":  # where they are, even if there are none
+            self.future_tokens = token_table(config.num_future_tokens, width)
         if config.use_vlln:
             self.vlln = nn.LayerNorm(config.context_dim, eps=NORM_EPS)
+        if config.vl_num_layers > 0:
             self.vl_self_attention = VlSelfAttention(config)
         if config.add_pos_embed:
             self.position_embedding = token_table(config.max_positions, width)
+        for name in unused:
+            self.hold_unused(name)
 
     @classmethod
     def load(
@@ -428,25 +449,47 @@ class ActionHead(nn.Module):
         """
         whole = loading.read_config(source, config)
         with torch.device("meta"):  # no memory and no time spent on an initialisation that is replaced
-            head = cls(HeadConfig.from_dict(whole), time_distribution=TimeDistribution.from_dict(whole))
+            head = cls(
+                HeadConfig.from_dict(whole),
+                time_distribution=TimeDistribution.from_dict(whole),
+                unused=filter(is_unused, loading.tensor_names(source)),
+            )
         shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
         head.load_state_dict(loading.read_tensors(source, shapes, dtype), assign=True)
         return head
 
+    def hold_unused(self, name: str) -> None:
+        """Adds a parameter that only the released training uses, as that code starts it."""
+        if name == MASK_TOKEN:
+            self.mask_token = nn.Parameter(TABLE_STD * torch.randn(1, 1, self.config.width))
+        elif name == DROPOUT_PROB:
+            self.register_buffer(DROPOUT_PROB, torch.zeros(self.config.num_embodiments))
+        else:
+            if not hasattr(self, "task_log_sigma"):
+                self.task_log_sigma = nn.ParameterDict()
+            self.task_log_sigma[name.removeprefix(LOG_SIGMA)] = nn.Parameter(torch.zeros(()))
+
     @property
     def dtype(self) -> torch.dtype:
         """The dtype of the parameters, in which everything is computed."""
-        return self.future_tokens.weight.dtype
+        return self.model.proj_out_2.weight.dtype
 
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""
-        return self.future_tokens.weight.device
+        return self.model.proj_out_2.weight.device
 
-    def encode(
-        self, backbone_features: Tensor | np.ndarray, *, drop_vl: Tensor | np.ndarray | None = None
-    ) -> Tensor:
+    @property
+    def learned_tokens(self) -> Tensor:
+        """The future tokens, `(N, width)`; only N1.5 has any."""
+        if self.config.version == "n1.5":
+            return self.future_tokens.weight
+        return torch.empty(0, self.config.width, dtype=self.dtype, device=self.device)
+
+    def encode(self, backbone_features: Tensor | np.ndarray, *, drop_vl: Mask = None) -> Tensor:
         """Normalises and mixes the backbone's features, once per observation.
+
+        Here every token reads every other one: the masks of N1.6 and N1.7 are for the blocks that follow.
 
         Args:
             backbone_features: `(B, S, context_dim)`.
@@ -454,14 +497,17 @@ class ActionHead(nn.Module):
                 kept, with zeros, so `velocity`, `sample` and `trace` must be given `drop_vl` too.
 
         Returns:
-            `vl_embs (B, S, context_dim)`; the features themselves if the config has `use_vlln` false.
+            `vl_embs (B, S, context_dim)`; the features themselves where the head has neither `vlln` nor VL
+            self-attention.
         """
         features = self.as_input(backbone_features)
         check_shape("backbone_features", features, (None, None, self.config.context_dim))
-        removed = removed_tokens(drop_vl, features)
+        removed = token_mask("drop_vl", drop_vl, features)
         if self.config.use_vlln:
+            features = self.vlln(features)
+        if self.config.vl_num_layers > 0:
             bias = None if removed is None else removal_bias(removed, self.dtype)
-            features = self.vl_self_attention(self.vlln(features), bias)
+            features = self.vl_self_attention(features, bias)
         return features if removed is None else features.masked_fill(removed[..., None], 0.0)
 
     def velocity(
@@ -472,7 +518,9 @@ class ActionHead(nn.Module):
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
         *,
-        drop_vl: Tensor | np.ndarray | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
@@ -484,7 +532,8 @@ class ActionHead(nn.Module):
             embodiment_id: an int, or `(B,)`.
             actions: `(B, T, encoder_action_dim)`.
             timestep: time bucket, an int or `(B,)`.
-            drop_vl, intervention, stop_gradient: as in `trace`; this is step 0 of 1.
+            drop_vl, attention_mask, image_mask, intervention, stop_gradient: as in `trace`; this is step 0 of
+                1.
 
         Returns:
             `(B, T, action_dim)`.
@@ -501,6 +550,8 @@ class ActionHead(nn.Module):
             num_steps=1,
             intervention=intervention,
             drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
             stop_gradient=stop_gradient,
         )
         return self.velocity_in(run, 0, vl_embs, state, embodiment_id, actions, timestep)
@@ -527,7 +578,7 @@ class ActionHead(nn.Module):
         timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
 
         state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
-        tokens = self.future_tokens.weight if run.future_tokens is None else run.future_tokens
+        tokens = self.learned_tokens if run.future_tokens is None else run.future_tokens  # (N, width)
         future_rows = tokens.expand(batch, -1, -1)  # (B, N, width)
         action_rows = self.action_encoder(actions, timestep, embodiment_id)  # (B, T, width)
         if config.add_pos_embed:
@@ -535,10 +586,11 @@ class ActionHead(nn.Module):
         rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
 
         changes = [run.change(evaluation, block) for block in range(config.num_layers)]
-        hidden = self.model(
-            rows[:, run.first_row(evaluation) :], vl_embs, timestep, changes
-        )  # (B, R', hidden_dim)
-        return self.action_decoder(hidden[:, -horizon:], embodiment_id)  # (B, T, action_dim)
+        hidden = self.model(rows[:, run.first_row(evaluation) :], vl_embs, timestep, changes)[
+            :, -horizon:
+        ]  # (B, T, hidden_dim)
+        decoded = [self.get_submodule(name)(hidden, embodiment_id) for name, _ in config.decoders]
+        return torch.cat(decoded, dim=-1)  # (B, T, action_dim)
 
     def sample(
         self,
@@ -550,7 +602,11 @@ class ActionHead(nn.Module):
         num_steps: int | None = None,
         integrator: str | None = None,
         future_refresh: int | None = None,
-        drop_vl: Tensor | np.ndarray | None = None,
+        previous_chunk: Tensor | np.ndarray | None = None,
+        chunking: Chunking | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
@@ -564,8 +620,14 @@ class ActionHead(nn.Module):
             future_refresh: the rows of state and future tokens run at every so many evaluations of the
                 velocity only, from the first one on. At the others self-attention reads them as it last did.
                 Default: at all.
-            drop_vl, intervention, stop_gradient: as in `trace`. All evaluations of a step are that step. A
-                patch of rows at a step at which they do not always run is an error.
+            previous_chunk: the chunk that is being carried out, `(B, T, action_dim)` or `(B, T,
+                encoder_action_dim)`, normalised as it left the head; with `chunking`, whose `horizon` is the
+                least number of its actions.
+            chunking: how this chunk goes on from the previous one. The flow that is followed is slowed down
+                by `velocity_strength`, in both evaluations of a midpoint step.
+            drop_vl, attention_mask, image_mask, intervention, stop_gradient: as in `trace`. All evaluations
+                of a step are that step. A patch of rows at a step at which they do not always run is an
+                error.
 
         Returns:
             Actions `(B, T, action_dim)`, normalised.
@@ -577,10 +639,18 @@ class ActionHead(nn.Module):
             in_step=INTEGRATORS[check_integrator(integrator)],
             future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
             drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
             intervention=intervention,
             stop_gradient=stop_gradient,
         )
-        return self.follow(run, vl_embs, state, embodiment_id, noise)
+        start, strength = self.as_input(noise), None
+        if (previous_chunk is None) != (chunking is None):
+            raise InputError("previous_chunk, chunking: one of them, expected both or neither")
+        if previous_chunk is not None and chunking is not None:
+            start = self.continued(start, self.as_input(previous_chunk), chunking)
+            strength = self.as_input(velocity_strength(chunking, self.config.action_horizon))[:, None]
+        return self.follow(run, vl_embs, state, embodiment_id, start, strength)
 
     def trace(
         self,
@@ -590,7 +660,9 @@ class ActionHead(nn.Module):
         *,
         noise: Tensor | np.ndarray,
         num_steps: int | None = None,
-        drop_vl: Tensor | np.ndarray | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
         record: Iterable[str] = ("attention",),
@@ -606,6 +678,10 @@ class ActionHead(nn.Module):
         Args:
             vl_embs, state, embodiment_id, noise, num_steps: as in `sample`.
             drop_vl: bool `(B, S)`, as given to `encode`: no row reads these tokens.
+            attention_mask: bool `(B, S)`, True where a token is attended; default everywhere. A head that
+                ignores padding takes an all-true one only.
+            image_mask: bool `(B, S)`, True where a token is of an image. N1.6 and N1.7 need it: their
+                cross-attention blocks read attended text and attended images in turn.
             intervention: one or several :class:`saccade.Intervention`.
             stop_gradient: pairs (reader, source) as in `Intervention.cut`, in all blocks, steps and heads.
                 The result stays as it is (to rounding), but in the backward pass the reader's rows take the
@@ -627,12 +703,14 @@ class ActionHead(nn.Module):
             num_steps,
             intervention=intervention,
             drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
             stop_gradient=stop_gradient,
             record=record,
             blocks=blocks,
             steps=steps,
         )
-        actions = self.follow(run, vl_embs, state, embodiment_id, noise)
+        actions = self.follow(run, vl_embs, state, embodiment_id, self.as_input(noise))
         return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
 
     def run_of(self, vl_embs: Tensor, num_steps: int | None, **options: Any) -> Run:
@@ -650,22 +728,48 @@ class ActionHead(nn.Module):
         vl_embs: Tensor,
         state: Tensor | np.ndarray,
         embodiment_id: int | Tensor | np.ndarray,
-        noise: Tensor | np.ndarray,
+        start: Tensor,
+        strength: Tensor | None = None,
     ) -> Tensor:
-        """The steps of `sample`: actions `(B, T, action_dim)`."""
+        """The steps of `sample` from `start (B, T, encoder_action_dim)`; to `(B, T, action_dim)`.
+
+        `strength (T, 1)` multiplies the velocity. A head that decodes fewer dimensions than it encodes keeps
+        the others at 0.
+        """
+        config = self.config
+        check_shape("noise", start, (len(vl_embs), config.action_horizon, config.encoder_action_dim))
+        rest = (0, config.encoder_action_dim - config.action_dim)
 
         def velocity(evaluation: int, actions: Tensor) -> Tensor:
             time = evaluation / (run.num_steps * run.in_step)
-            bucket = int(time * self.config.num_timestep_buckets)
-            return self.velocity_in(run, evaluation, vl_embs, state, embodiment_id, actions, bucket)
+            bucket = int(time * config.num_timestep_buckets)
+            direction = self.velocity_in(run, evaluation, vl_embs, state, embodiment_id, actions, bucket)
+            return F.pad(direction if strength is None else strength * direction, rest)
 
-        actions = self.as_input(noise)
+        actions = F.pad(start[..., : config.action_dim], rest)
         for step in range(run.num_steps):
             direction = velocity(step * run.in_step, actions)
             if run.in_step == 2:  # the midpoint rule
                 direction = velocity(2 * step + 1, actions + direction / (2 * run.num_steps))
             actions = actions + direction / run.num_steps
-        return actions
+        return actions[..., : config.action_dim]
+
+    def continued(self, start: Tensor, previous: Tensor, chunking: Chunking) -> Tensor:
+        """`start (B, T, encoder_action_dim)` with the tail of the previous chunk as its first actions."""
+        config = self.config
+        horizon = config.action_horizon if chunking.horizon is None else chunking.horizon
+        if not chunking.overlap <= horizon <= config.action_horizon:
+            raise InputError(
+                f"chunking: overlap {chunking.overlap}, horizon {horizon}, expected overlap <= horizon <= "
+                f"{config.action_horizon}"
+            )
+        dims = config.action_dim if previous.shape[-1] == config.action_dim else config.encoder_action_dim
+        rows = previous.shape[1] if previous.ndim == 3 else None
+        rows = rows if rows in range(horizon, config.action_horizon) else config.action_horizon
+        check_shape("previous_chunk", previous, (len(start), rows, dims))
+        previous = F.pad(previous, (0, config.encoder_action_dim - dims))
+        tail = previous[:, horizon - chunking.overlap : horizon]  # (B, overlap, encoder_action_dim)
+        return torch.cat((tail, start[:, chunking.overlap :]), dim=1)
 
     def forward(
         self,
@@ -677,7 +781,11 @@ class ActionHead(nn.Module):
         num_steps: int | None = None,
         integrator: str | None = None,
         future_refresh: int | None = None,
-        drop_vl: Tensor | np.ndarray | None = None,
+        previous_chunk: Tensor | np.ndarray | None = None,
+        chunking: Chunking | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
         intervention: Intervention | Sequence[Intervention] | None = None,
         stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
@@ -690,7 +798,11 @@ class ActionHead(nn.Module):
             num_steps=num_steps,
             integrator=integrator,
             future_refresh=future_refresh,
+            previous_chunk=previous_chunk,
+            chunking=chunking,
             drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
             intervention=intervention,
             stop_gradient=stop_gradient,
         )
@@ -721,8 +833,13 @@ class ActionHead(nn.Module):
         noise: Tensor | np.ndarray,
         time: Tensor | np.ndarray,
         action_mask: Tensor | np.ndarray | None = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
     ) -> Tensor:
         """Flow-matching loss: on the way from noise to actions the velocity should be `actions - noise`.
+
+        Dimensions that the head encodes and does not decode are 0, as in `sample`, and all decoders weigh the
+        same: a fork that learns the weights of its decoders (`task_log_sigma`) trains them differently.
 
         Args:
             backbone_features: `(B, S, context_dim)`.
@@ -731,6 +848,7 @@ class ActionHead(nn.Module):
             noise: the same shape, standard normal.
             time: `(B,)`, from `sample_time`.
             action_mask: broadcast to `actions`; weights of the mean of squared errors. Default: all the same.
+            attention_mask, image_mask: as in `trace`.
 
         Returns:
             A scalar.
@@ -739,7 +857,15 @@ class ActionHead(nn.Module):
         t = time[:, None, None]  # (B, 1, 1)
         noisy = (1 - t) * noise + t * actions  # (B, T, action_dim)
         bucket = torch.floor(time * self.config.num_timestep_buckets).long()  # (B,)
-        predicted = self.velocity(self.encode(backbone_features), state, embodiment_id, noisy, bucket)
+        predicted = self.velocity(
+            self.encode(backbone_features),
+            state,
+            embodiment_id,
+            F.pad(noisy, (0, self.config.encoder_action_dim - self.config.action_dim)),
+            bucket,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
+        )
         error = (predicted - (actions - noise)).square()  # (B, T, action_dim)
         if action_mask is None:
             return error.mean()
@@ -764,6 +890,31 @@ class ActionHead(nn.Module):
                 f"embodiment_id: {ids.tolist()}, expected 0 to {self.config.num_embodiments - 1}"
             )
         return int(ids) if ids.ndim == 0 else ids.to(dtype=torch.long, device=self.device)
+
+
+def velocity_strength(chunking: Chunking, action_horizon: int) -> np.ndarray:
+    """How fast each action of a chunk follows the flow where it goes on from the previous chunk.
+
+    Args:
+        chunking: frozen actions stay as they are, the rest of the overlap is ever less held back.
+        action_horizon: actions in a chunk.
+
+    Returns:
+        `(action_horizon,)` float64: 0 at the f frozen actions; then, up to the overlap o, at action j
+        (1 - exp(-a r)) / (1 - exp(-a)) with r = (j - f + 1) / (o - f + 1) and a = `ramp_rate`; then 1.
+    """
+    frozen, overlap = chunking.frozen, chunking.overlap
+    strength = np.ones(action_horizon)
+    strength[:frozen] = 0.0
+    r = np.arange(1, overlap - frozen + 1) / (overlap - frozen + 1)
+    rate = max(chunking.ramp_rate, SLOWEST_RAMP)
+    strength[frozen:overlap] = np.expm1(-rate * r) / np.expm1(-rate)
+    return strength
+
+
+def is_unused(name: str) -> bool:
+    """Whether a checkpoint may have a parameter of this name that only the released training uses."""
+    return name in (MASK_TOKEN, DROPOUT_PROB) or name.startswith(LOG_SIGMA)
 
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:

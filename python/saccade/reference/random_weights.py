@@ -223,7 +223,7 @@ def unused_parameters(config: Mapping[str, Any]) -> list[str]:
 def random_head(config: Mapping[str, Any], seed: int, *, dtype: torch.dtype = torch.float32) -> ActionHead:
     """A head whose every tensor is random, so that a forgotten or transposed one shows."""
     with torch.device("meta"):
-        head = ActionHead(HeadConfig.from_dict(config))
+        head = ActionHead(HeadConfig.from_dict(config), unused=unused_parameters(config))
     generator = torch.Generator().manual_seed(seed)
     shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
     tensors = {name: random_tensor(name, shape, generator).to(dtype) for name, shape in shapes.items()}
@@ -251,7 +251,8 @@ def write_checkpoint(
         shard_bytes: a shard is closed when it reaches this size.
     """
     with torch.device("meta"):
-        shapes = {name: t.shape for name, t in ActionHead(HeadConfig.from_dict(config)).state_dict().items()}
+        head = ActionHead(HeadConfig.from_dict(config), unused=unused_parameters(config))
+    shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
     generator = torch.Generator().manual_seed(seed)
     shard: dict[str, Tensor] = {}
     num_shards, held = 0, 0
@@ -305,7 +306,7 @@ def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: i
         "noise": torch.randn(batch, config.action_horizon, config.encoder_action_dim, generator=generator),
         "embodiment_id": torch.randint(config.num_embodiments, (batch,), generator=generator),
     }
-    if getattr(config, "mask_mode", "none") == "alternate":
+    if config.mask_mode == "alternate":
         inputs |= random_masks(generator, batch=batch, num_vl_tokens=num_vl_tokens)
     return inputs
 
