@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use numpy::{
     Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
@@ -17,8 +17,8 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
 use saccade::{
     Arithmetic, Array, Checkpoint, Chunking, ElementsRef, Error, Features, Group, Integrator, Isa, Keep,
-    LoadOptions, OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, TensorView,
-    TensorViews, Tokens, TraceOptions, peak,
+    LoadOptions, OwnedArray, Part, Patch, Profile, QuantizeOptions, Recorded, Sampling, TensorFacts,
+    TensorView, TensorViews, Tokens, TraceOptions, peak,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -656,6 +656,96 @@ fn read_tensors<'py>(py: Python<'py>, source: PathBuf, prefix: &str) -> PyResult
     Ok(dict)
 }
 
+/// Name, type, shape and bytes in the file of a tensor.
+type PyTensorFacts = (String, String, Vec<usize>, u64);
+
+/// An open checkpoint and what it is. Behind a lock, since threads share the place in its files.
+#[pyclass(frozen, module = "saccade._saccade")]
+struct Published(Mutex<saccade::Published>);
+
+impl Published {
+    fn lock(&self) -> MutexGuard<'_, saccade::Published> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[pymethods]
+impl Published {
+    #[staticmethod]
+    fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
+        py.detach(|| saccade::Published::open(&source, config.as_deref()))
+            .map(|published| Self(Mutex::new(published)))
+            .map_err(raise)
+    }
+
+    fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        config_dict(py, &self.lock().config)
+    }
+
+    #[getter]
+    fn config_json(&self) -> String {
+        self.lock().config_json.clone()
+    }
+
+    #[getter]
+    fn layout(&self) -> String {
+        self.lock().layout.to_string()
+    }
+
+    #[getter]
+    fn prefix(&self) -> &'static str {
+        self.lock().prefix
+    }
+
+    #[getter]
+    fn evidence(&self) -> Vec<String> {
+        self.lock().evidence.clone()
+    }
+
+    #[getter]
+    fn files(&self) -> Vec<PathBuf> {
+        self.lock().files().map(PathBuf::from).collect()
+    }
+
+    fn tensors(&self) -> PyResult<Vec<PyTensorFacts>> {
+        let tensors = self.lock().tensors().map_err(raise)?;
+        let fields = |tensor: TensorFacts| (tensor.name, tensor.dtype, tensor.shape, tensor.nbytes);
+        Ok(tensors.into_iter().map(fields).collect())
+    }
+
+    fn check(&self) -> PyResult<()> {
+        self.lock().check().map_err(raise)
+    }
+
+    /// A tensor as float32, or one slice of its first axis.
+    fn read<'py>(
+        &self,
+        py: Python<'py>,
+        name: &str,
+        index: Option<usize>,
+    ) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let (data, shape) = py.detach(|| {
+            let published = self.lock();
+            let checkpoint = &published.checkpoint;
+            let shape = checkpoint.shape(name).unwrap_or_default().to_vec();
+            let elements = match index {
+                None => checkpoint.read(name),
+                Some(index) => checkpoint.read_slices(name, index..index.saturating_add(1)),
+            };
+            elements
+                .map(|elements| (elements.into_f32(), shape))
+                .map_err(raise)
+        })?;
+        to_numpy(py, data, &shape[usize::from(index.is_some())..])
+    }
+
+    fn nbytes(&self, py: Python<'_>, precision: &str, num_embodiments: usize) -> PyResult<usize> {
+        let precision = precision.parse().map_err(raise)?;
+        py.detach(|| self.lock().nbytes(precision, num_embodiments))
+            .map_err(raise)
+    }
+}
+
 /// `progress(done, total)` is called after each tensor; what it raises stops the work and is raised.
 #[pyfunction]
 #[allow(clippy::too_many_arguments)]
@@ -731,7 +821,7 @@ fn default_num_threads() -> PyResult<usize> {
 #[pymodule(gil_used = false)]
 mod _saccade {
     #[pymodule_export]
-    use super::{ActionHead, Context, CrossAttention, KeyValues};
+    use super::{ActionHead, Context, CrossAttention, KeyValues, Published};
     #[pymodule_export]
     use super::{
         available_isas, default_num_threads, dot_products, measure_peaks, parse_config, quantize,

@@ -8,7 +8,7 @@ use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
-use crate::checkpoint::{Checkpoint, read_text};
+use crate::checkpoint::read_text;
 use crate::chunking::{Chunking, Seam};
 use crate::config::{HeadConfig, Reads};
 use crate::context::{Context, EncodeBuffers, Seen, VlEncoder, removed_keys};
@@ -21,6 +21,7 @@ use crate::layout::{HeadNames, is_unused};
 use crate::memory::{self, MemorySource, TensorViews};
 use crate::precision::Precision;
 use crate::reading::HeadTensors;
+use crate::recognise::Published;
 use crate::tables::action_time;
 use crate::trace::{Keep, Recorded, Shapes, StepBlock, Trace, TraceOptions};
 
@@ -193,14 +194,14 @@ impl ActionHead {
     /// other (all that is wrong is listed), [`Error::Input`] for options out of range.
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = engine(options.precision, options.num_threads)?;
-        let checkpoint = Checkpoint::open(source)?;
-        let config = match &options.config {
-            Some(text) => HeadConfig::from_json(text)?,
-            None => HeadConfig::from_json(&read_config_beside(source)?)?,
-        };
+        let Published {
+            checkpoint,
+            prefix,
+            config,
+            ..
+        } = Published::open(source, options.config.as_deref())?;
         let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
         let names = HeadNames::new(&config);
-        let prefix = checkpoint.head_prefix()?;
         checkpoint.check(prefix, &config)?;
         let wanted = names.reading_order(&config, &embodiment_ids);
         HeadTensors::read_ahead(&checkpoint, prefix, wanted, |tensors| {
@@ -1304,7 +1305,7 @@ mod tests {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../../tests/data")
             .join(name);
-        let checkpoint = Checkpoint::open(&path).unwrap();
+        let checkpoint = crate::Checkpoint::open(&path).unwrap();
         let (width, id, bucket) = (head.config.width, 1, 250);
         let slice = |name: &str| {
             let tensor = checkpoint
