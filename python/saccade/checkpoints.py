@@ -1,8 +1,9 @@
-"""Checkpoints without torch: reading tensors, writing quantised copies."""
+"""Checkpoints without torch: what they are, reading tensors, writing copies."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import Any
 from saccade import _saccade
 from saccade._arrays import Float32Array
 from saccade.config import to_json
+from saccade.hub import resolve
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,62 @@ def source_sha256(source: Path) -> str:
     return digest.hexdigest()
 
 
+def describe(
+    source: str | os.PathLike[str],
+    config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
+    """What a checkpoint is, by its ``config.json`` and the headers of its files; no tensor is read.
+
+    Args:
+        source: As for :meth:`saccade.ActionHead.load`.
+        config: As there.
+
+    Returns:
+        Numbers, strings, lists and dicts as JSON has them:
+
+        - ``source``: the path; ``layout``: who wrote it, ``"nvidia"``, ``"isaac"`` (a fine-tune by
+          Isaac-GR00T's trainer), ``"lerobot"``, ``"fork"`` (lerobot's with several action decoders) or
+          ``"saccade"``; ``prefix``: what the head's tensors begin with.
+        - ``version``: ``"n1"``, ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``; ``evidence``: what tells it.
+        - ``config``: the fields of :class:`saccade.HeadConfig`; ``head_config``: the same in the released
+          key names, with what ``config.json`` leaves out.
+        - ``files``: ``path`` and ``nbytes`` of each with tensors; ``tensors``: ``name``, ``dtype``, ``shape``
+          and ``nbytes`` of each, those outside the head too.
+
+    Raises:
+        FileNotFoundError, CheckpointError: as :meth:`saccade.ActionHead.load`, except that single tensors
+            need not fit the config.
+    """
+    return facts(open_published(source, config), source)
+
+
+def open_published(
+    source: str | os.PathLike[str],
+    config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
+) -> _saccade.Published:
+    """An open checkpoint, its layout, version and config recognised; raises as :func:`describe`."""
+    return _saccade.Published.open(os.fspath(resolve(source)), None if config is None else to_json(config))
+
+
+def facts(published: _saccade.Published, source: str | os.PathLike[str]) -> dict[str, Any]:
+    """What :func:`describe` returns."""
+    config = published.config()
+    return {
+        "source": os.fspath(source),
+        "layout": published.layout,
+        "prefix": published.prefix,
+        "version": config["version"],
+        "evidence": published.evidence,
+        "config": config,
+        "head_config": json.loads(published.config_json),
+        "files": [{"path": str(file), "nbytes": file.stat().st_size} for file in published.files],
+        "tensors": [
+            {"name": name, "dtype": dtype, "shape": shape, "nbytes": nbytes}
+            for name, dtype, shape, nbytes in published.tensors()
+        ],
+    }
+
+
 def read_tensors(source: str | os.PathLike[str], prefix: str = "") -> dict[str, Float32Array]:
     """Reads the tensors whose names begin with ``prefix``, as float32; the prefix is cut off the names.
 
@@ -110,4 +168,4 @@ def read_tensors(source: str | os.PathLike[str], prefix: str = "") -> dict[str, 
         CheckpointError: the file is broken, or a tensor is not F32, BF16, F16 or I8 with
             scales.
     """
-    return _saccade.read_tensors(os.fspath(source), prefix)
+    return _saccade.read_tensors(os.fspath(resolve(source)), prefix)

@@ -30,6 +30,7 @@ from saccade.attention import check_precision
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError
+from saccade.hub import resolve
 from saccade.integrator import check_integrator
 from saccade.intervention import Intervention, as_interventions
 from saccade.trace import Record, Trace, check_record
@@ -133,10 +134,12 @@ class ActionHead:
 
         Args:
             source: A directory (``config.json`` beside one or more ``.safetensors``, with or without an
-                index) or one ``.safetensors`` file.
+                index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache of
+                ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``; nothing is downloaded.
             config: A dict or the path of a JSON file: a whole checkpoint config (with ``action_head_cfg``)
                 or the head's own.
-                Default: ``config.json`` beside the weights.
+                Default: ``config.json`` beside the weights; of lerobot's, which holds no size of the head,
+                sizes come from the tensors.
             embodiment_ids: Keep only these embodiments' layers; ids keep their numbers. Default all.
             precision: What is computed in what. The residual stream, norms, softmax and all sums of floating
                 point products are float32 in each.
@@ -161,7 +164,7 @@ class ActionHead:
             InputError: an option is out of range.
         """
         check_precision(precision)
-        path = _path("source", source)
+        path = os.fspath(resolve(source))
         text = None if config is None else to_json(config)
         ids, threads = _embodiment_ids(embodiment_ids), _optional_integer("num_threads", num_threads)
         head = _saccade.ActionHead.load(path, text, ids, precision, threads)
@@ -567,18 +570,6 @@ def _load(source: str, options: dict[str, Any]) -> ActionHead:
 
 def _embodiment_ids(given: Sequence[int] | None) -> list[int] | None:
     return None if given is None else int64("embodiment_ids", given).reshape(-1).tolist()
-
-
-def _path(name: str, value: str | os.PathLike[str]) -> str:
-    try:
-        path = os.fspath(value)
-    except TypeError:
-        path = None
-    if not isinstance(path, str):
-        raise InputError(f"{name}: expected a path, got {type(value).__name__}")
-    if "\0" in path:
-        raise InputError(f"{name}: expected a path, got one with a null character")
-    return path
 
 
 def _held(context: Context) -> _saccade.Context:
