@@ -1,8 +1,7 @@
-"""The reference and the Rust head against lerobot's own GR00T N1.7 head. `make test-compat` runs it where lerobot
-is 0.6 or later.
+"""The reference and the Rust head against lerobot's own GR00T N1.7 head.
 
-Sine tables differ: the released code calls torch's float32 exp, sin and cos, so up to 2e-4 may come from them
-alone.
+`make test-compat` runs this where lerobot is 0.6 or later. Sine tables differ: the released code calls
+torch's float32 exp, sin and cos, so up to 2e-4 may come from them alone.
 """
 
 # Calls of torch modules are untyped.
