@@ -94,6 +94,11 @@ def find_python(version: str) -> Path:
     raise Failed(f"no CPython {version} on PATH or in pyenv")
 
 
+def pin(numpy: str) -> str:
+    """What to ask pip for."""
+    return "numpy" if numpy == "newest" else f"numpy=={numpy}"
+
+
 def environment(version: str, folder: Path, *requirements: str | Path) -> Path:
     """A fresh environment; returns its interpreter."""
     run([find_python(version), "-m", "venv", "--clear", "--without-pip", folder], Path.cwd())
@@ -158,8 +163,7 @@ def try_versions(wheel: Path, work: Path) -> list[list[str]]:
         for numpy in numpys:
             row = [version, numpy]
             try:
-                pin = "numpy" if numpy == "newest" else f"numpy=={numpy}"
-                python = environment(version, work / f"{version}-{numpy}", wheel, pin)
+                python = environment(version, work / f"{version}-{numpy}", wheel, pin(numpy))
                 result, actions = check(python, work)
                 if any(np.any(actions[key] != value) for key, value in bits.get(result["isa"], {}).items()):
                     raise Failed("other actions than in the rows above")
@@ -206,7 +210,7 @@ def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
 
 
 def refuses_avx2(qemu: str, work: Path) -> str:
-    """Whether the oldest emulated CPU stops at an AVX2 instruction; else its row would mean nothing."""
+    """Whether the oldest emulated CPU stops at an AVX2 instruction: else the rows above mean nothing."""
     program = work / "avx2"
     program.with_suffix(".c").write_text(AVX2_PROGRAM)
     try:
@@ -219,31 +223,30 @@ def refuses_avx2(qemu: str, work: Path) -> str:
 
 
 def try_rollouts(wheel: Path, work: Path) -> list[list[str]]:
-    """A row for each CPython: the shipped policy drives the simulated robot for one episode."""
+    """A row for each CPython with NumPy 1.26, where there is one, and with the newest: one episode."""
     rows = []
-    for version in MATRIX:
-        row = [version]
+    pairs = [(version, numpy) for version, numpys in MATRIX.items() for numpy in numpys]
+    for version, numpy in pairs:
+        if numpy not in ("1.26.4", "newest"):
+            continue
+        row = [version, numpy]
         try:
-            python = environment(version, work / f"rollout-{version}", f"{wheel}[sim]")
-            names = ("numpy", "mujoco", "metaworld")
+            folder = work / f"rollout-{version}-{numpy}"
+            python = environment(version, folder, f"{wheel}[sim]", pin(numpy))
+            names = ("numpy", "mujoco", "metaworld", "gymnasium")
             code = f"import importlib.metadata as m; print(*map(m.version, {names}))"
-            versions = run([python, "-I", "-c", code], work).split()
+            row = [version, *run([python, "-I", "-c", code], work).split()]
             command: list[str | Path] = [
                 python.parent / "saccade",
                 "rollout",
-                "--tasks",
-                "reach",
-                "--episodes",
-                "1",
+                "--json",
+                "--out",
+                folder / "out",
             ]
-            said = run([*command, "--out", work / f"out-{version}", "--json"], work)
-            row += [
-                *versions,
-                "reached" if json.loads(said)["episodes"][0]["success"] else "not reached",
-                "passed",
-            ]
+            said = json.loads(run([*command, "--tasks", "reach", "--episodes", "1"], work))
+            row += ["reached" if said["episodes"][0]["success"] else "not reached", "passed"]
         except Failed as error:
-            row += ["", "", "", "", f"FAILED: {error}"]
+            row += [""] * (6 - len(row)) + [f"FAILED: {error}"]
         rows.append(row)
         print("  ", *row, flush=True)
     return rows
@@ -282,7 +285,9 @@ def main() -> int:
             cpus=table(
                 "CPU | instruction set | float32 | bfloat16 | int8 | equal bits | ", try_cpus(wheel, work)
             ),
-            rollouts=table("CPython | NumPy | mujoco | metaworld | goal | ", try_rollouts(wheel, work)),
+            rollouts=table(
+                "CPython | NumPy | mujoco | metaworld | gymnasium | goal | ", try_rollouts(wheel, work)
+            ),
             machine=f"{wheel.name}, on {platform.system()} {platform.release()}",
         )
     print(page)
