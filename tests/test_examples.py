@@ -1,10 +1,13 @@
-"""The examples run as they are, with NumPy only."""
+"""The examples run as they are."""
 
 from __future__ import annotations
 
+import json
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -45,3 +48,68 @@ def test_real_time_refuses_nonsense(arguments: list[str]) -> None:
     finished = run("real_time.py", *arguments)
     assert finished.returncode == 2
     assert "expected" in finished.stderr or "invalid choice" in finished.stderr
+
+
+@pytest.fixture
+def asynchronous(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Runs the example in this process: it imports much, and only the first time takes long."""
+
+    def run(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["asynchronous.py", *arguments])
+        try:
+            runpy.run_path(str(EXAMPLES / "asynchronous.py"), run_name="__main__")
+        except SystemExit as stopped:
+            return stopped.code if isinstance(stopped.code, int) else 1
+        return 0
+
+    return run
+
+
+def test_asynchronous_goes_on_where_it_was_and_reports(
+    asynchronous: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["--tasks", "reach", "push", "--max-steps", "20", "--out", str(tmp_path)]
+    assert asynchronous("--episodes", "1", "--delays", "0", "8", *few, "--video") == 0
+    record = json.loads((tmp_path / "results.json").read_text())
+    rows = {(row["delay"], row["arm"], row["task"]): row for row in record["episodes"]}
+    assert len(rows) == len(record["episodes"]) == 8
+    assert len(list((tmp_path / "videos").glob("*.mp4"))) == 8
+    for (delay, arm, task), row in rows.items():
+        # 20 steps: looks at 8 and 16, whose chunks come `delay` later.
+        assert row["num_seams"] == {0: 2, 8: 1}[delay], (arm, task)
+        assert row["seam"] > 0
+        assert row["within"] > 0
+        assert row["bend"] > 0
+    # What is frozen is carried out as it was planned: the arms part at the first seam, and not before.
+    assert rows[8, "plain", "push"] != rows[8, "chunked", "push"]
+    capsys.readouterr()
+    assert asynchronous("--episodes", "1", "--delays", "0", "8", "4", *few) == 0
+    again = json.loads((tmp_path / "results.json").read_text())["episodes"]
+    assert again[:8] == record["episodes"]
+    assert len(again) == 12
+    assert (tmp_path / "asynchronous.png").stat().st_size > 10_000
+    printed = capsys.readouterr().out
+    assert printed.count("\n| 4 | chunked | 0/2 |") == 1, printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--delays", "9"], "expected 0 to 8"),
+        (["--episodes", "0"], "episodes"),
+        (["--seed", "1000000"], "seed"),
+        (["--max-steps", "0"], "at least 1"),
+        (["--tasks", "fork"], "invalid choice"),
+        (["report"], "results.json"),
+    ],
+)
+def test_asynchronous_refuses_nonsense(
+    asynchronous: Callable[..., int],
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert asynchronous(*arguments, "--out", str(tmp_path)) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,408 @@
+"""Acting while thinking: what inference delay does in closed loop, with and without real-time chunking.
+
+    python examples/asynchronous.py                     2 episodes of each task in each arm, a minute
+    python examples/asynchronous.py --episodes 60       what docs/asynchronous.md shows; goes on where it was
+    python examples/asynchronous.py report              prints the tables and draws the picture again
+
+The shipped policy drives the simulated robot, but a chunk of actions is not there when the robot looks: it
+comes `delay` control ticks later, and until then the robot goes on along the last chunk. So the first `delay`
+actions of the new chunk are over when it comes, and the robot jumps from one chunk into the middle of the
+next. Two arms, on the same layouts, words and noise:
+
+plain     the next chunk knows nothing of what the robot did meanwhile
+chunked   the head is given the last chunk, `previous_chunk=`: its next `delay` actions are certain to be
+          carried out, so they are frozen; those after them pull on the new chunk less and less
+          (`saccade.Chunking`)
+
+The delay is counted in ticks, not in seconds: every run of a seed is the same, on any machine.
+Needs `pip install 'saccade[study]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure as Picture
+from numpy.typing import NDArray
+
+import saccade
+from saccade.errors import InputError
+from saccade.sim.environment import TaskEnvironment
+from saccade.sim.files import writable_directory, write_json
+from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Policy
+from saccade.sim.report import cpu_name
+from saccade.sim.rollout import Episode, environment_for
+from saccade.sim.tasks import DEMO_TASKS, TASKS, check_evaluation_seeds
+from saccade.sim.video import VideoWriter
+from saccade.study.figures import COLOURS, WIDTH
+from saccade.study.statistics import Estimate, bootstrap, paired_difference, scaled, wilson
+
+Float32Array = NDArray[np.float32]
+ARMS = ("plain", "chunked")
+#: No training, choice or other page used seeds from here on.
+FIRST_SEED = 10_000
+#: In the picture: the first episode of this task, and so much of it.
+SHOWN_TASK = "push"
+SHOWN_TICKS = 72
+
+
+class Thinker:
+    """The shipped policy: from what the robot sees to a chunk, with or without the chunk before it."""
+
+    def __init__(self) -> None:
+        self.policy = Policy.load(num_threads=1)
+        self._head = saccade.ActionHead.load(DEMO_CHECKPOINT, num_threads=1)
+
+    def chunk(
+        self,
+        environment: TaskEnvironment,
+        rng: np.random.Generator,
+        previous: Float32Array | None,
+        chunking: saccade.Chunking | None,
+    ) -> Float32Array:
+        """`(1, horizon, action_dim)`, normalised as the head gives it; so is `previous`."""
+        observation = environment.observe()
+        return np.asarray(
+            self._head(
+                self.policy.features(observation),
+                self.policy.state(observation),
+                EMBODIMENT_ID,
+                noise=self.policy.noise(rng),
+                previous_chunk=previous,
+                chunking=chunking,
+            )
+        )
+
+    def commands(self, chunk: Float32Array) -> Float32Array:
+        """What the robot is told, `(horizon, 4)` in [-1, 1]."""
+        return np.clip(self.policy.config.action.restore(chunk[0]), -1.0, 1.0)
+
+
+@dataclass
+class Drive:
+    """One episode.
+
+    Attributes:
+        delay: Control ticks from a look to its chunk.
+        arm: Of `ARMS`.
+        task, seed, success, steps: As in `saccade.sim.rollout.Episode`.
+        commands: What the robot was told, `(steps, 4)`.
+        seams: The steps at which a new chunk took over.
+    """
+
+    delay: int
+    arm: str
+    task: str
+    seed: int
+    success: bool
+    steps: int
+    commands: Float32Array
+    seams: tuple[int, ...]
+
+    def row(self) -> dict[str, Any]:
+        """For the result file: how smooth it was, and no longer every command."""
+        values = {name: value for name, value in asdict(self).items() if name not in ("commands", "seams")}
+        return {**values, "num_seams": len(self.seams), **self.smoothness()}
+
+    def smoothness(self) -> dict[str, float | None]:
+        """Euclidean norms over the command's four numbers, in the mean; None where there is nothing to mean.
+
+        `seam`: of the change at the steps at which a new chunk took over. `within`: of the change at the
+        others. `bend`: of the second difference, all along the episode.
+        """
+        changes = np.linalg.norm(np.diff(self.commands, axis=0), axis=1)
+        bends = np.linalg.norm(np.diff(self.commands, n=2, axis=0), axis=1)
+        at_seams = np.isin(np.arange(1, len(self.commands)), self.seams)
+        parts = {"seam": changes[at_seams], "within": changes[~at_seams], "bend": bends}
+        return {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
+
+
+def drive(
+    thinker: Thinker,
+    environment: TaskEnvironment,
+    seed: int,
+    delay: int,
+    arm: str,
+    max_steps: int | None = None,
+    on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
+) -> Drive:
+    """Runs an episode. The first chunk is there when the robot starts; all others are late."""
+    task = environment.task
+    every, horizon = thinker.policy.config.execute_steps, thinker.policy.horizon
+    # What the last chunk still holds when the robot looks again; its first `delay` actions will be executed.
+    chunking = saccade.Chunking(overlap=horizon - every, frozen=delay) if arm == "chunked" else None
+    environment.restart(seed)
+    rng = np.random.default_rng((list(TASKS).index(task.name), seed))
+    episode = Episode(task.name, seed, environment.instruction)
+    told, seams = [], []
+    current, looked = thinker.chunk(environment, rng, None, None), 0
+    thinking, asked = current, 0
+    on_step(environment, episode)
+    for step in range(min(task.max_steps, max_steps or task.max_steps)):
+        if thinking is not current and step - asked >= delay:
+            current, looked = thinking, asked
+            seams.append(step)
+        if step and step % every == 0:
+            given = (current, chunking) if chunking else (None, None)
+            thinking, asked = thinker.chunk(environment, rng, *given), step
+            if delay == 0:
+                current, looked = thinking, asked
+                seams.append(step)
+        told.append(thinker.commands(current)[step - looked])
+        episode.success = environment.advance(told[-1]).success
+        episode.steps += 1
+        on_step(environment, episode)
+        if episode.success:
+            break
+    commands = np.array(told, np.float32).reshape(-1, 4)
+    return Drive(delay, arm, task.name, seed, episode.success, episode.steps, commands, tuple(seams))
+
+
+def interval(value: Estimate, digits: int = 3) -> str:
+    """A number with its interval."""
+    return f"{value.value:.{digits}f} ({value.low:.{digits}f} to {value.high:.{digits}f})"
+
+
+def percent(value: Estimate) -> str:
+    """A rate, or a difference of rates, in percent."""
+    return interval(scaled(value), 1)
+
+
+class Results:
+    """Episodes by delay and arm, and what they say. `rows` are those of the result file."""
+
+    def __init__(self, rows: Sequence[dict[str, Any]]) -> None:
+        self._arms: dict[tuple[int, str], dict[tuple[str, int], dict[str, Any]]] = {}
+        for row in rows:
+            self._arms.setdefault((row["delay"], row["arm"]), {})[row["task"], row["seed"]] = row
+        self.delays = sorted({delay for delay, _ in self._arms})
+
+    def arm(self, delay: int, arm: str) -> list[dict[str, Any]]:
+        """Its episodes."""
+        return list(self._arms.get((delay, arm), {}).values())
+
+    def success(self, delay: int, arm: str) -> Estimate:
+        """The success rate, with Wilson's interval."""
+        rows = self.arm(delay, arm)
+        return wilson(sum(row["success"] for row in rows), len(rows))
+
+    def mean(self, delay: int, arm: str, what: str) -> Estimate:
+        """The mean over episodes of one of `Drive.smoothness`, with a bootstrap interval."""
+        values = [row[what] for row in self.arm(delay, arm) if row[what] is not None]
+        if not values:
+            return Estimate(np.nan, np.nan, np.nan)
+        return bootstrap(values, range(len(values)))
+
+    def pairs(
+        self, first: tuple[int, str], second: tuple[int, str]
+    ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+        """The episodes that both arms have."""
+        one, two = self._arms.get(first, {}), self._arms.get(second, {})
+        return [(one[key], two[key]) for key in one if key in two]
+
+    def table(self) -> list[str]:
+        """Each arm alone."""
+        lines = [
+            "| delay, ticks | arm | success | % (Wilson 95 %) | change at a seam | change elsewhere "
+            "| second difference |",
+            "|---|---|---|---|---|---|---|",
+        ]
+        for delay, arm in product(self.delays, ARMS):
+            rows = self.arm(delay, arm)
+            if rows:
+                means = [interval(self.mean(delay, arm, what)) for what in ("seam", "within", "bend")]
+                wins = f"{sum(row['success'] for row in rows)}/{len(rows)}"
+                cells = [str(delay), arm, wins, percent(self.success(delay, arm)), *means]
+                lines.append(f"| {' | '.join(cells)} |")
+        return lines
+
+    def comparisons(self) -> list[str]:
+        """Arms side by side, on the same episodes."""
+        lines = [
+            "| compared | pairs | success, points (Tango 95 %) | change at a seam | second difference |",
+            "|---|---|---|---|---|",
+        ]
+        asked = [((delay, "chunked"), (delay, "plain")) for delay in self.delays]
+        asked += [((delay, arm), (0, "plain")) for delay, arm in product(self.delays, ARMS) if delay]
+        for first, second in asked:
+            pairs = self.pairs(first, second)
+            if pairs:
+                won = paired_difference(*([pair[i]["success"] for pair in pairs] for i in (0, 1)))
+                cells = [
+                    f"delay {first[0]} {first[1]}, less delay {second[0]} {second[1]}",
+                    str(len(pairs)),
+                    percent(won.difference),
+                    *(self.change(pairs, what) for what in ("seam", "bend")),
+                ]
+                lines.append(f"| {' | '.join(cells)} |")
+        return lines
+
+    def change(self, pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]], what: str) -> str:
+        """The mean difference within pairs."""
+        both = [
+            (one[what], two[what]) for one, two in pairs if one[what] is not None and two[what] is not None
+        ]
+        if not both:
+            return "-"
+        return interval(bootstrap([one - two for one, two in both], range(len(both))))
+
+    def by_task(self) -> list[str]:
+        """Successes of each task."""
+        tasks = list(dict.fromkeys(row["task"] for key in self._arms for row in self._arms[key].values()))
+        lines = [f"| delay, ticks | arm | {' | '.join(tasks)} |", f"|---|---|{'---|' * len(tasks)}"]
+        for delay, arm in product(self.delays, ARMS):
+            rows = self.arm(delay, arm)
+            if rows:
+                won = [[row["success"] for row in rows if row["task"] == task] for task in tasks]
+                cells = [f"{sum(part)}/{len(part)}" for part in won]
+                lines.append(f"| {delay} | {arm} | {' | '.join(cells)} |")
+        return lines
+
+
+def draw(results: Results, examples: Sequence[Drive], path: Path) -> None:
+    """Success and changes at seams over the delay, and the commands of one episode in each arm."""
+    picture = Picture(figsize=(WIDTH, 5.2), layout="constrained")
+    axes = picture.subplot_mosaic([["success", "seam"], ["trace", "trace"]])
+    for plot in axes.values():
+        plot.spines[["top", "right"]].set_visible(False)
+    for number, arm in enumerate(ARMS):
+        delays = [delay for delay in results.delays if results.arm(delay, arm)]
+        x = [delay + 0.12 * (2 * number - 1) for delay in delays]
+        for name, values in (
+            ("success", [scaled(results.success(delay, arm)) for delay in delays]),
+            ("seam", [results.mean(delay, arm, "seam") for delay in delays]),
+        ):
+            middle = [value.value for value in values]
+            spread = [
+                [value.value - value.low for value in values],
+                [value.high - value.value for value in values],
+            ]
+            axes[name].errorbar(
+                x, middle, spread, fmt="o-", color=COLOURS[number], markersize=4, linewidth=1.2, label=arm
+            )
+    within = [results.mean(delay, ARMS[0], "within").value for delay in results.delays]
+    axes["seam"].plot(results.delays, within, ":", color="0.4", linewidth=1.2, label="plain, between seams")
+    axes["success"].set(ylim=(0, 103), ylabel="success, %")
+    axes["seam"].set_ylim(bottom=0)
+    axes["seam"].set_ylabel("change at a seam")
+    for name in ("success", "seam"):
+        axes[name].set_xlabel("delay, control ticks")
+        axes[name].set_xticks(results.delays)
+        axes[name].legend(frameon=False, fontsize=8, loc="lower left")
+    for example in examples:
+        shown = example.commands[:SHOWN_TICKS, 0]
+        seams = [seam for seam in example.seams if seam < len(shown)]
+        colour = COLOURS[ARMS.index(example.arm)]
+        axes["trace"].plot(shown, color=colour, linewidth=1.2, label=example.arm)
+        axes["trace"].plot(seams, shown[seams], "o", color=colour, markersize=4)
+    one = examples[0]
+    axes["trace"].set_title(f"{one.task}, seed {one.seed}, delay {one.delay}; dots: a new chunk", fontsize=9)
+    axes["trace"].set(xlabel="control tick", ylabel="command sideways")
+    axes["trace"].legend(frameon=False, fontsize=8)
+    picture.savefig(path, dpi=160)
+
+
+def run(args: argparse.Namespace, seeds: range) -> None:
+    """Runs what the result file does not have yet."""
+    thinker = Thinker()
+    most = thinker.policy.horizon - thinker.policy.config.execute_steps
+    if not all(0 <= delay <= most for delay in args.delays):
+        raise InputError(f"--delays: given {args.delays}, expected 0 to {most}: there the old chunk ends")
+    file = writable_directory(args.out) / "results.json"
+    record = {
+        "checkpoint_sha256": thinker.policy.checkpoint_sha256(),
+        "engine": thinker.policy.engine.describe(),
+        "machine": {"cpu": cpu_name(), "system": platform.platform(), "python": platform.python_version()},
+        "max_steps": args.max_steps,
+        "episodes": [],
+    }
+    if file.exists():
+        found = json.loads(file.read_text(encoding="utf-8"))
+        same = ("checkpoint_sha256", "engine", "max_steps")
+        if any(found.get(key) != record[key] for key in same):
+            raise InputError(f"{file}: holds another policy, engine or --max-steps; give another --out")
+        record["episodes"] = found["episodes"]
+    done = {(row["delay"], row["arm"], row["task"], row["seed"]) for row in record["episodes"]}
+    if args.video:
+        writable_directory(args.out / "videos")
+    with contextlib.ExitStack() as opened:
+        mode = "rgb_array" if args.video else None
+        environments = {
+            task: opened.enter_context(
+                contextlib.closing(environment_for(thinker.policy, task, render_mode=mode))
+            )
+            for task in args.tasks
+        }
+        for seed, task, delay, arm in product(seeds, args.tasks, args.delays, ARMS):
+            if (delay, arm, task, seed) in done:
+                continue
+            with contextlib.ExitStack() as stack:
+                more = {}
+                if args.video and seed == seeds[0]:
+                    name = f"{task}-{seed}-delay-{delay}-{arm}.mp4"
+                    more["on_step"] = stack.enter_context(VideoWriter(args.out / "videos" / name)).add
+                one = drive(thinker, environments[task], seed, delay, arm, args.max_steps, **more)
+            record["episodes"].append(one.row())
+            write_json(file, record)
+            print(f"{task} {seed} delay {delay} {arm}: {'done' if one.success else 'failed'} {one.steps}")
+
+
+def report(args: argparse.Namespace) -> None:
+    """Prints the tables and writes the picture."""
+    record = json.loads((args.out / "results.json").read_text(encoding="utf-8"))
+    results = Results(record["episodes"])
+    print(f"{record['machine']['cpu']}; {record['engine']}; checkpoint {record['checkpoint_sha256'][:12]}\n")
+    for table in (results.table(), results.comparisons(), results.by_task()):
+        print("\n".join(table) + "\n")
+    # An episode to look at: commands are not kept, and the same seed gives them again.
+    thinker, delay = Thinker(), results.delays[len(results.delays) // 2]
+    rows = results.arm(delay, ARMS[0])
+    first = next((row for row in rows if row["task"] == SHOWN_TASK), rows[0])
+    with contextlib.closing(environment_for(thinker.policy, first["task"])) as environment:
+        examples = [
+            drive(thinker, environment, first["seed"], delay, arm, record["max_steps"]) for arm in ARMS
+        ]
+    draw(results, examples, args.out / "asynchronous.png")
+    print(f"picture: {args.out / 'asynchronous.png'}")
+
+
+def main() -> None:
+    """Runs, then reports."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = [task.name for task in DEMO_TASKS]
+    parser.add_argument("do", nargs="?", choices=("run", "report"), default="run", help="default: run")
+    parser.add_argument(
+        "--tasks", nargs="+", choices=names, default=names, metavar="TASK", help="default all"
+    )
+    parser.add_argument("--episodes", type=int, default=2, help="of each task and arm (default 2)")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"the first (default {FIRST_SEED})")
+    parser.add_argument(
+        "--delays", type=int, nargs="+", default=[0, 2, 4, 6, 8], help="ticks; default 0 2 4 6 8"
+    )
+    parser.add_argument("--max-steps", type=int, help="end episodes earlier than their tasks do")
+    parser.add_argument("--video", action="store_true", help="an MP4 of the first seed in each arm")
+    parser.add_argument("--out", type=Path, default=Path("out/asynchronous"), help="default out/asynchronous")
+    args = parser.parse_args()
+    if args.max_steps is not None and args.max_steps < 1:
+        parser.error(f"--max-steps: expected at least 1, got {args.max_steps}")
+    try:
+        if args.do == "run":
+            run(args, check_evaluation_seeds(args.seed, args.episodes))
+        report(args)
+    except (InputError, FileNotFoundError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()
