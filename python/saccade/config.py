@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from saccade import _saccade
 from saccade.errors import CheckpointError
+
+#: No config is longer; the same for one that is found beside the weights.
+MOST_BYTES = 100_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,13 +116,19 @@ def to_json(config: Mapping[str, Any] | str | os.PathLike[str]) -> str:
         return read_json(config)
     try:
         return json.dumps(dict(config), allow_nan=False)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"config: expected a mapping as JSON has it, or a path: {error}") from None
 
 
 def read_json(path: str | os.PathLike[str]) -> str:
     """The text of a config file."""
     try:
+        about = Path(path).stat()
+        # A pipe would be waited for, a device read without end.
+        if not stat.S_ISREG(about.st_mode):
+            raise ValueError("not a regular file")
+        if about.st_size > MOST_BYTES:
+            raise ValueError(f"more than {MOST_BYTES} bytes")
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise FileNotFoundError(f"config: no such file: {os.fspath(path)}") from None

@@ -47,12 +47,12 @@ impl Error {
     }
 }
 
-/// A message shows at most so many lines, and so many characters of a line.
+/// A message shows at most so many lines, and of a line at most so many characters of its beginning and of its end.
 const MAX_LINES: usize = 1000;
 const MAX_LINE: usize = 1000;
 
 /// A message as it may reach a terminal: names and values in it come from files, which may hold anything. Control characters, and those
-/// that turn the direction of writing, are escaped; of a long message the beginning is shown.
+/// that turn the direction of writing, are escaped; what is too long is cut.
 fn printable(message: &str) -> Cow<'_, str> {
     let is_plain = |line: &str| line.len() <= MAX_LINE && !line.contains(is_active);
     if message.lines().count() <= MAX_LINES && message.lines().all(is_plain) {
@@ -67,10 +67,13 @@ fn printable(message: &str) -> Cow<'_, str> {
         if number > 0 {
             shown.push('\n');
         }
+        let length = line.chars().count();
         for (column, character) in line.chars().enumerate() {
-            if column == MAX_LINE {
+            if column == MAX_LINE && length > 2 * MAX_LINE {
                 shown.push_str("...");
-                break;
+            }
+            if column >= MAX_LINE && column < length.saturating_sub(MAX_LINE) {
+                continue;
             }
             if is_active(character) {
                 write!(shown, "{}", character.escape_unicode()).expect("strings take everything");
@@ -119,9 +122,13 @@ mod tests {
 
     #[test]
     fn long_messages_end() {
-        let long = "name".repeat(MAX_LINE);
-        let shown = Error::Input(long.clone()).to_string();
-        assert_eq!(shown, format!("{}...", &long[..MAX_LINE]));
+        let (begin, end) = ("a".repeat(MAX_LINE), "e".repeat(MAX_LINE));
+        let shown = Error::Input(format!("{begin}{}{end}", "m".repeat(10 * MAX_LINE))).to_string();
+        assert_eq!(shown, format!("{begin}...{end}"));
+        assert_eq!(
+            Error::Input(format!("{begin}{end}")).to_string(),
+            format!("{begin}{end}")
+        );
         let many = "a line\n".repeat(10 * MAX_LINES);
         let shown = Error::Input(many.clone()).to_string();
         assert_eq!(shown.lines().count(), MAX_LINES + 1);
