@@ -1,0 +1,138 @@
+"""Writes what the fuzzers start from to fuzz/corpus: cuts of the files in tests/data and checkpoints in every
+published layout, small enough to be changed everywhere.
+
+Usage: python fuzz/seeds.py, in the environment of the tests.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, TypeAlias
+
+HERE = Path(__file__).resolve().parent
+TESTS = HERE.parent / "tests"
+DATA = TESTS / "data"
+sys.path.insert(0, str(TESTS))
+import layouts  # noqa: E402
+
+#: Name to dtype, shape and bytes.
+Tensors: TypeAlias = dict[str, tuple[str, list[int], bytes]]
+
+CONFIG = json.loads((HERE / "config.json").read_text())
+BETWEEN = b"\n====\n"  # what the target `index` cuts its input at
+
+
+def safetensors(tensors: Tensors, metadata: dict[str, str] | None = None) -> bytes:
+    """A file of `tensors`."""
+    header: dict[str, Any] = {} if metadata is None else {"__metadata__": metadata}
+    begin = 0
+    for name, (dtype, shape, data) in tensors.items():
+        header[name] = {"dtype": dtype, "shape": shape, "data_offsets": [begin, begin + len(data)]}
+        begin += len(data)
+    text = json.dumps(header, separators=(",", ":")).encode()
+    return struct.pack("<Q", len(text)) + text + b"".join(data for _, _, data in tensors.values())
+
+
+def read(path: Path) -> Tensors:
+    """The tensors of a file."""
+    raw = path.read_bytes()
+    begin = 8 + struct.unpack("<Q", raw[:8])[0]
+    header = json.loads(raw[8:begin])
+    return {
+        name: (
+            info["dtype"],
+            info["shape"],
+            raw[begin + info["data_offsets"][0] : begin + info["data_offsets"][1]],
+        )
+        for name, info in header.items()
+        if name != "__metadata__"
+    }
+
+
+def cut(tensors: Tensors, nbytes: int) -> Tensors:
+    """The tensors of at most `nbytes`."""
+    return {name: tensor for name, tensor in tensors.items() if len(tensor[2]) <= nbytes}
+
+
+def headers() -> dict[str, bytes]:
+    """Files: cuts of a released head in each dtype, and what is odd but allowed."""
+    seeds = {}
+    for path in sorted(DATA.glob("n1*.safetensors")):
+        small = cut(read(path), 160)
+        seeds[path.stem] = safetensors(dict(list(small.items())[:40]))
+        seeds[f"{path.stem}_few"] = safetensors(dict(list(small.items())[:3]))
+    four = struct.pack("<4f", 1, -2, 0.5, 0)
+    seeds["metadata"] = safetensors({"a": ("F32", [2, 2], four)}, {"format": "pt"})
+    seeds["nothing"] = safetensors({})
+    seeds["empty_and_scalar"] = safetensors({"a": ("F32", [0, 5], b""), "b": ("BF16", [], b"\0\x3f")})
+    seeds["halves"] = safetensors(
+        {"a": ("F16", [3], b"\0\x3c\0\xbc\1\0"), "b": ("BF16", [1, 1], b"\x80\x3f")}
+    )
+    scales = struct.pack("<2f", 0.5, 0)
+    seeds["int8"] = safetensors({"x_scale": ("F32", [2], scales), "x": ("I8", [2, 2], b"\1\x7f\0\0")})
+    name = "vlln.weight"
+    for prefix in ("", "action_head.", "_groot_model.action_head."):
+        seeds[f"prefix_{len(prefix)}"] = safetensors({prefix + name: ("F32", [4], four)})
+    return seeds
+
+
+def indexes(files: dict[str, bytes]) -> dict[str, bytes]:
+    """Indexes with their shards behind them."""
+    seeds = {}
+    for shards in (["prefix_12"], ["metadata", "halves"], ["int8", "empty_and_scalar", "n15_tiny_few"]):
+        weight_map = {}
+        for shard, file in zip(shards, "abc", strict=False):
+            raw = files[shard]
+            for name in json.loads(raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]]):
+                if name != "__metadata__":
+                    weight_map[name] = f"{file}.safetensors"
+        index = json.dumps({"metadata": {"total_size": 16}, "weight_map": weight_map}).encode()
+        seeds["_".join(shards)] = BETWEEN.join([index, *(files[shard] for shard in shards)])
+    return seeds
+
+
+def configs() -> dict[str, bytes]:
+    """Configs as released, inside a checkpoint's config, with what changes the head; whole checkpoints."""
+    whole = {"model_type": "gr00t_n1_5", "action_head_cfg": CONFIG}
+    changes = [{"use_vlln": False}, {"num_target_vision_tokens": 0}, {"add_pos_embed": False}]
+    seeds = [CONFIG, whole, *(CONFIG | change for change in changes)]
+    return {f"{number}": json.dumps(seed).encode() for number, seed in enumerate(seeds)} | checkpoints()
+
+
+def checkpoints() -> dict[str, bytes]:
+    """`config.json` and the header of the weights in every published layout; two layers and no backbone make
+    them small.
+    """
+    seeds = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for layout in layouts.LAYOUTS:
+            head = layouts.head_config(layout)
+            head["diffusion_model_cfg"]["num_layers"] = 2
+            layouts.write(Path(folder) / layout, layout, config=head)
+            tensors: Tensors = {}
+            for file in sorted((Path(folder) / layout).glob("model*.safetensors")):
+                tensors |= read(file)
+            config = (Path(folder) / layout / "config.json").read_bytes()
+            header = safetensors({name: tensor for name, tensor in tensors.items() if "action_head." in name})
+            end = 8 + struct.unpack("<Q", header[:8])[0]
+            seeds[layout] = config + BETWEEN + header[8:end]
+    return seeds
+
+
+def main() -> None:
+    """Writes all seeds, each under a name of its own, and says how many there are."""
+    files = headers()
+    for target, seeds in {"header": files, "index": indexes(files), "config": configs()}.items():
+        folder = HERE / "corpus" / target
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, seed in seeds.items():
+            (folder / f"seed_{name}").write_bytes(seed)
+        print(f"{target}: {len(seeds)} seeds, at most {max(map(len, seeds.values()))} bytes")
+
+
+if __name__ == "__main__":
+    main()
