@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import functools
+import json
+import shutil
+from pathlib import Path
 from typing import Any
 
 import layouts
@@ -17,14 +20,16 @@ from saccade import ActionHead, Normalizer, Policy
 from saccade.sim.policy import DEMO_CHECKPOINT
 
 Array = NDArray[np.float32]
-#: What a small head of each layout needs to be told, and the id that the statistics have for it.
-EMBODIMENTS = {"nvidia": 31, "isaac": 31, "lerobot": 31}
+#: The layouts that bring statistics, and the id of the robot that they have in common.
+EMBODIMENTS = {
+    **dict.fromkeys(("nvidia", "isaac", "lerobot", "fork", "fork-split", "n1"), 31),
+    **dict.fromkeys(("n16", "n17", "lerobot-n17"), 10),
+}
 
 
 @functools.cache
 def load(layout: str) -> ActionHead:
-    folder = published(layout)
-    return ActionHead.load(folder, config={"action_head_cfg": layouts.head_config(layout)})
+    return ActionHead.load(published(layout))
 
 
 def draw(*shape: int, seed: int = 0) -> Array:
@@ -35,21 +40,90 @@ def features(head: ActionHead, batch: int = 2) -> Array:
     return draw(batch, 5, head.config.context_dim)
 
 
+def masks(head: ActionHead, batch: int = 2) -> dict[str, Any]:
+    """What `encode` needs to be told besides the features."""
+    image = np.zeros((batch, 5), bool)
+    image[:, 1:3] = True
+    return {"image_mask": image} if head.config.mask_mode == "alternate" else {}
+
+
 @pytest.mark.parametrize("layout", EMBODIMENTS)
 def test_a_policy_is_the_head_between_the_normalizers_halves(layout: str) -> None:
     head = load(layout)
     policy = Policy(head, embodiment="new_embodiment")
     normalizer = Normalizer.load(published(layout), "new_embodiment")
     state = draw(2, 7, seed=1)
-    found = policy(features(head), state, seed=4, num_steps=2)
-    normalised = head(features(head), normalizer.state(state), EMBODIMENTS[layout], seed=4, num_steps=2)
+    found = policy(features(head), state, seed=4, num_steps=2, **masks(head))
+    context = head.encode(features(head), **masks(head))
+    normalised = head.sample(context, normalizer.state(state), EMBODIMENTS[layout], seed=4, num_steps=2)
+    horizon = normalizer.action_horizon or head.config.action_horizon
     assert policy.embodiment_id == EMBODIMENTS[layout]
-    assert found.shape == (2, head.config.action_horizon, 6)
+    assert found.shape == (2, horizon, 6)
     assert np.array_equal(found, normalizer.actions(normalised))
-    context = head.encode(features(head))
     assert np.array_equal(policy.sample(context, state[:, None], seed=4, num_steps=2), found)
     samples = policy.sample(context, state, seed=4, num_steps=2, num_samples=3)
-    assert samples.shape == (2, 3, head.config.action_horizon, 6)
+    assert samples.shape == (2, 3, horizon, 6)
+
+
+@pytest.mark.parametrize("layout", ["lerobot", "fork", "n17"])
+def test_a_chunk_goes_on_where_the_last_one_is(layout: str) -> None:
+    head = load(layout)
+    policy = Policy(head, embodiment="new_embodiment")
+    context = head.encode(features(head), **masks(head))
+    rows = policy.normalizer.action_horizon or head.config.action_horizon
+    width = policy.normalizer.action_width
+    first, second = draw(2, 7, seed=1), draw(2, 7, seed=2)
+    # Within the range of the statistics, where nothing is cut off.
+    before = np.asarray(policy.normalizer.actions(np.random.default_rng(0).uniform(-1, 1, (2, rows, 8))))
+    chunking = saccade.Chunking(overlap=9, frozen=4)
+    after = policy.sample(context, second, seed=1, previous_chunk=before, chunking=chunking)
+    assert np.allclose(np.asarray(after)[:, :4], before[:, rows - 9 : rows - 5], atol=1e-5)
+    free = policy.sample(context, second, seed=1)
+    assert not np.allclose(np.asarray(after)[:, 4:], np.asarray(free)[:, 4:], atol=1e-3)
+    # The head's own rule, on what the normalizer makes of the chunk.
+    normalised = np.zeros((2, rows, head.config.encoder_action_dim), np.float32)
+    normalised[..., :width] = np.asarray(policy.normalizer.unactions(before))[..., :width]
+    expected = head.sample(
+        context,
+        policy.normalizer.state(second),
+        policy.embodiment_id,
+        seed=1,
+        previous_chunk=normalised,
+        chunking=saccade.Chunking(overlap=9, frozen=4, horizon=rows),
+    )
+    assert np.array_equal(after, policy.normalizer.actions(expected))
+    with pytest.raises(saccade.InputError, match="both or neither"):
+        policy.sample(context, first, previous_chunk=before)
+    with pytest.raises(saccade.ShapeError, match="previous_chunk"):
+        policy.sample(context, first, previous_chunk=before[:, 1:], chunking=chunking)
+
+
+def test_what_is_relative_to_the_state_stays_where_it_is_in_the_room(tmp_path: Path) -> None:
+    """The last chunk was relative to an older state: the robot's units tell what that is now."""
+    shutil.copytree(published("n17"), tmp_path, dirs_exist_ok=True)
+    relative = {"rep": "RELATIVE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
+    config = json.loads((tmp_path / "processor_config.json").read_text())
+    kwargs = config["processor_kwargs"]
+    kwargs["use_relative_action"] = True
+    kwargs["modality_configs"]["new_embodiment"]["action"]["action_configs"] = [
+        relative,
+        {**relative, "rep": "ABSOLUTE"},
+    ]
+    layouts.write_json(tmp_path / "processor_config.json", config)
+    statistics = json.loads((tmp_path / "statistics.json").read_text())
+    statistics["new_embodiment"]["relative_action"] = {"arm": {"min": [-3.0] * 5, "max": [3.0] * 5}}
+    layouts.write_json(tmp_path / "statistics.json", statistics)
+    head = load("n17")
+    policy = Policy(head, tmp_path, "new_embodiment")
+    context = head.encode(features(head), **masks(head))
+    older, newer = draw(2, 7, seed=1), draw(2, 7, seed=2)
+    before = np.asarray(policy.sample(context, older, seed=0))
+    chunking = saccade.Chunking(overlap=8, frozen=8)
+    after = np.asarray(policy.sample(context, newer, seed=1, previous_chunk=before, chunking=chunking))
+    # What lies further than 3 from the newer state is beyond the statistics, and cut off as in training.
+    near = np.abs(before[:, 8:, :5] - newer[:, None, :5]) < 3
+    assert near.mean() > 0.5
+    assert np.allclose(after[:, :8, :5][near], before[:, 8:, :5][near], atol=1e-5)
 
 
 def test_torch_in_torch_out() -> None:
@@ -90,9 +164,7 @@ def test_which_embodiment_is_meant() -> None:
     for other in ("oxe_droid", 17):
         with pytest.raises(saccade.InputError, match="embodiment: given"):
             Policy(head, read, other)
-    one = ActionHead.load(
-        published("isaac"), config={"action_head_cfg": layouts.head_config("isaac")}, embodiment_ids=[3]
-    )
+    one = ActionHead.load(published("isaac"), embodiment_ids=[3])
     assert Policy(one, statistics(7, 6)).embodiment_id == 3
     with pytest.raises(saccade.InputError, match=r"one of the head's embodiments \(3\), got 31"):
         Policy(one)

@@ -124,7 +124,7 @@ class Normalizer(Robot):
             normalised = np.zeros((*values.shape[:-1], self.state_dim), np.float32)
         else:
             # Isaac-GR00T and lerobot cut a state off that is wider than the head's.
-            normalised = _padded(_mapped(values, self.state_groups, Group.to_head), self.state_dim)
+            normalised = padded(_mapped(values, self.state_groups, Group.to_head), self.state_dim)
         return like_features(normalised, is_torch(state))
 
     def unstate(self, state: ArrayLike) -> Array:
@@ -178,7 +178,7 @@ class Normalizer(Robot):
         """
         values = self._robot("actions", actions, self.action_groups)
         values = values - self._reference(state, values)
-        normalised = _padded(_mapped(values, self.action_groups, Group.to_head), self.action_dim)
+        normalised = padded(_mapped(values, self.action_groups, Group.to_head), self.action_dim)
         return like_features(normalised, is_torch(actions))
 
     def _reference(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array:
@@ -252,7 +252,7 @@ def _mapped(
     return np.concatenate(parts, axis=-1)
 
 
-def _padded(values: Float32Array, width: int) -> Float32Array:
+def padded(values: Float32Array, width: int) -> Float32Array:
     """With zeros on the right, or cut off there."""
     given = values.shape[-1]
     if given >= width:

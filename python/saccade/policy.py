@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from saccade._arrays import Array, ArrayLike, integer
-from saccade.errors import InputError, ShapeError
-from saccade.normalizer import Normalizer
+from saccade.errors import InputError
+from saccade.normalizer import Normalizer, padded
 
 if TYPE_CHECKING:
     from saccade.chunking import Chunking
@@ -114,7 +114,8 @@ class Policy:
                 action_width)`` in the robot's units; see :meth:`saccade.ActionHead.sample`. Where actions are
                 relative to the state, it is taken relative to the new one. The head's padding beyond the
                 robot's numbers is taken for zeros, as in training.
-            chunking: What of it stays; with ``previous_chunk`` only.
+            chunking: What of it stays; both or neither. Its ``horizon`` is by default the normalizer's
+                ``action_horizon``.
             options: ``noise``, ``seed``, ``num_steps``, ``integrator``, ``num_samples``, ``future_refresh``
                 and ``intervention`` of :meth:`saccade.ActionHead.sample`.
 
@@ -129,33 +130,15 @@ class Policy:
         if "out" in options:
             raise InputError("out: expected none, since the head's normalised actions would be written to it")
         if previous_chunk is not None:
-            options["previous_chunk"], chunking = self._previous(previous_chunk, chunking, state)
+            previous = np.asarray(self.normalizer.unactions(previous_chunk, state))
+            options["previous_chunk"] = padded(previous, self.head.config.encoder_action_dim)
+        horizon = self.normalizer.action_horizon
         if chunking is not None:
+            if chunking.horizon is None and horizon is not None:
+                chunking = replace(chunking, horizon=min(horizon, self.head.config.action_horizon))
             options["chunking"] = chunking
         normalised = self.head.sample(context, self.normalizer.state(state), self.embodiment_id, **options)
         return self.normalizer.actions(normalised, state)
-
-    def _previous(
-        self, chunk: ArrayLike, chunking: Chunking | None, state: ArrayLike
-    ) -> tuple[Array, Chunking | None]:
-        """The last chunk as the head has it: as many rows as it makes, of which only the first ones count
-        where the robot takes a shorter chunk.
-        """
-        normalised = self.normalizer.unactions(chunk, state)
-        horizon, own = self.head.config.action_horizon, self.normalizer.action_horizon
-        if own is None or own >= horizon:
-            return normalised, chunking
-        if normalised.ndim != 3 or normalised.shape[1] != own:
-            raise ShapeError(
-                f"previous_chunk: expected (batch, {own}, action_width), got {tuple(np.shape(chunk))}"
-            )
-        if chunking is not None:
-            if (chunking.horizon or own) > own:
-                raise InputError(f"chunking: horizon {chunking.horizon}, expected at most the robot's {own}")
-            chunking = replace(chunking, horizon=chunking.horizon or own)
-        rows = np.zeros((normalised.shape[0], horizon, normalised.shape[2]), np.float32)
-        rows[:, :own] = normalised
-        return rows, chunking
 
     def __repr__(self) -> str:
         return (
