@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,6 +34,10 @@ from saccade.hub import resolve
 from saccade.integrator import check_integrator
 from saccade.intervention import Intervention, as_interventions
 from saccade.trace import Record, Trace, check_record
+
+if TYPE_CHECKING:
+    from saccade.normalizer import Normalizer
+    from saccade.policy import Policy
 
 
 class Context:
@@ -544,6 +548,25 @@ class ActionHead:
             rows={group: slice(*span) for group, span in rows.items()},
             actions=like_features(actions, context._torch),
         )
+
+    def policy(
+        self,
+        normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
+        embodiment: str | int | None = None,
+    ) -> Policy:
+        """This head in the robot's units: what the robot is and does, in place of normalised numbers.
+
+        Args:
+            normalizer: What turns them into each other, or what :meth:`saccade.Normalizer.load` reads it
+                from. Default: the checkpoint that this head was loaded from.
+            embodiment: Tag or id of the robot, where the statistics are of several.
+
+        Raises:
+            FileNotFoundError, CheckpointError, InputError: as :class:`saccade.Policy`.
+        """
+        from saccade.policy import Policy
+
+        return Policy(self, normalizer, embodiment)
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._source is None:

@@ -44,7 +44,7 @@ class Policy:
         >>> import importlib.resources
         >>> import numpy as np, saccade
         >>> head = saccade.ActionHead.load(importlib.resources.files("saccade") / "sim" / "demo")
-        >>> policy = saccade.Policy(head)
+        >>> policy = head.policy()
         >>> features = np.zeros((1, 57, head.config.context_dim), np.float32)
         >>> policy(features, np.array([[0.0, 0.6, 0.2, 1.0]]), seed=0).shape
         (1, 16, 4)
