@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import sys
 import types
 from collections.abc import Callable
@@ -585,6 +586,15 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 def test_what_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Normalizer.load(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="hf download nobody/nothing"):
+        Normalizer.load("nobody/nothing")
+    with pytest.raises(saccade.CheckpointError, match="too long"):
+        Normalizer.load(tmp_path / ("x" * 300))
+    with pytest.raises(saccade.InputError, match="expected a path"):
+        Normalizer.load(5)  # type: ignore[arg-type]
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(saccade.CheckpointError, match="not a regular file"):
+        Normalizer.load(tmp_path / "pipe.json")
     with pytest.raises(
         saccade.CheckpointError, match=r"no statistics.*policy_preprocessor\.json.*metadata\.json"
     ):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import stat
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from saccade._arrays import Float32Array, integer
 from saccade.errors import CheckpointError, InputError, ShapeError
+from saccade.hub import resolve
 
 #: How the numbers of a group may be normalised.
 MODES = ("min_max", "q99", "mean_std", "binary", "sin_cos", "none")
@@ -256,13 +258,11 @@ ALL_STATISTICS = frozenset(name for names in STATISTICS.values() for name in nam
 
 def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -> Robot:
     """The robot that `source` describes, see :meth:`saccade.Normalizer.load`."""
-    where = "source" if isinstance(source, Mapping) else os.fspath(source)
+    where = "source" if isinstance(source, Mapping) else str(resolve(source))
     try:
-        return (
-            _from_values(source, options, where)
-            if isinstance(source, Mapping)
-            else _from_path(Path(where), options)
-        )
+        if isinstance(source, Mapping):
+            return _from_values(source, options, where)
+        return _from_path(Path(where), options)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         # A file may hold anything where an object is expected: so it says where instead of how.
         raise CheckpointError(f"{where}: statistics of an unknown form ({error!r})") from error
@@ -270,9 +270,7 @@ def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -
 
 def _from_path(path: Path, options: Options) -> Robot:
     """What a file says, or the first of `FILES` in a folder that has statistics."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
-    if not path.is_dir():
+    if not os.path.isdir(path):  # noqa: PTH112 (of a name that is too long Path.is_dir raises OSError)
         return _from_values(read_json(path), options, str(path))
     for name in FILES:
         if (path / name).is_file():
@@ -683,9 +681,7 @@ def read_json(path: Path) -> dict[str, Any]:
         CheckpointError: it holds something else.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise CheckpointError(f"{path}: expected at most {MOST_BYTES} bytes")
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(_bytes(path))
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
     except (OSError, ValueError, RecursionError) as error:
@@ -705,9 +701,7 @@ def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
     kinds = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "i1"}
     kinds |= {"U8": "u1", "BOOL": "?"}
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ValueError(f"expected at most {MOST_BYTES} bytes")
-        content = path.read_bytes()
+        content = _bytes(path)
         start = 8 + int.from_bytes(content[:8], "little")
         if len(content) < 8 or start > len(content):
             raise ValueError("the header is longer than the file")
@@ -726,3 +720,14 @@ def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: no safetensors file of statistics: {error}") from None
     return tensors
+
+
+def _bytes(path: Path) -> bytes:
+    """A small file's content."""
+    about = path.stat()
+    # A pipe would be waited for, a device read without end.
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError("not a regular file")
+    if about.st_size > MOST_BYTES:
+        raise ValueError(f"more than {MOST_BYTES} bytes")
+    return path.read_bytes()
