@@ -148,7 +148,7 @@ wheel:
 	$(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist $(WHEEL_ARGS)
 
 test-wheel: wheel
-	@$(PYTHON) .ci/needs.py opengl
+	@$(PYTHON) .ci/needs.py opengl qemu
 	$(WHEEL_VENV)/bin/python .ci/wheels/test.py dist --page docs/wheels.md
 
 $(WHEEL_VENV)/.tools: .ci/wheels/requirements.txt

@@ -82,7 +82,23 @@ def lacks_browser():
     )
 
 
-CHECKS = {"python": lacks_python, "rust": lacks_rust, "opengl": lacks_opengl, "browser": lacks_browser}
+def lacks_qemu():
+    """What is missing for running a wheel on an old CPU, or None."""
+    if shutil.which("qemu-x86_64"):
+        return None
+    return (
+        "Old CPUs are emulated by qemu-user; no qemu-x86_64 was found on PATH."
+        "\n    Debian, Ubuntu: apt-get install qemu-user"
+    )
+
+
+CHECKS = {
+    "python": lacks_python,
+    "rust": lacks_rust,
+    "opengl": lacks_opengl,
+    "browser": lacks_browser,
+    "qemu": lacks_qemu,
+}
 
 
 def main():
