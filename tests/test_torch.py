@@ -133,6 +133,19 @@ def test_other_dtypes(dtype: torch.dtype) -> None:
     assert_matches(output, expected, max(torch.finfo(dtype).eps, 1e-6))
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_autocast(compiled: bool) -> None:
+    module = attention()
+    ours = CrossAttention.from_attention(module)
+    states, context = tensors()
+    called = torch.compile(ours, fullgraph=True, backend="aot_eager") if compiled else ours
+    with torch.autocast("cpu", torch.bfloat16):
+        output, theirs = called(states, context), module(states, context)
+    assert output.dtype == theirs.dtype == torch.bfloat16
+    assert torch.equal(output, ours(states, context).bfloat16())
+    assert called(states, context).dtype == torch.float32
+
+
 @pytest.mark.parametrize("precision", ["bfloat16", "int8"])
 def test_precisions_are_the_engines(precision: str) -> None:
     module = attention()

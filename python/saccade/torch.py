@@ -146,7 +146,7 @@ class CrossAttention(nn.Module):
                 ``to_out``'s bias.
 
         Returns:
-            ``(batch, queries, width)`` in the dtype of ``hidden_states``.
+            ``(batch, queries, width)`` in the dtype of ``hidden_states``, or in autocast's where that is on.
 
         Raises:
             ShapeError, DtypeError: an argument does not fit, or is not on the CPU.
@@ -164,7 +164,11 @@ class CrossAttention(nn.Module):
             if value.device.type != "cpu":
                 raise DtypeError(f"{name}: expected a tensor on the CPU, got one on {value.device}")
         mask = _key_mask(attention_mask, encoder)
-        return cross_attention(hidden_states, encoder, mask, weights, self.heads, self.precision)  # type: ignore[no-any-return]
+        output: torch.Tensor = cross_attention(
+            hidden_states, encoder, mask, weights, self.heads, self.precision
+        )
+        # As diffusers' linear layers give it; nothing is computed in less than `precision` for it.
+        return output.to(torch.get_autocast_dtype("cpu")) if torch.is_autocast_enabled("cpu") else output
 
     def extra_repr(self) -> str:
         """Heads and precision, for ``print(module)``."""
