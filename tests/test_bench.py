@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +117,34 @@ def test_heads_of_another_structure_are_counted_too(tmp_path: Path) -> None:
     heads.write(tmp_path, config)
     head = saccade.ActionHead.load(tmp_path)
     assert_counted(head, Call.of(head.config, 5, future_refresh=2))
+
+
+@pytest.mark.parametrize("size", ["n1.6", "n1.7"])
+def test_later_versions_are_counted_and_are_of_the_published_size(tmp_path: Path, size: str) -> None:
+    """Seven blocks, so that text is read by twice as many of them as images are; five image tokens of 13."""
+    config = heads.sized(size)
+    published = _saccade.tensor_shapes(json.dumps(config))
+    parameters = sum(math.prod(shape) for _, shape in published)
+    assert parameters == {"n1.6": 1_103_465_600, "n1.7": 1_304_913_028}[size]  # table 5.1, one embodiment
+    config |= {"backbone_embedding_dim": 128, "hidden_size": 64, "input_embedding_dim": 96}
+    config["diffusion_model_cfg"] |= {"cross_attention_dim": 128, "num_attention_heads": 2, "num_layers": 7}
+    config["diffusion_model_cfg"]["output_dim"] = 64
+    if "vl_self_attention_cfg" in config:
+        config["vl_self_attention_cfg"] |= {"num_attention_heads": 2}
+    heads.write(tmp_path, config)
+    head = saccade.ActionHead.load(tmp_path)
+    call = Call.of(head.config, 13, num_image_tokens=5)
+    assert encode_work(head.config, call)["context_to_kv"].multiply_adds == (2 * 8 + 2 * 5) * 128 * 2 * 96
+    assert_counted(head, call)
+    assert_counted(head, replace(call, num_image_tokens=None, num_samples=2))
+
+
+def test_several_decoders_are_counted(tmp_path: Path) -> None:
+    config = heads.sized("small") | {"use_multi_action_heads": True, "action_arm_dim": 5}
+    heads.write(tmp_path, config)
+    head = saccade.ActionHead.load(tmp_path)
+    assert (head.config.action_dim, head.config.encoder_action_dim) == (7, 32)
+    assert_counted(head, Call.of(head.config, 5))
 
 
 def assert_counted(head: saccade.ActionHead, call: Call) -> None:
@@ -244,6 +274,7 @@ def test_json_has_times_profile_and_model(
         "num_samples": 2,
         "future_refresh": 2,
         "num_future_tokens": 32,
+        "num_image_tokens": None,
     }
     assert report["machine"]["num_threads"] == 1
     assert set(report["machine"]["macs_per_second"]) == set(PRECISIONS)

@@ -19,8 +19,8 @@ class Chunking:
     follows the velocity by a factor ``g``: 0 for the first ``frozen``, which stay as they are; then
     ``(1 - exp(-a r)) / (1 - exp(-a))`` with ``a = ramp_rate`` and
     ``r = (j - frozen + 1) / (overlap - frozen + 1)``, which grows from 0 to 1; and 1 from ``overlap`` on. It
-    is GR00T N1.7's rule (its options ``rtc_overlap_steps``, ``rtc_frozen_steps``, ``rtc_ramp_rate``), here for
-    every head; with ``integrator="midpoint"`` the factor stands before both velocities of a step.
+    is GR00T N1.7's rule (its options ``rtc_overlap_steps``, ``rtc_frozen_steps``, ``rtc_ramp_rate``), here
+    for every head; with ``integrator="midpoint"`` the factor stands before both velocities of a step.
 
     Attributes:
         overlap: Actions that are taken over, at most ``horizon``.

@@ -546,6 +546,21 @@ impl Reader {
                     .to_owned(),
             );
         }
+        for (what, size) in [
+            (
+                "diffusion_model_cfg.num_attention_heads x attention_head_dim",
+                config.width,
+            ),
+            (
+                "max_state_dim x state_history_length",
+                config.state_dim * config.state_history,
+            ),
+        ] {
+            if size as u64 > MAX_SIZE {
+                self.problems
+                    .push(format!("{what} is {size}, expected at most {MAX_SIZE}"));
+            }
+        }
         if !config.width.is_multiple_of(2) {
             self.problems.push(format!(
                 "input_embedding_dim is {}, expected an even number (half sines, half cosines)",

@@ -1196,7 +1196,7 @@ fn chosen_embodiments(ids: Option<&[i64]>, num_embodiments: usize) -> Result<Vec
 mod tests {
     use super::*;
 
-    /// The released N1.5 fixtures; their configs stand in the files' metadata.
+    /// A released head; its config stands in the file's metadata.
     fn released(name: &str) -> ActionHead {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../../tests/data")
@@ -1227,8 +1227,12 @@ mod tests {
     fn context(head: &ActionHead, batch: usize) -> Context {
         let shape = [batch, 9, head.config.context_dim];
         let features = numbers(shape.iter().product(), 1);
-        head.encode(&Features::new(Array::new(&features, &shape)))
-            .unwrap()
+        let image_mask: Vec<_> = (0..batch * 9).map(|token| token % 3 == 1).collect();
+        head.encode(&Features {
+            image_mask: Some(Array::new(&image_mask, &shape[..2])),
+            ..Features::new(Array::new(&features, &shape))
+        })
+        .unwrap()
     }
 
     /// One velocity with all rows, or only the needed ones, in the last block.
@@ -1244,7 +1248,8 @@ mod tests {
         );
         let times = &mut workspace.dit.times;
         times.resize(context.batch, head.dit.time(head.engine, bucket));
-        head.encode_state(&numbers(context.batch * config.state_dim, 3), &mut workspace);
+        let state = numbers(context.batch * config.state_history * config.state_dim, 3);
+        head.encode_state(&state, &mut workspace);
         let changes = Changes::new(&[], head.extent(&[], context, 1).unwrap()).unwrap();
         let pass = Pass {
             context,
@@ -1257,10 +1262,12 @@ mod tests {
         workspace.velocity
     }
 
-    const FILES: [&str; 3] = [
+    const FILES: [&str; 5] = [
         "n15_tiny.safetensors",
         "n15_single_view.safetensors",
         "n15_bf16.safetensors",
+        "n17_tiny.safetensors",
+        "fork_two_decoders.safetensors",
     ];
 
     #[test]

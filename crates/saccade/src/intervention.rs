@@ -692,6 +692,47 @@ mod tests {
     }
 
     #[test]
+    fn the_configs_own_bias_is_in_every_self_attention_block_and_under_all_others() {
+        let config = HeadConfig {
+            future_key_bias: Some(vec![0.5, -1.0, 2.0]),
+            ..config()
+        };
+        let own = [0.0, 0.5, -1.0, 2.0, 0.0, 0.0];
+        let plain = changes(&config, &[]).unwrap();
+        for (step, block) in [(0, 1), (2, 3)] {
+            let bias = plain.bias(step, block, 4).unwrap();
+            assert_eq!(
+                (row(bias, 0, 0, 6), row(bias, 1, 1, 6)),
+                (own.to_vec(), own.to_vec())
+            );
+        }
+        assert!(
+            plain.bias(0, 0, 0).is_none(),
+            "cross-attention has no future keys"
+        );
+        assert_eq!(plain.biases.len(), 1);
+
+        let interventions = [Intervention {
+            cut: vec![(some(Group::State, &[0]), some(Group::Future, &[1]))],
+            key_bias: vec![(all(Group::Future), OwnedArray::new(vec![0.25], &[]))],
+            steps: Some(vec![1]),
+            ..Intervention::default()
+        }];
+        let both = changes(&config, &interventions).unwrap();
+        assert_eq!(row(both.bias(0, 1, 0).unwrap(), 0, 0, 6), own);
+        let bias = both.bias(1, 1, 0).unwrap();
+        assert_eq!(row(bias, 0, 0, 6), [0.0, 0.75, CUT, 2.25, 0.0, 0.0]);
+        assert_eq!(row(bias, 0, 1, 6), [0.0, 0.75, -0.75, 2.25, 0.0, 0.0]);
+
+        let replaced = [Intervention {
+            future_tokens: Some(OwnedArray::new(vec![0.0; 8], &[2, 4])),
+            ..Intervention::default()
+        }];
+        let replaced = changes(&config, &replaced).unwrap();
+        assert!(replaced.bias(0, 1, 0).is_none(), "it is the learned tokens' own");
+    }
+
+    #[test]
     fn what_adds_nothing_is_no_bias() {
         let config = config();
         let empty = [

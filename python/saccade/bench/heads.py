@@ -47,10 +47,37 @@ N15: Mapping[str, Any] = {
     },
 }
 
+#: What differs in nvidia/GR00T-N1.6-3B and nvidia/GR00T-N1.7-3B, whose configs say all in one object.
+LATER: Mapping[str, Mapping[str, Any]] = {
+    "n1.6": {
+        "model_type": "Gr00tN1d6",
+        "action_horizon": 50,
+        "max_action_dim": 128,
+        "max_state_dim": 128,
+        "use_alternate_vl_dit": True,
+    },
+    "n1.7": {
+        "model_type": "Gr00tN1d7",
+        "action_horizon": 40,
+        "max_action_dim": 132,
+        "max_state_dim": 132,
+        "state_history_length": 1,
+        "use_alternate_vl_dit": True,
+    },
+}
+
+#: What `sized` knows.
+SIZES = ("n1.5", "n1.6", "n1.7", "small")
+
 
 def sized(size: str) -> dict[str, Any]:
-    """The config of a size: `n1.5`, or `small`, the same structure in milliseconds."""
+    """The config of a size: a version's, or `small`, N1.5's structure in milliseconds."""
     config = copy.deepcopy(dict(N15))
+    if size in LATER:
+        absent = ["action_dim", "num_target_vision_tokens"]
+        absent += ["vl_self_attention_cfg"] if size == "n1.6" else []
+        config = {key: value for key, value in config.items() if key not in absent} | dict(LATER[size])
+        config["diffusion_model_cfg"]["num_layers"] = 32
     if size == "small":
         config |= {"backbone_embedding_dim": 128, "hidden_size": 64, "input_embedding_dim": 96}
         config["diffusion_model_cfg"] |= {
@@ -67,9 +94,9 @@ def write(folder: Path, config: Mapping[str, Any]) -> None:
     """Writes `config.json` and `model.safetensors`, whose weights keep activations of order one.
 
     Stored as bfloat16. One block of random numbers is repeated, so that the disk sets the pace: 1.5 GB for
-    the size of N1.5.
+    the size of N1.5, 2.2 GB and 2.6 GB for those of N1.6 and N1.7.
     """
-    text = json.dumps({"action_head_cfg": dict(config)})
+    text = json.dumps(dict(config) if "model_type" in config else {"action_head_cfg": dict(config)})
     (folder / "config.json").write_text(text)
     shapes = _saccade.tensor_shapes(text)
     header, end = {}, 0

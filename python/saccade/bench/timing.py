@@ -35,19 +35,29 @@ def pieces(
     num_samples: int | None = None,
     future_refresh: int | None = None,
     num_future_tokens: int | None = None,
+    num_image_tokens: int | None = None,
 ) -> dict[str, Callable[[], Any]]:
-    """Calls of a head on a random observation: those of `PIECES`, warmed up."""
+    """Calls of a head on a random observation: those of `PIECES`, warmed up.
+
+    The first tokens are those of images, half of them unless a number is given.
+    """
     config = head.config
     rng = np.random.default_rng(0)
     features = rng.standard_normal((1, num_vl_tokens, config.context_dim), np.float32)
-    state = rng.standard_normal((1, config.state_dim), np.float32)
+    images = num_vl_tokens // 2 if num_image_tokens is None else num_image_tokens
+    image_mask = np.arange(num_vl_tokens)[None] < images
+    state = rng.standard_normal((1, config.state_history, config.state_dim), np.float32)
     leading = (1,) if num_samples is None else (1, num_samples)
     noise = rng.standard_normal((*leading, config.action_horizon, config.encoder_action_dim), np.float32)
     changes = []
     if num_future_tokens is not None and num_future_tokens != config.num_future_tokens:
         tokens = rng.standard_normal((num_future_tokens, config.width), np.float32)
         changes = [saccade.Intervention(future_tokens=tokens)]
-    context = head.encode(features)
+
+    def encode() -> saccade.Context:
+        return head.encode(features, image_mask=image_mask)
+
+    context = encode()
 
     def sample(observed: saccade.Context) -> Any:
         return head.sample(
@@ -63,9 +73,9 @@ def pieces(
 
     sample(context)
     return {
-        "encode": lambda: head.encode(features),
+        "encode": encode,
         "sample": lambda: sample(context),
-        "both": lambda: sample(head.encode(features)),
+        "both": lambda: sample(encode()),
     }
 
 

@@ -26,6 +26,9 @@ class Call:
         num_samples: chunks of each.
         future_refresh: as `ActionHead.sample` takes it, 1 where that is None.
         num_future_tokens: N, which an intervention may have changed.
+        num_image_tokens: how many of the T_vl are of images, for heads whose blocks see either these or the
+            others; None is half of them, which is as much work as any number where as many blocks see the
+            ones as the others.
     """
 
     num_vl_tokens: int
@@ -34,6 +37,7 @@ class Call:
     num_samples: int = 1
     future_refresh: int = 1
     num_future_tokens: int = 32
+    num_image_tokens: int | None = None
 
     @classmethod
     def of(cls, config: HeadConfig, num_vl_tokens: int, num_steps: int | None = None, **sizes: int) -> Call:
@@ -71,14 +75,14 @@ def encode_work(config: HeadConfig, call: Call) -> Works:
     """`ActionHead.encode`: the VL self-attention, and keys and values of every cross-attention block."""
     rows, width = call.batch * call.num_vl_tokens, config.context_dim
     works: Works = {}
-    for _ in range(config.vl_num_layers if config.use_vlln else 0):
+    for _ in range(config.vl_num_layers):
         add_linear(works, "to_q", rows, width, width)
         add_linear(works, "to_kv", rows, width, 2 * width)
         add_attention(works, call.batch, call.num_vl_tokens, call.num_vl_tokens, width)
         add_linear(works, "to_out", rows, width, width)
         add_feed_forward(works, rows, width)
-    for _ in filter(None, cross_blocks(config)):
-        add_linear(works, "context_to_kv", rows, width, 2 * config.width)
+    for keys in filter(None, cross_keys(config, call)):
+        add_linear(works, "context_to_kv", call.batch * keys, width, 2 * config.width)
     return works
 
 
@@ -99,18 +103,18 @@ def sample_work(config: HeadConfig, call: Call) -> Works:
         running = all_rows if step % call.future_refresh == 0 else horizon
         add_linear(works, "embodiment", chunks * horizon, config.encoder_action_dim, width)
         add_linear(works, "embodiment", chunks * horizon, width, width)
-        for block, is_cross in enumerate(cross_blocks(config)):
+        for block, cross in enumerate(cross_keys(config, call)):
             queries = horizon if block == config.num_layers - 1 else running
             add_linear(works, "to_q", chunks * queries, width, width)
-            if not is_cross:
+            if cross is None:
                 add_linear(works, "to_kv", chunks * running, width, 2 * width)
-            keys = call.num_vl_tokens if is_cross else all_rows
-            add_attention(works, chunks, queries, keys, width)
+            add_attention(works, chunks, queries, all_rows if cross is None else cross, width)
             add_linear(works, "to_out", chunks * queries, width, width)
             add_feed_forward(works, chunks * queries, width)
         add_linear(works, "output", chunks * horizon, width, hidden)
-        add_linear(works, "embodiment", chunks * horizon, hidden, hidden)
-        add_linear(works, "embodiment", chunks * horizon, hidden, config.action_dim)
+        for _, outputs in config.decoders:
+            add_linear(works, "embodiment", chunks * horizon, hidden, hidden)
+            add_linear(works, "embodiment", chunks * horizon, hidden, outputs)
     return works
 
 
@@ -119,9 +123,17 @@ def total(works: Works) -> Work:
     return sum(works.values(), Work())
 
 
-def cross_blocks(config: HeadConfig) -> Iterator[bool]:
-    """For each block whether it reads the vision-language tokens."""
-    return (block % 2 == 0 or not config.interleave_self_attention for block in range(config.num_layers))
+def cross_keys(config: HeadConfig, call: Call) -> Iterator[int | None]:
+    """For each block how many of the vision-language tokens it reads; None if it is self-attention."""
+    images = call.num_vl_tokens // 2 if call.num_image_tokens is None else call.num_image_tokens
+    every = config.attend_text_every_n_blocks
+    for block in range(config.num_layers):
+        if config.interleave_self_attention and block % 2 == 1:
+            yield None
+        elif config.mask_mode == "none":
+            yield call.num_vl_tokens
+        else:
+            yield images if block % (2 * every) else call.num_vl_tokens - images
 
 
 def add_feed_forward(works: Works, rows: int, width: int) -> None:

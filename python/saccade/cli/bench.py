@@ -55,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "checkpoint", nargs="?", type=Path, help="directory or .safetensors file; default: the shipped policy"
     )
     parser.add_argument(
-        "--size", choices=("n1.5", "small"), help="random weights of this size (n1.5: 1.5 GB of disk)"
+        "--size",
+        choices=heads.SIZES,
+        help="random weights of this size (n1.5: 1.5 GB of disk, n1.6 2.2, n1.7 2.6)",
     )
     parser.add_argument(
         "--precision",
@@ -157,13 +159,14 @@ def default_vl_tokens(source: Path) -> int:
         return DEFAULT_VL_TOKENS
 
 
-def options(call: Call) -> dict[str, int]:
+def options(call: Call) -> dict[str, int | None]:
     """The call as keyword arguments of `pieces`."""
     return {
         "num_steps": call.num_steps,
         "num_samples": call.num_samples,
         "future_refresh": call.future_refresh,
         "num_future_tokens": call.num_future_tokens,
+        "num_image_tokens": call.num_image_tokens,
     }
 
 
