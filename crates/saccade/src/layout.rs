@@ -112,12 +112,14 @@ pub(crate) struct HeadNames {
     pub proj_out: [LinearNames; 2],
 }
 
-/// Name, without a prefix, and shape of every tensor of a head's checkpoint.
+/// Name, without a prefix, and shape of every tensor that a head's checkpoint must hold.
 #[must_use]
 pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
     let tensors = HeadNames::new(config).tensors();
     tensors
         .into_iter()
+        // A head without future tokens may come with an empty tensor of them, and need not.
+        .filter(|tensor| !tensor.shape.contains(&0))
         .map(|tensor| (tensor.name, tensor.shape))
         .collect()
 }
