@@ -124,7 +124,7 @@ def contents(wheel: Path, folder: Path) -> dict[str, Any]:
     """
     with zipfile.ZipFile(wheel) as archive:
         sizes = {item.filename: item.file_size for item in archive.infolist() if not item.is_dir()}
-        archive.extract("saccade/_saccade.abi3.so", folder)
+        archive.extractall(folder)
     library = folder / "saccade" / "_saccade.abi3.so"
     (info,) = {name.split("/")[0] for name in sizes if ".dist-info/" in name}
     wanted = {
@@ -140,8 +140,12 @@ def contents(wheel: Path, folder: Path) -> dict[str, Any]:
         raise Failed(f"not in the wheel: {', '.join(sorted(missing))}")
     if foreign := {name for name in sizes if name.split("/")[0] not in ("saccade", info) or "test" in name}:
         raise Failed(f"should not be in the wheel: {', '.join(sorted(foreign))}")
-    if b"/home/" in library.read_bytes() or str(Path.home()).encode() in library.read_bytes():
-        raise Failed("the library names a home directory of the machine that built it")
+    traces = (str(Path.home()).encode(), b"/home/", b"file:///")
+    built = [library, *(folder / info).rglob("*")]
+    if named := [
+        path.name for path in built if path.is_file() and any(t in path.read_bytes() for t in traces)
+    ]:
+        raise Failed(f"names a folder of the machine that built it: {', '.join(named)}")
     with library.open("rb") as file:
         needs = ELFFile(file).get_section_by_name(".gnu.version_r")
         names = [version.name for _, versions in needs.iter_versions() for version in versions]
@@ -274,7 +278,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         try:
-            inside = contents(wheel, work)
+            inside = contents(wheel, work / "unpacked")
         except Failed as error:
             parser.exit(1, f"{wheel}: {error}\n")
         megabytes = {key: f"{inside[key] / 1e6:.1f}" for key in ("library", "demo", "wheel")}
