@@ -1,6 +1,5 @@
 """The extension module: what the Python package calls. Arrays are C-contiguous."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
 
@@ -24,12 +23,14 @@ __all__ = [
     "Published",
     "__version__",
     "available_isas",
+    "convert",
     "default_num_threads",
     "dot_products",
     "measure_peaks",
     "parse_config",
     "quantize",
     "read_tensors",
+    "resize",
     "selected_isa",
     "start_profile",
     "take_profile",
@@ -185,15 +186,12 @@ class Published:
 
 def parse_config(text: str) -> dict[str, Any]: ...
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
-def quantize(
-    source: str,
-    out: str,
-    config: str | None,
-    head_only: bool,
-    force: bool,
-    metadata: dict[str, str],
-    max_shard_bytes: int | None,
-    progress: Callable[[int, int], object] | None,
+def quantize(rewrite: dict[str, Any]) -> dict[str, Any]: ...
+def convert(
+    rewrite: dict[str, Any], embodiment_ids: list[int] | None, dtype: str | None
+) -> dict[str, Any]: ...
+def resize(
+    rewrite: dict[str, Any], num_future_tokens: int, perturbation: float, seed: int
 ) -> dict[str, Any]: ...
 def available_isas() -> list[str]: ...
 def selected_isa() -> str: ...

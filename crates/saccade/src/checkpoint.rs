@@ -17,6 +17,7 @@ use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 
+use crate::companions::is_processor;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, show_shape};
 use crate::fit::{self, Problem};
@@ -48,7 +49,7 @@ pub enum Elements {
     Int8 {
         /// The whole numbers.
         values: Vec<i8>,
-        /// One for each row: finite, not negative, zero only for a row of zeros.
+        /// One for each row: not negative, zero only for a row of zeros, 127 times it finite.
         scales: Vec<f32>,
     },
 }
@@ -264,12 +265,22 @@ impl Checkpoint {
     }
 
     /// Gives the bytes of tensor `name`, of whatever type, to `take`, piece by piece.
-    pub(crate) fn read_bytes(&self, name: &str, mut take: impl FnMut(&[u8]) -> Result<()>) -> Result<()> {
+    pub(crate) fn read_bytes(&self, name: &str, take: impl FnMut(&[u8]) -> Result<()>) -> Result<()> {
+        self.read_byte_range(name, 0..self.nbytes(name)?, take)
+    }
+
+    /// Gives some of the bytes of tensor `name`, of whatever type, to `take`, piece by piece; a piece holds whole elements if `bytes` does.
+    pub(crate) fn read_byte_range(
+        &self,
+        name: &str,
+        bytes: Range<u64>,
+        mut take: impl FnMut(&[u8]) -> Result<()>,
+    ) -> Result<()> {
         let entry = self.entry(name)?;
-        let nbytes = self.nbytes(name)? as usize;
+        let (start, end) = (bytes.start as usize, bytes.end as usize);
         let mut piece: Vec<u8> = Vec::new();
-        for first in (0..nbytes).step_by(PIECE) {
-            piece = self.read_plain(name, entry, first, PIECE.min(nbytes - first), piece)?;
+        for first in (start..end).step_by(PIECE) {
+            piece = self.read_plain(name, entry, first, PIECE.min(end - first), piece)?;
             take(&piece)?;
         }
         Ok(())
@@ -341,10 +352,10 @@ impl Checkpoint {
         let bad = |problem: String| Err(Error::Checkpoint(format!("source: {problem}")));
         if let Some(row) = scales
             .iter()
-            .position(|scale| !(scale.is_finite() && *scale >= 0.0))
+            .position(|scale| !((127.0 * scale).is_finite() && *scale >= 0.0))
         {
             return bad(format!(
-                "{scale} is {} at index {row}, expected finite scales that are not negative",
+                "{scale} is {} at index {row}, expected finite scales that are not negative, and 127 times them finite",
                 scales[row]
             ));
         }
@@ -512,7 +523,7 @@ impl Listing {
             .filter(|name| name.ends_with(".safetensors.index.json"));
         let files: Vec<PathBuf> = names
             .iter()
-            .filter(|name| name.ends_with(".safetensors"))
+            .filter(|name| name.ends_with(".safetensors") && !is_processor(name))
             .map(|name| directory.join(name))
             .collect();
         match (indexes.next(), indexes.next()) {
@@ -592,7 +603,7 @@ fn read_header(
 
 /// A JSON object from names of tensors, all different (the usual map types keep the last of two equal keys in silence) and printable, to
 /// values. What a file says of itself, `__metadata__`, is left out.
-struct UniqueMap<T>(Vec<(String, T)>);
+pub(crate) struct UniqueMap<T>(pub Vec<(String, T)>);
 
 impl<'de, T: Deserialize<'de>> Deserialize<'de> for UniqueMap<T> {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {

@@ -1,6 +1,6 @@
 //! The action head: encode an observation once, sample chunks of actions from it as often as wanted.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -8,7 +8,6 @@ use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
-use crate::checkpoint::read_text;
 use crate::chunking::{Chunking, Seam};
 use crate::config::{HeadConfig, Reads};
 use crate::context::{Context, EncodeBuffers, Seen, VlEncoder, removed_keys};
@@ -1156,17 +1155,7 @@ fn next_id() -> u64 {
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-pub(crate) fn read_config_beside(source: &Path) -> Result<String> {
-    let directory = if source.is_dir() {
-        source
-    } else {
-        source.parent().unwrap_or(Path::new(""))
-    };
-    let path: PathBuf = directory.join("config.json");
-    read_text("config", &path)
-}
-
-fn chosen_embodiments(ids: Option<&[i64]>, num_embodiments: usize) -> Result<Vec<usize>> {
+pub(crate) fn chosen_embodiments(ids: Option<&[i64]>, num_embodiments: usize) -> Result<Vec<usize>> {
     let Some(ids) = ids else {
         return Ok((0..num_embodiments).collect());
     };

@@ -32,6 +32,8 @@ pub(crate) struct TensorSpec {
     pub shape: Vec<usize>,
     /// Whether it may be stored as int8 with a scale for each row: the weights that run so.
     pub may_be_int8: bool,
+    /// Whether its first axis is of embodiments.
+    pub per_embodiment: bool,
 }
 
 /// A tensor to read, or some slices of its first axis.
@@ -301,6 +303,7 @@ impl TensorSpec {
             name: name.to_owned(),
             shape: shape.to_vec(),
             may_be_int8: false,
+            per_embodiment: false,
         }
     }
 }
@@ -346,11 +349,13 @@ impl LinearNames {
 impl CategoryLinearNames {
     fn list(&self, tensors: &mut Vec<TensorSpec>) {
         let weight = [self.num_embodiments, self.in_features, self.out_features];
-        tensors.push(TensorSpec::plain(&self.weight, &weight));
-        tensors.push(TensorSpec::plain(
-            &self.bias,
-            &[self.num_embodiments, self.out_features],
-        ));
+        let bias = [self.num_embodiments, self.out_features];
+        for (name, shape) in [(&self.weight, &weight[..]), (&self.bias, &bias)] {
+            tensors.push(TensorSpec {
+                per_embodiment: true,
+                ..TensorSpec::plain(name, shape)
+            });
+        }
     }
 }
 

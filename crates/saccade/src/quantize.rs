@@ -1,60 +1,27 @@
 //! Quantised checkpoints: the weights that int8 runs in int8, stored so.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use saccade_kernels::quantize_rows;
 use safetensors::Dtype;
 
 use crate::checkpoint::{Checkpoint, SCALE_SUFFIX};
-use crate::config::HeadConfig;
 use crate::error::{Error, Result};
-use crate::head::read_config_beside;
 use crate::layers::weight_view;
 use crate::layout::{HeadNames, TensorSpec};
+use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::{CheckpointWriter, Planned};
-
-/// Published checkpoints are cut into files of this size.
-const MAX_SHARD_BYTES: u64 = 5_000_000_000;
-
-/// How a checkpoint is quantised.
-#[derive(Clone, Debug)]
-pub struct QuantizeOptions {
-    /// The config as JSON; default the `config.json` beside the weights.
-    pub config: Option<String>,
-    /// Whether tensors outside the head's prefix, such as a backbone's, are left out; otherwise they are copied.
-    pub head_only: bool,
-    /// Whether a checkpoint that is there is replaced.
-    pub force: bool,
-    /// What the files' metadata say.
-    pub metadata: BTreeMap<String, String>,
-    /// A file is closed before it grows larger than this.
-    pub max_shard_bytes: u64,
-}
-
-impl Default for QuantizeOptions {
-    fn default() -> Self {
-        Self {
-            config: None,
-            head_only: false,
-            force: false,
-            metadata: BTreeMap::new(),
-            max_shard_bytes: MAX_SHARD_BYTES,
-        }
-    }
-}
 
 /// What [`quantize`] wrote.
 #[derive(Clone, Debug)]
 pub struct QuantizeReport {
-    /// The files with tensors.
-    pub files: Vec<PathBuf>,
+    /// The files.
+    pub written: Written,
     /// Weights that are int8 now.
     pub num_quantized: usize,
     /// Tensors copied bit for bit.
     pub num_copied: usize,
-    /// Tensors outside the head that were left out.
-    pub num_dropped: usize,
     /// Bytes of the head's tensors before.
     pub head_bytes_before: u64,
     /// Bytes of the head's tensors now, scales included.
@@ -75,97 +42,63 @@ pub struct QuantizeReport {
 pub fn quantize(
     source: &Path,
     out: &Path,
-    options: &QuantizeOptions,
+    options: &RewriteOptions,
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<QuantizeReport> {
-    let checkpoint = Checkpoint::open(source)?;
-    let config = match &options.config {
-        Some(text) => text.clone(),
-        None => read_config_beside(source)?,
-    };
-    let head_config = HeadConfig::from_json(&config)?;
-    let specs = HeadNames::new(&head_config).tensors();
-    let prefix = checkpoint.head_prefix()?;
+    let source = Source::open(source, options.config.as_deref())?;
+    let specs = HeadNames::new(&source.config).tensors();
     let int8: BTreeMap<String, &TensorSpec> = specs
         .iter()
         .filter(|spec| spec.may_be_int8)
-        .map(|spec| (format!("{prefix}{}", spec.name), spec))
+        .map(|spec| (format!("{}{}", source.prefix, spec.name), spec))
         .collect();
     if let Some(name) = int8
         .keys()
-        .find(|name| matches!(checkpoint.dtype(name), Ok(Dtype::I8)))
+        .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
     {
         return Err(Error::Checkpoint(format!(
             "source: it is quantised already: {name} is I8, expected F32, BF16 or F16"
         )));
     }
-    checkpoint.check(prefix, &head_config)?;
-    check_apart(source, checkpoint.files(), out)?;
-
-    let is_kept = |name: &&str| !options.head_only || name.starts_with(prefix);
-    let names: Vec<&str> = checkpoint.names().filter(is_kept).collect();
-    let mut planned = Vec::with_capacity(names.len());
+    let mut planned = Vec::new();
     let mut report = QuantizeReport {
-        files: Vec::new(),
+        written: Written::default(),
         num_quantized: 0,
         num_copied: 0,
-        num_dropped: checkpoint.names().count() - names.len(),
         head_bytes_before: 0,
         head_bytes_after: 0,
     };
-    let mut total = 0;
-    for &name in &names {
-        let shape = checkpoint
-            .shape(name)
-            .expect("the name is one of the checkpoint's");
-        let nbytes = checkpoint.nbytes(name)?;
-        total += nbytes;
-        let mut nbytes_after = nbytes;
+    for name in source.names(options) {
+        let mut tensors = vec![source.as_it_is(name)?];
         if int8.contains_key(name) {
             report.num_quantized += 1;
-            nbytes_after = (shape.iter().product::<usize>() + 4 * shape[0]) as u64;
-            planned.push(Planned {
+            tensors[0].dtype = Dtype::I8;
+            tensors.push(Planned {
                 name: format!("{name}{SCALE_SUFFIX}"),
                 dtype: Dtype::F32,
-                shape: vec![shape[0]],
+                shape: vec![source.shape(name)[0]],
             });
         } else {
             report.num_copied += 1;
         }
-        if name.starts_with(prefix) {
-            report.head_bytes_before += nbytes;
-            report.head_bytes_after += nbytes_after;
+        if source.is_head(name) {
+            report.head_bytes_before += source.checkpoint.nbytes(name)?;
+            report.head_bytes_after += tensors.iter().map(Planned::nbytes).sum::<usize>() as u64;
         }
-        planned.push(Planned {
-            name: name.to_owned(),
-            dtype: if int8.contains_key(name) {
-                Dtype::I8
-            } else {
-                checkpoint.dtype(name)?
-            },
-            shape: shape.to_vec(),
-        });
+        planned.extend(tensors);
     }
-    let mut writer = CheckpointWriter::create(
+    let config = [("config.json", Some(source.given_config.as_str()))];
+    report.written = source.write(
         out,
+        options,
+        &config,
         planned,
-        &options.metadata,
-        options.max_shard_bytes,
-        options.force,
+        &mut progress,
+        |name, writer| match int8.get(name) {
+            Some(spec) => write_quantized(&source.checkpoint, name, spec, writer),
+            None => source.copy(name, writer),
+        },
     )?;
-    writer.file("config.json", &config)?;
-    let mut done = 0;
-    for &name in &names {
-        match int8.get(name) {
-            Some(spec) => write_quantized(&checkpoint, name, spec, &mut writer)?,
-            None => checkpoint.read_bytes(name, |bytes| writer.tensor(name, bytes))?,
-        }
-        done += checkpoint.nbytes(name)?;
-        if !progress(done, total) {
-            return Err(Error::Input("quantize: stopped; nothing was written".to_owned()));
-        }
-    }
-    report.files = writer.finish()?;
     Ok(report)
 }
 
@@ -185,7 +118,7 @@ fn write_quantized(
         &mut values,
         &mut scales,
     );
-    if let Some(row) = scales.iter().position(|scale| !scale.is_finite()) {
+    if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
         return Err(Error::Checkpoint(format!(
             "source: {name} holds NaN or infinity in row {row}, expected finite weights"
         )));
@@ -193,20 +126,4 @@ fn write_quantized(
     writer.tensor(name, bytemuck::cast_slice(&values))?;
     let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
     writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)
-}
-
-/// That neither the source nor a file that it links to is in what would be replaced.
-fn check_apart<'a>(source: &'a Path, files: impl Iterator<Item = &'a Path>, out: &Path) -> Result<()> {
-    // Of what is not a directory the writer says so.
-    let Some(to) = out.canonicalize().ok().filter(|to| to.is_dir()) else {
-        return Ok(());
-    };
-    let is_inside = |path: &Path| path.canonicalize().is_ok_and(|from| from.starts_with(&to));
-    if std::iter::once(source).chain(files).any(is_inside) {
-        return Err(Error::Input(format!(
-            "out: {} holds the source, expected another directory",
-            out.display()
-        )));
-    }
-    Ok(())
 }

@@ -1,16 +1,20 @@
 //! Writing checkpoints: `config.json` and one or more `.safetensors`, tensor by tensor, all of them or nothing.
 //!
 //! Everything goes to a directory beside the wanted one, which takes its name at the end. Whoever looks finds what was there before, or
-//! a whole checkpoint; a program that is killed leaves at most a directory whose name begins with a dot.
+//! a whole checkpoint; a program that is killed leaves at most a directory whose name begins with a dot, which the next one to write under
+//! that name removes. Linux exchanges the two directories in one step; elsewhere, and on file systems that cannot, there is a moment
+//! between two renames in which neither has the name.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 
+use crate::companions::{Companions, is_processor};
 use crate::error::{Error, Result};
 
 /// A tensor to be written.
@@ -21,7 +25,7 @@ pub(crate) struct Planned {
 }
 
 impl Planned {
-    fn nbytes(&self) -> usize {
+    pub(crate) fn nbytes(&self) -> usize {
         self.shape.iter().product::<usize>() * self.dtype.bitsize() / 8
     }
 }
@@ -37,13 +41,17 @@ struct Place {
 /// A checkpoint that is being written; dropped before [`CheckpointWriter::finish`], it leaves nothing.
 pub(crate) struct CheckpointWriter {
     out: PathBuf,
+    /// Whether something has that name already, which the checkpoint may replace.
+    replaces: bool,
+    force: bool,
+    companions: BTreeSet<PathBuf>,
     temporary: TemporaryDirectory,
     shards: Vec<(String, File)>,
     places: BTreeMap<String, Place>,
 }
 
 impl CheckpointWriter {
-    /// Prepares `out` for the `planned` tensors, in files of at most `max_shard_bytes` unless one tensor is larger.
+    /// Prepares `out` for the `planned` tensors, in files of at most `max_shard_bytes` unless one tensor is larger, and writes `companions`.
     ///
     /// # Errors
     /// [`Error::Input`] if `out` is there and `force` is not given, or `out` holds anything but a checkpoint; [`Error::Output`] if it
@@ -52,10 +60,14 @@ impl CheckpointWriter {
         out: &Path,
         mut planned: Vec<Planned>,
         metadata: &BTreeMap<String, String>,
+        companions: &Companions,
         max_shard_bytes: u64,
         force: bool,
     ) -> Result<Self> {
-        check_replaceable(out, force)?;
+        // Behind a link, what it leads to is replaced and not the link.
+        let out = &out.canonicalize().unwrap_or_else(|_| out.to_owned());
+        let carried = companions.all_paths();
+        let replaces = check_replaceable(out, &carried, force)?;
         let temporary = TemporaryDirectory::beside(out)?;
         // Wide elements first, as the format's own writer does: each tensor then lies at a multiple of its element.
         planned.sort_by(|a, b| (b.dtype.bitsize(), &a.name).cmp(&(a.dtype.bitsize(), &b.name)));
@@ -72,6 +84,9 @@ impl CheckpointWriter {
         }
         let mut writer = Self {
             out: out.to_owned(),
+            replaces,
+            force,
+            companions: carried,
             temporary,
             shards: Vec::new(),
             places: BTreeMap::new(),
@@ -87,6 +102,7 @@ impl CheckpointWriter {
         if count > 1 {
             writer.write_index()?;
         }
+        companions.copy_to(&writer.temporary.path)?;
         Ok(writer)
     }
 
@@ -176,11 +192,21 @@ impl CheckpointWriter {
             .map_err(|error| failed(&self.temporary.path.join(shard), &error))
     }
 
-    /// Gives the checkpoint its name.
+    /// Leaves the next `nbytes` bytes of tensor `name` zero: a hole in the file, where the file system has such.
+    pub(crate) fn zeros(&mut self, name: &str, nbytes: u64) {
+        let place = self.places.get_mut(name).expect("the tensor was planned");
+        place.written += nbytes;
+        assert!(
+            place.written <= place.nbytes,
+            "{name}: more bytes than were planned"
+        );
+    }
+
+    /// Gives the checkpoint its name; returns those of the files with tensors.
     ///
     /// # Errors
     /// [`Error::Output`] if the disk is full or the name cannot be given; what was there is then there still.
-    pub(crate) fn finish(self) -> Result<Vec<PathBuf>> {
+    pub(crate) fn finish(self) -> Result<Vec<String>> {
         assert!(
             self.places.values().all(|place| place.written == place.nbytes),
             "all planned tensors are written"
@@ -189,61 +215,116 @@ impl CheckpointWriter {
             file.sync_all()
                 .map_err(|error| failed(&self.temporary.path.join(name), &error))?;
         }
-        let rename = |from: &Path, to: &Path| std::fs::rename(from, to).map_err(|error| failed(to, &error));
-        if self.out.exists() {
-            let replaced = TemporaryDirectory::beside(&self.out)?;
-            let old = replaced.path.join("replaced");
-            rename(&self.out, &old)?;
-            if let Err(error) = rename(&self.temporary.path, &self.out) {
-                // As it was; the first error is the one to tell.
-                let _ = std::fs::rename(&old, &self.out);
-                return Err(error);
-            }
+        let files = self.shards.iter().map(|(name, _)| name.clone()).collect();
+        if self.replaces {
+            // It may hold more by now.
+            check_replaceable(&self.out, &self.companions, self.force)?;
+            replace(&self.temporary.path, &self.out)?;
         } else {
+            // Fails where a directory with something in it has taken the name in the meantime.
             rename(&self.temporary.path, &self.out)?;
         }
-        Ok(self.shards.iter().map(|(name, _)| self.out.join(name)).collect())
+        // A system that crashes now finds the new name, where its file system can be told to make sure.
+        let parent = File::open(parent_of(&self.out));
+        let _ = parent.and_then(|directory| directory.sync_all());
+        Ok(files)
     }
 }
 
-/// That a checkpoint may take the name `out`.
-fn check_replaceable(out: &Path, force: bool) -> Result<()> {
+fn rename(from: &Path, to: &Path) -> Result<()> {
+    std::fs::rename(from, to).map_err(|error| failed(to, &error))
+}
+
+/// Gives the directory `new` the name `out`, whose directory is removed.
+fn replace(new: &Path, out: &Path) -> Result<()> {
+    if exchange(new, out) {
+        // What was there has the temporary name now, and is removed under it.
+        return Ok(());
+    }
+    let replaced = TemporaryDirectory::beside(out)?;
+    let old = replaced.path.join("replaced");
+    rename(out, &old)?;
+    rename(new, out).inspect_err(|_| {
+        // As it was; the first error is the one to tell.
+        let _ = std::fs::rename(&old, out);
+    })
+}
+
+/// Exchanges two directories in one step; false where the system cannot.
+#[cfg(target_os = "linux")]
+fn exchange(new: &Path, out: &Path) -> bool {
+    use rustix::fs::{CWD, RenameFlags, renameat_with};
+    renameat_with(CWD, new, CWD, out, RenameFlags::EXCHANGE).is_ok()
+}
+
+/// Exchanges two directories in one step; false where the system cannot.
+#[cfg(not(target_os = "linux"))]
+fn exchange(_new: &Path, _out: &Path) -> bool {
+    false
+}
+
+/// Whether something has the name `out`, which a checkpoint with these files beside its weights may then replace.
+///
+/// # Errors
+/// [`Error::Input`] if it may not: `force` is not given, or something there is no part of a checkpoint and would be lost.
+fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, force: bool) -> Result<bool> {
     let shown = out.display();
     let metadata = match std::fs::metadata(out) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(false),
         Err(error) => return Err(failed(out, &error)),
         Ok(metadata) => metadata,
     };
     if !metadata.is_dir() {
         return Err(Error::Input(format!("out: {shown} is there and is no directory")));
     }
-    let mut is_empty = true;
-    for entry in std::fs::read_dir(out).map_err(|error| failed(out, &error))? {
-        let entry = entry.map_err(|error| failed(out, &error))?;
-        is_empty = false;
-        let name = entry.file_name();
-        let name = name.to_string_lossy();
-        let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
-        let known = ["config.json", "model.safetensors.index.json"].contains(&&*name)
-            || name.ends_with(".safetensors");
-        if !(is_file && known) {
-            return Err(Error::Input(format!(
-                "out: {shown} holds {name}, which is no part of a checkpoint: choose another directory"
-            )));
+    let is_empty = std::fs::read_dir(out)
+        .map_err(|error| failed(out, &error))?
+        .next()
+        .is_none();
+    let mut folders = vec![PathBuf::new()];
+    while let Some(folder) = folders.pop() {
+        let entries = std::fs::read_dir(out.join(&folder)).map_err(|error| failed(out, &error))?;
+        for entry in entries {
+            let entry = entry.map_err(|error| failed(out, &error))?;
+            let path = folder.join(entry.file_name());
+            let kind = entry.file_type().map_err(|error| failed(out, &error))?;
+            if kind.is_dir() && companions.iter().any(|file| file.starts_with(&path)) {
+                folders.push(path);
+                continue;
+            }
+            let name = path.to_string_lossy();
+            let is_own = folder.as_os_str().is_empty()
+                && (OWN_FILES.contains(&&*name) || name.ends_with(".safetensors") && !is_processor(&name));
+            if !(kind.is_file() && (is_own || companions.contains(&path))) {
+                return Err(Error::Input(format!(
+                    "out: {shown} holds {name}, which is no part of this checkpoint: choose another directory"
+                )));
+            }
         }
     }
     if is_empty || force {
-        return Ok(());
+        return Ok(true);
     }
     Err(Error::Input(format!(
         "out: {shown} is there already; force replaces it"
     )))
 }
 
+/// What a checkpoint may hold beside its weights and companions.
+const OWN_FILES: [&str; 3] = ["config.json", "model.safetensors.index.json", OWN_CONFIG];
+
+/// What of a config is saccade's own, for layouts whose `config.json` takes no other keys.
+pub(crate) const OWN_CONFIG: &str = "saccade.json";
+
 /// A directory with a name of its own, removed with all that is in it.
 struct TemporaryDirectory {
     path: PathBuf,
+    /// Locked as long as somebody writes to it.
+    _lock: Option<File>,
 }
+
+/// A directory that nobody has locked and that is older was left by a program that was killed; a younger one may be about to be locked.
+const ABANDONED_AFTER: Duration = Duration::from_secs(60);
 
 impl TemporaryDirectory {
     /// In the directory of `out`, so that renaming needs no copy.
@@ -254,15 +335,17 @@ impl TemporaryDirectory {
                 out.display()
             ))
         })?;
-        let parent = out.parent().unwrap_or(Path::new(""));
-        if !parent.as_os_str().is_empty() {
-            std::fs::create_dir_all(parent).map_err(|error| failed(parent, &error))?;
-        }
+        let parent = parent_of(out);
+        std::fs::create_dir_all(parent).map_err(|error| failed(parent, &error))?;
+        let start = format!(".{}.saccade-", name.to_string_lossy());
+        remove_abandoned(parent, &start);
         for attempt in 0.. {
-            let name = format!(".{}.{}.{attempt}", name.to_string_lossy(), std::process::id());
-            let path = parent.join(name);
+            let path = parent.join(format!("{start}{}.{attempt}", std::process::id()));
             match std::fs::create_dir(&path) {
-                Ok(()) => return Ok(Self { path }),
+                Ok(()) => {
+                    let lock = File::open(&path).ok().filter(|file| file.try_lock().is_ok());
+                    return Ok(Self { path, _lock: lock });
+                }
                 Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
                 Err(error) => return Err(failed(&path, &error)),
             }
@@ -273,11 +356,39 @@ impl TemporaryDirectory {
 
 impl Drop for TemporaryDirectory {
     fn drop(&mut self) {
-        // After `finish` there is none under this name.
+        // After `finish` there is none under this name, or what was replaced.
         let _ = std::fs::remove_dir_all(&self.path);
     }
 }
 
-fn failed(path: &Path, error: &std::io::Error) -> Error {
+/// Removes what programs that were killed left in `parent` under names that begin with `start`, as far as it can be.
+fn remove_abandoned(parent: &Path, start: &str) {
+    let Ok(entries) = std::fs::read_dir(parent) else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let is_old = || {
+            let modified = entry.metadata().and_then(|metadata| metadata.modified());
+            modified.is_ok_and(|time| time.elapsed().is_ok_and(|age| age > ABANDONED_AFTER))
+        };
+        let is_directory = || entry.file_type().is_ok_and(|kind| kind.is_dir());
+        let is_unlocked = || File::open(entry.path()).is_ok_and(|file| file.try_lock().is_ok());
+        let is_ours = entry.file_name().to_string_lossy().starts_with(start);
+        if is_ours && is_directory() && is_old() && is_unlocked() {
+            let _ = std::fs::remove_dir_all(entry.path());
+        }
+    }
+}
+
+/// The directory that `path` is in.
+fn parent_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        Some(_) => Path::new("."),
+        None => path,
+    }
+}
+
+pub(crate) fn failed(path: &Path, error: &std::io::Error) -> Error {
     Error::Output(format!("out: {} cannot be written: {error}", path.display()))
 }

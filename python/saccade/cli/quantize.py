@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from saccade.cli import EXIT_OK
+
+if TYPE_CHECKING:
+    from saccade.checkpoints import Written
 
 HELP = "write a copy of a checkpoint with int8 weights"
 
 EPILOG = """\
 The weights of the attention and feed-forward layers of all blocks become int8, X.weight, beside a float32
 scale for each output, X.weight_scale. All other tensors are copied bit for bit, those outside the head too
-unless --head-only. ActionHead.load(DIR, precision="int8") then gives the same bits as SOURCE at int8; other
-precisions load it too, with the weights that the integers stand for. docs/precision.md says what int8 costs.
+unless --head-only, and so is what lies beside the weights, such as statistics and processors.
+ActionHead.load(DIR, precision="int8") then gives the same bits as SOURCE at int8; other precisions load it
+too, with the weights that the integers stand for. docs/precision.md says what int8 costs.
 
 examples:
   saccade quantize GR00T-N1.5-3B/ --out GR00T-N1.5-3B-int8
@@ -37,28 +44,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what is in it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-
     from saccade.checkpoints import quantize
 
-    columns = (TextColumn("quantizing"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task("", total=None)
+    with copying("quantizing") as progress:
         report = quantize(
             args.source,
             args.out,
             config=args.config,
             head_only=args.head_only,
             force=args.force,
-            progress=lambda done, total: progress.update(bar, completed=done, total=total),
+            progress=progress,
         )
     if args.json:
-        print(json.dumps({**dataclasses.asdict(report), "files": [str(file) for file in report.files]}))
+        print(json.dumps(dataclasses.asdict(report), default=str))
         return EXIT_OK
     before, after = (size / 1e6 for size in (report.head_bytes_before, report.head_bytes_after))
     print(
         f"{args.out}: {report.num_quantized} weights in int8, {report.num_copied} tensors copied, "
         f"{report.num_dropped} left out; the head's {before:.1f} MB are {after:.1f} MB"
     )
+    left_behind(report)
     return EXIT_OK
+
+
+@contextlib.contextmanager
+def copying(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error for work on a checkpoint; what it gives is called with bytes done and bytes in
+    all.
+
+    Args:
+        what: is done.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn(what), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    # Where nobody sees it, it would still leave an empty line.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda done, total: progress.update(bar, completed=done, total=total)
+
+
+def left_behind(report: Written) -> None:
+    """Says what lay beside the source's weights and was not copied, if anything."""
+    if report.left:
+        print(f"not copied: {', '.join(map(str, report.left))}")
