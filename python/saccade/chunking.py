@@ -67,9 +67,7 @@ class Chunking:
         except (TypeError, ValueError, OverflowError):
             ramp_rate = math.nan
         if not (math.isfinite(ramp_rate) and ramp_rate > 0):
-            raise InputError(
-                f"chunking: ramp_rate: expected a finite number above 0, got {self.ramp_rate!r}"
-            )
+            raise InputError(f"chunking: ramp_rate: expected a finite number above 0, got {self.ramp_rate!r}")
         plain = {"overlap": overlap, "frozen": frozen, "ramp_rate": ramp_rate, "horizon": horizon}
         for name, value in plain.items():
             object.__setattr__(self, name, value)

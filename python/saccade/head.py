@@ -1,4 +1,4 @@
-"""The action head: encode an observation once, sample chunks of actions from it."""
+"""The action head of every version of GR00T: encode an observation once, sample chunks of actions from it."""
 
 from __future__ import annotations
 
@@ -140,8 +140,8 @@ class ActionHead:
             source: A directory (``config.json`` beside one or more ``.safetensors``, with or without an
                 index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache of
                 ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``; nothing is downloaded.
-            config: A dict or the path of a JSON file: a whole checkpoint config (with ``action_head_cfg``)
-                or the head's own.
+            config: A dict or the path of a JSON file: a whole checkpoint config (with ``action_head_cfg``,
+                or flat as those of N1.6 and N1.7) or the head's own.
                 Default: ``config.json`` beside the weights; of lerobot's, which holds no size of the head,
                 sizes come from the tensors.
             embodiment_ids: Keep only these embodiments' layers; ids keep their numbers. Default all.

@@ -32,7 +32,8 @@ class Intervention:
     cross-attention blocks read). Where a group stands, ``(group, indices)`` may stand for some of its tokens.
     Cross-attention blocks have the keys ``vl``, self-attention blocks those of the three others; a cut or
     bias acts where its keys are. All batch elements and samples are treated alike. Keys of a mapping must be
-    hashable: ``("future", (0, 1))``.
+    hashable: ``("future", (0, 1))``. Indices of ``vl`` are of all positions, in blocks that see only some of
+    them too; what such a block does not see is neither cut nor biased there.
 
     Several interventions given in a sequence act together: biases add up, of two patches of one row the later
     one counts, and at most one replaces the future tokens.
@@ -46,7 +47,8 @@ class Intervention:
             ``(tokens, width)`` or ``(batch, tokens, width)``. A patch names its own step and block, and
             ``blocks``, ``steps`` and ``heads`` do not limit it.
         future_tokens: ``(N', width)``, used in place of the learned ones at every step; N' may be any number,
-            0 included, and the group ``future`` then has N' tokens.
+            0 included, and the group ``future`` then has N' tokens. They come without the config's
+            ``future_key_bias``.
         blocks: Blocks in which cuts and biases act; default all.
         steps: Euler steps at which they act; default all. ``velocity`` is step 0.
         heads: Attention heads in which they act; default all.

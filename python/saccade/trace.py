@@ -25,7 +25,8 @@ class Trace(Generic[ArrayT]):
     Attributes:
         attention: By ``(step, block)``, the probabilities used, ``(batch, heads, queries, keys)``. Queries
             are all rows; keys are the vision-language tokens in a cross-attention block and the rows in a
-            self-attention block, removed ones included. A removed key has exactly 0.
+            self-attention block, those that a block does not see included. Such a key, and a removed
+            one, has exactly 0.
         hidden: By ``(step, block)``, the rows as the next block reads them (after the block, and after what
             was patched there), ``(batch, rows, width)``.
         rows: Where the groups ``"state"``, ``"future"`` and ``"action"`` lie on the axes of rows.

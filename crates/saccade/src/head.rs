@@ -1012,19 +1012,18 @@ impl ActionHead {
 
     fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
         let (history, width) = (self.config.state_history, self.config.state_dim);
-        if history > 1 && state.shape != [batch, history, width] {
+        let is_one_state = history == 1 && state.shape == [batch, width];
+        if !is_one_state && state.shape != [batch, history, width] {
+            let axes = match history {
+                1 => format!(
+                    "(batch, state_dim) = {} or (batch, state_history, state_dim)",
+                    show_shape(&[batch, width])
+                ),
+                _ => format!("the last {history} states, (batch, state_history, state_dim)"),
+            };
             return Err(Error::Shape(format!(
-                "state: expected (batch, state_history, state_dim) = {}, since this head takes {history} states, each normalised and \
-                 zero-padded to state_dim as the checkpoint's normaliser does, got {}",
-                show_shape(&[batch, history, width]),
-                show_shape(state.shape)
-            )));
-        }
-        if state.shape != [batch, width] && state.shape != [batch, history, width] {
-            return Err(Error::Shape(format!(
-                "state: expected (batch, state_dim) = {} or (batch, state_history, state_dim) = {}, normalised and zero-padded to state_dim \
-                 as the checkpoint's normaliser does, got {}",
-                show_shape(&[batch, width]),
+                "state: expected {axes} = {}, normalised and zero-padded to state_dim as the checkpoint's normaliser does, got {}; \
+                 saccade.Normalizer turns a robot's state into that",
                 show_shape(&[batch, history, width]),
                 show_shape(state.shape)
             )));

@@ -87,7 +87,7 @@ pub struct Intervention {
     pub key_bias: Vec<(Tokens, OwnedArray)>,
     /// Replaced rows; `blocks`, `steps` and `heads` do not limit them.
     pub patch: Vec<Patch>,
-    /// `(tokens, width)`, in place of the learned ones; any number of tokens.
+    /// `(tokens, width)`, in place of the learned ones and of the biases that these have; any number of tokens.
     pub future_tokens: Option<OwnedArray>,
     /// Blocks in which cuts and biases act; default all.
     pub blocks: Option<Vec<usize>>,

@@ -34,7 +34,7 @@ pub type StepBlock = (usize, usize);
 /// What was kept, by place: [`StepBlock`], or the block of the VL self-attention.
 #[derive(Clone, Debug)]
 pub struct Recorded<Place> {
-    /// The probabilities used, `(batch, heads, queries, keys)`; exactly 0 for keys that were cut or dropped.
+    /// The probabilities used, `(batch, heads, queries, keys)`; exactly 0 for keys that were cut, dropped or are not seen.
     pub attention: BTreeMap<Place, OwnedArray>,
     /// Rows after the block, `(batch, rows, width)`.
     pub hidden: BTreeMap<Place, OwnedArray>,
