@@ -73,7 +73,7 @@ def test_published_sizes(kind: str) -> None:
 
 @pytest.mark.parametrize("size", ["n1.5", "n1.6", "n1.7"])
 def test_the_sizes_to_time_are_the_published_ones(size: str) -> None:
-    assert read(sized(size)) == read(CONFIGS[size] | {"max_num_embodiments": 1})
+    assert read(sized(size)) == read({**CONFIGS[size], "max_num_embodiments": 1})
 
 
 @pytest.mark.parametrize(
