@@ -14,9 +14,11 @@ from typing import Any
 import pytest
 import torch
 from diffusers.models.attention import Attention
+from reference_cases import small_config
 
 import saccade
 import saccade.torch
+from saccade.reference import lerobot_head
 from saccade.torch import NAMES, CrossAttention, cross_attention
 
 HEADS, HEAD_DIM, WIDTH, CONTEXT_DIM = 3, 17, 51, 29
@@ -168,6 +170,24 @@ def test_strides() -> None:
     for name in ("to_q.weight", "to_k.weight"):
         weights[name] = weights[name].T.contiguous().T
     assert_matches(CrossAttention(weights, HEADS)(states, context), expected)
+
+
+def test_in_the_released_head() -> None:
+    """Every attention of lerobot's own head replaced: the same actions."""
+    config = small_config(num_layers=5, head_dim=6, vl_num_layers=2)
+    torch.manual_seed(4)
+    theirs = lerobot_head.build(config)
+    inputs = (torch.randn(2, 9, 10), torch.randn(2, 1, 6), torch.tensor([2, 0]), torch.randn(2, 5, 3))
+    expected = lerobot_head.get_action(theirs, *inputs)
+    replaced = 0
+    for parent in list(theirs.modules()):
+        for name, child in parent.named_children():
+            if isinstance(child, Attention):
+                setattr(parent, name, CrossAttention.from_attention(child))
+                replaced += 1
+    assert replaced == 7
+    assert expected.std() > 0.1
+    torch.testing.assert_close(lerobot_head.get_action(theirs, *inputs), expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(

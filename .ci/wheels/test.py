@@ -151,7 +151,6 @@ def contents(wheel: Path, folder: Path) -> dict[str, Any]:
         names = [version.name for _, versions in needs.iter_versions() for version in versions]
     glibc = max((tuple(map(int, n[6:].split("."))) for n in names if n.startswith("GLIBC_")), default=())
     return {
-        "files": len(sizes),
         "library": sizes["saccade/_saccade.abi3.so"],
         "demo": sizes["saccade/sim/demo/model.safetensors"],
         "wheel": wheel.stat().st_size,
@@ -277,10 +276,7 @@ def main() -> int:
     (wheel,) = wheels
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        try:
-            inside = contents(wheel, work / "unpacked")
-        except Failed as error:
-            parser.exit(1, f"{wheel}: {error}\n")
+        inside = contents(wheel, work / "unpacked")
         megabytes = {key: f"{inside[key] / 1e6:.1f}" for key in ("library", "demo", "wheel")}
         page = PAGE.read_text().format(
             glibc=inside["glibc"],
@@ -301,4 +297,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except Failed as error:
+        sys.exit(str(error))
