@@ -87,6 +87,7 @@ def test_lerobot_reproduces_the_recorded_outputs(released: Released) -> None:
         {"add_pos_embed": False},
         {"num_layers": 3},
         {"vl_num_layers": 2, "num_steps": 7},
+        {"num_future_tokens": 0, "use_vlln": False, "context_dim": 12},  # what N1 is
     ],
     ids=str,
 )
