@@ -1,0 +1,220 @@
+"""Finding a torch action head inside a policy, and what can be said of it without running it.
+
+Heads are known by their structure, so that lerobot's and Isaac-GR00T's classes, and forks of them, need not
+be imported. All have `get_action(backbone_output, action_input)`; later ones take `options` as well.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterator
+from types import MethodType
+from typing import TYPE_CHECKING, Any
+
+from saccade.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import nn
+
+#: What a head is known by, beside `get_action`.
+PARTS = ("state_encoder", "action_encoder", "model", "num_inference_timesteps")
+
+#: Attributes under which objects that are no modules hold the module, or another such object.
+HOLDERS = ("model", "policy", "_groot_model", "action_head")
+
+#: What of a head's config decides how it computes, in the released names. Some are class defaults.
+CONFIG_KEYS = (
+    "action_arm_dim",
+    "action_claw_dim",
+    "action_dim",
+    "action_horizon",
+    "action_left_arm_dim",
+    "action_right_arm_dim",
+    "add_pos_embed",
+    "attend_text_every_n_blocks",
+    "backbone_embedding_dim",
+    "diffusion_model_cfg",
+    "hidden_size",
+    "input_embedding_dim",
+    "max_action_dim",
+    "max_num_embodiments",
+    "max_seq_len",
+    "max_state_dim",
+    "model_type",
+    "num_inference_timesteps",
+    "num_target_vision_tokens",
+    "num_timestep_buckets",
+    "pretrained_action_dim",
+    "split_arm_heads",
+    "state_history_length",
+    "use_alternate_vl_dit",
+    "use_multi_action_heads",
+    "use_vlln",
+    "vl_self_attention_cfg",
+)
+
+
+def find(policy: object) -> nn.Module:
+    """The one action head in `policy`.
+
+    Args:
+        policy: the head itself, a module that holds it, or an object that holds such a module.
+
+    Raises:
+        InputError: there is none, or more than one.
+    """
+    from torch import nn
+
+    held: Any = policy
+    for _ in range(len(HOLDERS)):
+        if isinstance(held, nn.Module):
+            break
+        held = next((getattr(held, name) for name in HOLDERS if hasattr(held, name)), None)
+    if not isinstance(held, nn.Module):
+        raise InputError(
+            f"policy: expected a torch module, or an object that holds one as {', '.join(HOLDERS)}; got "
+            f"{type(policy).__name__}"
+        )
+    found: dict[str, nn.Module] = {
+        name or "itself": module for name, module in held.named_modules() if is_head(module)
+    }
+    if len(found) != 1:
+        raise InputError(
+            f"policy: expected one GR00T action head in {type(policy).__name__}, a module with get_action, "
+            f"{', '.join(PARTS)}; found {', '.join(found) or 'none'}"
+        )
+    return next(iter(found.values()))
+
+
+def is_head(module: nn.Module) -> bool:
+    """Whether `module` has the parts of an action head."""
+    return callable(getattr(module, "get_action", None)) and all(hasattr(module, name) for name in PARTS)
+
+
+def takes_options(module: nn.Module) -> bool:
+    """Whether the head's own `get_action` takes options of real-time chunking."""
+    return "options" in inspect.signature(type(module).get_action).parameters  # type: ignore[attr-defined]
+
+
+def check(module: nn.Module, stand_in: object = None) -> None:
+    """That the head computes by its parameters alone, as they are and where they are.
+
+    Args:
+        module: the head.
+        stand_in: what may stand in the place of its `get_action`.
+
+    Raises:
+        InputError: with all that speaks against it.
+    """
+    problems = [
+        *in_structure(module, stand_in),
+        *in_parameters(module),
+        *in_use(list(module.named_modules())),
+    ]
+    if problems:
+        raise InputError(f"{type(module).__name__} cannot be accelerated: {'; '.join(problems)}")
+
+
+def in_structure(module: nn.Module, stand_in: object) -> Iterator[str]:
+    """What stands in a head's code in the way."""
+    import torch
+
+    replaced = vars(module).get("get_action")
+    # A copy of an accelerated head holds its class's own method as an attribute.
+    own = isinstance(replaced, MethodType) and replaced.__func__ is type(module).get_action  # type: ignore[attr-defined]
+    if replaced is not None and replaced is not stand_in and not own:
+        yield (
+            f"its get_action has been replaced by {describe(replaced)} (TensorRT? torch.compile?): put the "
+            "class's own back"
+        )
+    allowed = {"self", "backbone_output", "action_input", "options"}
+    parameters = set(inspect.signature(type(module).get_action).parameters)  # type: ignore[attr-defined]
+    if not parameters <= allowed:
+        yield f"its get_action takes {', '.join(sorted(parameters - allowed))}, which no known head does"
+    for name, part in module.named_modules():
+        where = name or "the head"
+        if isinstance(part, torch.jit.ScriptModule):
+            yield f"{where} is compiled by torch.jit: accelerate it before"
+        elif hasattr(part, "_orig_mod"):
+            yield f"{where} is compiled by torch.compile: accelerate what it was made from"
+        elif "forward" in vars(part):
+            yield f"the forward of {where} has been replaced by {describe(part.forward)}"
+    config = getattr(module, "config", None)
+    horizons = [getattr(config, "action_horizon", None), getattr(module, "action_horizon", None)]
+    if None in horizons or horizons[0] != horizons[1]:
+        yield f"config.action_horizon is {horizons[0]}, action_horizon is {horizons[1]}"
+
+
+def in_parameters(module: nn.Module) -> Iterator[str]:
+    """What stands in a head's weights in the way."""
+    import torch
+
+    parameters = dict(module.named_parameters())
+    if not parameters:
+        yield "it has no parameters"
+        return
+    devices = {str(parameter.device) for parameter in parameters.values()}
+    if len(devices) > 1 or next(iter(devices)).partition(":")[0] not in ("cpu", "cuda"):
+        yield f"its parameters are on {', '.join(sorted(devices))}: expected all on the CPU, or on one GPU"
+    for name, parameter in parameters.items():
+        if type(parameter) is not torch.nn.Parameter:
+            yield (
+                f"{name} is of {type(parameter).__name__} (quantised? sharded?): accelerate the head with "
+                "plain parameters and choose a precision"
+            )
+            break
+        if parameter.dtype not in (torch.float32, torch.bfloat16, torch.float16):
+            yield f"{name} is {parameter.dtype}, expected float32, bfloat16 or float16"
+            break
+
+
+def in_use(parts: list[tuple[str, nn.Module]]) -> Iterator[str]:
+    """What stands in the way now and can pass: training mode and hooks.
+
+    `parts` are a head and its modules, by name.
+    """
+    training = [name or "the head" for name, part in parts if part.training]
+    if training:
+        yield (
+            f"{shortened(training)}: in training mode, in which dropout acts; call eval(), or restore() the "
+            "original while you train"
+        )
+    hooked = [name or "the head" for name, part in parts if part._forward_hooks or part._forward_pre_hooks]
+    if hooked:
+        yield f"{shortened(hooked)}: forward hooks would not run; remove them, or restore() the original"
+
+
+def config_of(module: nn.Module) -> dict[str, Any]:
+    """The head's config in the released names, as `config.json` has it.
+
+    Raises:
+        InputError: something in it is not what JSON holds.
+    """
+    config = module.config
+    # None and "" mean the same as an absent key: transformers' own default of model_type is "".
+    values = {key: getattr(config, key, None) for key in CONFIG_KEYS}
+    values = {key: value for key, value in values.items() if value is not None and value != ""}
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(values, default=dict))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{type(module).__name__}: its config cannot be read: {error}") from None
+    return plain
+
+
+def settings_of(module: nn.Module) -> tuple[Any, ...]:
+    """The numbers in a head's attributes and config that decide how it computes and that a user may set."""
+    config = module.config
+    own = [getattr(module, name, None) for name in ("action_horizon", "num_timestep_buckets")]
+    names = ("action_horizon", "add_pos_embed", "use_alternate_vl_dit")
+    return (*own, *(getattr(config, name, None) for name in names))
+
+
+def describe(function: object) -> str:
+    """A function's name for a message."""
+    return getattr(function, "__qualname__", None) or type(function).__name__
+
+
+def shortened(names: list[str]) -> str:
+    """The first of some names."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
