@@ -8,6 +8,7 @@ ROLLOUT_ARGS ?= --episodes 3 --video
 
 PEERS_VENV ?= .venv-peers
 PEERS_ARGS ?=
+COMPAT_ARGS ?=
 WHEEL_VENV ?= .venv-wheel
 WHEEL_ARGS ?=
 
@@ -20,7 +21,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat setup-rollout setup-test clean
 
 help:
 	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
@@ -28,6 +29,7 @@ help:
 	@echo "make bench-peers   saccade beside every engine that runs the same head; report in out/peers"
 	@echo "make lint      what .ci/run checks besides the tests"
 	@echo "make sanitize  kernel tests under AddressSanitizer (nightly Rust) and valgrind"
+	@echo "make test-compat  lerobot's own policies, accelerated, in an environment of each release; writes docs/compatibility.md"
 	@echo "make wheel     a manylinux wheel in dist, from the last commit"
 	@echo "make test-wheel   the wheel under every CPython, old and new NumPy, emulated old CPUs; writes docs/wheels.md"
 	@echo "make format    formats all Rust and Python files"
@@ -141,6 +143,10 @@ $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
 	@echo "setting up: ggml (builds it; minutes)"
 	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report goes without it"
 	@touch $@
+
+# lerobot 0.5 and later need Python 3.12: COMPAT_ARGS="--python312 PATH" where python3.12 is not on PATH.
+test-compat: setup-test
+	$(BIN)/python tests/compat/run.py $(COMPAT_ARGS)
 
 wheel:
 	@$(PYTHON) .ci/needs.py python rust
