@@ -8,7 +8,7 @@ import copy
 import functools
 import gc
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import integration_cases as cases
@@ -22,6 +22,15 @@ import saccade
 from saccade.integrations import accelerate
 from saccade.reference import lerobot_head
 from saccade.reference.random_weights import small_config
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Small tensors gain nothing from more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @functools.cache

@@ -39,6 +39,8 @@ PACKAGES = ("lerobot", "torch", "transformers", "diffusers", "numpy")
 
 RESULTS: dict[str, Any] = {}
 
+torch.set_num_threads(1)  # small tensors gain nothing from more
+
 
 @pytest.fixture(scope="module", autouse=True)
 def written_results() -> Iterator[None]:
