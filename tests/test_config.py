@@ -216,6 +216,15 @@ def test_plain_blocks_of_later_versions_ignore_masks() -> None:
     assert (config.version, config.mask_mode, config.attend_text_every_n_blocks) == ("n1.7", "none", 0)
 
 
+@pytest.mark.parametrize("none", [{}, {"num_layers": 0}])
+def test_no_layers_are_no_self_attention(none: Config) -> None:
+    for kind in ("n1.6", "n1.7"):
+        config = read(changed(kind, vl_self_attention_cfg=none))
+        assert (config.version, config.vl_num_layers, config.use_vlln) == (kind, 0, True)
+    with pytest.raises(saccade.CheckpointError, match="num_layers is missing"):
+        read(changed("n1.5", vl_self_attention_cfg=none and {"num_attention_heads": 2}))
+
+
 def test_a_bias_of_the_future_keys_is_read() -> None:
     bias = [0.5 * index for index in range(32)]
     assert read(changed("n1.5", saccade={"future_key_bias": bias})).future_key_bias == tuple(bias)

@@ -211,6 +211,14 @@ impl Version {
     }
 }
 
+/// Whether a transformer is asked for: N1.7's class builds none of null, nor of a config without layers.
+fn has_layers(cfg: &Value) -> bool {
+    match cfg {
+        Value::Object(cfg) => cfg.get("num_layers").is_some_and(|layers| *layers != 0),
+        _ => !cfg.is_null(),
+    }
+}
+
 /// Reads keys and remembers all that is wrong, so that one error lists everything.
 struct Reader {
     problems: Vec<String>,
@@ -223,7 +231,7 @@ impl Reader {
     fn version(&mut self, top: &Object, head: &Object) -> Version {
         // A head's own config that a program wrote whole has an empty one.
         let mut given = [top, head].into_iter().filter_map(|map| map.get("model_type"));
-        if let Some(given) = given.find(|given| given.as_str() != Some("")) {
+        if let Some(given) = given.find(|given| !given.is_null() && **given != "") {
             let known = Version::ALL
                 .into_iter()
                 .find(|version| *given == version.model_type());
@@ -345,7 +353,6 @@ impl Reader {
             head.get(key)
                 .is_some_and(|value| *value != none && !value.is_null())
         };
-        let has_layers = |key: &str| matches!(head.get(key), Some(Value::Object(cfg)) if cfg.get("num_layers") != Some(&none));
         for (key, is_asked_for, versions) in [
             (
                 "use_alternate_vl_dit",
@@ -369,7 +376,7 @@ impl Reader {
             ),
             (
                 "vl_self_attention_cfg",
-                has_layers("vl_self_attention_cfg"),
+                head.get("vl_self_attention_cfg").is_some_and(has_layers),
                 &[Version::N15, Version::N17],
             ),
             (
@@ -400,7 +407,7 @@ impl Reader {
         let key = "vl_self_attention_cfg";
         match version {
             Version::N15 if use_vlln => self.object(head, key),
-            Version::N17 if head.get(key).is_some_and(|cfg| !cfg.is_null()) => self.object(head, key),
+            Version::N17 if head.get(key).is_some_and(has_layers) => self.object(head, key),
             _ => None,
         }
     }
