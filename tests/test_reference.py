@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import layouts
 import numpy as np
 import pytest
 import torch
@@ -391,6 +392,16 @@ def write_checkpoint(
     return head
 
 
+@pytest.mark.parametrize("layout", layouts.LAYOUTS)
+def test_load_reads_every_layout(tmp_path: Path, layout: str) -> None:
+    layouts.write(tmp_path / layout, layout)
+    head, rust = ActionHead.load(tmp_path / layout), saccade.ActionHead.load(tmp_path / layout)
+    assert head.config == rust.config
+    inputs: dict[str, Any] = random_inputs(head.config, 1, batch=1, num_vl_tokens=6)
+    with torch.no_grad():
+        assert relative_error(rust(**inputs), head.double()(**inputs)) <= 1e-5
+
+
 @pytest.mark.parametrize("shards", [1, 3])
 @pytest.mark.parametrize("prefix", ["action_head.", "_groot_model.action_head.", ""])
 def test_load_finds_prefixes_and_shards(tmp_path: Path, prefix: str, shards: int) -> None:
@@ -405,7 +416,7 @@ def test_load_takes_the_config_given(tmp_path: Path) -> None:
     write_checkpoint(tmp_path, "action_head.")
     (tmp_path / "config.json").rename(tmp_path / "elsewhere.json")
     file = tmp_path / "model-00001-of-00001.safetensors"
-    with pytest.raises(saccade.CheckpointError, match="config"):
+    with pytest.raises(FileNotFoundError, match="config"):
         ActionHead.load(file)
     assert ActionHead.load(file, config=tmp_path / "elsewhere.json").config.num_layers == 4
     assert ActionHead.load(file, config=small_config(num_steps=9)).config.num_steps == 9
@@ -420,16 +431,12 @@ def test_load_reads_the_training_times_of_the_config(tmp_path: Path) -> None:
 
 def test_load_lists_all_that_is_wrong(tmp_path: Path) -> None:
     write_checkpoint(tmp_path, "action_head.", drop="vlln.bias", extra="action_head.mystery")
-    config = small_config(num_future_tokens=9)
     with pytest.raises(saccade.CheckpointError) as caught:
-        ActionHead.load(tmp_path, config=config)
-    message = str(caught.value)
-    for part in (
-        "vlln.bias: missing",
-        "mystery: unknown",
-        "future_tokens.weight: shape (4, 12), expected (9, 12)",
-    ):
-        assert part in message
+        ActionHead.load(tmp_path)
+    for part in ("vlln.bias: missing", "mystery: unknown"):
+        assert part in str(caught.value)
+    with pytest.raises(saccade.CheckpointError, match=r"future_tokens\.weight is \(4, 12\)"):
+        ActionHead.load(tmp_path, config=small_config(num_future_tokens=9))
     with pytest.raises(FileNotFoundError):
         ActionHead.load(tmp_path / "nothing")
 

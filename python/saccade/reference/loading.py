@@ -1,4 +1,4 @@
-"""Reads checkpoints for the reference: config, prefix, shards, and every disagreement in one message."""
+"""Reads checkpoints for the reference: every layout that the Rust head reads."""
 
 import json
 from collections.abc import Mapping
@@ -10,70 +10,34 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from saccade.config import read_json
+from saccade import checkpoints
 from saccade.errors import CheckpointError
-
-PREFIXES = ("action_head.", "_groot_model.action_head.", "")
 
 # Added to the name of an int8 weight: the scales of its rows.
 SCALE_SUFFIX = "_scale"
 
 
-def tensor_files(source: str | PathLike[str]) -> list[Path]:
-    """The `.safetensors` files of a directory, or the one file itself."""
-    path = Path(source)
-    if path.is_file():
-        return [path]
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
-    files = sorted(path.glob("*.safetensors"))
-    if not files:
-        raise CheckpointError(f"{path}: expected at least one .safetensors file")
-    return files
-
-
-def read_config(
+def described(
     source: str | PathLike[str], config: Mapping[str, Any] | str | PathLike[str] | None = None
-) -> Mapping[str, Any]:
-    """The config given, or the one that lies beside or inside the checkpoint."""
-    if isinstance(config, Mapping):
-        return config
-    if config is not None:
-        return parse(Path(config))
+) -> dict[str, Any]:
+    """What `saccade.checkpoints.describe` says; the config may also be in the metadata of a single file."""
     path = Path(source)
-    beside = (path if path.is_dir() else path.parent) / "config.json"
-    if beside.is_file():
-        return parse(beside)
-    for file in tensor_files(source):
-        with safe_open(file, framework="pt") as opened:
-            metadata = opened.metadata() or {}
-        if "config" in metadata:
-            return dict(json.loads(metadata["config"]))
-    raise CheckpointError(f"{path}: no config.json beside it; give config=")
+    if config is None and path.is_file() and not (path.parent / "config.json").is_file():
+        with safe_open(path, framework="pt") as opened:
+            inside = (opened.metadata() or {}).get("config")
+        config = None if inside is None else json.loads(inside)
+    return checkpoints.describe(source, config)
 
 
-def parse(path: Path) -> Mapping[str, Any]:
-    """The JSON object of a config file."""
-    return dict(json.loads(read_json(path)))
-
-
-def tensor_places(source: str | PathLike[str]) -> tuple[dict[str, Path], str]:
-    """The file that each tensor is in, by its full name, and the head's prefix."""
-    place = {}
-    for file in tensor_files(source):
-        with safe_open(file, framework="pt") as opened:
-            place.update(dict.fromkeys(opened.keys(), file))
-    return place, next(prefix for prefix in PREFIXES if any(name.startswith(prefix) for name in [*place, ""]))
-
-
-def tensor_names(source: str | PathLike[str]) -> list[str]:
-    """The names of the head's tensors, without their prefix."""
-    place, prefix = tensor_places(source)
-    return [name.removeprefix(prefix) for name in place if name.startswith(prefix)]
+def tensor_names(checkpoint: Mapping[str, Any]) -> list[str]:
+    """The names of the head's tensors in what was `described`, without their prefix."""
+    prefix = checkpoint["prefix"]
+    names = [tensor["name"] for tensor in checkpoint["tensors"]]
+    return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
 
 
 def read_tensors(
-    source: str | PathLike[str], expected: Mapping[str, torch.Size], dtype: torch.dtype
+    checkpoint: Mapping[str, Any], expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
     """The head's tensors without their prefix, in `dtype`; int8 weights as what they stand for, the integers
     of each row times its scale.
@@ -81,11 +45,11 @@ def read_tensors(
     Raises:
         CheckpointError: listing all that is missing, unknown inside the prefix, or of another shape.
     """
-    place, prefix = tensor_places(source)
+    prefix = checkpoint["prefix"]
     tensors, scales, problems = {}, {}, []
     integers = set()
-    for file in sorted(set(place.values())):
-        with safe_open(file, framework="pt") as opened:
+    for file in checkpoint["files"]:
+        with safe_open(file["path"], framework="pt") as opened:
             for full_name in opened.keys():  # noqa: SIM118  (a safetensors handle is no dict)
                 name = full_name.removeprefix(prefix)
                 if not full_name.startswith(prefix):
@@ -118,5 +82,6 @@ def read_tensors(
     problems += [f"{name}: missing" for name in sorted(absent)]
     if problems:
         listed = "; ".join(sorted(problems))
+        source = checkpoint["source"]
         raise CheckpointError(f"{source}: {len(problems)} tensors do not fit the config: {listed}")
     return tensors

@@ -436,26 +436,26 @@ class ActionHead(nn.Module):
         """Builds the head from a checkpoint.
 
         Args:
-            source: a directory with one or more `.safetensors` files, or one such file. Tensors are found
-                under `action_head.`, `_groot_model.action_head.` or no prefix; what lies outside the prefix
-                is ignored.
+            source: a directory or a file in any layout that :meth:`saccade.ActionHead.load` reads, or the id
+                of a repository in the local Hugging Face cache.
             config: the checkpoint's config or the head's own, as a dict or a path. By default `config.json`
-                beside the file, or else the `config` entry of the file's metadata.
+                beside the file, or else the `config` entry of the one file's metadata.
             dtype: of the parameters; narrower ones are widened exactly.
 
         Raises:
             FileNotFoundError: a path that is not there.
             CheckpointError: no config; or tensors missing, unknown or of the wrong shape (all are listed).
         """
-        whole = loading.read_config(source, config)
+        checkpoint = loading.described(source, config)
+        whole = checkpoint["head_config"]
         with torch.device("meta"):  # no memory and no time spent on an initialisation that is replaced
             head = cls(
                 HeadConfig.from_dict(whole),
                 time_distribution=TimeDistribution.from_dict(whole),
-                unused=filter(is_unused, loading.tensor_names(source)),
+                unused=filter(is_unused, loading.tensor_names(checkpoint)),
             )
         shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
-        head.load_state_dict(loading.read_tensors(source, shapes, dtype), assign=True)
+        head.load_state_dict(loading.read_tensors(checkpoint, shapes, dtype), assign=True)
         return head
 
     def hold_unused(self, name: str) -> None:
