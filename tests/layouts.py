@@ -20,6 +20,9 @@ from torch import Tensor
 
 from saccade.reference.random_weights import random_tensor
 
+# Small tensors gain nothing from threads, and on a busy machine every barrier between them stalls.
+torch.set_num_threads(1)
+
 Config = dict[str, Any]
 Shapes = dict[str, tuple[int, ...]]
 

@@ -707,10 +707,9 @@ impl Published {
         self.lock().files().map(PathBuf::from).collect()
     }
 
-    fn tensors(&self) -> PyResult<Vec<PyTensorFacts>> {
-        let tensors = self.lock().tensors().map_err(raise)?;
+    fn tensors(&self) -> Vec<PyTensorFacts> {
         let fields = |tensor: TensorFacts| (tensor.name, tensor.dtype, tensor.shape, tensor.nbytes);
-        Ok(tensors.into_iter().map(fields).collect())
+        self.lock().tensors().map(fields).collect()
     }
 
     fn check(&self) -> PyResult<()> {

@@ -118,22 +118,17 @@ impl Published {
         })
     }
 
-    /// All tensors of the checkpoint, sorted by name.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`] for a name that stands in two files.
-    pub fn tensors(&self) -> Result<Vec<TensorFacts>> {
-        let names = self.checkpoint.names();
-        names
-            .map(|name| {
-                Ok(TensorFacts {
-                    name: name.to_owned(),
-                    dtype: format!("{:?}", self.checkpoint.dtype(name)?),
-                    shape: self.checkpoint.shape(name).unwrap_or_default().to_vec(),
-                    nbytes: self.checkpoint.nbytes(name)?,
-                })
+    /// All tensors of the checkpoint, sorted by name; without those that stand in two files, which [`Published::check`] refuses in a head.
+    pub fn tensors(&self) -> impl Iterator<Item = TensorFacts> {
+        let checkpoint = &self.checkpoint;
+        checkpoint.names().filter_map(|name| {
+            Some(TensorFacts {
+                name: name.to_owned(),
+                dtype: format!("{:?}", checkpoint.dtype(name).ok()?),
+                shape: checkpoint.shape(name)?.to_vec(),
+                nbytes: checkpoint.nbytes(name).ok()?,
             })
-            .collect()
+        })
     }
 
     /// That exactly the head's tensors stand under the prefix, each of the right shape and a readable type.

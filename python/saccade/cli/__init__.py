@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     "study": "measure what the future tokens do, in closed loop and inside the head",
     "bench": "time the action head beside what this machine allows",
     "parity": "compare the Rust head with the reference in torch",
+    "inspect": "show what is in a checkpoint",
     "resize": "change the number of future tokens of a checkpoint",
     "convert": "write a checkpoint with other embodiments, dtype or shards",
     "quantize": "write a copy of a checkpoint with int8 weights",
