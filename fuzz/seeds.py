@@ -18,6 +18,7 @@ TESTS = HERE.parent / "tests"
 DATA = TESTS / "data"
 sys.path.insert(0, str(TESTS))
 import layouts  # noqa: E402
+import reference_cases  # noqa: E402
 
 #: Name to dtype, shape and bytes.
 Tensors: TypeAlias = dict[str, tuple[str, list[int], bytes]]
@@ -113,20 +114,50 @@ def checkpoints() -> dict[str, bytes]:
             head = layouts.head_config(layout)
             head["diffusion_model_cfg"]["num_layers"] = 2
             layouts.write(Path(folder) / layout, layout, config=head)
-            tensors: Tensors = {}
-            for file in sorted((Path(folder) / layout).glob("model*.safetensors")):
-                tensors |= read(file)
-            config = (Path(folder) / layout / "config.json").read_bytes()
-            header = safetensors({name: tensor for name, tensor in tensors.items() if "action_head." in name})
-            end = 8 + struct.unpack("<Q", header[:8])[0]
-            seeds[layout] = config + BETWEEN + header[8:end]
+            seeds[layout] = BETWEEN.join(checkpoint(Path(folder) / layout))
     return seeds
+
+
+def resizes() -> dict[str, bytes]:
+    """Small heads in three layouts: more tokens, fewer, as many and none."""
+    seeds = {}
+    small = reference_cases.small_config(num_layers=1, num_future_tokens=3)
+    # lerobot's config says no sizes: heads are as wide as those of the published checkpoints, chunks as long.
+    wide = reference_cases.small_config(
+        num_layers=1,
+        num_future_tokens=3,
+        action_horizon=16,
+        num_heads=1,
+        head_dim=48,
+        context_dim=64,
+        vl_num_heads=1,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        # The number of tokens, and what the weights' bytes are.
+        counts = {7: b"\x3f\x80\0", 2: b"\1\2\3\4\5\6\7", 3: b"", 0: b"\x3f"}
+        for layout, sizes in {"nvidia": small, "saccade": small, "lerobot": wide}.items():
+            layouts.write(Path(folder) / layout, layout, config=layouts.head_config(layout) | sizes)
+            config, header = checkpoint(Path(folder) / layout)
+            for count, data in counts.items():
+                pieces = [struct.pack("<H", count) + config, header, data]
+                seeds[f"{layout}_{count}"] = BETWEEN.join(pieces)
+    return seeds
+
+
+def checkpoint(folder: Path) -> tuple[bytes, bytes]:
+    """`config.json` and the header of the head's tensors."""
+    tensors: Tensors = {}
+    for file in sorted(folder.glob("model*.safetensors")):
+        tensors |= read(file)
+    raw = safetensors({name: tensor for name, tensor in tensors.items() if "action_head." in name})
+    return (folder / "config.json").read_bytes(), raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]]
 
 
 def main() -> None:
     """Writes all seeds, each under a name of its own, and says how many there are."""
     files = headers()
-    for target, seeds in {"header": files, "index": indexes(files), "config": configs()}.items():
+    targets = {"header": files, "index": indexes(files), "config": configs(), "resize": resizes()}
+    for target, seeds in targets.items():
         folder = HERE / "corpus" / target
         folder.mkdir(parents=True, exist_ok=True)
         for name, seed in seeds.items():

@@ -7,8 +7,12 @@
 
 #[path = "../../crates/saccade/src/checkpoint.rs"]
 pub mod checkpoint;
+#[path = "../../crates/saccade/src/companions.rs"]
+pub mod companions;
 #[path = "../../crates/saccade/src/config.rs"]
 pub mod config;
+#[path = "../../crates/saccade/src/convert.rs"]
+pub mod convert;
 #[path = "../../crates/saccade/src/error.rs"]
 pub mod error;
 #[path = "../../crates/saccade/src/fit.rs"]
@@ -17,6 +21,21 @@ pub mod fit;
 pub mod layout;
 #[path = "../../crates/saccade/src/recognise.rs"]
 pub mod recognise;
+#[path = "../../crates/saccade/src/resize.rs"]
+pub mod resize;
+#[path = "../../crates/saccade/src/rewrite.rs"]
+pub mod rewrite;
+#[path = "../../crates/saccade/src/writer.rs"]
+pub mod writer;
+
+/// What the files above want of `head.rs`, which needs the kernels.
+mod head {
+    use crate::error::Result;
+
+    pub(crate) fn chosen_embodiments(_: Option<&[i64]>, _: usize) -> Result<Vec<usize>> {
+        unreachable!("no target converts")
+    }
+}
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -26,6 +45,7 @@ use checkpoint::Checkpoint;
 use config::HeadConfig;
 use layout::HeadNames;
 use recognise::Published;
+use resize::ResizeOptions;
 
 /// More than any tensor of an input: reading may not take more memory than the file has bytes, twice for widened halves.
 const MAX_BYTES_READ: usize = 1 << 26;
@@ -110,7 +130,7 @@ fn use_head_config(config: &HeadConfig) {
 /// Says what the checkpoint of this `config.json` and this header is, as every command does. The file has all the bytes that the header
 /// promises, up to some gigabytes, which take no memory as long as nobody reads them.
 pub fn use_published(folder: &Path, config: &str, header: &[u8]) {
-    write_checkpoint(folder, config, header);
+    write_checkpoint(folder, config, header, b"", 1 << 33);
     let published = match Published::open(folder, None) {
         Ok(published) => published,
         Err(error) => return check_message(&error),
@@ -125,14 +145,72 @@ pub fn use_published(folder: &Path, config: &str, header: &[u8]) {
     }
 }
 
-fn write_checkpoint(folder: &Path, config: &str, header: &[u8]) {
+/// Resizes the checkpoint of this `config.json`, this header and these bytes, repeated; it may be refused.
+pub fn use_resize(folder: &Path, count: usize, config: &str, header: &[u8], bytes: &[u8]) {
+    if let Ok(parsed) = HeadConfig::from_json(config) {
+        match resize::plan(&parsed, config, count) {
+            Ok(plan) => check_plan(&plan, &parsed, count),
+            Err(error) => check_message(&error),
+        }
+    }
+    let (source, out) = (folder.join("source"), folder.join("out"));
+    let _ = fs::create_dir(&source);
+    write_checkpoint(&source, config, header, bytes, 1 << 20);
+    let options = ResizeOptions {
+        num_future_tokens: count,
+        // Some inputs with what is added to copies, some without.
+        perturbation: f64::from(u8::from(count % 2 == 1)),
+        ..ResizeOptions::default()
+    };
+    match resize::resize(&source, &out, &options, |_, _| true) {
+        Ok(report) => {
+            assert_eq!((report.num_after, report.sources.len()), (count, count));
+            let published = Published::open(&out, None).expect("what was written can be read");
+            published.check().expect("what was written fits");
+            assert_eq!(published.config.num_future_tokens, count);
+            assert_eq!(published.config.future_key_bias, report.future_key_bias);
+            fs::remove_dir_all(&out).expect("what was written can be removed");
+        }
+        Err(error) => {
+            check_message(&error);
+            assert!(!out.exists(), "half a checkpoint: {error}");
+        }
+    }
+    assert_eq!(
+        fs::read_dir(folder).expect("the folder is there").count(),
+        1,
+        "something was left behind"
+    );
+}
+
+/// The planned config says the new number, and is the old one else.
+fn check_plan(plan: &resize::Plan, before: &HeadConfig, count: usize) {
+    let (text, own) = plan.config(None);
+    if own.is_none()
+        && let Ok(after) = HeadConfig::from_json(&text)
+    {
+        let expected = HeadConfig {
+            num_future_tokens: count,
+            future_key_bias: None,
+            ..before.clone()
+        };
+        assert_eq!(after, expected);
+    }
+}
+
+/// `config.json` and a file of this header, `bytes` behind it, repeated up to the length that the header promises, but not longer than `most`.
+fn write_checkpoint(folder: &Path, config: &str, header: &[u8], bytes: &[u8], most: u64) {
     fs::write(folder.join("config.json"), config).expect("memory is not full");
     let mut file = File::create(folder.join("model.safetensors")).expect("memory is not full");
-    let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
-    bytes.extend(header);
-    file.write_all(&bytes).expect("memory is not full");
-    file.set_len(bytes.len() as u64 + promised(header).min(1 << 33))
-        .expect("holes take no memory");
+    let mut start = (header.len() as u64).to_le_bytes().to_vec();
+    start.extend(header);
+    let promised = promised(header).min(most);
+    let length = start.len() as u64 + promised;
+    if !bytes.is_empty() {
+        start.extend(bytes.iter().cycle().take(promised as usize));
+    }
+    file.write_all(&start).expect("memory is not full");
+    file.set_len(length).expect("holes take no memory");
 }
 
 /// The end of the last tensor by this header, whatever else is wrong with it.

@@ -406,16 +406,17 @@ def _rewrite(
 ) -> dict[str, Any]:
     """What all three take, for the engine."""
     path = resolve(source)
-    metadata = {"format": "pt", "saccade": _saccade.__version__}
-    if path.exists():
-        metadata["source_sha256"] = source_sha256(path)
+    text = None if config is None else to_json(config)
+    published = _saccade.Published.open(os.fspath(path), text)
+    published.check()  # a source that is refused is not hashed, which takes long
+    digest = source_sha256(path, published.files)
     return {
         "source": os.fspath(path),
         "out": os.fspath(out),
-        "config": None if config is None else to_json(config),
+        "config": text,
         "head_only": head_only,
         "force": force,
-        "metadata": metadata,
+        "metadata": {"format": "pt", "saccade": _saccade.__version__, "source_sha256": digest},
         "max_shard_bytes": None,
         "progress": progress,
     }
@@ -426,13 +427,12 @@ def _paths(written: dict[str, Any]) -> dict[str, Any]:
     return {**written, **{name: tuple(Path(path) for path in written[name]) for name in names}}
 
 
-def source_sha256(source: Path) -> str:
-    """Hash of a checkpoint: of ``config.json`` beside it, if any, and then of its tensors' files, by name."""
-    directory = source if source.is_dir() else source.parent
-    files = [directory / "config.json"] if (directory / "config.json").is_file() else []
-    files += sorted(directory.glob("*.safetensors")) if source.is_dir() else [source]
+def source_sha256(source: Path, tensors: Sequence[Path]) -> str:
+    """Hash of a checkpoint: of ``config.json`` beside it, if any, and then of its ``tensors``' files."""
+    config = (source if source.is_dir() else source.parent) / "config.json"
+    files = [config] if config.is_file() else []
     digest = hashlib.sha256()
-    for path in files:
+    for path in [*files, *tensors]:
         with path.open("rb") as file:
             while piece := file.read(1 << 24):
                 digest.update(piece)

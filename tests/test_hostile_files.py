@@ -1,0 +1,590 @@
+"""Files that nobody should have made: pipes, devices, loops, holes of terabytes, names that drive a terminal,
+disks that fill up. Whatever reads or writes a checkpoint says what is wrong, once, and leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import functools
+import json
+import os
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from released import load_released
+
+import saccade
+from saccade import cli
+from saccade.checkpoints import convert, describe, quantize, read_tensors, resize
+from saccade.errors import CheckpointError, SaccadeError
+
+TINY = load_released("n15_tiny")
+
+# What takes the path of a checkpoint and writes nothing.
+READERS: dict[str, Callable[[Path], object]] = {
+    "load": saccade.ActionHead.load,
+    "read_tensors": read_tensors,
+    "describe": describe,
+}
+# What takes the path of a checkpoint and that of a new one; options are those of the function.
+WRITERS: dict[str, Callable[..., object]] = {
+    "quantize": quantize,
+    "convert": lambda source, out, **options: convert(source, out, dtype="bfloat16", **options),
+    "resize": lambda source, out, **options: resize(source, out, num_future_tokens=6, **options),
+}
+# Commands with the path of a checkpoint and that of a new one.
+COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
+    "quantize": lambda source, out: ["quantize", str(source), "--out", str(out)],
+    "convert": lambda source, out: ["convert", str(source), "--out", str(out), "--embodiment-ids", "1"],
+    "resize": lambda source, out: ["resize", str(source), "--out", str(out), "--num-future-tokens", "6"],
+}
+
+
+@pytest.fixture(autouse=True)
+def no_hang() -> Iterator[None]:
+    """What waits for a pipe waits for ever, and no signal wakes it: the process ends with a traceback."""
+    faulthandler.dump_traceback_later(120, exit=True)
+    yield
+    faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    """A checkpoint with nothing wrong."""
+    folder = tmp_path / "good"
+    folder.mkdir()
+    shutil.copyfile(TINY.path, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(TINY.config))
+    return folder
+
+
+def safetensors(header: str | dict[str, Any], data: bytes = b"") -> bytes:
+    text = (header if isinstance(header, str) else json.dumps(header)).encode()
+    return struct.pack("<Q", len(text)) + text + data
+
+
+def tensor(begin: int, end: int, shape: list[int], dtype: str = "F32") -> dict[str, Any]:
+    return {"dtype": dtype, "shape": shape, "data_offsets": [begin, end]}
+
+
+def weights(content: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / "model.safetensors").write_bytes(content)
+
+
+def config(content: str | bytes) -> Callable[[Path], object]:
+    raw = content.encode() if isinstance(content, str) else content
+    return lambda folder: (folder / "config.json").write_bytes(raw)
+
+
+def index(weight_map: dict[str, Any] | str) -> Callable[[Path], object]:
+    text = weight_map if isinstance(weight_map, str) else json.dumps({"weight_map": weight_map})
+    return lambda folder: (folder / "model.safetensors.index.json").write_text(text)
+
+
+def pipe(name: str) -> Callable[[Path], object]:
+    return instead(name, os.mkfifo)
+
+
+def link(name: str, target: str) -> Callable[[Path], object]:
+    return instead(name, lambda path: path.symlink_to(target))
+
+
+def directory(name: str) -> Callable[[Path], object]:
+    return instead(name, Path.mkdir)
+
+
+def instead(name: str, make: Callable[[Path], object]) -> Callable[[Path], object]:
+    def change(folder: Path) -> None:
+        (folder / name).unlink(missing_ok=True)
+        make(folder / name)
+
+    return change
+
+
+def holes(dtype: str, shape: list[int], nbytes: int) -> Callable[[Path], object]:
+    """A file as long as its header says, with nothing in it."""
+
+    def change(folder: Path) -> None:
+        content = safetensors({"action_head.a": tensor(0, nbytes, shape, dtype)})
+        path = folder / "model.safetensors"
+        path.write_bytes(content)
+        os.truncate(path, len(content) + nbytes)
+
+    return change
+
+
+INDEX = "model.safetensors.index.json"
+# The head's names and shapes are compared before anything is read.
+TOO_LARGE = "cannot be read.*memory|do not fit the config|disagree"
+SUM_OVERFLOWS = {
+    # Eight tensors of 2^61 - 1 bytes and one of 8: 2^64 together, which is 0 in 64 bits.
+    f"t{i}": tensor(i * (2**61 - 1), (i + 1) * (2**61 - 1), [2**61 - 1], "U8")
+    for i in range(8)
+} | {"t8": tensor(8 * (2**61 - 1), 2**64 - 1, [7], "U8")}
+
+#: What is done to a good checkpoint, and what is said of it; of weights that `read_tensors` reads too.
+BROKEN_WEIGHTS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "pipe": (pipe("model.safetensors"), "not a regular file"),
+    "device": (link("model.safetensors", "/dev/zero"), "not a regular file"),
+    "directory": (directory("model.safetensors"), "not a regular file"),
+    "dangling link": (link("model.safetensors", "nowhere"), "no such file.*model.safetensors"),
+    "link to itself": (link("model.safetensors", "model.safetensors"), "model.safetensors cannot be read"),
+    "index is a pipe": (pipe(INDEX), "index.json cannot be read: not a regular file"),
+    "index is a device": (link(INDEX, "/dev/zero"), "index.json cannot be read: not a regular file"),
+    "index is a directory": (directory(INDEX), "index.json cannot be read: not a regular file"),
+    "index is a dangling link": (link(INDEX, "nowhere"), "no such file.*index.json"),
+    "index is no text": (lambda folder: (folder / INDEX).write_bytes(b'{"\xff": 1}'), "UTF-8"),
+    "index is deep": (index("[" * 100_000), "index.json: "),
+    "index with a name twice": (index('{"weight_map": {"a": "x", "a": "y"}}'), "a stands there twice"),
+    "index names a folder": (index({"a": "."}), "expected a file name in the same directory"),
+    "index names the folder above": (index({"a": ".."}), "expected a file name in the same directory"),
+    "index names nothing": (index({"a": ""}), "expected a file name in the same directory"),
+    "index leads outside": (index({"a": "../good/model.safetensors"}), "expected a file name in the same"),
+    "index leads to a device": (index({"a": "/dev/zero"}), "expected a file name in the same directory"),
+    "index with a zero byte": (index({"a": "x\0.safetensors"}), "cannot be read"),
+    "index to what is not there": (index({"a": "b.safetensors"}), r"no such file.*b\.safetensors"),
+    "index to the config": (index({"a": "config.json"}), r"config\.json: not safetensors"),
+    "index to itself": (index({"a": INDEX}), "not safetensors"),
+    "index to a very long name": (index({"a": "x" * 5000}), "File name too long"),
+    "index with a terminal's escape": (index({"\x1b[2J": "model.safetensors"}), "holds control characters"),
+    "sizes that overflow together": (weights(safetensors(SUM_OVERFLOWS)), "the header promises"),
+    "empty, of an overflowing shape": (
+        weights(safetensors({"a": tensor(0, 0, [2**63, 2**63, 0])})),
+        "header",
+    ),
+    "header of a terminal's escape": (
+        weights(safetensors({"\x1b]0;owned\x07": tensor(0, 0, [0])})),
+        "holds control characters",
+    ),
+    "header of many lines": (weights(safetensors({"a\nb": tensor(0, 0, [0])})), "holds control characters"),
+    "header of numbers that are none": (weights(safetensors('{"a": NaN}')), "header"),
+    "a lone surrogate": (weights(safetensors('{"\\ud800": 1}')), "header"),
+    "a name that is not UTF-8": (
+        lambda folder: Path(os.fsdecode(bytes(folder) + b"/\xff.safetensors")).write_bytes(b""),
+        "is not UTF-8",
+    ),
+    "float32 of terabytes": (holes("F32", [2**40], 2**42), TOO_LARGE),
+    "bfloat16 of terabytes": (
+        holes("BF16", [2, 2**40], 2**42),
+        "cannot be read.*memory|do not fit the config",
+    ),
+}
+
+#: What a config that no head has says.
+BROKEN_CONFIGS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "not there": (lambda folder: (folder / "config.json").unlink(), "no such file"),
+    "pipe": (pipe("config.json"), "not a regular file"),
+    "device": (link("config.json", "/dev/zero"), "not a regular file"),
+    "directory": (directory("config.json"), "not a regular file"),
+    "dangling link": (link("config.json", "nowhere"), "no such file"),
+    "link to itself": (link("config.json", "config.json"), "cannot be read"),
+    "terabytes": (lambda folder: os.truncate(folder / "config.json", 2**42), "more than 100000000 bytes"),
+    "empty": (config(""), "not valid JSON"),
+    "not UTF-8": (config(b'{"\xff": 1}'), "UTF-8"),
+    "deep": (config('{"a": ' * 100_000), "not valid JSON: recursion limit"),
+    "a list": (config("[]"), "expected a JSON object"),
+    "a number that is none": (
+        config(json.dumps(TINY.config | {"action_dim": float("nan")})),
+        "not valid JSON",
+    ),
+    "a number beyond numbers": (config('{"action_dim": 1e999}'), "not valid JSON: number out of range"),
+    "a string of megabytes": (config(json.dumps(TINY.config | {"action_dim": "x" * 10**7})), "action_dim is"),
+    "a terminal's escape": (
+        config(json.dumps(TINY.config | {"action_dim": "\x9b2J"}, ensure_ascii=False)),
+        r"action_dim is .\\u\{9b\}2J",
+    ),
+    "layers without end": (
+        config(
+            json.dumps(
+                TINY.config
+                | {"diffusion_model_cfg": TINY.config["diffusion_model_cfg"] | {"num_layers": 2**20}}
+            )
+        ),
+        "num_layers",
+    ),
+}
+
+
+def refused(call: Callable[[], object], message: str) -> None:
+    """That `call` raises an error of ours that can be read."""
+    with pytest.raises((SaccadeError, FileNotFoundError), match=message) as caught:
+        call()
+    text = str(caught.value)
+    assert "\x1b" not in text
+    assert "\x9b" not in text
+    assert len(text) < 2_000_000
+
+
+def names(folder: Path) -> set[str]:
+    """All that is in a folder, hidden files too."""
+    return {entry.name for entry in folder.iterdir()}
+
+
+@pytest.mark.parametrize("case", BROKEN_WEIGHTS)
+@pytest.mark.parametrize("entry", [*READERS, *WRITERS])
+def test_broken_weights(entry: str, case: str, good: Path) -> None:
+    change, message = BROKEN_WEIGHTS[case]
+    change(good)
+    out = good.parent / "out"
+    if entry == "describe" and "terabytes" in case:
+        describe(good)  # it reads no tensor, and says what is odd
+        return
+    refused(lambda: READERS[entry](good) if entry in READERS else WRITERS[entry](good, out), message)
+    assert names(good.parent) == {"good"}
+
+
+@pytest.mark.parametrize("case", BROKEN_CONFIGS)
+@pytest.mark.parametrize("entry", ["load", "describe", *WRITERS])
+def test_broken_configs(entry: str, case: str, good: Path) -> None:
+    change, message = BROKEN_CONFIGS[case]
+    change(good)
+    out = good.parent / "out"
+    refused(lambda: READERS[entry](good) if entry in READERS else WRITERS[entry](good, out), message)
+    assert names(good.parent) == {"good"}
+
+
+@pytest.mark.parametrize("case", [case for case in BROKEN_CONFIGS if case != "not there"])
+def test_broken_configs_given_by_path(case: str, good: Path) -> None:
+    change, _ = BROKEN_CONFIGS[case]
+    change(good)
+    refused(lambda: saccade.HeadConfig.from_file(good / "config.json"), "config")
+    refused(lambda: saccade.ActionHead.load(good, config=good / "config.json"), "config")
+
+
+def test_broken_configs_given_as_values() -> None:
+    deep: dict[str, Any] = {}
+    for _ in range(100_000):
+        deep = {"a": deep}
+    circular: dict[str, Any] = {}
+    circular["a"] = circular
+    given: list[dict[str, Any]] = [deep, circular, {"action_dim": float("nan")}, {"\ud800": 1}]
+    for values in given:
+        refused(functools.partial(saccade.HeadConfig.from_dict, values), "config")
+
+
+@pytest.mark.parametrize("entry", [*READERS, *WRITERS])
+@pytest.mark.parametrize(
+    "source",
+    [
+        "",
+        "a\0b",
+        "x" * 300,
+        "x/" * 3000,
+        "/dev/zero",
+        "/dev/null",
+        "/proc/self/mem",
+        "good/config.json/x",
+        "\x1b[2J",
+    ],
+)
+def test_sources_that_are_none(entry: str, source: str, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(good.parent)
+    path = Path(source)
+    refused(lambda: READERS[entry](path) if entry in READERS else WRITERS[entry](path, Path("out")), ".")
+    assert names(good.parent) == {"good"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "case", ["pipe", "link to itself", "header of a terminal's escape", "float32 of terabytes"]
+)
+def test_commands_say_it_in_one_line(
+    command: str, case: str, good: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    BROKEN_WEIGHTS[case][0](good)
+    assert cli.main(COMMANDS[command](good, good.parent / "out")) == cli.EXIT_BAD_INPUT
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("saccade: ")
+    assert line.isprintable()
+    assert names(good.parent) == {"good"}
+
+
+def test_very_many_tensors(good: Path) -> None:
+    header = {f"action_head.{number}": tensor(0, 0, [0]) for number in range(100_000)}
+    weights(safetensors(header))(good)
+    refused(lambda: saccade.ActionHead.load(good), "tensors do not fit the config")
+
+
+def test_a_name_of_megabytes(good: Path) -> None:
+    weights(safetensors({"action_head." + "x" * 10**7: tensor(0, 0, [0])}))(good)
+    with pytest.raises(CheckpointError) as caught:
+        saccade.ActionHead.load(good)
+    assert len(str(caught.value)) < 100_000
+
+
+def test_tensors_without_elements(good: Path) -> None:
+    weights(safetensors({"a": tensor(0, 0, [0, 2**40]), "b": tensor(0, 4, [])}, struct.pack("<f", 7)))(good)
+    read = read_tensors(good)
+    assert {name: array.shape for name, array in read.items()} == {"a": (0, 2**40), "b": ()}
+    assert read["b"] == 7
+
+
+def test_links_are_followed(good: Path, tmp_path: Path) -> None:
+    # As a cache of models lies on the disk.
+    view = tmp_path / "view"
+    view.mkdir()
+    for path in good.iterdir():
+        (view / path.name).symlink_to(path)
+    (tmp_path / "again").symlink_to(view)
+    expected = read_tensors(good, "action_head.")
+    for source in (view, tmp_path / "again", view / "model.safetensors"):
+        assert read_tensors(source, "action_head.").keys() == expected.keys()
+        saccade.ActionHead.load(source)
+
+
+def test_names_of_folders_may_be_any_bytes(good: Path) -> None:
+    odd = Path(os.fsdecode(bytes(good) + b"-\xff\n\x1b"))
+    good.rename(odd)
+    saccade.ActionHead.load(odd)
+    quantize(odd, odd / "int8")
+    saccade.ActionHead.load(odd / "int8")
+
+
+@contextlib.contextmanager
+def limited(kind: int, soft: int) -> Iterator[None]:
+    """A limit of this process, for a while."""
+    before = resource.getrlimit(kind)
+    resource.setrlimit(kind, (soft, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, before)
+
+
+def sharded(folder: Path, count: int) -> None:
+    """The tensors of the file there, each in one of `count` files, without an index."""
+    raw = (folder / "model.safetensors").read_bytes()
+    begin = 8 + struct.unpack("<Q", raw[:8])[0]
+    header = json.loads(raw[8:begin])
+    header.pop("__metadata__", None)
+    (folder / "model.safetensors").unlink()
+    listed = sorted(header)
+    for number in range(count):
+        part, data = {}, b""
+        for name in listed[number::count]:
+            first, last = header[name]["data_offsets"]
+            part[name] = header[name] | {"data_offsets": [len(data), len(data) + last - first]}
+            data += raw[begin + first : begin + last]
+        (folder / f"{number}.safetensors").write_bytes(safetensors(part, data))
+
+
+@pytest.mark.parametrize("entry", [*READERS, *WRITERS])
+def test_more_files_than_may_be_open(entry: str, good: Path) -> None:
+    sharded(good, 40)
+    out = good.parent / "out"
+    with limited(resource.RLIMIT_NOFILE, len(list(Path("/proc/self/fd").iterdir())) + 10):
+        refused(
+            lambda: READERS[entry](good) if entry in READERS else WRITERS[entry](good, out),
+            "Too many open files",
+        )
+    assert names(good.parent) == {"good"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_disk_that_is_full(entry: str, good: Path) -> None:
+    with limited(resource.RLIMIT_FSIZE, 50_000):
+        refused(lambda: WRITERS[entry](good, good.parent / "out"), "out: .* cannot be written")
+    assert names(good.parent) == {"good"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_file_system_that_is_full(entry: str, good: Path, tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("mounting is not permitted here")
+    try:
+        refused(lambda: WRITERS[entry](good, disk / "out"), "out: .* cannot be written: No space left")
+        assert names(disk) == set()
+        subprocess.run([*mount[:4], "remount,ro", str(disk)], check=True)
+        refused(lambda: WRITERS[entry](good, disk / "out"), "out: .* cannot be written: Read-only")
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("", "out: "),
+        ("/", "out: "),
+        ("..", "out: "),
+        ("a\0b", "out: "),
+        ("x" * 300, "out: .* File name too long"),
+        ("/proc/out", "out: .* cannot be written"),
+        ("good/config.json", "out: .* is no directory"),
+        ("good/config.json/out", "out: "),
+        ("good", "out: .* holds the source"),
+        ("good/../good/.", "out: "),
+        ("dangling", "out: "),
+        ("itself", "out: "),
+    ],
+)
+def test_outputs_that_are_none(
+    entry: str, out: str, message: str, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "dangling").symlink_to("nowhere")
+    (tmp_path / "itself").symlink_to("itself")
+    monkeypatch.chdir(tmp_path)
+    before = {path.name: path.read_bytes() for path in good.iterdir()}
+    refused(lambda: WRITERS[entry](good, Path(out), force=True), message)
+    assert {path.name: path.read_bytes() for path in good.iterdir()} == before
+    assert names(tmp_path) == {"good", "dangling", "itself"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_behind_a_link_what_it_leads_to_is_replaced(entry: str, good: Path, tmp_path: Path) -> None:
+    other, out = tmp_path / "other", tmp_path / "out"
+    shutil.copytree(good, other)
+    out.symlink_to(other)
+    refused(lambda: WRITERS[entry](good, out), "is there already")
+    assert (other / "model.safetensors").read_bytes() == TINY.path.read_bytes()
+    WRITERS[entry](good, out, force=True)
+    assert out.is_symlink()
+    assert (other / "model.safetensors").read_bytes() != TINY.path.read_bytes()
+    saccade.ActionHead.load(out)
+    assert names(tmp_path) == {"good", "other", "out"}
+
+
+class Meddler:
+    """Does something once, in the middle of the writing."""
+
+    def __init__(self, act: Callable[[], object]) -> None:
+        self.act: Callable[[], object] | None = act
+
+    def __call__(self, done: int, total: int) -> None:
+        if self.act is not None and done > total // 3:
+            act, self.act = self.act, None
+            act()
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+@pytest.mark.parametrize("force", [False, True])
+def test_what_appears_under_the_name_meanwhile_is_not_replaced(
+    entry: str, force: bool, good: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+
+    def appear() -> None:
+        out.mkdir()
+        (out / "thesis.tex").write_text("the only copy")
+
+    refused(
+        lambda: WRITERS[entry](good, out, force=force, progress=Meddler(appear)),
+        "out: .*(thesis.tex|not empty)",
+    )
+    assert (out / "thesis.tex").read_text() == "the only copy"
+    assert names(tmp_path) == {"good", "out"}
+    assert names(out) == {"thesis.tex"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_checkpoint_that_appears_meanwhile_is_replaced_only_by_force(
+    entry: str, good: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    refused(
+        lambda: WRITERS[entry](good, out, progress=Meddler(lambda: shutil.copytree(good, out))),
+        "is there already|not empty",
+    )
+    assert (out / "model.safetensors").read_bytes() == TINY.path.read_bytes()
+    assert names(tmp_path) == {"good", "out"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+@pytest.mark.parametrize("change", ["shrinks", "grows", "is written to"])
+def test_a_source_that_changes_while_it_is_read(entry: str, change: str, good: Path, tmp_path: Path) -> None:
+    path = good / "model.safetensors"
+
+    def meddle() -> None:
+        if change == "shrinks":
+            os.truncate(path, path.stat().st_size // 2)
+        elif change == "grows":
+            with path.open("ab") as file:
+                file.write(b"more")
+        else:
+            with path.open("r+b") as file:
+                file.seek(-4, os.SEEK_END)
+                file.write(b"\xff\xff\xff\xff")
+            os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
+
+    refused(
+        lambda: WRITERS[entry](good, tmp_path / "out", progress=Meddler(meddle)),
+        "cannot be read from .*model.safetensors: (failed to fill whole buffer|it changed while it was read)",
+    )
+    assert names(tmp_path) == {"good"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_source_that_vanishes_is_still_there_for_who_opened_it(
+    entry: str, good: Path, tmp_path: Path
+) -> None:
+    expected = tmp_path / "expected"
+    WRITERS[entry](good, expected)
+    path = good / "model.safetensors"
+    WRITERS[entry](good, tmp_path / "out", progress=Meddler(path.unlink))
+    assert (tmp_path / "out" / path.name).read_bytes() == (expected / path.name).read_bytes()
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_folder_that_vanishes_while_it_is_written(entry: str, good: Path, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    work.mkdir()
+    refused(
+        lambda: WRITERS[entry](good, work / "out", progress=Meddler(lambda: shutil.rmtree(work))),
+        "out: .* cannot be written",
+    )
+    assert names(tmp_path) == {"good"}
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_folder_in_the_source_is_written_and_changes_nothing_there(entry: str, good: Path) -> None:
+    WRITERS[entry](good, good / "out")
+    assert names(good) == {"config.json", "model.safetensors", "out"}
+    assert (good / "model.safetensors").read_bytes() == TINY.path.read_bytes()
+    saccade.ActionHead.load(good)
+    saccade.ActionHead.load(good / "out")
+
+
+@pytest.mark.parametrize("entry", WRITERS)
+def test_a_killed_writer_leaves_no_checkpoint(entry: str, good: Path, tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys; sys.path.insert(0, os.environ['TESTS']);"
+        "import test_hostile_files as t; from pathlib import Path;"
+        "kill = lambda: os.kill(os.getpid(), signal.SIGKILL);"
+        "t.WRITERS[sys.argv[1]](Path('good'), Path('out'), progress=t.Meddler(kill))"
+    )
+    environment = os.environ | {"TESTS": str(Path(__file__).parent)}
+    done = subprocess.run(
+        [sys.executable, "-c", code, entry], cwd=tmp_path, env=environment, capture_output=True, check=False
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    (left,) = names(tmp_path) - {"good"}
+    assert left.startswith(".out.")
+    WRITERS[entry](good, tmp_path / "out")
+    saccade.ActionHead.load(tmp_path / "out")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="changing to a user who may not read needs root")
+def test_files_that_may_not_be_read(good: Path) -> None:
+    (good / "model.safetensors").chmod(0)
+    code = (
+        "import os, sys; import numpy, saccade; os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
+        "try: saccade.ActionHead.load(sys.argv[1])\n"
+        "except saccade.CheckpointError as error: print(error)\n"
+    )
+    for parent in good.parents:
+        if parent.stat().st_mode & 0o005 != 0o005 and parent != Path("/"):
+            parent.chmod(parent.stat().st_mode | 0o005)
+    done = subprocess.run([sys.executable, "-c", code, str(good)], capture_output=True, text=True, check=True)
+    assert "model.safetensors cannot be read: Permission denied" in done.stdout

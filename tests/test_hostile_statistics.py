@@ -1,0 +1,190 @@
+"""What lies beside the weights, changed at one place to something that nobody expects there: an answer or one
+clear error, whatever it is.
+"""
+
+from __future__ import annotations
+
+import copy
+import faulthandler
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import layouts
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import saccade
+from saccade.checkpoints import describe
+from saccade.errors import SaccadeError
+
+# Layouts and the files beside their weights.
+FILES = [
+    ("nvidia", "config.json"),
+    ("nvidia", "experiment_cfg/metadata.json"),
+    ("lerobot", "config.json"),
+    ("lerobot", "policy_preprocessor.json"),
+    ("lerobot", "policy_postprocessor.json"),
+    ("lerobot-n17", "policy_preprocessor.json"),
+    ("fork", "config.json"),
+    ("n17", "config.json"),
+    ("n17", "processor_config.json"),
+    ("n17", "statistics.json"),
+    ("n17", "embodiment_id.json"),
+]
+EMBODIMENTS = {"nvidia": "gr1", "n17": "libero_sim"}
+
+JUNK: list[Any] = [
+    *(None, True, False, 0, -1, 1, 3, 2**31, 2**64, -(2**63), 10**400, 0.5, 1e308),
+    *(float("nan"), float("inf"), "", "x", "../../x", "/dev/zero", "\x1b[2J\x9b", "\ud800", "1" * 5000),
+    *([], {}, [[]], [None], [1, "x"], [[1.0], [1.0, 2.0]], {"": {}}, {"a": 1}),
+]
+
+
+@pytest.fixture(autouse=True)
+def no_hang() -> Iterator[None]:
+    """What waits for a pipe waits for ever, and no signal wakes it: the process ends with a traceback."""
+    faulthandler.dump_traceback_later(120, exit=True)
+    yield
+    faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A small checkpoint of each layout."""
+    root = tmp_path_factory.mktemp("layouts")
+    return {layout: layouts.write(root / layout, layout) for layout, _ in FILES}
+
+
+def read(layout: str, folder: Path) -> None:
+    """All that reads what lies beside the weights, which must answer or say what is wrong, in a few words."""
+    calls: list[Callable[[], object]] = [
+        lambda: describe(folder),
+        lambda: use(saccade.Normalizer.load(folder, EMBODIMENTS.get(layout))),
+    ]
+    for call in calls:
+        message = refusal(call)
+        assert message is None or 0 < len(message) < 100_000
+        assert message is None or not {"\x1b", "\x9b"} & set(message)
+
+
+def refusal(call: Callable[[], object]) -> str | None:
+    """What is said against a call, if anything."""
+    try:
+        call()
+    except (SaccadeError, FileNotFoundError) as error:
+        return str(error)
+    return None
+
+
+def use(normalizer: saccade.Normalizer) -> None:
+    state = np.zeros(normalizer.state_width, np.float32)
+    assert np.asarray(normalizer.state(state)).shape == (normalizer.state_dim,)
+    actions = np.zeros((4, normalizer.action_dim), np.float32)
+    assert np.asarray(normalizer.actions(actions, state)).shape[-1] == normalizer.action_width
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The paths of all values in a JSON value; of long lists the first."""
+    yield path
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from places(inner, (*path, key))
+    elif isinstance(value, list) and value:
+        yield from places(value[0], (*path, 0))
+
+
+def changed(value: Any, path: tuple[Any, ...], change: Callable[[Any, Any], None]) -> Any:
+    value = copy.deepcopy(value)
+    inner = value
+    for key in path[:-1]:
+        inner = inner[key]
+    change(inner, path[-1])
+    return value
+
+
+@pytest.mark.parametrize(("layout", "name"), FILES)
+@settings(max_examples=40)
+@given(data=st.data())
+def test_one_value_is_something_else(
+    layout: str, name: str, data: st.DataObject, checkpoints: dict[str, Path]
+) -> None:
+    folder = checkpoints[layout]
+    original = (folder / name).read_text()
+    value = json.loads(original)
+    path = data.draw(st.sampled_from([path for path in places(value) if path]), label="path")
+    junk = data.draw(st.sampled_from([KeyError, *JUNK]), label="junk")
+    if junk is KeyError:
+        value = changed(value, path, lambda inner, key: inner.__delitem__(key))
+    else:
+        value = changed(value, path, lambda inner, key: inner.__setitem__(key, junk))
+    try:
+        (folder / name).write_text(json.dumps(value))
+        read(layout, folder)
+    finally:
+        (folder / name).write_text(original)
+
+
+def terabytes(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 2**42)
+
+
+WHOLE: dict[str, Callable[[Path], object]] = {
+    "pipe": os.mkfifo,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "directory": Path.mkdir,
+    "dangling link": lambda path: path.symlink_to("nowhere"),
+    "link to itself": lambda path: path.symlink_to(path.name),
+    "empty": Path.touch,
+    "not UTF-8": lambda path: path.write_bytes(b'{"\xff": 1}'),
+    "deep": lambda path: path.write_text('{"a": ' * 100_000),
+    "deep and whole": lambda path: path.write_text('{"a": ' * 5_000 + "1" + "}" * 5_000),
+    "numbers without end": lambda path: path.write_text('{"a": ' + "1" * 100_000 + "}"),
+    "a list": lambda path: path.write_text("[]"),
+    "a word": lambda path: path.write_text('"x"'),
+    "terabytes": terabytes,
+}
+
+
+@pytest.mark.parametrize("case", WHOLE)
+@pytest.mark.parametrize(("layout", "name"), FILES)
+def test_the_file_is_something_else(layout: str, name: str, case: str, checkpoints: dict[str, Path]) -> None:
+    folder = checkpoints[layout]
+    path, aside = folder / name, folder / "aside"
+    path.rename(aside)
+    try:
+        WHOLE[case](path)
+        read(layout, folder)
+    finally:
+        if path.is_dir():
+            path.rmdir()
+        path.unlink(missing_ok=True)
+        aside.rename(path)
+
+
+@pytest.mark.parametrize("case", [*WHOLE, "damaged"])
+@pytest.mark.parametrize("name", ["policy_preprocessor", "policy_postprocessor"])
+def test_statistics_in_safetensors(
+    name: str, case: str, checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "lerobot"
+    shutil.copytree(checkpoints["lerobot"], folder)
+    (path,) = folder.glob(f"{name}*.safetensors")
+    if case == "damaged":
+        rng = np.random.default_rng(0)
+        original = path.read_bytes()
+        for _ in range(50):
+            damaged = bytearray(original)
+            damaged[int(rng.integers(len(original)))] = int(rng.integers(256))
+            path.write_bytes(damaged[: int(rng.integers(len(original) + 1))])
+            read("lerobot", folder)
+        return
+    path.unlink()
+    WHOLE[case](path)
+    read("lerobot", folder)
