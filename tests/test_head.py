@@ -255,6 +255,26 @@ def test_warmup(head: saccade.ActionHead) -> None:
             head.warmup(size)
 
 
+def test_warmup_of_a_head_with_text_and_image_blocks() -> None:
+    head = load(load_released("n17_tiny"))
+    for num_vl_tokens in (2, 13):
+        head.warmup(num_vl_tokens, batch=3)
+    with pytest.raises(saccade.InputError, match="num_vl_tokens: expected at least 2, one of text"):
+        head.warmup(1)
+
+
+def test_a_context_holds_what_its_blocks_see() -> None:
+    """Of 16 tokens 4 are of images and 4 are padding, so that blocks see a quarter or a half of them."""
+    released = load_released("n17_tiny")
+    head = load(released)
+    features = np.zeros((1, 16, head.config.context_dim), np.float32)
+    is_image, is_attended = np.arange(16)[None] < 4, np.arange(16)[None] < 12
+    masked = head.encode(features, image_mask=is_image, attention_mask=is_attended)
+    few = head.encode(features[:, :12], image_mask=is_image[:, :12])
+    others = 4 * 4 * head.config.context_dim + 4  # the tokens that are padding, and their part of the mask
+    assert masked.nbytes == few.nbytes + others
+
+
 def test_many_threads_share_a_head_and_a_context(tiny: Released) -> None:
     head = load(tiny, num_threads=2)
     context = head.encode(tiny.backbone_features)
