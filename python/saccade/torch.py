@@ -57,7 +57,8 @@ class CrossAttention(nn.Module):
 
     The parameters are ordinary torch memory, shared with ``state_dict``; the engine has a packed copy.
     Every call compares the weights with what was packed, and packs them anew if they have changed, be it in
-    a way that torch does not count (through ``.data`` or NumPy). This reads the weights once.
+    a way that torch does not count (through ``.data`` or NumPy). This reads the weights once, which was 6 to
+    26 % of a call at N1.5's sizes.
 
     Args:
         state_dict: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
