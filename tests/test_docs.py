@@ -25,6 +25,8 @@ PAGES = [
     ROOT / "studies" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
+#: Need checkpoints to run on: tests/test_docs_checkpoints.py has them.
+NEED_CHECKPOINTS = ("lerobot.md", "nvidia.md", "fork.md", "resize.md")
 MODULES = sorted(
     info.name
     for info in pkgutil.walk_packages(saccade.__path__, "saccade.")
@@ -63,7 +65,7 @@ def test_the_public_classes_have_examples() -> None:
         assert any(test.examples for test in finder.find(public)), f"{public} has no example"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=page_id)
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in NEED_CHECKPOINTS], ids=page_id)
 def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
     blocks = code_blocks(page, "python")
     if blocks:  # one program from top to bottom, as a reader would paste it

@@ -1,0 +1,68 @@
+"""The pages on the ways in are run as they are written, in a folder with the checkpoints that they name."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from published import published
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGES = ("lerobot", "nvidia", "fork", "resize")
+#: The names on the pages, and the layouts of what is there under these names.
+CHECKPOINTS = {
+    "GR00T-N1.5-3B": "nvidia",
+    "GR00T-N1.7": "n17",
+    "my-lerobot-policy": "lerobot",
+    "my-finetune": "isaac",
+    "my-fork": "fork",
+}
+
+
+def commands(page: Path) -> list[list[str]]:
+    """What is to be run, from top to bottom. The Python blocks of a page are one program: those between two
+    blocks of the shell are run together, after all that were before them.
+    """
+    found: list[list[str]] = []
+    program = ""
+    for language, text in re.findall(
+        r"^```(bash|python)\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL
+    ):
+        if language == "bash":
+            found.append(["bash", "-euo", "pipefail", "-c", text])
+            continue
+        program += text
+        if found and found[-1][0] == sys.executable:
+            found.pop()
+        found.append([sys.executable, "-c", program])
+    return found
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
+    page = DOCS / f"{name}.md"
+    asked = commands(page)
+    assert asked
+    for folder, layout in CHECKPOINTS.items():
+        if folder in page.read_text():
+            shutil.copytree(published(layout), tmp_path / folder)
+    # The commands of the environment that runs the test go before others of the same name.
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    for command in asked:
+        done = subprocess.run(
+            command,
+            cwd=tmp_path,
+            env={**os.environ, "PATH": path},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{command[-1]}\n{done.stdout}\n{done.stderr}"
+    # Nothing was written but what the page names.
+    unknown = [found.name for found in tmp_path.iterdir() if found.name not in page.read_text()]
+    assert unknown == []
