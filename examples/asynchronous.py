@@ -1,7 +1,7 @@
 """Acting while thinking: what inference delay does in closed loop, with and without real-time chunking.
 
     python examples/asynchronous.py                     2 episodes of each task in each arm, a minute
-    python examples/asynchronous.py --episodes 60       what docs/asynchronous.md shows; goes on where it was
+    python examples/asynchronous.py --episodes 30       what docs/asynchronous.md shows; goes on where it was
     python examples/asynchronous.py report              prints the tables and draws the picture again
 
 The shipped policy drives the simulated robot, but a chunk of actions is not there when the robot looks: it
@@ -292,12 +292,11 @@ def draw(results: Results, examples: Sequence[Drive], path: Path) -> None:
     within = [results.mean(delay, ARMS[0], "within").value for delay in results.delays]
     axes["seam"].plot(results.delays, within, ":", color="0.4", linewidth=1.2, label="plain, between seams")
     axes["success"].set(ylim=(0, 103), ylabel="success, %")
-    axes["seam"].set_ylim(bottom=0)
-    axes["seam"].set_ylabel("change at a seam")
+    axes["seam"].set(ylim=(0, 1.5 * axes["seam"].get_ylim()[1]), ylabel="change at a seam")
     for name in ("success", "seam"):
         axes[name].set_xlabel("delay, control ticks")
         axes[name].set_xticks(results.delays)
-        axes[name].legend(frameon=False, fontsize=8, loc="lower left")
+        axes[name].legend(frameon=False, fontsize=8, loc="lower left" if name == "success" else "upper right")
     for example in examples:
         shown = example.commands[:SHOWN_TICKS, 0]
         seams = [seam for seam in example.seams if seam < len(shown)]
