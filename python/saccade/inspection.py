@@ -54,6 +54,9 @@ N17_EMBODIMENTS = {
 #: Of N1.5, those that NVIDIA's published checkpoint was trained with.
 PRETRAINED = ("gr1", "agibot_genie1", "oxe_droid")
 
+#: Groups of equal tokens that are named one by one.
+SHOWN = 4
+
 #: A median absolute deviation times this is the standard deviation of normal numbers.
 MAD_TO_STD = 1.4826
 
@@ -379,6 +382,7 @@ def token_statistics(tokens: Float32Array) -> dict[str, Any]:
     values, fresh = sample(tokens), Draw("normal", NORMAL_STD)
     _, index, counts = np.unique(tokens, axis=0, return_inverse=True, return_counts=True)
     groups = [np.flatnonzero(index.reshape(-1) == group).tolist() for group in np.flatnonzero(counts > 1)]
+    groups.sort()
     return {
         "count": tokens.shape[0],
         **shape_of_tokens(tokens),
@@ -489,7 +493,10 @@ def odd_of_tokens(report: Mapping[str, Any]) -> list[str]:
     tokens = report["future_tokens"]
     if tokens is None:
         return ["a head of N1.5 without future tokens"] if report["version"] == "n1.5" else []
-    odd = [f"future tokens {', '.join(map(str, group))} are identical" for group in tokens["identical"]]
+    groups = [", ".join(map(str, group)) for group in tokens["identical"]]
+    odd = [f"future tokens {group} are identical" for group in groups[:SHOWN]]
+    if len(groups) > SHOWN:
+        odd.append(f"and so are those of {len(groups) - SHOWN} more groups")
     odd += [f"future token {index} is zero" for index in tokens["zero"]]
     if tokens["key_bias"] is not None:
         odd.append("the keys of the future tokens have a bias that only saccade applies")
