@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import saccade
+from saccade import cli
 from saccade.errors import InputError
 from saccade.hub import resolve
 
@@ -129,3 +130,12 @@ def test_what_is_no_path() -> None:
     for source in (3, None, b"bytes", "null\0character"):
         with pytest.raises(InputError, match="source: expected a path"):
             resolve(source)  # type: ignore[arg-type]
+
+
+def test_commands_take_ids(cache: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cached(cache, checkpoint)
+    assert cli.main(["inspect", NAME, "--no-time", "--json"]) == 0
+    assert '"version": "n1.5"' in capsys.readouterr().out
+    for command in (["bench", "nvidia/absent"], ["parity", "nvidia/absent"], ["inspect", "nvidia/absent"]):
+        assert cli.main(command) == 2
+        assert "hf download nvidia/absent" in capsys.readouterr().err

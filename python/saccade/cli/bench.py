@@ -28,6 +28,7 @@ from saccade.bench.cost import (
 from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
 from saccade.bench.work import Call, Works, encode_work, sample_work, total
 from saccade.cli import UsageError
+from saccade.hub import resolve
 
 HELP = "time the action head beside what this machine allows"
 EPILOG = """examples:
@@ -121,8 +122,10 @@ def check(args: argparse.Namespace) -> list[str]:
     """The precisions; refuses arguments that cannot be followed before anything long has run."""
     if args.checkpoint is not None and args.size is not None:
         raise UsageError("--size is about random weights: leave out the checkpoint")
-    if args.checkpoint is not None and not args.checkpoint.exists():
-        raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
+    if args.checkpoint is not None:
+        args.checkpoint = resolve(args.checkpoint)
+        if not args.checkpoint.exists():
+            raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
     for name in ("threads", "num_vl_tokens", "num_steps", "num_samples", "future_refresh", "rounds"):
         value = getattr(args, name)
         if value is not None and value < 1:

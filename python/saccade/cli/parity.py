@@ -19,6 +19,7 @@ import numpy as np
 
 import saccade
 from saccade.cli import UsageError
+from saccade.hub import resolve
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -160,8 +161,10 @@ def check(args: argparse.Namespace) -> None:
     """Refuses arguments that contradict each other before anything long has run."""
     if args.checkpoint is not None and (args.full or args.bf16 or args.version is not None):
         raise UsageError("--full, --bf16 and --version are about random weights: leave out the checkpoint")
-    if args.checkpoint is not None and not args.checkpoint.exists():
-        raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
+    if args.checkpoint is not None:
+        args.checkpoint = resolve(args.checkpoint)
+        if not args.checkpoint.exists():
+            raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
     if args.inputs is not None and not args.inputs.is_file():
         raise FileNotFoundError(f"{args.inputs}: no such file")
     for name in ("batch", "vl_tokens", "num_steps", "threads"):
