@@ -24,7 +24,7 @@ from torch import Tensor
 
 import saccade
 from saccade import cli
-from saccade.checkpoints import convert, quantize
+from saccade.checkpoints import action_changes, convert, quantize, resize
 from saccade.errors import CheckpointError, InputError
 from saccade.reference.random_weights import random_inputs
 
@@ -165,10 +165,31 @@ def test_embodiments_keep_their_numbers(source: Path, tmp_path: Path) -> None:
     assert taken <= report.bytes_after
     for embodiment_id in (3, 31):
         assert same(actions(source, embodiment_id), actions(tmp_path / "out", embodiment_id))
+    assert saccade.ActionHead.load(tmp_path / "out").embodiment_ids == (3, 31)
+    with pytest.raises(InputError, match="expected some of 3, 31, which alone are in this checkpoint, got 5"):
+        saccade.ActionHead.load(tmp_path / "out", embodiment_ids=[3, 5])
+    # A copy of the copy knows it too.
+    convert(tmp_path / "out", tmp_path / "half", dtype="bfloat16", max_shard_bytes=2_000_000)
+    quantize(tmp_path / "half", tmp_path / "int8")
+    resize(tmp_path / "int8", tmp_path / "more", num_future_tokens=40)
+    assert saccade.ActionHead.load(tmp_path / "more").embodiment_ids == (3, 31)
+    moved = action_changes(tmp_path / "int8", tmp_path / "more", num_observations=1, num_vl_tokens=5)
+    assert moved.in_saccade.largest < 1e-5
+    convert(tmp_path / "more", tmp_path / "one", embodiment_ids=[31])
+    assert saccade.ActionHead.load(tmp_path / "one").embodiment_ids == (31,)
+    with pytest.raises(InputError, match="expected some of 31"):
+        convert(tmp_path / "one", tmp_path / "none", embodiment_ids=[3])
     with pytest.raises(InputError, match="embodiment_ids: expected ids from 0 to 31, got 32"):
         convert(source, tmp_path / "more", embodiment_ids=[32])
     with pytest.raises(InputError, match="embodiment_ids"):
         convert(source, tmp_path / "more", embodiment_ids=[])
+
+
+@pytest.mark.parametrize("note", ["", "3;5", "3,32", "3,-1", "9" * 30])
+def test_a_note_of_embodiments_that_is_none(note: str, source: Path) -> None:
+    save_file(tensors_of(source), source / "model.safetensors", {"saccade_embodiment_ids": note})
+    with pytest.raises((CheckpointError, InputError), match="embodiment_ids"):
+        saccade.ActionHead.load(source)
 
 
 def test_embodiments_in_another_type(source: Path, tmp_path: Path) -> None:
@@ -217,6 +238,7 @@ def test_what_lies_beside_the_weights(source: Path, tmp_path: Path) -> None:
     (source / "dangling.json").symlink_to(source / "nowhere")
     (source / "round").symlink_to(source)
     os.mkfifo(source / "pipe.json")
+    os.mkfifo(source / "pipe.safetensors.txt")
     report = convert(source, tmp_path / "out")
     assert {str(path) for path in report.carried} == {
         *("tokenizer.json", "merges.txt", "chat_template.jinja", "README.md", "LICENSE", "a/b/c.yaml"),
@@ -224,6 +246,7 @@ def test_what_lies_beside_the_weights(source: Path, tmp_path: Path) -> None:
     }
     assert {str(path) for path in report.left} == {
         *("optimizer.pt", "checkpoint-5", "loop.exe", "dangling.json", "round", "pipe.json"),
+        "pipe.safetensors.txt",
     }
     found = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*")}
     assert found == {
@@ -269,6 +292,13 @@ def test_behind_a_link_the_directory_is_replaced(source: Path, tmp_path: Path) -
     convert(source, tmp_path / "out", force=True, dtype="float16")
     assert (tmp_path / "out").is_symlink()
     assert (tmp_path / "disk" / "model.safetensors").is_file()
+
+
+def test_a_link_to_nothing_is_refused(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(CheckpointError, match=r"out: .* cannot be written"):
+        convert(source, tmp_path / "out", force=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "source"]
 
 
 def test_whoever_looks_finds_a_checkpoint(source: Path, tmp_path: Path) -> None:

@@ -171,8 +171,9 @@ def convert(
         source, config, out, head_only, force, progress: As in :func:`quantize`. Other programs need what is
             not the head's.
         embodiment_ids: Keep only these. The layers of the others become zero and stay in place, so that the
-            ids keep their numbers and every program that read the source reads the copy. On file systems with
-            holes the zeros take no room.
+            ids keep their numbers and every program that read the source reads the copy; saccade refuses the
+            ids that are not there, by a note in the files' metadata. On file systems with holes the zeros
+            take no room.
         dtype: ``"float32"``, ``"bfloat16"`` or ``"float16"``, which all floating point tensors become, those
             outside the head too; default what each is. Numbers are rounded to the nearest, and the report
             says by how much. int8 weights and their scales stay.
@@ -291,8 +292,8 @@ def action_changes(
         resized: The copy.
         config: Of the source, as in :func:`resize`.
         features: A file of recorded observations, ``.npz`` or ``.safetensors``, as ``saccade attention
-            --features`` takes it. Default: random numbers, of embodiment 0, which say less: no robot sees
-            them.
+            --features`` takes it. Default: random numbers, of the first embodiment that is there, which say
+            less: no robot sees them.
         seed: Of what is drawn: random observations, and noise that the file does not bring.
         num_observations, num_vl_tokens: Of random observations; 296 is what one camera makes.
         num_threads: As for :meth:`saccade.ActionHead.load`. One head is in memory at a time.
@@ -309,11 +310,12 @@ def action_changes(
         from saccade.maps.inputs import read_arrays
 
         recorded = read_arrays(Path(features))
-    ids = [0] if recorded is None else np.unique(recorded["embodiment_id"]).tolist()
+    kept = open_published(source, config).kept_embodiments() or [0]
+    ids = kept[:1] if recorded is None else np.unique(recorded["embodiment_id"]).tolist()
     loading: dict[str, Any] = {"embodiment_ids": ids, "num_threads": num_threads}
     head = ActionHead.load(source, config=config, **loading)
     if features is None or recorded is None:
-        observations = _random_observations(head.config, rng, num_observations, num_vl_tokens)
+        observations = _random_observations(head, rng, num_observations, num_vl_tokens)
     else:
         observations = _recorded_observations(Path(features), recorded, head.config, rng)
     before = _chunks(head, observations)
@@ -337,8 +339,9 @@ def action_changes(
 
 
 def _random_observations(
-    config: HeadConfig, rng: np.random.Generator, count: int, num_vl_tokens: int
+    head: ActionHead, rng: np.random.Generator, count: int, num_vl_tokens: int
 ) -> list[dict[str, Any]]:
+    config = head.config
     shapes = {
         "backbone_features": (1, num_vl_tokens, config.context_dim),
         "state": (1, config.state_history, config.state_dim),
@@ -346,7 +349,7 @@ def _random_observations(
     }
     return [
         {
-            "embodiment_id": 0,
+            "embodiment_id": head.embodiment_ids[0],
             **{name: rng.standard_normal(shape, np.float32) for name, shape in shapes.items()},
         }
         for _ in range(count)

@@ -707,6 +707,11 @@ impl Published {
         self.lock().files().map(PathBuf::from).collect()
     }
 
+    /// The embodiments that are left, if others were taken out.
+    fn kept_embodiments(&self) -> PyResult<Option<Vec<i64>>> {
+        self.lock().checkpoint.kept_embodiments().map_err(raise)
+    }
+
     fn tensors(&self) -> Vec<PyTensorFacts> {
         let fields = |tensor: TensorFacts| (tensor.name, tensor.dtype, tensor.shape, tensor.nbytes);
         self.lock().tensors().map(fields).collect()

@@ -29,6 +29,9 @@ const MAX_HEADER_BYTES: u64 = 100_000_000;
 /// What a safetensors header calls its notes.
 const METADATA: &str = "__metadata__";
 
+/// The note of the embodiments that were kept.
+pub(crate) const KEPT_EMBODIMENTS: &str = "saccade_embodiment_ids";
+
 /// Bytes that are copied together.
 const PIECE: usize = 1 << 24;
 
@@ -112,6 +115,8 @@ pub struct Checkpoint {
     entries: BTreeMap<String, Entry>,
     /// Names that stand in more than one file, with what to say of them: fatal only where the tensor is wanted.
     duplicates: BTreeMap<String, String>,
+    /// What the files say of themselves.
+    notes: BTreeMap<String, String>,
 }
 
 impl Checkpoint {
@@ -128,6 +133,7 @@ impl Checkpoint {
             files: Vec::new(),
             entries: BTreeMap::new(),
             duplicates: BTreeMap::new(),
+            notes: BTreeMap::new(),
         };
         if metadata.is_dir() {
             let listing = Listing::of(path)?;
@@ -139,6 +145,27 @@ impl Checkpoint {
             checkpoint.add_file(path)?;
         }
         Ok(checkpoint)
+    }
+
+    /// What the files say of themselves; where they differ, what the first one says.
+    pub(crate) fn notes(&self) -> &BTreeMap<String, String> {
+        &self.notes
+    }
+
+    /// The embodiments whose layers were kept when others were taken out; none if nobody did.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if the files' note of it is not a list of numbers.
+    pub fn kept_embodiments(&self) -> Result<Option<Vec<i64>>> {
+        let Some(note) = self.notes.get(KEPT_EMBODIMENTS) else {
+            return Ok(None);
+        };
+        let ids: std::result::Result<_, _> = note.split(',').map(str::parse).collect();
+        ids.map(Some).map_err(|_| {
+            Error::Checkpoint(format!(
+                "source: {KEPT_EMBODIMENTS} in the metadata is `{note}`, expected numbers with commas between them"
+            ))
+        })
     }
 
     /// The files that tensors are read from.
@@ -412,7 +439,14 @@ impl Checkpoint {
         let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
         let mut file = open_regular(path).map_err(|error| Error::from_io("source", path, &error))?;
         let stamp = Stamp::of(&file).map_err(|error| Error::from_io("source", path, &error))?;
-        let (header, data_start) = read_header(&mut file, stamp.length).map_err(bad)?;
+        let Header {
+            tensors: header,
+            data_start,
+            notes,
+        } = read_header(&mut file, stamp.length).map_err(bad)?;
+        for (key, note) in notes {
+            self.notes.entry(key).or_insert(note);
+        }
         let index = self.files.len();
         for (name, info) in header {
             let start = data_start + info.data_offsets.0 as u64;
@@ -459,7 +493,7 @@ impl Checkpoint {
 }
 
 /// Opens a file that may be read to its end: opening a pipe would wait for somebody to write to it, and a device has no end.
-fn open_regular(path: &Path) -> std::io::Result<File> {
+pub(crate) fn open_regular(path: &Path) -> std::io::Result<File> {
     let is_file = |metadata: std::io::Result<std::fs::Metadata>| match metadata?.is_file() {
         true => Ok(()),
         false => Err(std::io::Error::other("not a regular file")),
@@ -567,11 +601,16 @@ impl Listing {
     }
 }
 
-/// The tensors that a file's header names, checked against the file's length, and where the data begins.
-fn read_header(
-    file: &mut File,
-    length: u64,
-) -> std::result::Result<(Vec<(String, TensorInfo)>, u64), String> {
+/// What a file's header says.
+struct Header {
+    tensors: Vec<(String, TensorInfo)>,
+    /// Where the data begins.
+    data_start: u64,
+    notes: BTreeMap<String, String>,
+}
+
+/// A file's header, checked against the file's length.
+fn read_header(file: &mut File, length: u64) -> std::result::Result<Header, String> {
     let mut size = [0; 8];
     file.read_exact(&mut size)
         .map_err(|_| format!("not safetensors: {length} bytes, expected at least 8"))?;
@@ -598,7 +637,23 @@ fn read_header(
             length - 8 - size
         ));
     }
-    Ok((tensors, 8 + size))
+    Ok(Header {
+        tensors,
+        data_start: 8 + size,
+        notes: notes(&header),
+    })
+}
+
+/// What a header says of its file, as far as it is text.
+fn notes(header: &[u8]) -> BTreeMap<String, String> {
+    #[derive(serde::Deserialize)]
+    struct Notes {
+        #[serde(rename = "__metadata__", default)]
+        notes: BTreeMap<String, serde_json::Value>,
+    }
+    let found = serde_json::from_slice::<Notes>(header).map_or_else(|_| BTreeMap::new(), |found| found.notes);
+    let text = |(key, note): (String, serde_json::Value)| Some((key, note.as_str()?.to_owned()));
+    found.into_iter().filter_map(text).collect()
 }
 
 /// A JSON object from names of tensors, all different (the usual map types keep the last of two equal keys in silence) and printable, to

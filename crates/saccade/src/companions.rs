@@ -3,8 +3,10 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use crate::checkpoint::open_regular;
 use crate::error::{Error, Result};
 use crate::writer::failed;
 
@@ -21,6 +23,9 @@ const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
 
 /// A tokenizer has 15 MB.
 const MAX_BYTES: u64 = 1 << 28;
+
+/// The published ones have a dozen.
+const MAX_FILES: usize = 1000;
 
 /// No published checkpoint has folders in folders in folders.
 const MAX_DEPTH: usize = 4;
@@ -83,7 +88,11 @@ impl Companions {
             };
             if metadata.is_dir() && !from.is_symlink() && self.is_part(&path) {
                 self.add_folder(&path, weights)?;
-            } else if metadata.is_file() && metadata.len() <= MAX_BYTES && belongs(name) {
+            } else if metadata.is_file()
+                && metadata.len() <= MAX_BYTES
+                && belongs(name)
+                && self.carried.len() < MAX_FILES
+            {
                 self.carried.insert(path);
             } else {
                 self.left.push(path);
@@ -120,15 +129,15 @@ impl Companions {
     pub(crate) fn copy_to(&self, directory: &Path) -> Result<()> {
         for path in &self.carried {
             let (from, to) = (self.root.join(path), directory.join(path));
-            let mut source = File::open(&from).map_err(|error| Error::from_io("source", &from, &error))?;
+            let source = open_regular(&from).map_err(|error| Error::from_io("source", &from, &error))?;
             let folder = to.parent().expect("a path in a directory has a parent");
             let copy = || {
                 std::fs::create_dir_all(folder)?;
                 let mut copy = File::create_new(&to)?;
-                std::io::copy(&mut source, &mut copy)?;
+                // Of a file that grows for ever, no more than it had when it was found.
+                std::io::copy(&mut source.take(MAX_BYTES), &mut copy)?;
                 copy.sync_all()
             };
-            let mut copy = copy;
             copy().map_err(|error| failed(&to, &error))?;
         }
         Ok(())

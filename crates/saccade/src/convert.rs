@@ -6,7 +6,7 @@ use std::path::Path;
 use half::{bf16, f16};
 use safetensors::Dtype;
 
-use crate::checkpoint::SCALE_SUFFIX;
+use crate::checkpoint::{KEPT_EMBODIMENTS, SCALE_SUFFIX};
 use crate::error::{Error, Result};
 use crate::head::chosen_embodiments;
 use crate::layout::HeadNames;
@@ -110,7 +110,8 @@ impl Float {
 pub struct ConvertOptions {
     /// What is common to all rewriting.
     pub rewrite: RewriteOptions,
-    /// Keep only these embodiments; default all. Ids keep their numbers: the slices of the others are zero.
+    /// Keep only these embodiments; default all. Ids keep their numbers: the slices of the others are zero, and the files' metadata say
+    /// which are not.
     pub embodiment_ids: Option<Vec<i64>>,
     /// What floating point tensors become; default what they are. int8 and its scales stay.
     pub dtype: Option<Float>,
@@ -158,9 +159,15 @@ pub fn convert(
 ) -> Result<ConvertReport> {
     let source = Source::open(source, options.rewrite.config.as_deref())?;
     let mut report = ConvertReport::default();
+    let mut rewrite = options.rewrite.clone();
     let mut kept = None;
     if let Some(ids) = &options.embodiment_ids {
-        let ids = chosen_embodiments(Some(ids), source.config.num_embodiments)?;
+        let there = source.checkpoint.kept_embodiments()?;
+        let ids = chosen_embodiments(Some(ids), there.as_deref(), source.config.num_embodiments)?;
+        let note: Vec<String> = ids.iter().map(usize::to_string).collect();
+        rewrite
+            .metadata
+            .insert(KEPT_EMBODIMENTS.to_owned(), note.join(","));
         kept = Some(ids.iter().copied().collect::<BTreeSet<usize>>());
         report.embodiment_ids = Some(ids);
     }
@@ -186,44 +193,37 @@ pub fn convert(
     let config = [("config.json", Some(source.given_config.as_str()))];
     let mut rounding = Rounding::default();
     let mut zeroed_bytes = 0;
-    report.written = source.write(
-        out,
-        &options.rewrite,
-        &config,
-        planned,
-        &mut progress,
-        |name, writer| {
-            let change = change(&source, name, options)?;
-            let nbytes = source.checkpoint.nbytes(name)?;
-            let slices = match &kept {
-                Some(kept) if per_embodiment.contains(name) => {
-                    let slice = nbytes / source.config.num_embodiments as u64;
-                    let ids = 0..source.config.num_embodiments;
-                    ids.map(|id| (kept.contains(&id), slice)).collect()
-                }
-                _ => vec![(true, nbytes)],
-            };
-            let mut start = 0;
-            for (is_kept, nbytes) in slices {
-                if is_kept {
-                    source
-                        .checkpoint
-                        .read_byte_range(name, start..start + nbytes, |bytes| match change {
-                            None => writer.tensor(name, bytes),
-                            Some((from, to)) => rounding.write(name, bytes, from, to, writer),
-                        })?;
-                } else {
-                    let nbytes = change.map_or(nbytes, |(from, to)| {
-                        nbytes / from.dtype().bitsize() as u64 * to.dtype().bitsize() as u64
-                    });
-                    writer.zeros(name, nbytes);
-                    zeroed_bytes += nbytes;
-                }
-                start += nbytes;
+    report.written = source.write(out, &rewrite, &config, planned, &mut progress, |name, writer| {
+        let change = change(&source, name, options)?;
+        let nbytes = source.checkpoint.nbytes(name)?;
+        let slices = match &kept {
+            Some(kept) if per_embodiment.contains(name) => {
+                let slice = nbytes / source.config.num_embodiments as u64;
+                let ids = 0..source.config.num_embodiments;
+                ids.map(|id| (kept.contains(&id), slice)).collect()
             }
-            Ok(())
-        },
-    )?;
+            _ => vec![(true, nbytes)],
+        };
+        let mut start = 0;
+        for (is_kept, nbytes) in slices {
+            if is_kept {
+                source
+                    .checkpoint
+                    .read_byte_range(name, start..start + nbytes, |bytes| match change {
+                        None => writer.tensor(name, bytes),
+                        Some((from, to)) => rounding.write(name, bytes, from, to, writer),
+                    })?;
+            } else {
+                let nbytes = change.map_or(nbytes, |(from, to)| {
+                    nbytes / from.dtype().bitsize() as u64 * to.dtype().bitsize() as u64
+                });
+                writer.zeros(name, nbytes);
+                zeroed_bytes += nbytes;
+            }
+            start += nbytes;
+        }
+        Ok(())
+    })?;
     Ok(ConvertReport {
         num_rounded: rounding.count,
         largest_error: rounding.largest,

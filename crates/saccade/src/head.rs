@@ -199,7 +199,11 @@ impl ActionHead {
             config,
             ..
         } = Published::open(source, options.config.as_deref())?;
-        let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
+        let embodiment_ids = chosen_embodiments(
+            options.embodiment_ids.as_deref(),
+            checkpoint.kept_embodiments()?.as_deref(),
+            config.num_embodiments,
+        )?;
         let names = HeadNames::new(&config);
         checkpoint.check(prefix, &config)?;
         let wanted = names.reading_order(&config, &embodiment_ids);
@@ -221,7 +225,8 @@ impl ActionHead {
             Error::Input("config: expected one, since tensors in memory bring none".to_owned())
         })?;
         let config = HeadConfig::from_json(config)?;
-        let embodiment_ids = chosen_embodiments(options.embodiment_ids.as_deref(), config.num_embodiments)?;
+        let embodiment_ids =
+            chosen_embodiments(options.embodiment_ids.as_deref(), None, config.num_embodiments)?;
         let names = HeadNames::new(&config);
         let problems = memory::problems(tensors, &names.tensors(), |name, shape| {
             is_unused(&config, name, shape)
@@ -1154,18 +1159,31 @@ fn next_id() -> u64 {
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-pub(crate) fn chosen_embodiments(ids: Option<&[i64]>, num_embodiments: usize) -> Result<Vec<usize>> {
-    let Some(ids) = ids else {
+/// The embodiments `ids`, ascending, of those that are there: the ones `kept`, or else all.
+pub(crate) fn chosen_embodiments(
+    ids: Option<&[i64]>,
+    kept: Option<&[i64]>,
+    num_embodiments: usize,
+) -> Result<Vec<usize>> {
+    let Some(ids) = ids.or(kept) else {
         return Ok((0..num_embodiments).collect());
     };
     let mut chosen = Vec::with_capacity(ids.len());
     for &id in ids {
         match usize::try_from(id) {
-            Ok(id) if id < num_embodiments => chosen.push(id),
+            Ok(known) if known < num_embodiments && kept.is_none_or(|kept| kept.contains(&id)) => {
+                chosen.push(known);
+            }
             _ => {
-                let last = num_embodiments - 1;
+                let expected = match kept {
+                    None => format!("ids from 0 to {}", num_embodiments - 1),
+                    Some(kept) => {
+                        let kept: Vec<String> = kept.iter().map(i64::to_string).collect();
+                        format!("some of {}, which alone are in this checkpoint", kept.join(", "))
+                    }
+                };
                 return Err(Error::Input(format!(
-                    "embodiment_ids: expected ids from 0 to {last}, got {id}"
+                    "embodiment_ids: expected {expected}, got {id}"
                 )));
             }
         }

@@ -22,7 +22,7 @@ pub struct RewriteOptions {
     pub head_only: bool,
     /// Whether a checkpoint that is there is replaced.
     pub force: bool,
-    /// What the files' metadata say.
+    /// What the files' metadata say, besides what the source's do.
     pub metadata: BTreeMap<String, String>,
     /// A file is closed before it grows larger than this; default one file of one, and 5 GB of several, as they are published.
     pub max_shard_bytes: Option<u64>,
@@ -123,10 +123,12 @@ impl Source {
             1 => u64::MAX,
             _ => MAX_SHARD_BYTES,
         };
+        let mut metadata = self.checkpoint.notes().clone();
+        metadata.extend(options.metadata.clone());
         let mut writer = CheckpointWriter::create(
             out,
             planned,
-            &options.metadata,
+            &metadata,
             &companions,
             options.max_shard_bytes.unwrap_or(default),
             options.force,

@@ -270,7 +270,7 @@ fn exchange(_new: &Path, _out: &Path) -> bool {
 fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, force: bool) -> Result<bool> {
     let shown = out.display();
     let metadata = match std::fs::metadata(out) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(false),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound && !out.is_symlink() => return Ok(false),
         Err(error) => return Err(failed(out, &error)),
         Ok(metadata) => metadata,
     };
