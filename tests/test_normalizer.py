@@ -479,6 +479,8 @@ def test_mappings_may_be_lerobots_or_plain() -> None:
     plain = Normalizer.load({"state": row(3, 0), "action": row(2, 1)}, 7)
     theirs = Normalizer.load({"observation.state": row(3, 0), "action": row(2, 1)}, "gr1")
     assert (plain.embodiment, plain.embodiment_id) == (None, 7)
+    with pytest.raises(saccade.InputError, match="embodiment: given 3, expected None"):
+        Normalizer.load(DEMO_CHECKPOINT, 3)
     assert (theirs.embodiment, theirs.embodiment_id) == ("gr1", 24)
     assert np.array_equal(as_array(plain.state(draw(2, 3))), as_array(theirs.state(draw(2, 3))))
 

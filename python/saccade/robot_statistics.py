@@ -22,6 +22,7 @@ from saccade.hub import resolve
 MODES = ("min_max", "q99", "mean_std", "binary", "sin_cos", "none")
 #: The statistics that a mode takes.
 STATISTICS = {"min_max": ("min", "max"), "q99": ("q01", "q99"), "mean_std": ("mean", "std")}
+ALL_STATISTICS = frozenset(name for names in STATISTICS.values() for name in names)
 #: Embodiments of GR00T N1 and N1.5: what the code bases call them, and their slice of the head's layers.
 EMBODIMENTS = {
     "new_embodiment": 31,
@@ -253,9 +254,6 @@ class Builder:
         return tuple(group for group in groups if group is not None)
 
 
-ALL_STATISTICS = frozenset(name for names in STATISTICS.values() for name in names)
-
-
 def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -> Robot:
     """The robot that `source` describes, see :meth:`saccade.Normalizer.load`."""
     where = "source" if isinstance(source, Mapping) else str(resolve(source))
@@ -371,12 +369,13 @@ def _from_flat(
         has_bounds = isinstance(found, Mapping) and {"min", "max"} <= set(found)
         groups.append(builder.group(kind, found, "min_max" if has_bounds else "mean_std"))
     state, action = builder.check(groups)
-    if isinstance(options.embodiment, int) and embodiment_id is None:
-        embodiment_id = integer("embodiment", options.embodiment, least=0)
-    tag = options.embodiment if isinstance(options.embodiment, str) and embodiment_id is None else None
+    # Where nothing says whose statistics these are, the caller does.
+    tag, asked = None, options.embodiment
+    if embodiment_id is None and isinstance(asked, str):
+        tag, embodiment_id = asked, EMBODIMENTS.get(asked)
+    elif embodiment_id is None and asked is not None:
+        embodiment_id = integer("embodiment", asked, least=0)
     options.agrees(tag, embodiment_id, where)
-    if tag is not None:
-        embodiment_id = EMBODIMENTS.get(tag)
     return _finished(where, options, tag, embodiment_id, (state,), (action,), dims)
 
 
