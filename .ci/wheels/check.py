@@ -14,6 +14,7 @@ import json
 import platform
 import random
 import sys
+import tempfile
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import numpy.typing as npt
 
 import saccade
 from saccade import cli
+from saccade.checkpoints import convert, resize
 
 PACKAGE = Path(saccade.__file__).parent
 DEMO = PACKAGE / "sim" / "demo"
@@ -71,21 +73,29 @@ def check_cross_attention() -> float:
     return error
 
 
-def sample() -> dict[str, npt.NDArray[np.float32]]:
-    """Actions of the shipped head, in each precision."""
-    actions = {}
-    for precision in ("float32", "bfloat16", "int8"):
-        head = saccade.ActionHead.load(DEMO, precision=precision)
-        config = head.config
-        RANDOM.seed(7)
-        features, state = uniform(2, 21, config.context_dim), uniform(2, config.state_dim)
-        noise = uniform(2, config.action_horizon, config.encoder_action_dim)
-        result = np.asarray(head(features, state, 0, noise=noise))
-        assert result.shape == (2, config.action_horizon, config.action_dim)
-        assert np.isfinite(result).all()
-        assert 0.01 < np.abs(result).max() < 100
-        actions[precision] = result
+def sample(source: Path, precision: str) -> npt.NDArray[np.float32]:
+    """Actions of a head on the same inputs each time."""
+    head = saccade.ActionHead.load(source, precision=precision)
+    config = head.config
+    RANDOM.seed(7)
+    features, state = uniform(2, 21, config.context_dim), uniform(2, config.state_dim)
+    noise = uniform(2, config.action_horizon, config.encoder_action_dim)
+    actions = np.asarray(head(features, state, 0, noise=noise))
+    assert actions.shape == (2, config.action_horizon, config.action_dim)
+    assert np.isfinite(actions).all()
+    assert 0.01 < np.abs(actions).max() < 100
     return actions
+
+
+def check_files(actions: npt.NDArray[np.float32]) -> None:
+    """Written anew: in shards, the same bits; with more future tokens, the same actions."""
+    with tempfile.TemporaryDirectory() as folder:
+        shards, more = Path(folder, "shards"), Path(folder, "more")
+        convert(DEMO, shards, max_shard_bytes=1_000_000)
+        assert len(list(shards.glob("*.safetensors"))) > 1
+        assert np.array_equal(sample(shards, "float32"), actions)
+        resize(DEMO, more, num_future_tokens=40)
+        assert np.abs(sample(more, "float32") - actions).max() < 1e-5
 
 
 def run(*args: str) -> tuple[int, str, str]:
@@ -141,7 +151,8 @@ def main() -> None:
     """Everything above."""
     check_import()
     error = check_cross_attention()
-    actions = sample()
+    actions = {precision: sample(DEMO, precision) for precision in ("float32", "bfloat16", "int8")}
+    check_files(actions["float32"])
     check_torch_is_named()
     works = check_commands()
     np.savez(sys.argv[1], **actions)  # type: ignore[arg-type]
