@@ -37,7 +37,7 @@ EPILOG = """examples:
                                                   on recorded features, state, embodiment_id and noise
   saccade parity --version n1.7                   a small random head of another version
   saccade parity --full                           N1.5's full size; 3 GB of disk, 8 GB of memory
-  saccade parity --full --version n1.7 --bf16     N1.7's; 3 GB of disk, 14 GB of memory
+  saccade parity --full --version n1.7 --bf16     N1.7's; 3 GB of disk, more than 11 GB of memory
   saccade parity --full --json                    as a program reads it
   saccade parity checkpoint/ --precision int8     how far int8 is from float64; no verdict
 """
