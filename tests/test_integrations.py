@@ -7,14 +7,18 @@ from __future__ import annotations
 import copy
 import functools
 import gc
+import subprocess
+import sys
 import weakref
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import integration_cases as cases
 import pytest
 import torch
 import upstream_heads
+from compat import run as compat
 from torch import nn
 from transformers.feature_extraction_utils import BatchFeature
 
@@ -22,6 +26,8 @@ import saccade
 from saccade.integrations import accelerate
 from saccade.reference import lerobot_head
 from saccade.reference.random_weights import small_config
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(autouse=True)
@@ -213,3 +219,19 @@ def test_inference_mode() -> None:
     theirs = cases.call(case, given)
     with torch.inference_mode(), accelerate(case.head):
         cases.assert_same(cases.call(case, given), theirs, cases.EXACT)
+
+
+def test_the_benchmark_runs() -> None:
+    options = ["--size", "small", "--num-vl-tokens", "9", "--rounds", "1", "--threads", "1"]
+    command = [sys.executable, "-m", "benches.accelerate", *options, "--precisions", "int8"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.count("| int8 | float32") == 2
+
+
+def test_the_page_is_what_the_command_writes() -> None:
+    page = (ROOT / "docs" / "compatibility.md").read_text()
+    assert page.startswith(compat.INTRODUCTION)
+    assert page.endswith(compat.CHECKED)
+    for release in compat.RELEASES:
+        assert f"lerobot {release.lerobot} |" in page
+        assert f"lerobot=={release.lerobot}\n" in release.packages.read_text() or release.on_top_of == ""

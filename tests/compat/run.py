@@ -47,9 +47,9 @@ class Release:
 
 #: In the order in which their environments build on each other; "" is the one that runs this.
 RELEASES = (
-    Release("0.4.4", "", ("policies.py",)),
-    Release("0.6.1", None, ("policies.py", "n17_parity.py")),
-    Release("0.5.1", "0.6.1", ("policies.py",)),
+    Release("0.4.4", "", ("policies.py", "normalizers.py")),
+    Release("0.6.1", None, ("policies.py", "normalizers.py", "n17_parity.py")),
+    Release("0.5.1", "0.6.1", ("policies.py", "normalizers.py")),
 )
 
 INTRODUCTION = """\
