@@ -290,9 +290,9 @@ def main() -> int:
             ),
             machine=f"{wheel.name}, on {platform.system()} {platform.release()}",
         )
-    print(page)
-    if args.page is not None:
-        args.page.write_text(page)
+        print(page, flush=True)
+        if args.page is not None:
+            args.page.write_text(page)
     return 1 if "FAILED" in page else 0
 
 
