@@ -9,6 +9,7 @@ ROLLOUT_ARGS ?= --episodes 3 --video
 PEERS_VENV ?= .venv-peers
 PEERS_ARGS ?=
 COMPAT_ARGS ?=
+FUZZ_SECONDS ?= 1800
 WHEEL_VENV ?= .venv-wheel
 WHEEL_ARGS ?=
 
@@ -21,7 +22,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat fuzz setup-rollout setup-test clean
 
 help:
 	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
@@ -29,6 +30,7 @@ help:
 	@echo "make bench-peers   saccade beside every engine that runs the same head; report in out/peers"
 	@echo "make lint      what .ci/run checks besides the tests"
 	@echo "make sanitize  kernel tests under AddressSanitizer (nightly Rust) and valgrind"
+	@echo "make fuzz      hostile headers, indexes, configs and resizes, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  lerobot's own policies, accelerated, in an environment of each release; writes docs/compatibility.md"
 	@echo "make wheel     a manylinux wheel in dist, from the last commit"
 	@echo "make test-wheel   the wheel under every CPython, old and new NumPy, emulated old CPUs; writes docs/wheels.md"
@@ -143,6 +145,14 @@ $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
 	@echo "setting up: ggml (builds it; minutes)"
 	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report goes without it"
 	@touch $@
+
+# fuzz/README.md says what is done with which input, and why without AddressSanitizer.
+fuzz: setup-test
+	@cargo +nightly fuzz --version >/dev/null 2>&1 || { echo "make fuzz: needs a nightly Rust (rustup toolchain install nightly) and cargo-fuzz (cargo install cargo-fuzz)"; exit 1; }
+	$(BIN)/python fuzz/seeds.py
+	@for target in header index config resize; do \
+		cargo +nightly fuzz run --sanitizer none $$target -- -dict=fuzz/words.dict -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=2048 || exit 1; \
+	done
 
 # lerobot 0.5 and later need Python 3.12: COMPAT_ARGS="--python312 PATH" where python3.12 is not on PATH.
 test-compat: setup-test
