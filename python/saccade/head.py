@@ -361,7 +361,7 @@ class ActionHead:
                 at a step at which they do not always run is an error. All evaluations of a step are that
                 step.
             previous_chunk: The chunk before, ``(batch, rows, action_dim)`` as it left the head (or
-                ``encoder_action_dim`` wide), of at least ``chunking.horizon`` rows. All samples of an
+                ``encoder_action_dim`` wide), of ``chunking.horizon`` to ``action_horizon`` rows. All samples of an
                 observation begin with the same.
             chunking: How much of it is taken over; see :class:`saccade.Chunking`. Both or neither.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
@@ -592,7 +592,10 @@ def _load(source: str, options: dict[str, Any]) -> ActionHead:
 
 
 def _embodiment_ids(given: Sequence[int] | None) -> list[int] | None:
-    return None if given is None else int64("embodiment_ids", given).reshape(-1).tolist()
+    if given is None:
+        return None
+    # NumPy takes an empty list for one of floats.
+    return int64("embodiment_ids", given).reshape(-1).tolist() if np.size(given) else []
 
 
 def _held(context: Context) -> _saccade.Context:

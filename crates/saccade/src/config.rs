@@ -102,6 +102,11 @@ impl HeadConfig {
             }
         };
         let mut reader = Reader { problems: Vec::new() };
+        if !std::ptr::eq(top, head) && top.contains_key("saccade") {
+            reader
+                .problems
+                .push("saccade stands beside action_head_cfg, expected inside".to_owned());
+        }
         let version = reader.version(top, head);
         let config = reader.head(version, head);
         if reader.problems.is_empty() {
