@@ -159,7 +159,7 @@ const MAX_LAYERS: u64 = 1024;
 
 /// A release of the architecture, for what its class does with the keys that its config names or leaves out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Version {
+pub(crate) enum Version {
     N1,
     N15,
     N16,
@@ -167,9 +167,9 @@ enum Version {
 }
 
 impl Version {
-    const ALL: [Self; 4] = [Self::N1, Self::N15, Self::N16, Self::N17];
+    pub(crate) const ALL: [Self; 4] = [Self::N1, Self::N15, Self::N16, Self::N17];
 
-    fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::N1 => "n1",
             Self::N15 => "n1.5",
@@ -178,7 +178,7 @@ impl Version {
         }
     }
 
-    fn model_type(self) -> &'static str {
+    pub(crate) fn model_type(self) -> &'static str {
         match self {
             Self::N1 => "gr00t_n1",
             Self::N15 => "gr00t_n1_5",

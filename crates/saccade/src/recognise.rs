@@ -11,6 +11,7 @@ use serde_json::{Map, Value, json};
 
 use crate::checkpoint::{Checkpoint, read_text};
 use crate::config::HeadConfig;
+use crate::config::Version::{self, N1, N15, N16, N17};
 use crate::error::{Error, Result, show_shape};
 
 /// Who wrote a checkpoint, and so where things are in it.
@@ -103,7 +104,8 @@ impl Published {
         let head = HeadConfig::from_json(&config_json)?;
         if !problems.is_empty() {
             return Err(Error::Checkpoint(format!(
-                "source: config and tensors disagree (GR00T {version}):\n  {}",
+                "source: config and tensors disagree (GR00T {}):\n  {}",
+                show(version),
                 problems.join("\n  ")
             )));
         }
@@ -250,37 +252,9 @@ const RIGHT_ARM: &str = "action_right_arm_decoder";
 const CLAW: &str = "action_claw_decoder";
 const FUTURE_TOKENS: &str = "future_tokens.weight";
 
-/// A release of the architecture, in the order of their release.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Version {
-    N1,
-    N15,
-    N16,
-    N17,
-}
-
-use Version::{N1, N15, N16, N17};
-
-impl Version {
-    fn model_type(self) -> &'static str {
-        match self {
-            N1 => "gr00t_n1",
-            N15 => "gr00t_n1_5",
-            N16 => "Gr00tN1d6",
-            N17 => "Gr00tN1d7",
-        }
-    }
-}
-
-impl fmt::Display for Version {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            N1 => "N1",
-            N15 => "N1.5",
-            N16 => "N1.6",
-            N17 => "N1.7",
-        })
-    }
+/// A version as its models are named: `N1.5`.
+fn show(version: Version) -> String {
+    version.name().to_uppercase()
 }
 
 /// Something that only some versions have.
@@ -293,9 +267,9 @@ struct Evidence {
 fn recognise_version(config: &Config, tensors: &HeadShapes<'_>) -> Result<(Version, Vec<String>)> {
     let found = evidence(config, tensors)?;
     let fits = |version: &Version| found.iter().all(|one| one.versions.contains(version));
-    let possible: Vec<Version> = [N1, N15, N16, N17].into_iter().filter(fits).collect();
+    let possible: Vec<Version> = Version::ALL.into_iter().filter(fits).collect();
     let sentences = found.iter().map(|one| {
-        let versions: Vec<String> = one.versions.iter().map(Version::to_string).collect();
+        let versions: Vec<String> = one.versions.iter().copied().map(show).collect();
         format!("{}: {}", one.what, versions.join(" or "))
     });
     let version = match possible[..] {
@@ -543,21 +517,23 @@ const BLOCKS: [(&str, &str); 2] = [
 
 /// The fork's keys, where its decoders are there and the file does not name them: its code makes them up while it loads.
 fn add_decoders(head: &mut Map<String, Value>, tensors: &HeadShapes<'_>) {
-    let widths: Vec<usize> = DECODERS
-        .iter()
-        .filter_map(|(name, _)| tensors.decoder(name))
-        .collect();
-    if widths.is_empty() || tensors.decoder(DECODER).is_some() {
+    let widths = DECODERS.iter().filter_map(|(name, _)| tensors.decoder(name));
+    // Shapes of tensors without elements may be anything.
+    let Some(together) = widths.reduce(usize::saturating_add) else {
+        return;
+    };
+    if tensors.decoder(DECODER).is_some() {
         return;
     }
     head.entry("use_multi_action_heads").or_insert(json!(true));
     if let (Some(left), Some(right)) = (tensors.decoder(LEFT_ARM), tensors.decoder(RIGHT_ARM)) {
         head.entry("split_arm_heads").or_insert(json!(true));
-        head.entry("action_arm_dim").or_insert(json!(left + right));
+        head.entry("action_arm_dim")
+            .or_insert(json!(left.saturating_add(right)));
     }
     if !head.contains_key("pretrained_action_dim") || !head.contains_key("action_dim") {
         // What the file calls action_dim is then the width of the model that the fork started from.
-        head.insert("action_dim".to_owned(), json!(widths.iter().sum::<usize>()));
+        head.insert("action_dim".to_owned(), json!(together));
     }
 }
 
@@ -610,8 +586,9 @@ fn from_tensors(
     let mut heads = |what: &str, width: usize, head_dim: usize| {
         if !width.is_multiple_of(head_dim) {
             problems.push(format!(
-                "{what} is {width}: not a multiple of {head_dim}, the width of an attention head in GR00T {version}; lerobot's \
-                 config.json does not say how wide they are here"
+                "{what} is {width}: not a multiple of {head_dim}, the width of an attention head in GR00T {}; lerobot's config.json \
+                 does not say how wide they are here",
+                show(version)
             ));
         }
         width / head_dim
@@ -686,8 +663,9 @@ fn from_tensors(
         return Ok(head);
     }
     Err(Error::Checkpoint(format!(
-        "source: config.json (lerobot's, GR00T {version}) and tensors do not make a head; the head's own config can be given as \
+        "source: config.json (lerobot's, GR00T {}) and tensors do not make a head; the head's own config can be given as \
          `config`:\n  {}",
+        show(version),
         problems.join("\n  ")
     )))
 }
