@@ -361,8 +361,8 @@ class ActionHead:
                 at a step at which they do not always run is an error. All evaluations of a step are that
                 step.
             previous_chunk: The chunk before, ``(batch, rows, action_dim)`` as it left the head (or
-                ``encoder_action_dim`` wide), of ``chunking.horizon`` to ``action_horizon`` rows. All samples of an
-                observation begin with the same.
+                ``encoder_action_dim`` wide), of ``chunking.horizon`` to ``action_horizon`` rows. All samples
+                of an observation begin with the same.
             chunking: How much of it is taken over; see :class:`saccade.Chunking`. Both or neither.
             out: Where the result goes: writable float32, C-contiguous, of the result's shape.
 
