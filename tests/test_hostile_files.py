@@ -8,6 +8,7 @@ import contextlib
 import faulthandler
 import functools
 import json
+import math
 import os
 import resource
 import shutil
@@ -23,7 +24,7 @@ import pytest
 from released import load_released
 
 import saccade
-from saccade import cli
+from saccade import _saccade, cli
 from saccade.checkpoints import convert, describe, quantize, read_tensors, resize
 from saccade.errors import CheckpointError, SaccadeError
 
@@ -43,6 +44,7 @@ WRITERS: dict[str, Callable[..., object]] = {
 }
 # Commands with the path of a checkpoint and that of a new one.
 COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
+    "inspect": lambda source, out: ["inspect", str(source)],
     "quantize": lambda source, out: ["quantize", str(source), "--out", str(out)],
     "convert": lambda source, out: ["convert", str(source), "--out", str(out), "--embodiment-ids", "1"],
     "resize": lambda source, out: ["resize", str(source), "--out", str(out), "--num-future-tokens", "6"],
@@ -573,6 +575,34 @@ def test_a_killed_writer_leaves_no_checkpoint(entry: str, good: Path, tmp_path: 
     assert left.startswith(".out.")
     WRITERS[entry](good, tmp_path / "out")
     saccade.ActionHead.load(tmp_path / "out")
+
+
+@pytest.mark.parametrize("dtype", ["F32", "BF16", "F16"])
+@pytest.mark.parametrize("entry", ["load", "read_tensors"])
+def test_more_than_there_is_memory_for(entry: str, dtype: str, tmp_path: Path) -> None:
+    """A checkpoint without a flaw, of holes: 8 GB of weights for a process that may have 6."""
+    head = TINY.config["diffusion_model_cfg"] | {"num_attention_heads": 1024}
+    wide = {"input_embedding_dim": 8192, "diffusion_model_cfg": head | {"num_layers": 8}}
+    text = json.dumps(TINY.config | wide)
+    (tmp_path / "config.json").write_text(text)
+    header, end = {}, 0
+    for name, shape in _saccade.tensor_shapes(text):
+        begin, end = end, end + math.prod(shape) * (4 if dtype == "F32" else 2)
+        header["action_head." + name] = tensor(begin, end, list(shape), dtype)
+    weights(safetensors(header))(tmp_path)
+    file = tmp_path / "model.safetensors"
+    os.truncate(file, file.stat().st_size + end)
+    code = (
+        "import resource, sys, saccade; from saccade.checkpoints import read_tensors; from pathlib import Path\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2)\n"
+        "calls = {'load': saccade.ActionHead.load, 'read_tensors': read_tensors}\n"
+        "try: calls[sys.argv[1]](Path('.'))\n"
+        "except saccade.CheckpointError as error: print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, entry], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "GB of memory, more than there is" in done.stdout
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="changing to a user who may not read needs root")

@@ -647,7 +647,7 @@ fn read_tensors<'py>(py: Python<'py>, source: PathBuf, prefix: &str) -> PyResult
     let checkpoint = Checkpoint::open(&source).map_err(raise)?;
     let dict = PyDict::new(py);
     for name in checkpoint.names().filter(|name| name.starts_with(prefix)) {
-        let data = checkpoint.read(name).map_err(raise)?.into_f32();
+        let data = checkpoint.read_f32(name).map_err(raise)?;
         let shape = checkpoint
             .shape(name)
             .expect("the name is one of the checkpoint's");

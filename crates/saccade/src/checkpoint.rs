@@ -243,6 +243,16 @@ impl Checkpoint {
         self.read_into(name, None, None)
     }
 
+    /// Reads tensor `name` whole as float32, as [`Elements::into_f32`] has it.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::read`], and for more than there is memory for.
+    pub fn read_f32(&self, name: &str) -> Result<Vec<f32>> {
+        let elements = self.entry(name)?.info.shape.iter().product::<usize>();
+        grant(elements.saturating_mul(size_of::<f32>()))?;
+        Ok(self.read(name)?.into_f32())
+    }
+
     /// Reads the slices `wanted` of the first axis of tensor `name`.
     ///
     /// # Errors
@@ -519,6 +529,20 @@ pub(crate) fn read_text(what: &'static str, path: &Path) -> Result<String> {
         Ok(text)
     };
     read().map_err(|error| Error::from_io(what, path, &error))
+}
+
+/// That the system has so many bytes at all, which it says before they are used: an allocation that fails later ends the process, and a file
+/// with holes is as long as it likes.
+///
+/// # Errors
+/// [`Error::Checkpoint`] with the number of bytes.
+pub(crate) fn grant(bytes: usize) -> Result<()> {
+    Vec::<u8>::new().try_reserve_exact(bytes).map_err(|_| {
+        let gigabytes = bytes as f64 / 1e9;
+        Error::Checkpoint(format!(
+            "source: it takes {gigabytes:.1} GB of memory, more than there is"
+        ))
+    })
 }
 
 /// Puts the bytes of each value in this machine's order; on most machines there is nothing to do, and no code.

@@ -8,6 +8,7 @@ use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
+use crate::checkpoint::grant;
 use crate::chunking::{Chunking, Seam};
 use crate::config::{HeadConfig, Reads};
 use crate::context::{Context, EncodeBuffers, Seen, VlEncoder, removed_keys};
@@ -193,19 +194,21 @@ impl ActionHead {
     /// other (all that is wrong is listed), [`Error::Input`] for options out of range.
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = engine(options.precision, options.num_threads)?;
+        let published = Published::open(source, options.config.as_deref())?;
+        let embodiment_ids = chosen_embodiments(
+            options.embodiment_ids.as_deref(),
+            published.checkpoint.kept_embodiments()?.as_deref(),
+            published.config.num_embodiments,
+        )?;
+        published.check()?;
+        grant(published.nbytes(options.precision, embodiment_ids.len())?)?;
         let Published {
             checkpoint,
             prefix,
             config,
             ..
-        } = Published::open(source, options.config.as_deref())?;
-        let embodiment_ids = chosen_embodiments(
-            options.embodiment_ids.as_deref(),
-            checkpoint.kept_embodiments()?.as_deref(),
-            config.num_embodiments,
-        )?;
+        } = published;
         let names = HeadNames::new(&config);
-        checkpoint.check(prefix, &config)?;
         let wanted = names.reading_order(&config, &embodiment_ids);
         HeadTensors::read_ahead(&checkpoint, prefix, wanted, |tensors| {
             Self::build(tensors, engine, config, &names, embodiment_ids)
