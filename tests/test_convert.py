@@ -181,7 +181,7 @@ def test_embodiments_keep_their_numbers(source: Path, tmp_path: Path) -> None:
         convert(tmp_path / "one", tmp_path / "none", embodiment_ids=[3])
     with pytest.raises(InputError, match="embodiment_ids: expected ids from 0 to 31, got 32"):
         convert(source, tmp_path / "more", embodiment_ids=[32])
-    with pytest.raises(InputError, match="embodiment_ids"):
+    with pytest.raises(InputError, match="embodiment_ids: expected at least one"):
         convert(source, tmp_path / "more", embodiment_ids=[])
 
 

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import saccade
-from saccade.checkpoints import describe
+from saccade.checkpoints import convert, describe, quantize
 from saccade.errors import CheckpointError
 
 Json = dict[str, Any]
@@ -206,7 +206,25 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Json], object], Callable[[Json], 
         "nvidia",
         lambda config: config.update(model_type="gr00t_n2"),
         lambda tensors: None,
-        ['the model is "gr00t_n2", expected GR00T N1, N1.5, N1.6 or N1.7'],
+        ['the model is "gr00t_n2", expected one of gr00t_n1, gr00t_n1_5, Gr00tN1d6, Gr00tN1d7'],
+    ),
+    "another model": (
+        "nvidia",
+        lambda config: config.update(model_type="bert"),
+        lambda tensors: None,
+        ['model_type is "bert", expected one of gr00t_n1, gr00t_n1_5'],
+    ),
+    "two models": (
+        "nvidia",
+        lambda config: config["action_head_cfg"].update(model_type="Gr00tN1d7"),
+        lambda tensors: None,
+        ['model_type is "gr00t_n1_5": N1.5', r'action_head_cfg\.model_type is "Gr00tN1d7": N1\.7'],
+    ),
+    "saccade's own key in the wrong place": (
+        "nvidia",
+        lambda config: config.update(saccade={"future_key_bias": [0.0] * 32}),
+        lambda tensors: None,
+        ["saccade stands beside action_head_cfg, expected inside"],
     ),
     "another policy of lerobot's": (
         "lerobot",
@@ -235,6 +253,23 @@ def test_contradictions_are_one_error_with_all_that_was_found(tmp_path: Path, ca
         saccade.ActionHead.load(folder, embodiment_ids=[0])
     for message in messages:
         assert re.search(message, str(caught.value)), caught.value
+
+
+def test_contradictions_of_a_config_alone() -> None:
+    config = {"model_type": "gr00t_n1_5", "action_head_cfg": layouts.n15_head()}
+    saccade.HeadConfig.from_dict(config)
+    with pytest.raises(CheckpointError, match=r"action_head_cfg\.model_type is \"Gr00tN1d7\""):
+        saccade.HeadConfig.from_dict(
+            config | {"action_head_cfg": layouts.n15_head() | {"model_type": "Gr00tN1d7"}}
+        )
+    with pytest.raises(CheckpointError, match="saccade stands beside action_head_cfg"):
+        saccade.HeadConfig.from_dict(config | {"saccade": {"future_key_bias": [0.0] * 32}})
+
+
+def test_lerobots_n17_is_known_without_the_name_of_its_base(tmp_path: Path) -> None:
+    folder = layouts.write(tmp_path / "policy", "lerobot-n17")
+    (folder / "config.json").write_text('{"type": "groot", "chunk_size": 40}')
+    assert saccade.ActionHead.load(folder, embodiment_ids=[0]).config.version == "n1.7"
 
 
 def test_heads_whose_width_lerobots_config_would_have_to_tell(tmp_path: Path) -> None:
@@ -277,6 +312,16 @@ def test_a_config_that_is_a_directory_or_missing(tmp_path: Path) -> None:
     (folder / "config.json").mkdir()
     with pytest.raises(CheckpointError, match="config"):
         saccade.ActionHead.load(folder)
+
+
+def test_saccades_own_file_goes_with_a_single_file(tmp_path: Path) -> None:
+    folder = layouts.write(tmp_path / "policy", "lerobot")
+    (folder / "saccade.json").write_text(json.dumps({"future_key_bias": [0.5] * 32}))
+    for rewrite in (convert, quantize):
+        out = tmp_path / rewrite.__name__
+        rewrite(folder / "model.safetensors", out)
+        found = saccade.ActionHead.load(out, embodiment_ids=[0]).config
+        assert found.future_key_bias == (0.5,) * 32
 
 
 def test_saccades_own_file_beside_lerobots_config(tmp_path: Path) -> None:

@@ -189,6 +189,9 @@ def test_arguments_that_do_not_fit() -> None:
         policy.head(given, draw(2, 7), 31)
     with pytest.raises(saccade.InputError, match="out: expected none"):
         policy(given, draw(2, 7), out=np.empty((2, 16, 8), np.float32))
+    chunk: Any = {"overlap": 2, "frozen": 1}
+    with pytest.raises(saccade.InputError, match=r"chunking: expected a saccade\.Chunking, got dict"):
+        policy(given, draw(2, 7), previous_chunk=policy(given, draw(2, 7)), chunking=chunk)
 
 
 def test_it_says_what_it_is() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import sys
-from collections.abc import Collection, Mapping, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -140,6 +140,18 @@ def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
         raise InputError(f"{name}: expected integers that fit in 64 bits, got {array.max()}")
     # ascontiguousarray would give a scalar an axis.
     return np.require(array, np.int64, ["C", "A"])
+
+
+def optional_integers(name: str, values: Sequence[int] | None) -> list[int] | None:
+    """``values`` as a list of integers, None as it is.
+
+    Raises:
+        InputError: as :func:`int64`.
+    """
+    if values is None:
+        return None
+    # An empty list is one of floats to NumPy.
+    return int64(name, values).reshape(-1).tolist() if len(values) else []
 
 
 def integer(name: str, value: int, least: int = 1) -> int:

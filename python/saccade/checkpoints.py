@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from saccade import _saccade
-from saccade._arrays import Float32Array, int64, integer
+from saccade._arrays import Float32Array, integer, optional_integers
 from saccade.config import HeadConfig, to_json
 from saccade.errors import CheckpointError, InputError
 from saccade.hub import resolve
@@ -190,7 +190,7 @@ def convert(
     rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
     if max_shard_bytes is not None:
         rewrite["max_shard_bytes"] = integer("max_shard_bytes", max_shard_bytes)
-    ids = None if embodiment_ids is None else int64("embodiment_ids", embodiment_ids).reshape(-1).tolist()
+    ids = optional_integers("embodiment_ids", embodiment_ids)
     found = _paths(_saccade.convert(rewrite, ids, dtype))
     kept = found["embodiment_ids"]
     return ConvertReport(**{**found, "embodiment_ids": None if kept is None else tuple(kept)})

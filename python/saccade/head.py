@@ -24,6 +24,7 @@ from saccade._arrays import (
     integer,
     is_torch,
     like_features,
+    optional_integers,
     result,
 )
 from saccade.attention import check_precision
@@ -170,7 +171,8 @@ class ActionHead:
         check_precision(precision)
         path = os.fspath(resolve(source))
         text = None if config is None else to_json(config)
-        ids, threads = _embodiment_ids(embodiment_ids), _optional_integer("num_threads", num_threads)
+        ids = optional_integers("embodiment_ids", embodiment_ids)
+        threads = _optional_integer("num_threads", num_threads)
         head = _saccade.ActionHead.load(path, text, ids, precision, threads)
         options = {"config": text, "embodiment_ids": ids, "precision": precision, "num_threads": threads}
         return cls(head, str(Path(path).absolute()), options)
@@ -211,7 +213,8 @@ class ActionHead:
         """
         check_precision(precision)
         text = to_json(config)
-        ids, threads = _embodiment_ids(embodiment_ids), _optional_integer("num_threads", num_threads)
+        ids = optional_integers("embodiment_ids", embodiment_ids)
+        threads = _optional_integer("num_threads", num_threads)
         return cls(_saccade.ActionHead.from_tensors(as_stored(tensors), text, ids, precision, threads))
 
     @property
@@ -589,13 +592,6 @@ def _load(source: str, options: dict[str, Any]) -> ActionHead:
     """Unpickles a head: the weights are loaded anew."""
     config, rest = options["config"], {name: value for name, value in options.items() if name != "config"}
     return ActionHead.load(source, config=None if config is None else json.loads(config), **rest)
-
-
-def _embodiment_ids(given: Sequence[int] | None) -> list[int] | None:
-    if given is None:
-        return None
-    # NumPy takes an empty list for one of floats.
-    return int64("embodiment_ids", given).reshape(-1).tolist() if np.size(given) else []
 
 
 def _held(context: Context) -> _saccade.Context:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from saccade._arrays import Array, ArrayLike, integer
+from saccade.chunking import Chunking
 from saccade.errors import InputError
 from saccade.normalizer import Normalizer, padded
 
 if TYPE_CHECKING:
-    from saccade.chunking import Chunking
     from saccade.head import ActionHead, Context
 
 
@@ -133,9 +133,9 @@ class Policy:
             previous = np.asarray(self.normalizer.unactions(previous_chunk, state))
             options["previous_chunk"] = padded(previous, self.head.config.encoder_action_dim)
         horizon = self.normalizer.action_horizon
+        if isinstance(chunking, Chunking) and chunking.horizon is None and horizon is not None:
+            chunking = replace(chunking, horizon=min(horizon, self.head.config.action_horizon))
         if chunking is not None:
-            if chunking.horizon is None and horizon is not None:
-                chunking = replace(chunking, horizon=min(horizon, self.head.config.action_horizon))
             options["chunking"] = chunking
         normalised = self.head.sample(context, self.normalizer.state(state), self.embodiment_id, **options)
         return self.normalizer.actions(normalised, state)

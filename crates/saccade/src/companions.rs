@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use crate::checkpoint::open_regular;
 use crate::error::{Error, Result};
-use crate::writer::failed;
+use crate::writer::{OWN_CONFIG, failed};
 
 /// What ends the name of a file that belongs to a checkpoint.
 const ENDINGS: [&str; 10] = [
@@ -45,17 +45,24 @@ pub(crate) struct Companions {
 }
 
 impl Companions {
-    /// Those of `source`, a checkpoint with the files `weights`. A source that is a single file has none: what its directory holds may
-    /// belong to anything.
+    /// Those of `source`, a checkpoint with the files `weights`. Of what lies beside a source that is a single file only saccade's own part of
+    /// the config counts: the rest may belong to anything.
     pub(crate) fn of<'a>(source: &Path, weights: impl Iterator<Item = &'a Path>) -> Result<Self> {
+        let is_directory = source.is_dir();
+        let root = match is_directory {
+            true => source,
+            false => source.parent().unwrap_or(Path::new("")),
+        };
         let mut companions = Self {
-            root: source.to_owned(),
+            root: root.to_owned(),
             carried: BTreeSet::new(),
             left: Vec::new(),
         };
-        if source.is_dir() {
+        if is_directory {
             let weights: BTreeSet<&Path> = weights.collect();
             companions.add_folder(Path::new(""), &weights)?;
+        } else if root.join(OWN_CONFIG).is_file() {
+            companions.carried.insert(PathBuf::from(OWN_CONFIG));
         }
         Ok(companions)
     }

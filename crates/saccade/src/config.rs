@@ -235,8 +235,15 @@ impl Reader {
     /// What `model_type` says, or else what the keys of the head tell.
     fn version(&mut self, top: &Object, head: &Object) -> Version {
         // A head's own config that a program wrote whole has an empty one.
-        let mut given = [top, head].into_iter().filter_map(|map| map.get("model_type"));
-        if let Some(given) = given.find(|given| !given.is_null() && **given != "") {
+        let given = [top, head].into_iter().filter_map(|map| map.get("model_type"));
+        let mut given = given.filter(|given| !given.is_null() && **given != "");
+        if let Some(first) = given.next() {
+            if let Some(other) = given.find(|other| *other != first) {
+                self.problems.push(format!(
+                    "model_type is {first}, but action_head_cfg.model_type is {other}"
+                ));
+            }
+            let given = first;
             let known = Version::ALL
                 .into_iter()
                 .find(|version| *given == version.model_type());

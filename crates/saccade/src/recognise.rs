@@ -1,8 +1,8 @@
 //! What a checkpoint is: its layout, the version of the architecture, and the head's whole config, from `config.json` and from the tensors.
 //!
-//! Every command and [`ActionHead::load`](crate::ActionHead::load) come in here. What `config.json` leaves out is taken from the shapes of
-//! the tensors; lerobot's holds no size of the head at all, and what no shape tells (how wide an attention head is, how many steps) is
-//! then what the published checkpoints of that version have. Where config and tensors disagree, one error says all that was found.
+//! Every command and [`ActionHead::load`](crate::ActionHead::load) come in here. Sizes that published configs leave out are taken from the
+//! shapes of the tensors; lerobot's holds no size of the head at all, and what no shape tells (how wide an attention head is, how many steps)
+//! is then what the published checkpoints of that version have. Where config and tensors disagree, one error says all that was found.
 
 use std::fmt;
 use std::path::Path;
@@ -176,6 +176,9 @@ impl Config {
             Err(error) => return bad(format!("not valid JSON: {error}")),
         };
         let head = match (top.get("action_head_cfg"), top.get("type")) {
+            (Some(Value::Object(_)), _) if top.contains_key("saccade") => {
+                return bad("saccade stands beside action_head_cfg, expected inside".to_owned());
+            }
             (Some(Value::Object(head)), _) => Some(head.clone()),
             (Some(_), _) => return bad("action_head_cfg: expected an object".to_owned()),
             (None, Some(Value::String(policy))) if policy == LEROBOT_POLICY => None,
@@ -299,6 +302,8 @@ fn usual_version(config: &Config, tensors: &HeadShapes<'_>) -> Version {
     ) {
         (true, true) => N17,
         (true, false) => N16,
+        // lerobot's: every N1.5 that it can read has future tokens, which say so.
+        (false, _) if config.head.is_none() => N17,
         (false, _) if config.get("use_vlln").is_none() && !tensors.any("vlln.") => N1,
         (false, _) => N15,
     }
@@ -307,10 +312,17 @@ fn usual_version(config: &Config, tensors: &HeadShapes<'_>) -> Version {
 fn evidence(config: &Config, tensors: &HeadShapes<'_>) -> Result<Vec<Evidence>> {
     let mut found = Vec::new();
     let mut add = |versions, what| found.push(Evidence { versions, what });
-    if let Some(model_type) = config.get("model_type")
-        && let Some(versions) = versions_of_name(model_type)?
-    {
-        add(versions, format!("model_type is {model_type}"));
+    let own = config.head.as_ref().filter(|head| **head != config.top);
+    for (path, map) in [("", Some(&config.top)), ("action_head_cfg.", own)] {
+        let given = map.and_then(|map| map.get("model_type"));
+        // A head's own config that a program wrote whole has an empty one.
+        let Some(model_type) = given.filter(|given| !given.is_null() && **given != "") else {
+            continue;
+        };
+        match versions_of_name(model_type)? {
+            Some(versions) => add(versions, format!("{path}model_type is {model_type}")),
+            None => return Err(unknown_model(&format!("{path}model_type is {model_type}"))),
+        }
     }
     if let Some(Value::Array(classes)) = config.top.get("architectures") {
         for class in classes {
@@ -380,11 +392,14 @@ fn versions_of_name(name: &Value) -> Result<Option<&'static [Version]>> {
         "gr00tn15" | "gr00tn1d5" => Ok(Some(&[N15])),
         "gr00tn16" | "gr00tn1d6" => Ok(Some(&[N16])),
         "gr00tn17" | "gr00tn1d7" => Ok(Some(&[N17])),
-        _ if plain.starts_with("gr00t") => Err(Error::Checkpoint(format!(
-            "config: the model is {name}, expected GR00T N1, N1.5, N1.6 or N1.7"
-        ))),
+        _ if plain.starts_with("gr00t") => Err(unknown_model(&format!("the model is {name}"))),
         _ => Ok(None),
     }
+}
+
+fn unknown_model(what: &str) -> Error {
+    let names = Version::ALL.map(Version::model_type).join(", ");
+    Error::Checkpoint(format!("config: {what}, expected one of {names}"))
 }
 
 /// As lerobot reads the version from the name of the model that a policy was made from.
