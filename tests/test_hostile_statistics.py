@@ -83,10 +83,13 @@ def refusal(call: Callable[[], object]) -> str | None:
 
 
 def use(normalizer: saccade.Normalizer) -> None:
-    state = np.zeros(normalizer.state_width, np.float32)
+    """Both directions: of the widths that it says, and finite."""
+    state = np.ones(normalizer.state_width, np.float32)
     assert np.asarray(normalizer.state(state)).shape == (normalizer.state_dim,)
-    actions = np.zeros((4, normalizer.action_dim), np.float32)
-    assert np.asarray(normalizer.actions(actions, state)).shape[-1] == normalizer.action_width
+    actions = np.ones((4, normalizer.action_dim), np.float32)
+    robot = np.asarray(normalizer.actions(actions, state))
+    assert robot.shape[-1] == normalizer.action_width
+    assert np.isfinite(robot).all()
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -128,6 +131,20 @@ def test_one_value_is_something_else(
         read(layout, folder)
     finally:
         (folder / name).write_text(original)
+
+
+@pytest.mark.parametrize("key", ["max_state_dim", "action_dim"])
+@pytest.mark.parametrize("width", [2**20 + 1, 2**64, 10**400])
+def test_a_head_is_not_as_wide_as_a_file_likes(
+    key: str, width: int, checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "nvidia"
+    shutil.copytree(checkpoints["nvidia"] / "experiment_cfg", folder / "experiment_cfg")
+    config = json.loads((checkpoints["nvidia"] / "config.json").read_text())
+    config["action_head_cfg"][key] = width
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(saccade.CheckpointError, match=r"_dim is .*, expected at most 1048576"):
+        saccade.Normalizer.load(folder, "gr1")
 
 
 def terabytes(path: Path) -> None:

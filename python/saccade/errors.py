@@ -6,6 +6,9 @@ class SaccadeError(Exception):
     there.
     """
 
+    def __str__(self) -> str:
+        return printable(super().__str__())
+
 
 class ShapeError(SaccadeError, ValueError):
     """An array has the wrong number of axes, or the wrong size on one of them."""
@@ -23,3 +26,17 @@ class CheckpointError(SaccadeError, ValueError):
     """A checkpoint or its config is broken, incomplete, or of another kind; the message lists all that is
     wrong.
     """
+
+
+def printable(message: str) -> str:
+    """A message that does nothing to a terminal: what stands in files, and so in names and values, may be
+    anything. Lines stay lines.
+
+    Example:
+        >>> print(printable("a\\x1b[2Jb"))
+        a\\x1b[2Jb
+    """
+    return "".join(
+        character if character.isprintable() or character == "\n" else ascii(character)[1:-1]
+        for character in message
+    )

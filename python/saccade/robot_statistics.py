@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._arrays import Float32Array, integer
-from saccade.errors import CheckpointError, InputError, ShapeError
+from saccade.errors import CheckpointError, InputError, ShapeError, printable
 from saccade.hub import resolve
 
 #: How the numbers of a group may be normalised.
@@ -42,6 +42,11 @@ FILES = (
 )
 #: No robot's statistics are larger, and what a name points to is read whole.
 MOST_BYTES = 1 << 26
+#: No head is wider: config.rs has the same bound.
+MOST_WIDTH = 1 << 20
+
+#: What is computed from statistics of more could be beyond float32, and an action infinite.
+MOST = 1e30
 
 Statistics: TypeAlias = "npt.NDArray[np.floating[Any]]"
 
@@ -239,11 +244,12 @@ class Builder:
     def _row(self, key: str, name: str, values: Any) -> Statistics | None:
         """One statistic, or None with a problem noted."""
         try:
-            row = np.atleast_1d(np.asarray(values, dtype=self.dtype))
+            with np.errstate(over="ignore"):  # infinity is told below
+                row = np.atleast_1d(np.asarray(values, dtype=self.dtype))
         except (TypeError, ValueError, OverflowError):
             row = np.empty(0)
-        if row.ndim > 2 or not row.size or not np.isfinite(row).all():
-            self.problems.append(f"{key}: {name} is not a row of finite numbers")
+        if row.ndim > 2 or not row.size or not (np.abs(row) <= MOST).all():  # NaN is not, either
+            self.problems.append(f"{key}: {name} is not a row of finite numbers up to {MOST:g}")
             return None
         return row
 
@@ -298,6 +304,8 @@ def _finished(
         if given is not None and said is not None and given != said:
             raise InputError(f"{name}: given {given}, but {where} is for a head of {said}")
         dims.append(given or said or width)
+        if dims[-1] > MOST_WIDTH:
+            raise CheckpointError(f"{where}: {name} is {dims[-1]}, expected at most {MOST_WIDTH}")
     if widths[0] > dims[0] and not cuts_state:
         raise CheckpointError(
             f"{where}: the robot's state has {widths[0]} numbers, the head's only {dims[0]} (state_dim)"
@@ -682,7 +690,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(_bytes(path))
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
+        raise FileNotFoundError(printable(f"{path}: no such file")) from None
     except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(values, dict):
@@ -715,7 +723,7 @@ def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
                 raise ValueError(f"{name}: data_offsets {first} to {last} do not hold {shape} of {kind}")
             tensors[name] = np.frombuffer(data, kind).reshape(shape)
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
+        raise FileNotFoundError(printable(f"{path}: no such file")) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: no safetensors file of statistics: {error}") from None
     return tensors
