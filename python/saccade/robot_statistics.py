@@ -379,10 +379,11 @@ def _from_flat(
     state, action = builder.check(groups)
     # Where nothing says whose statistics these are, the caller does.
     tag, asked = None, options.embodiment
-    if embodiment_id is None and isinstance(asked, str):
-        tag, embodiment_id = asked, EMBODIMENTS.get(asked)
-    elif embodiment_id is None and asked is not None:
-        embodiment_id = integer("embodiment", asked, least=0)
+    if embodiment_id is None and asked is not None:
+        if isinstance(asked, str):
+            tag, embodiment_id = asked, EMBODIMENTS.get(asked)
+        else:
+            embodiment_id = integer("embodiment", asked, least=0)
     options.agrees(tag, embodiment_id, where)
     return _finished(where, options, tag, embodiment_id, (state,), (action,), dims)
 
