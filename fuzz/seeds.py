@@ -68,6 +68,7 @@ def headers() -> dict[str, bytes]:
         seeds[f"{path.stem}_few"] = safetensors(dict(list(small.items())[:3]))
     four = struct.pack("<4f", 1, -2, 0.5, 0)
     seeds["metadata"] = safetensors({"a": ("F32", [2, 2], four)}, {"format": "pt"})
+    seeds["kept"] = safetensors({"a": ("F32", [2, 2], four)}, {"saccade_embodiment_ids": "3,31"})
     seeds["nothing"] = safetensors({})
     seeds["empty_and_scalar"] = safetensors({"a": ("F32", [0, 5], b""), "b": ("BF16", [], b"\0\x3f")})
     seeds["halves"] = safetensors(

@@ -32,7 +32,7 @@ pub mod writer;
 mod head {
     use crate::error::Result;
 
-    pub(crate) fn chosen_embodiments(_: Option<&[i64]>, _: usize) -> Result<Vec<usize>> {
+    pub(crate) fn chosen_embodiments(_: Option<&[i64]>, _: Option<&[i64]>, _: usize) -> Result<Vec<usize>> {
         unreachable!("no target converts")
     }
 }
@@ -93,6 +93,9 @@ pub fn use_checkpoint(path: &Path) {
             Ok(()) => assert_eq!(nbytes, checkpoint.nbytes(name).expect("it was read")),
             Err(error) => check_message(&error),
         }
+    }
+    if let Err(error) = checkpoint.kept_embodiments() {
+        check_message(&error);
     }
     match checkpoint.head_prefix() {
         Ok(prefix) => {
