@@ -254,6 +254,12 @@ def through_numpy(head: Any) -> None:
     weight.detach().numpy()[...] *= 0.5
 
 
+def half_of_a_matrix(head: Any) -> None:
+    for parameter in head.model.parameters():
+        if parameter.ndim == 2:
+            parameter.data[:, : parameter.shape[1] // 2].mul_(-1)
+
+
 def replace_parameter(head: Any) -> None:
     linear = head.model.proj_out_2
     linear.weight = nn.Parameter(linear.weight.detach() * 0.5)
@@ -270,7 +276,17 @@ def to_bfloat16(head: Any) -> None:
 
 CHANGES = {
     change.__name__: change
-    for change in (step, load, assign, average, through_numpy, replace_parameter, replace_module, to_bfloat16)
+    for change in (
+        step,
+        load,
+        assign,
+        average,
+        through_numpy,
+        half_of_a_matrix,
+        replace_parameter,
+        replace_module,
+        to_bfloat16,
+    )
 }
 
 
@@ -358,6 +374,18 @@ def check_refusals(case: Case) -> None:
     block.forward = lambda *arguments: None
     refused("forward of model.transformer_blocks.0")
     del block.forward
+
+    handle = accelerate(head)
+    block.forward = lambda *arguments: None
+    with pytest.raises(
+        saccade.InputError, match=r"forward of model\.transformer_blocks\.0 has been replaced"
+    ):
+        call(case, inputs(case, batch=1))
+    del block.forward
+    handle.restore()
+
+    with pytest.raises(saccade.InputError, match=r"compiled by torch\.compile"):
+        accelerate(torch.compile(head))
 
     compiled = torch.compile(block)
     head.model.transformer_blocks[0] = compiled

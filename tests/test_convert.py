@@ -28,7 +28,7 @@ from saccade.checkpoints import action_changes, convert, quantize, resize
 from saccade.errors import CheckpointError, InputError
 from saccade.reference.random_weights import random_inputs
 
-PER_EMBODIMENT = re.compile(r".*(state_encoder|action_encoder|action_decoder)\..*\.[Wb]")
+PER_EMBODIMENT = re.compile(r".*(state_encoder|action_encoder|action_(\w+_)?decoder)\..*\.[Wb]")
 
 
 @pytest.fixture
@@ -143,6 +143,22 @@ def test_infinity_and_nan_stay(source: Path, tmp_path: Path) -> None:
     save_file(tensors, source / "model.safetensors")
     convert(source, tmp_path / "out", dtype="float16")
     assert str(tensors_of(tmp_path / "out")["backbone.x"].tolist()) == "[inf, -inf, nan, 1.0]"
+
+
+@pytest.mark.parametrize("layout", layouts.LAYOUTS)
+def test_fewer_embodiments_in_another_type(layout: str, tmp_path: Path) -> None:
+    source = layouts.write(tmp_path / "source", layout)
+    for dtype in ("bfloat16", "float32"):
+        report = convert(
+            source, tmp_path / dtype, embodiment_ids=[2, 10], dtype=dtype, max_shard_bytes=2_000_000
+        )
+        assert report.embodiment_ids == (2, 10)
+        converted = tensors_of(tmp_path / dtype)
+        for name, tensor in tensors_of(source).items():
+            expected = tensor.to(getattr(torch, dtype))
+            if PER_EMBODIMENT.fullmatch(name):
+                expected[[index for index in range(32) if index not in (2, 10)]] = 0
+            assert torch.equal(converted[name], expected), name
 
 
 def test_embodiments_keep_their_numbers(source: Path, tmp_path: Path) -> None:

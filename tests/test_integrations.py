@@ -235,3 +235,18 @@ def test_the_page_is_what_the_command_writes() -> None:
     for release in compat.RELEASES:
         assert f"lerobot {release.lerobot} |" in page
         assert f"lerobot=={release.lerobot}\n" in release.packages.read_text() or release.on_top_of == ""
+
+
+@pytest.mark.parametrize("untrained", ["first", "all"])
+def test_embodiments_that_were_never_trained(untrained: str) -> None:
+    """They hardly move the noise, and rounding it to bfloat16 is then most of the difference."""
+    case = n15()
+    chosen = slice(0, 1) if untrained == "first" else slice(None)
+    with torch.no_grad():
+        for name, parameter in case.head.named_parameters():
+            if name.endswith(".W"):
+                parameter[chosen] = 0.02 * torch.randn(parameter[chosen].shape)
+            elif name.endswith(".b"):
+                parameter[chosen] = 0.0
+    accelerate(case.head.to(torch.bfloat16)).restore()
+    accelerate(case.head.float(), precision="int8").restore()

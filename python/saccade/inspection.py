@@ -492,7 +492,9 @@ def odd_of_tokens(report: Mapping[str, Any]) -> list[str]:
     """What is unusual about the future tokens."""
     tokens = report["future_tokens"]
     if tokens is None:
-        return ["a head of N1.5 without future tokens"] if report["version"] == "n1.5" else []
+        # Tokens that are not finite are told of as such.
+        has_none = report["version"] == "n1.5" and report["config"]["num_future_tokens"] == 0
+        return ["a head of N1.5 without future tokens"] if has_none else []
     groups = [", ".join(map(str, group)) for group in tokens["identical"]]
     odd = [f"future tokens {group} are identical" for group in groups[:SHOWN]]
     if len(groups) > SHOWN:

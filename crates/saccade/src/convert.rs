@@ -215,7 +215,7 @@ pub fn convert(
                     })?;
             } else {
                 let nbytes = change.map_or(nbytes, |(from, to)| {
-                    nbytes / from.dtype().bitsize() as u64 * to.dtype().bitsize() as u64
+                    nbytes * to.dtype().bitsize() as u64 / from.dtype().bitsize() as u64
                 });
                 writer.zeros(name, nbytes);
                 zeroed_bytes += nbytes;

@@ -76,6 +76,10 @@ def find(policy: object) -> nn.Module:
             f"policy: expected a torch module, or an object that holds one as {', '.join(HOLDERS)}; got "
             f"{type(policy).__name__}"
         )
+    if hasattr(held, "_orig_mod"):
+        raise InputError(
+            f"policy: {type(held).__name__} is compiled by torch.compile: accelerate what it was made from"
+        )
     found: dict[str, nn.Module] = {
         name or "itself": module for name, module in held.named_modules() if is_head(module)
     }
@@ -138,8 +142,6 @@ def in_structure(module: nn.Module, stand_in: object) -> Iterator[str]:
             yield f"{where} is compiled by torch.jit: accelerate it before"
         elif hasattr(part, "_orig_mod"):
             yield f"{where} is compiled by torch.compile: accelerate what it was made from"
-        elif "forward" in vars(part):
-            yield f"the forward of {where} has been replaced by {describe(part.forward)}"
     config = getattr(module, "config", None)
     horizons = [getattr(config, "action_horizon", None), getattr(module, "action_horizon", None)]
     if None in horizons or horizons[0] != horizons[1]:
@@ -174,6 +176,12 @@ def in_use(parts: list[tuple[str, nn.Module]]) -> Iterator[str]:
 
     `parts` are a head and its modules, by name.
     """
+    replaced = [name or "the head" for name, part in parts if "forward" in vars(part)]
+    if replaced:
+        yield (
+            f"the forward of {shortened(replaced)} has been replaced: put the class's own back, or restore() "
+            "the original"
+        )
     training = [name or "the head" for name, part in parts if part.training]
     if training:
         yield (

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-#: Values of a tensor that are compared at each call, spread over its first axis. Each is a read from memory.
+#: Values of a tensor that are compared at each call, spread over its axes. Each is a read from memory.
 SAMPLES = 8
 
 #: A first axis of at most this size is sampled whole: that of category-specific layers is embodiments.
@@ -18,13 +18,15 @@ WHOLE = 64
 class Watch:
     """What a module's weights are when this is made, to be compared later.
 
-    Seen are: submodules and parameters that were replaced, memory that was (`.to()`, `.data =`), every
-    operation in place that torch counts (optimizers, `load_state_dict`, `copy_`), and, for those that it does
-    not count (through `.data` or NumPy), a change of any of a few values of each tensor.
+    Seen are: submodules that were added or replaced, parameters and memory that were replaced (`.to()`,
+    `.data =`), every operation in place that torch counts (optimizers, `load_state_dict`, `copy_`), and, for
+    those that it does not count (through `.data` or NumPy), a change of any of a few values of each tensor.
+    Not seen are numbers of a layer that are no weights, such as the `eps` of a norm.
     """
 
     def __init__(self, module: nn.Module) -> None:
         modules = list(module.modules())
+        self._counts = [(part._modules, len(part._modules)) for part in modules]
         self._children = [
             (part._modules, name, part._modules[name]) for part in modules for name in part._modules
         ]
@@ -39,6 +41,8 @@ class Watch:
 
     def changed(self) -> bool:
         """Whether anything that is seen has changed."""
+        if any(len(children) != count for children, count in self._counts):
+            return True
         for modules, name, child in self._children:
             if modules.get(name) is not child:
                 return True
@@ -64,14 +68,19 @@ def version(parameter: Tensor) -> int:
 
 
 def sample(parameter: Tensor) -> Tensor:
-    """A few values spread over its first axis, from the middle of the others: a view."""
-    tensor: Any = parameter.detach()
-    if tensor.ndim == 0:
-        return tensor.reshape(1)  # type: ignore[no-any-return]
-    if tensor.numel() == 0:
-        return tensor.flatten()  # type: ignore[no-any-return]
-    step = 1 if tensor.shape[0] <= WHOLE else -(-tensor.shape[0] // SAMPLES)
-    return tensor[(slice(None, None, step), *(size // 2 for size in tensor.shape[1:]))]  # type: ignore[no-any-return]
+    """A few values spread over its first and its last axis: a view."""
+    tensor = parameter.detach()
+    if tensor.ndim == 0 or tensor.numel() == 0:
+        return tensor.reshape(-1)
+    count = tensor.shape[0] if tensor.shape[0] <= WHOLE else SAMPLES
+    if not tensor.is_contiguous():
+        index: list[slice | int] = [size // 2 for size in tensor.shape]
+        index[0] = slice(None, None, -(-tensor.shape[0] // count))
+        return tensor[tuple(index)]
+    # Along the diagonal: from one value to the next a share of the first axis, and one of the last.
+    width = tensor.shape[-1] if tensor.ndim > 1 else 0
+    step = max(1, tensor.numel() // count + width // count)
+    return tensor.view(-1)[width // (2 * count) :: step]
 
 
 def tensors_of(module: nn.Module) -> dict[str, torch.Tensor]:
