@@ -236,6 +236,22 @@ def test_evidence_on_a_trained_checkpoint(base: Path) -> None:
     assert set(sides(inspect(base, time=False)).values()) == {"against"}
 
 
+def test_a_reference_of_another_version(base: Path, tmp_path: Path) -> None:
+    other = layouts.write(tmp_path / "n17", "n17")
+    with pytest.raises(saccade.InputError, match=r"n17 is of GR00T N1\.7, expected N1\.5"):
+        inspect(base, reference=other, time=False)
+
+
+def test_tokens_that_are_not_finite(tmp_path: Path) -> None:
+    folder = layouts.write(tmp_path / "odd", "saccade")
+    tensors = load_file(folder / "model.safetensors")
+    tensors["action_head.future_tokens.weight"][0, 0] = torch.nan
+    save_file(tensors, folder / "model.safetensors")
+    assert inspect(folder, time=False)["odd"] == [
+        "future_tokens.weight holds 1 numbers that are NaN or infinite"
+    ]
+
+
 def fine_tuned(base: Path, folder: Path, tensors: dict[str, Tensor] | None = None) -> Path:
     """A fork's checkpoint that started from `base`: a little training, one more embodiment, new decoders."""
     config = layouts.head_config("fork")

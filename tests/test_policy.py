@@ -65,6 +65,23 @@ def test_a_policy_is_the_head_between_the_normalizers_halves(layout: str) -> Non
     assert samples.shape == (2, 3, horizon, 6)
 
 
+def test_frozen_actions_stay_beyond_the_statistics_too() -> None:
+    head = load("lerobot-n17")
+    policy = Policy(head, embodiment="new_embodiment")
+    context = head.encode(features(head), **masks(head))
+    within = np.asarray(policy.normalizer.actions(np.ones((2, 40, head.config.action_dim), np.float32)))
+    before = 3 * within + 1
+    chunking = saccade.Chunking(overlap=9, frozen=4)
+    after = policy.sample(context, draw(2, 7), seed=1, previous_chunk=before, chunking=chunking)
+    rows = before.shape[1]
+    moving = ~np.isclose(
+        policy.normalizer.actions(np.zeros((1, 40, head.config.action_dim), np.float32))[0, 0], within[0, 0]
+    )
+    assert moving.any()
+    frozen, taken = np.asarray(after)[:, :4], before[:, rows - 9 : rows - 5]
+    assert np.allclose(frozen[..., moving], taken[..., moving], rtol=1e-5)
+
+
 @pytest.mark.parametrize("layout", ["lerobot", "fork", "n17"])
 def test_a_chunk_goes_on_where_the_last_one_is(layout: str) -> None:
     head = load(layout)

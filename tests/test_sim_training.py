@@ -328,8 +328,9 @@ def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Pa
     tokens = run.learner.action_head.future_tokens.weight
     assert tokens.grad is not None
     assert bool((tokens.grad.abs().sum(dim=1) > 0).all())
+    decoder = run.learner.action_head.get_submodule("action_decoder")
     # Only the first block lies before the rows, and the targets' side must not move.
-    assert all(parameter.grad is None for parameter in run.learner.action_head.action_decoder.parameters())
+    assert all(parameter.grad is None for parameter in decoder.parameters())
     assert all(tensor.grad is None and not tensor.requires_grad for tensor in run.average.values())
 
 

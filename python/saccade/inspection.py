@@ -20,7 +20,7 @@ from saccade.bench.cost import PRECISIONS, Machine, predict
 from saccade.bench.work import Call
 from saccade.checkpoints import Config, Source, facts, open_published
 from saccade.config import HeadConfig
-from saccade.errors import SaccadeError
+from saccade.errors import InputError, SaccadeError
 from saccade.initialisation import NORMAL_STD, Draw, distance, draw, is_as_drawn, is_norm, sample
 from saccade.robot_statistics import EMBODIMENTS, read_json
 
@@ -130,7 +130,7 @@ def inspect(
 
     Raises:
         FileNotFoundError, CheckpointError: as :meth:`saccade.ActionHead.load`.
-        InputError: ``num_vl_tokens`` is not an integer of at least 1.
+        InputError: ``num_vl_tokens`` is not an integer of at least 1; ``reference`` is of another version.
     """
     num_vl_tokens = integer("num_vl_tokens", num_vl_tokens)
     published = open_published(source, config)
@@ -138,6 +138,11 @@ def inspect(
     report = facts(published, source)
     head = HeadConfig(**report["config"])
     other = None if reference is None else Other(reference)
+    if other is not None and other.version != head.version:
+        raise InputError(
+            f"reference: {os.fspath(other.source)} is of GR00T {other.version.upper()}, expected "
+            f"{head.version.upper()} as the source: no training leads from one to the other"
+        )
     survey = Survey(published, head, other, progress)
     report["parts"] = survey.parts()
     report["parameters"] = sum(part["parameters"] for part in report["parts"].values())
@@ -423,6 +428,7 @@ class Other:
     def __init__(self, source: Source) -> None:
         self.source = source
         self._published = open_published(source)
+        self.version: str = self._published.config()["version"]
         self._shapes = {name: tuple(shape) for name, _, shape, _ in self._published.tensors()}
         self._parts: dict[str, dict[str, Any]] = {}
         self._different: list[str] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -164,7 +165,8 @@ class Normalizer(Robot):
         return like_features(robot + self._reference(state, robot), is_torch(actions))
 
     def unactions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
-        """The inverse of :meth:`actions`, for a ``previous_chunk`` or to train: zero-padded on the right.
+        """The inverse of :meth:`actions`, to train: zero-padded on the right, and cut off where the code that
+        trained the head cuts off.
 
         Args:
             actions: ``(..., horizon, action_width)`` in the robot's units.
@@ -176,9 +178,21 @@ class Normalizer(Robot):
         Raises:
             ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; no ``state``.
         """
-        values = self._robot("actions", actions, self.action_groups)
+        return self._to_head(actions, state, self.action_groups)
+
+    def previous_chunk(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
+        """What :meth:`saccade.ActionHead.sample` takes as ``previous_chunk``: as :meth:`unactions`, but
+        nothing is cut off, so that actions which do not change stay what they were.
+
+        Args, returns, raises: as :meth:`unactions`.
+        """
+        groups = tuple(replace(group, clips=False) for group in self.action_groups)
+        return self._to_head(actions, state, groups)
+
+    def _to_head(self, actions: ArrayLike, state: ArrayLike | None, groups: tuple[Group, ...]) -> Array:
+        values = self._robot("actions", actions, groups)
         values = values - self._reference(state, values)
-        normalised = padded(_mapped(values, self.action_groups, Group.to_head), self.action_dim)
+        normalised = padded(_mapped(values, groups, Group.to_head), self.action_dim)
         return like_features(normalised, is_torch(actions))
 
     def _reference(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array:

@@ -130,7 +130,7 @@ class Policy:
         if "out" in options:
             raise InputError("out: expected none, since the head's normalised actions would be written to it")
         if previous_chunk is not None:
-            previous = np.asarray(self.normalizer.unactions(previous_chunk, state))
+            previous = np.asarray(self.normalizer.previous_chunk(previous_chunk, state))
             options["previous_chunk"] = padded(previous, self.head.config.encoder_action_dim)
         horizon = self.normalizer.action_horizon
         if isinstance(chunking, Chunking) and chunking.horizon is None and horizon is not None:

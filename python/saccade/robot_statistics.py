@@ -47,6 +47,8 @@ MOST_WIDTH = 1 << 20
 
 #: What is computed from statistics of more could be beyond float32, and an action infinite.
 MOST = 1e30
+#: What is divided by less could be beyond float32, too.
+LEAST = 1e-30
 
 Statistics: TypeAlias = "npt.NDArray[np.floating[Any]]"
 
@@ -238,6 +240,11 @@ class Builder:
             moving = ~np.isclose(second, first) if self.is_close else second != first
         if (second < (0 if mode == "mean_std" else first)).any():
             self.problems.append(f"{key}: {names[1]} below {'0' if mode == 'mean_std' else names[0]}")
+        spans = second if mode == "mean_std" else second - first
+        if (moving & (spans < LEAST)).any():
+            self.problems.append(
+                f"{key}: {names[1]} is less than {LEAST:g} above {'0' if mode == 'mean_std' else names[0]}"
+            )
         keeps = mode == "mean_std" or (mode == "q99" and not self.is_close)
         return Group(key, size, mode, first, second, moving, keeps, **switches)
 

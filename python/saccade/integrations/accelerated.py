@@ -105,8 +105,8 @@ class Accelerated:
 
     The head's weights may change: they are compared before each call, as far as
     :class:`saccade.integrations.weights.Watch` says, and taken anew if they have. That takes as long as
-    loading did. An edit that it cannot see, a few values through ``.data``, needs :meth:`refresh`. Copies and
-    pickles of the policy hold the original `get_action`.
+    loading did. An edit that it cannot see, of some values through ``.data``, needs :meth:`refresh`. Copies
+    and pickles of the policy hold the original `get_action`.
 
     As a context manager it restores the original at the end.
     """
@@ -279,7 +279,8 @@ class Accelerated:
 
     def _current(self, module: nn.Module) -> ActionHead:
         """The head with the weights of now."""
-        head, watch = self._head, self._watch
+        # In this order, so that a load in another thread can make this one look stale but not current.
+        watch, head = self._watch, self._head
         if head is None or watch is None or self._settings != heads.settings_of(module) or watch.changed():
             with self._lock:
                 # Unless another thread has loaded it in the meantime.
