@@ -234,7 +234,10 @@ def embodiments(report: Mapping[str, Any]) -> Section:
             close()
         run.append(entry)
     close()
-    title = "Embodiments: norms of their layers, and how many robust deviations these are from the median"
+    title = (
+        "Embodiments: norms of their layers, and how many robust deviations these are from the median; "
+        '"trained" are those that are not distributed as before any training'
+    )
     return Section(title, [">id", "name", ">norm", ">robust z", "looks"], rows)
 
 
