@@ -6,9 +6,9 @@ import argparse
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 from saccade.cli import EXIT_OK, UsageError
+from saccade.cli._copying import add_copy_arguments, copying, left_behind
 
 HELP = "write a checkpoint with other embodiments, dtype or shards"
 
@@ -32,9 +32,7 @@ UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MI
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
-    parser.add_argument("source", type=Path, help="checkpoint: a directory or one .safetensors file")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory to write")
-    parser.add_argument("--config", type=Path, help="default: config.json beside the weights")
+    add_copy_arguments(parser)
     parser.add_argument(
         "--embodiment-ids", type=int, nargs="+", metavar="ID", help="keep only these (default: all)"
     )
@@ -49,14 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="close a file before it grows larger, such as 5GB (default: one file of one, 5GB of several)",
     )
     parser.add_argument("--head-only", action="store_true", help="leave out tensors outside the head")
-    parser.add_argument("--force", action="store_true", help="replace a checkpoint that is there")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what is in it."""
     from saccade.checkpoints import convert
-    from saccade.cli.quantize import copying, left_behind
 
     max_shard_bytes = None if args.max_shard_size is None else size(args.max_shard_size)
     with copying("converting") as progress:

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from saccade.cli import EXIT_OK
-
-if TYPE_CHECKING:
-    from saccade.checkpoints import Written
+from saccade.cli._copying import add_copy_arguments, copying, left_behind
 
 HELP = "write a copy of a checkpoint with int8 weights"
 
@@ -34,12 +28,8 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
-    parser.add_argument("source", type=Path, help="checkpoint: a directory or one .safetensors file")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory to write")
-    parser.add_argument("--config", type=Path, help="default: config.json beside the weights")
+    add_copy_arguments(parser)
     parser.add_argument("--head-only", action="store_true", help="leave out tensors outside the head")
-    parser.add_argument("--force", action="store_true", help="replace a checkpoint that is there")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,28 +55,3 @@ def run(args: argparse.Namespace) -> int:
     )
     left_behind(report)
     return EXIT_OK
-
-
-@contextlib.contextmanager
-def copying(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on standard error for work on a checkpoint; what it gives is called with bytes done and bytes in
-    all.
-
-    Args:
-        what: is done.
-    """
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn(what), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    # Where nobody sees it, it would still leave an empty line.
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("", total=None)
-        yield lambda done, total: progress.update(bar, completed=done, total=total)
-
-
-def left_behind(report: Written) -> None:
-    """Says what lay beside the source's weights and was not copied, if anything."""
-    if report.left:
-        print(f"not copied: {', '.join(map(str, report.left))}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade.cli import EXIT_OK
+from saccade.cli._copying import add_copy_arguments, copying, left_behind
 
 if TYPE_CHECKING:
     from saccade.checkpoints import ActionChanges, ResizeReport
@@ -32,12 +33,10 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
-    parser.add_argument("source", type=Path, help="checkpoint: a directory or one .safetensors file")
+    add_copy_arguments(parser)
     parser.add_argument(
         "--num-future-tokens", type=int, required=True, metavar="M", help="how many the copy is to have"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory to write")
-    parser.add_argument("--config", type=Path, help="default: config.json beside the weights")
     parser.add_argument(
         "--perturbation",
         type=float,
@@ -56,14 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="observations to compare actions on, .npz or .safetensors as for saccade attention (default: "
         "random ones)",
     )
-    parser.add_argument("--force", action="store_true", help="replace a checkpoint that is there")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Writes the copy, and reports what is in it and how far actions move."""
     from saccade.checkpoints import action_changes, resize
-    from saccade.cli.quantize import copying, left_behind
 
     with copying("resizing") as progress:
         report = resize(
