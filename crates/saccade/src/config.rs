@@ -102,11 +102,7 @@ impl HeadConfig {
             }
         };
         let mut reader = Reader { problems: Vec::new() };
-        if !std::ptr::eq(top, head) && top.contains_key("saccade") {
-            reader
-                .problems
-                .push("saccade stands beside action_head_cfg, expected inside".to_owned());
-        }
+        reader.problems.extend(misplaced_own_key(top));
         let version = reader.version(top, head);
         let config = reader.head(version, head);
         if reader.problems.is_empty() {
@@ -149,6 +145,12 @@ impl HeadConfig {
             _ => Reads::Images,
         })
     }
+}
+
+/// What is wrong with saccade's own key in a whole checkpoint config, whose head would not have it.
+pub(crate) fn misplaced_own_key(top: &Map<String, Value>) -> Option<String> {
+    let both = top.contains_key("action_head_cfg") && top.contains_key("saccade");
+    both.then(|| "saccade stands beside action_head_cfg, expected inside".to_owned())
 }
 
 /// No size in a config is larger: products of three of them stay far below `u64::MAX`.

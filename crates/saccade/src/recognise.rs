@@ -10,8 +10,8 @@ use std::path::Path;
 use serde_json::{Map, Value, json};
 
 use crate::checkpoint::{Checkpoint, read_text};
-use crate::config::HeadConfig;
 use crate::config::Version::{self, N1, N15, N16, N17};
+use crate::config::{HeadConfig, misplaced_own_key};
 use crate::error::{Error, Result, show_shape};
 
 /// Who wrote a checkpoint, and so where things are in it.
@@ -176,10 +176,10 @@ impl Config {
             Err(error) => return bad(format!("not valid JSON: {error}")),
         };
         let head = match (top.get("action_head_cfg"), top.get("type")) {
-            (Some(Value::Object(_)), _) if top.contains_key("saccade") => {
-                return bad("saccade stands beside action_head_cfg, expected inside".to_owned());
-            }
-            (Some(Value::Object(head)), _) => Some(head.clone()),
+            (Some(Value::Object(head)), _) => match misplaced_own_key(&top) {
+                None => Some(head.clone()),
+                Some(problem) => return bad(problem),
+            },
             (Some(_), _) => return bad("action_head_cfg: expected an object".to_owned()),
             (None, Some(Value::String(policy))) if policy == LEROBOT_POLICY => None,
             (None, Some(policy)) => {
