@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade.errors import CheckpointError
 
 #: No config is longer; the same for one that is found beside the weights.

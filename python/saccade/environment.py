@@ -8,7 +8,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 
 
 @overload
