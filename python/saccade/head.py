@@ -228,6 +228,13 @@ class ActionHead:
         return tuple(self._head.embodiment_ids)
 
     @property
+    def future_tokens(self) -> Float32Array:
+        """A copy of the learned future tokens: ``(num_future_tokens, width)`` float32, as they enter the first
+        block. Change it and pass it to :class:`Intervention` as ``future_tokens`` to replace them in a call.
+        """
+        return self._head.future_tokens()
+
+    @property
     def num_threads(self) -> int:
         """Threads that a call uses."""
         return self._head.num_threads
