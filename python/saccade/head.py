@@ -229,8 +229,9 @@ class ActionHead:
 
     @property
     def future_tokens(self) -> Float32Array:
-        """A copy of the learned future tokens: ``(num_future_tokens, width)`` float32, as they enter the first
-        block. Change it and pass it to :class:`Intervention` as ``future_tokens`` to replace them in a call.
+        """A copy of the learned future tokens: ``(num_future_tokens, width)`` float32, as they enter the
+        first block. To replace them in a call, change the copy and pass it to :class:`Intervention` as
+        ``future_tokens``.
         """
         return self._head.future_tokens()
 
