@@ -26,7 +26,7 @@ from saccade._arrays import (
     optional_integers,
     result,
 )
-from saccade.checkpoints.hub import resolve
+from saccade.hub import resolve
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig, to_json
 from saccade.context import Context
@@ -211,14 +211,6 @@ class ActionHead:
     def embodiment_ids(self) -> tuple[int, ...]:
         """The loaded embodiments, in ascending order."""
         return tuple(self._head.embodiment_ids)
-
-    @property
-    def future_tokens(self) -> Float32Array:
-        """A copy of the learned future tokens: ``(num_future_tokens, width)`` float32, as they enter the
-        first block. To replace them in a call, change the copy and pass it to :class:`Intervention` as
-        ``future_tokens``.
-        """
-        return self._head.future_tokens()
 
     @property
     def num_threads(self) -> int:

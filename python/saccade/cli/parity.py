@@ -195,7 +195,7 @@ def random_inputs(source: Path, args: argparse.Namespace) -> dict[str, NDArray[A
     """Standard normal inputs that fit the checkpoint."""
     from saccade.reference import loading, random_weights
 
-    config = saccade.HeadConfig.from_dict(loading.described(source)["head_config"])
+    config = saccade.HeadConfig.from_dict(loading.described(source).head_config)
     if config.mask_mode == "alternate" and args.vl_tokens < 2:
         raise UsageError("--vl-tokens is 1, expected at least 2: this head reads text and images in turn")
     drawn = random_weights.random_inputs(
@@ -267,7 +267,7 @@ def run_rust(source: Path, inputs: dict[str, NDArray[Any]], args: argparse.Names
     with forced_isa(isa):
         head = saccade.ActionHead.load(
             source,
-            config=loading.described(source)["head_config"],
+            config=loading.described(source).head_config,
             precision=args.precision,
             num_threads=args.threads,
         )
