@@ -14,8 +14,8 @@ import matplotlib as mpl
 from jinja2 import Environment
 from matplotlib.figure import Figure as Picture
 
+from saccade._files import writable_directory, write_atomically
 from saccade.errors import InputError
-from saccade.sim.files import writable_directory, write_atomically
 from saccade.study import STUDIES, load_study
 from saccade.study.statistics import Estimate
 from saccade.study.tables import Provenance, provenance_path, read_study, table_path
