@@ -29,13 +29,13 @@ EXTRAS: dict[str, dict[str, str]] = {
         "PIL": "pillow",
         "matplotlib": "matplotlib",
         "threadpoolctl": "threadpoolctl",
+        "jinja2": "jinja2",
+        "scipy": "scipy",
     },
     "study": {
-        "jinja2": "jinja2",
         "joblib": "joblib",
         "pandas": "pandas",
         "sklearn": "scikit-learn",
-        "scipy": "scipy",
     },
     "ray": {"ray": "ray"},
 }
