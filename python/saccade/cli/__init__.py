@@ -1,8 +1,8 @@
 """The `saccade` command: one file per command, imported only when that command is chosen.
 
-Exit status: 0, or what the command returned (`parity` returns 1 for a difference); 2 with one line on standard
-error for bad input, missing packages, and paths or streams that cannot be used; 130 after Ctrl-C; 141 if the
-reader of standard output went away, as a shell reports for a program that SIGPIPE ended.
+Exit status: 0, or what the command returned (`parity` returns 1 for a difference); 2 with one line on
+standard error for bad input, missing packages, and paths or streams that cannot be used; 130 after Ctrl-C;
+141 if the reader of standard output went away, as a shell reports for a program that SIGPIPE ended.
 """
 
 from __future__ import annotations
@@ -145,7 +145,9 @@ def describe(error: BaseException) -> str:
         'first; second'
     """
     if isinstance(error, OSError) and error.strerror:
-        return error.strerror if error.filename is None else f"{os.fspath(error.filename)}: {error.strerror}"
+        return (
+            error.strerror if error.filename is None else f"{os.fsdecode(error.filename)}: {error.strerror}"
+        )
     lines = [line.strip() for line in str(error).splitlines()]
     return "; ".join(line for line in lines if line) or type(error).__name__
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 #: Characters of our texts, and what is written where the encoding of a stream lacks them.
-ASCII = dict(zip("–—×·…“”→±≤≥━", ("-", "-", "x", "*", "...", '"', '"', "->", "+-", "<=", ">=", "-"), strict=True))
+ASCII = {"–": "-", "—": "-", "×": "x", "·": "*", "…": "...", "“": '"', "”": '"', "→": "->", "±": "+-"}
 REPLACE = "saccade-ascii"  # name of the error handler
 
 

@@ -292,9 +292,14 @@ def check_tasks(names: Iterable[str]) -> None:
     Raises:
         InputError: one is unknown; lists those that are known.
     """
+    check_known("--tasks", names, known_tasks())
+
+
+def known_tasks() -> tuple[str, ...]:
+    """The names of all tasks; needs no simulator."""
     from saccade.sim.tasks import TASKS
 
-    check_known("--tasks", names, TASKS)
+    return tuple(TASKS)
 
 
 def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:
