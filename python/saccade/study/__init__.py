@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from saccade.study.cells import OnDone
-    from saccade.study.report import Section
+    from saccade.study.section import Section
     from saccade.study.tables import Provenance
 
 # Where each study lives, `module` or `module:object`, and its one line of help. They stand here so that

@@ -29,7 +29,7 @@ from saccade.sim.policy import DEMO_CHECKPOINT, Float32Array
 from saccade.study import figures
 from saccade.study.arms import control_line, episode_rng
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
-from saccade.study.report import Figure, Grid, Section, not_measured, number, too_few
+from saccade.study.section import Figure, Grid, Section, not_measured, number, too_few
 from saccade.study.statistics import Estimate, bootstrap_ratio
 from saccade.study.tables import Provenance
 
