@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from saccade._files import sha256_of
 from saccade.cli import main
 from saccade.errors import InputError
-from saccade.sim.files import sha256_of
 from saccade.study import STUDIES, cuts, patching
 from saccade.study.arms import ARMS
 from saccade.study.report import write_report

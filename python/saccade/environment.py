@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -45,3 +46,13 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     for name, value in config.items():
         print(f"{name}: {', '.join(value) or 'none' if isinstance(value, list) else value}")
     return None
+
+
+def cpu_name() -> str:
+    """The processor's name as Linux reports it, or what Python's ``platform`` knows."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -103,9 +103,9 @@ def run(args: argparse.Namespace) -> int:
     """Checks everything that can be wrong, then looks, measures and writes."""
     from rich.console import Console
 
+    from saccade._files import writable_directory, write_json
     from saccade.maps.page import write_page
     from saccade.maps.sheet import write_sheet
-    from saccade.sim.files import writable_directory, write_json
 
     maps = look(args)
     writable_directory(args.out)

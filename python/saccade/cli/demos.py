@@ -47,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from saccade._files import writable_directory
     from saccade.cli.rollout import parse_tasks
     from saccade.sim import graphics
-    from saccade.sim.files import writable_directory
     from saccade.sim.tasks import DEMO_TASKS
 
     check_numbers(args)

@@ -95,7 +95,7 @@ class Session:
 
     def run(self, on_episode: Callable[[Episode], None]) -> None:
         """Runs all episodes; what is done is in the result file after each of them."""
-        from saccade.sim.files import write_json
+        from saccade._files import write_json
         from saccade.sim.rollout import environment_for
 
         for task in self.tasks:
@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
     """Checks everything that can be wrong, then rolls out."""
     from rich.console import Console
 
-    from saccade.sim.files import writable_directory, write_json
+    from saccade._files import writable_directory, write_json
 
     session = prepare(args)
     from saccade.sim.report import write_contact_sheet  # imports mujoco, which needs a working OpenGL

@@ -85,7 +85,7 @@ def run_study(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from saccade.sim.files import writable_directory
+    from saccade._files import writable_directory
     from saccade.study.cells import Finished, check_workers
 
     check_workers(args.backend, args.jobs)

@@ -89,9 +89,9 @@ def run(args: argparse.Namespace) -> int:
     )
     from rich.progress import Progress as Bar
 
+    from saccade._files import writable_directory
     from saccade.sim import train
     from saccade.sim.demos import recorded_tasks
-    from saccade.sim.files import writable_directory
 
     settings = training_settings(args)
     recorded_tasks(args.demos)

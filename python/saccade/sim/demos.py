@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._files import write_atomically, write_json
 from saccade.errors import InputError
 from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
 from saccade.sim.environment import DEFAULT_IMAGE_SIZE, TaskEnvironment
 from saccade.sim.experts import Expert, NoiseBursts
-from saccade.sim.files import write_atomically, write_json
 from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
 
 MAX_STEPS = 250  # bursts make the expert's way longer

@@ -12,7 +12,8 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 import saccade
-from saccade.sim.files import write_atomically
+from saccade._files import write_atomically
+from saccade.environment import cpu_name
 from saccade.sim.policy import Policy
 from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import PARTS, Episode
@@ -121,16 +122,6 @@ def result_record(
         "summary": [asdict(summary) for summary in summarize_tasks(episodes)],
         "episodes": [asdict(episode) for episode in episodes],
     }
-
-
-def cpu_name() -> str:
-    """The processor's name as Linux gives it, or what Python knows."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def write_contact_sheet(pictures: Sequence[tuple[Episode, UInt8Array]], path: Path) -> None:

@@ -22,13 +22,13 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from saccade._files import sha256_of, write_atomically, write_json
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.sim import demos
 from saccade.sim.backbone import BackboneConfig
 from saccade.sim.dataset import Samples, describe, load_samples, statistics
 from saccade.sim.environment import ACTION_DIM, PROPRIO_DIM
-from saccade.sim.files import sha256_of, write_atomically, write_json
 from saccade.sim.instructions import Tokenizer, build_vocabulary, words
 from saccade.sim.learner import Learner
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config

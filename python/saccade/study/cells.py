@@ -21,9 +21,9 @@ import numpy as np
 import pandas as pd
 
 import saccade
+from saccade._files import sha256_of, writable_directory, write_json
+from saccade.environment import cpu_name
 from saccade.errors import InputError, SaccadeError
-from saccade.sim.files import sha256_of, writable_directory, write_json
-from saccade.sim.report import cpu_name
 from saccade.study.tables import (
     Provenance,
     provenance_path,

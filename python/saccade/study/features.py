@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from saccade._files import sha256_of
 from saccade.config import HeadConfig
 from saccade.errors import InputError, ShapeError
 from saccade.head import ActionHead, Context
@@ -24,7 +25,6 @@ from saccade.intervention import Intervention
 from saccade.maps.inputs import as_mask, head_inputs, read_arrays
 from saccade.maps.record import describe_checkpoint
 from saccade.maps.record import learned_tokens as stored_tokens
-from saccade.sim.files import sha256_of
 from saccade.sim.policy import DEMO_CHECKPOINT, Float32Array
 from saccade.study import figures
 from saccade.study.arms import control_line, episode_rng

@@ -22,10 +22,10 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import GroupKFold, StratifiedGroupKFold
 from sklearn.preprocessing import StandardScaler
 
+from saccade._files import write_atomically
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS
-from saccade.sim.files import write_atomically
 from saccade.sim.policy import EMBODIMENT_ID
 from saccade.study import figures
 from saccade.study.cells import Cell, OnDone, Rows, digest, run_cells

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import matplotlib as mpl
 
+from saccade._files import writable_directory, write_atomically
 from saccade.errors import InputError
-from saccade.sim.files import writable_directory, write_atomically
 from saccade.study import STUDIES, load_study
 from saccade.study.page import Part, Picture, to_html, to_markdown
 from saccade.study.section import Figure, Prose, Section

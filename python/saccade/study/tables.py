@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
+from saccade._files import sha256_of, write_atomically, write_json
 from saccade.errors import InputError
-from saccade.sim.files import sha256_of, write_atomically, write_json
 
 
 @dataclass(frozen=True)

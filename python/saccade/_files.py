@@ -1,4 +1,4 @@
-"""Writing files so that a reader never finds half of one."""
+"""Files: written so that a reader never sees half of one, and hashed."""
 
 import hashlib
 import json
@@ -11,9 +11,9 @@ from typing import Any
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """Gives a temporary path beside `path`; renamed to it at the end, removed after an error.
+    """Gives a temporary path in the same directory; it is renamed to `path` at the end and removed after an error.
 
-    The temporary name keeps the suffix, by which some writers choose the format.
+    The temporary name keeps the suffix, because some writers choose the format by it.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
@@ -24,16 +24,16 @@ def write_atomically(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON, indented, with a final newline."""
+    """Writes indented JSON with a final newline."""
     with write_atomically(path) as temporary:
         temporary.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def writable_directory(path: Path) -> Path:
-    """The directory, made if it is not there.
+    """Creates the directory if it does not exist, and checks that files can be written to it.
 
     Raises:
-        NotADirectoryError, PermissionError, FileExistsError: it cannot be made or written to.
+        OSError: it cannot be created or written to.
     """
     path.mkdir(parents=True, exist_ok=True)
     probe = path / f".writable.{os.getpid()}"
@@ -43,10 +43,18 @@ def writable_directory(path: Path) -> Path:
 
 
 def sha256_of(*paths: Path) -> str:
-    """Hash of files, one after the other, read in pieces."""
+    """SHA-256 of files, one after the other, read in pieces."""
     digest = hashlib.sha256()
     for path in paths:
         with path.open("rb") as file:
             while piece := file.read(1 << 24):
                 digest.update(piece)
     return digest.hexdigest()
+
+
+def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
+    """`name` and `sha256` of a checkpoint; the hash covers `config.json`, if there is one, and the tensor files."""
+    directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    config = [directory / "config.json"] if (directory / "config.json").is_file() else []
+    tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
+    return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}
