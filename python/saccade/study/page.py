@@ -67,9 +67,10 @@ def to_html(markdown: str, pictures: Mapping[str, str]) -> str:
     tokens = parser.parse(markdown)
     title = ""
     for token, following in itertools.pairwise(tokens):
-        if token.type == "heading_open":
+        if token.type == "heading_open" and token.tag == "h1":
+            title = following.content
+        if token.type == "heading_open" and token.tag == "h2":
             token.attrSet("id", anchor(following.content))
-            title = title or following.content
         for child in token.children or ():
             if child.type == "image":
                 source = str(child.attrs["src"])
