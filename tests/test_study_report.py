@@ -167,7 +167,7 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
         assert f"{STUDIES[name][1][1:]} (not measured)" in parsed.text
 
     text = markdown.read_text(encoding="utf-8")
-    pictures = re.findall(r"\]\((.*?)\)", text)
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert len(pictures) == sum(one.startswith("data:image/svg") for one in parsed.found) == 5
     for picture in pictures:
         with Image.open(tmp_path / picture) as image:
