@@ -5,6 +5,9 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
@@ -241,6 +244,33 @@ def test_attention_sheets_are_put_in(tmp_path: Path) -> None:
     assert f"data:image/png;base64,{data}" in parse(page).found
     assert "attention/push/page.html" in parse(page).text
     assert "(attention/push/sheet.png)" in markdown.read_text()
+
+
+WITHOUT_A_SIMULATOR = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("mujoco", "metaworld", "gymnasium", "OpenGL", "imageio"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from saccade.cli import main
+status = main(["study", "report", sys.argv[1]])
+sys.exit(status)
+"""
+
+
+def test_the_report_of_every_study_needs_no_simulator(tmp_path: Path) -> None:
+    committed = Path(__file__).parent.parent / "studies"
+    for name in STUDIES:
+        for folder in (committed / "first", committed / "fast"):
+            for file in folder.glob(f"{name}.*"):
+                shutil.copy(file, tmp_path / file.name)
+    command = [sys.executable, "-c", WITHOUT_A_SIMULATOR, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").count("(not measured)") == 2  # tvl, vlsa
 
 
 def test_names_are_escaped(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from scipy.optimize import brentq
 from scipy.stats import binomtest, nct, norm, t
 
+from saccade import _intervals
+from saccade._intervals import CONFIDENCE as CONFIDENCE
 from saccade.errors import InputError
 
-CONFIDENCE = 0.95
 POWER = 0.8
 LOSS_THAT_MATTERS = 0.05  # of the success rate: 5 percentage points
 Statistic: TypeAlias = Callable[..., float]
@@ -91,12 +92,8 @@ def wilson(successes: int, trials: int) -> Estimate:
         >>> rate.value, round(rate.low, 3), round(rate.high, 3)
         (0.9, 0.699, 0.972)
     """
-    if not 0 <= successes <= trials:
-        raise InputError(f"successes: given {successes} of {trials}, expected 0 to {trials}")
-    if trials == 0:
-        return Estimate(math.nan, 0.0, 1.0)
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(successes / trials, float(interval.low), float(interval.high))
+    low, high = _intervals.wilson(successes, trials)
+    return Estimate(successes / trials if trials else math.nan, low, high)
 
 
 def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> PairedDifference:
