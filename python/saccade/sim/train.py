@@ -28,11 +28,10 @@ from saccade.errors import InputError
 from saccade.sim import demos
 from saccade.sim.backbone import BackboneConfig
 from saccade.sim.dataset import Samples, describe, load_samples, statistics
-from saccade.sim.environment import ACTION_DIM, PROPRIO_DIM
 from saccade.sim.instructions import Tokenizer, build_vocabulary, words
 from saccade.sim.learner import Learner
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
-from saccade.sim.tasks import TASKS, find_task
+from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
 
 STATE_FILE = "training.pt"
 CHECKPOINT_SECONDS = 60.0
