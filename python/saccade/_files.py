@@ -58,7 +58,7 @@ def sha256_of(*paths: Path) -> str:
 
 
 def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
-    """`name` and `sha256` of a checkpoint; the hash covers `config.json`, if there is one, and the tensors."""
+    """`name` and `sha256` of a checkpoint; the hash covers `config.json`, if any, and the tensors."""
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
     config = [directory / "config.json"] if (directory / "config.json").is_file() else []
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]

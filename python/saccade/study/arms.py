@@ -43,8 +43,8 @@ class Arm:
     name: str
     label: str = ""
     about: str = ""
-    intervention: Callable[[Float32Array, np.random.Generator], Intervention | None] = (
-        lambda tokens, rng: None
+    intervention: Callable[[Float32Array, np.random.Generator], Intervention | None] = lambda tokens, rng: (
+        None
     )
     needs_future: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class ArmStudy(Study):
         return {arm.name: arm for arm in (self.baseline, *self.arms)}
 
     def cells(self) -> Sequence[Cell]:
-        """An episode of one arm each; the arms of one episode follow each other and share what it recorded."""
+        """An episode of one arm each; arms of one episode follow each other, to share what it recorded."""
         return [
             Cell((*unit, arm.name), arm.settings)
             for unit in self.source.units

@@ -25,7 +25,7 @@ NOISES = 4  # drawn for each observation if the file has none
 
 @dataclass(frozen=True)
 class Recording(Source):
-    """A checkpoint and a file of features for it. Chunks are compared; there is no closed loop, so no success.
+    """A checkpoint and a file of features for it. There is no closed loop, so success is unknown.
 
     Attributes:
         checkpoint: Whatever `ActionHead.load` reads.
@@ -157,9 +157,7 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
 
 
 @functools.lru_cache(maxsize=3)
-def head_of(
-    checkpoint: str, config: str | None, precision: str, num_threads: int | None
-) -> ActionHead:
+def head_of(checkpoint: str, config: str | None, precision: str, num_threads: int | None) -> ActionHead:
     """A head; one of each precision is kept."""
     return ActionHead.load(checkpoint, config=config, precision=precision, num_threads=num_threads)
 

@@ -17,7 +17,14 @@ from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Float32Array, HeadEngine, Policy, check_trained_on
+from saccade.sim.policy import (
+    DEMO_CHECKPOINT,
+    EMBODIMENT_ID,
+    Float32Array,
+    HeadEngine,
+    Policy,
+    check_trained_on,
+)
 from saccade.sim.rollout import Episode, environment_for, run_episode
 from saccade.study.source import Source, episode_rng
 
@@ -165,8 +172,8 @@ class PrivilegedState:
     """What the simulator knows and the policy is not given, at every observation of an episode.
 
     Attributes:
-        object, goal: Positions `(observations, 3)`, metres; the first and the last ball where a task has its own
-            balls.
+        object, goal: Positions `(observations, 3)`, metres; the first and the last ball where a task has
+            balls of its own.
         hand: Its position `(observations, 3)`, metres.
         gripper: How far it is open `(observations, 1)`, 0 to 1.
     """

@@ -7,12 +7,12 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from saccade.cli.arguments import check_tasks
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.head import ActionHead
@@ -23,10 +23,10 @@ Float32Array = npt.NDArray[np.float32]
 
 
 class Source(ABC):
-    """Observations for a checkpoint. A frozen dataclass: it is pickled, and what it gives is cached by its value.
+    """Observations for a checkpoint.
 
-    A unit is what an observation is asked for by: task and seed of an episode, or `recording.TASK` and a row of
-    the file.
+    A source is a frozen dataclass: it is pickled, and results are cached by its value. A unit is an episode,
+    named by task and seed, or a row of a file, named by `recording.TASK` and its number.
 
     Attributes:
         closed_loop: Whether episodes can be run, so that success is known.
@@ -143,49 +143,15 @@ def changed(source: Source, task: str, seed: int, intervention: Intervention | N
     return np.concatenate([source.actions(one, intervention, context) for one, context in pairs])
 
 
-def add_source_arguments(parser: argparse.ArgumentParser, episodes: int) -> None:
-    """Declares policy, tasks and seeds, or a file of features; `episodes` is the default number per task."""
-    parser.add_argument(
-        "--checkpoint",
-        type=Path,
-        metavar="PATH",
-        help="policy to measure (default: the bundled one); with --features any checkpoint of a head",
-    )
-    parser.add_argument(
-        "--tasks", nargs="+", metavar="NAME", help="tasks (default: all that the policy was trained on)"
-    )
-    parser.add_argument(
-        "--episodes", type=int, metavar="NUMBER", help=f"episodes per task (default: {episodes})"
-    )
-    parser.set_defaults(default_episodes=episodes)
-    parser.add_argument(
-        "--seed",
-        type=int,
-        default=0,
-        help="seed of the first episode; the next episodes count up. With --features: of what is drawn "
-        "(default: 0)",
-    )
-    file = parser.add_argument_group("recorded features instead of the simulator")
-    file.add_argument(
-        "--features",
-        type=Path,
-        metavar="FILE",
-        help=".npz or .safetensors as for `saccade attention`, with `episode` for intervals by episode",
-    )
-    file.add_argument(
-        "--config", type=Path, help="the head's config (default: config.json in the checkpoint's directory)"
-    )
-
-
 def source_of(args: argparse.Namespace, *refused: str) -> Source:
     """The source that the arguments ask for, checked.
 
     Args:
-        args: as `add_source_arguments` declares them.
-        refused: names of options of the study that mean nothing for a file of features.
+        args: as `saccade.cli.arguments.add_rollout_arguments` declares them.
+        refused: options of the study that cannot be used with a file of features.
 
     Raises:
-        InputError: an argument is wrong, or means nothing together with another one.
+        InputError: an argument is wrong, or cannot be combined with another one.
         FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
         GraphicsError: the simulator is needed and cannot draw here.
     """
@@ -207,13 +173,12 @@ def simulator_of(args: argparse.Namespace) -> Any:
             "and fast take a file of features"
         )
     from saccade.sim import graphics
-    from saccade.sim.tasks import check_evaluation_seeds, find_task
-    from saccade.study.arguments import names
+    from saccade.sim.tasks import check_evaluation_seeds
 
     episodes = args.default_episodes if args.episodes is None else args.episodes
     seeds = check_evaluation_seeds(args.seed, episodes)
-    asked = None if args.tasks is None else tuple(find_task(name).name for name in names("--tasks", args.tasks))
+    check_tasks(args.tasks or ())
     graphics.check()  # before MuJoCo is imported, which ends in a traceback without OpenGL
     from saccade.study.simulator import simulator
 
-    return simulator(args.checkpoint, asked, seeds, getattr(args, "engine", None) or "rust")
+    return simulator(args.checkpoint, args.tasks, seeds, getattr(args, "engine", None) or "rust")

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
+from saccade.cli.arguments import add_list, add_rollout_arguments, check_known
 from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.study import figures
-from saccade.study.arguments import check_known, names
 from saccade.study.arms import Arm, ArmStudy, control_line
 from saccade.study.changes import change_section
 from saccade.study.section import Figure, Grid, Section, effect, not_measured, number, rate, too_few
-from saccade.study.source import Float32Array, add_source_arguments, source_of
+from saccade.study.source import Float32Array, source_of
 from saccade.study.statistics import (
     Estimate,
     PairedDifference,
@@ -168,8 +168,8 @@ class Cuts(ArmStudy):
         parser.epilog = EPILOG.format(
             arms="\n".join(f"  {arm.name:{width}}  {arm.label}" for arm in ARMS.values())
         )
-        add_source_arguments(parser, episodes=15)
-        parser.add_argument("--arms", nargs="+", metavar="NAME", help="arms (default: all)")
+        add_rollout_arguments(parser, episodes=15)
+        add_list(parser, "--arms", help="arms (default: all)")
         parser.add_argument(
             "--engine", choices=("rust", "torch"), help="what computes the action head (default: rust)"
         )
@@ -177,8 +177,8 @@ class Cuts(ArmStudy):
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Cuts:
         """See `Study`."""
-        chosen = tuple(ARMS) if args.arms is None else names("--arms", args.arms)
-        check_known("arms", chosen, ARMS)
+        chosen = tuple(args.arms or ARMS)
+        check_known("--arms", chosen, ARMS)
         return cls(source_of(args, "engine"), tuple(ARMS[name] for name in chosen))
 
     def settings(self) -> Mapping[str, Any]:
