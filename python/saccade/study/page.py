@@ -13,7 +13,7 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
 from saccade.study.section import Section, templates
-from saccade.study.tables import Provenance
+from saccade.study.table import Provenance
 
 
 @dataclass(frozen=True)

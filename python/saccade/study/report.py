@@ -10,10 +10,10 @@ import matplotlib as mpl
 
 from saccade._files import writable_directory, write_atomically
 from saccade.errors import InputError
-from saccade.study import STUDIES, load_study
 from saccade.study.page import Part, Picture, to_html, to_markdown
 from saccade.study.section import Figure, Prose, Section
-from saccade.study.tables import provenance_path, read_study, table_path
+from saccade.study.study import STUDIES, load_study
+from saccade.study.table import provenance_path, read_study, table_path
 
 ATTENTION = "attention"  # the directory that `saccade attention` writes
 SEPARATE = ("fast",)  # studies with a question of their own: a report of these alone names no others
@@ -66,7 +66,7 @@ def make_part(directory: Path, name: str) -> Part:
         return Part(absent, measured=False, provenance=provenance)
     where = table_path(directory, name)
     try:
-        section = load_study(name).section(table, provenance)
+        section = load_study(name).summarise(table, provenance)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except KeyError as error:
