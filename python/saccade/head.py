@@ -228,6 +228,14 @@ class ActionHead:
         return tuple(self._head.embodiment_ids)
 
     @property
+    def future_tokens(self) -> Float32Array:
+        """A copy of the learned future tokens: ``(num_future_tokens, width)`` float32, as they enter the
+        first block. To replace them in a call, change the copy and pass it to :class:`Intervention` as
+        ``future_tokens``.
+        """
+        return self._head.future_tokens()
+
+    @property
     def num_threads(self) -> int:
         """Threads that a call uses."""
         return self._head.num_threads

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade.cli import EXIT_OK, Parser
-from saccade.study import STUDIES, load_study
+from saccade.study.study import STUDIES, load_study
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,20 +77,20 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the study, or makes the report."""
-    return run_report(args) if args.study == "report" else run_study(args)
+    return run_report(args) if args.study == "report" else measure(args)
 
 
-def run_study(args: argparse.Namespace) -> int:
+def measure(args: argparse.Namespace) -> int:
     """Checks the arguments, works through the cells behind a progress bar, and says what came out."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from saccade._files import writable_directory
-    from saccade.study.cells import Finished, check_workers
+    from saccade.study.run import Finished, check_workers
+    from saccade.study.run import run as run_study
 
     check_workers(args.backend, args.jobs)
-    study = load_study(args.study)
-    settings = study.settings(args)
+    study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
@@ -99,14 +99,14 @@ def run_study(args: argparse.Namespace) -> int:
         def on_done(finished: Finished, done: int, total: int) -> None:
             progress.update(bar, completed=done, total=total, description=finished.cell.name)
 
-        study.run(settings, out, backend=args.backend, jobs=args.jobs, on_done=on_done)
+        run_study(study, out, backend=args.backend, jobs=args.jobs, on_done=on_done)
     show(args.study, out, args.json)
     return EXIT_OK
 
 
 def show(name: str, out: Path, as_json: bool) -> None:
     """Prints what the table allows to be said, and where it is."""
-    from saccade.study import tables
+    from saccade.study import table as tables
 
     provenance = tables.read_provenance(tables.provenance_path(out, name))
     if as_json:
@@ -115,7 +115,7 @@ def show(name: str, out: Path, as_json: bool) -> None:
         )
         print(json.dumps({"provenance": vars(provenance), "rows": rows}, indent=2, ensure_ascii=False))
         return
-    section = load_study(name).section(tables.read_table(tables.table_path(out, name)), provenance)
+    section = load_study(name).summarise(tables.read_table(tables.table_path(out, name)), provenance)
     for line in section.concluded:
         print(f"- {line}")
     print(f"table   {tables.table_path(out, name)}")
