@@ -96,8 +96,8 @@ def describe(args: argparse.Namespace, report: ResizeReport, changes: ActionChan
         print("the tokens are float32 now, because their dtype cannot represent the new values")
     observations = "random observations" if args.features is None else f"observations of {args.features}"
     print(
-        f"change of actions on {changes.observations} {observations}, in float32 (root mean square of actions "
-        f"{changes.actions_rms:.3g}; mean change by another noise {changes.of_other_noise.mean:.3g}):"
+        f"change of actions on {changes.observations} {observations}, in float32 (root mean square of "
+        f"actions {changes.actions_rms:.3g}; mean change by another noise {changes.of_other_noise.mean:.3g}):"
     )
     for where, change in (("saccade", changes.in_saccade), ("other programs", changes.in_other_programs)):
         print(f"  in {where:14}  mean {change.mean:.3g}, largest {change.largest:.3g}")
