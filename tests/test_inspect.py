@@ -19,13 +19,13 @@ from torch import Tensor, nn
 import saccade
 from saccade import _saccade, cli
 from saccade.checkpoints import quantize
-from saccade.errors import CheckpointError, InputError
 from saccade.checkpoints.findings import Counts, Inspection, Part
 from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
 from saccade.checkpoints.inspection import inspect
 from saccade.checkpoints.parts import parameters
 from saccade.checkpoints.survey import robust_z
 from saccade.checkpoints.tokens import token_statistics
+from saccade.errors import CheckpointError, InputError
 from saccade.reference.random_weights import CONFIGS, whole_config
 
 #: Of the fork's head, at published sizes: the specification, section 2.3.
@@ -302,9 +302,7 @@ def test_beside_a_checkpoint_that_was_dropped(base: Path, tmp_path: Path) -> Non
     assert sides(report)["DiT blocks compared with the reference"] == "for"
     assert sides(report)["embodiment 24 (gr1), which NVIDIA trained"] == "for"
     assert report.reference is not None
-    assert report.reference.different_shapes == [
-        "future_tokens.weight: (64, 96), in the reference (32, 96)"
-    ]
+    assert report.reference.different_shapes == ["future_tokens.weight: (64, 96), in the reference (32, 96)"]
     assert any("64 future tokens" in sentence for sentence in report.from_noise["neither"])
 
 

@@ -1,7 +1,7 @@
 """saccade: the action head of GR00T-style robot policies on CPUs, exact and fast.
 
-The public names below need NumPy only. Submodules such as `saccade.reference` are imported when they are first
-used; some of them need optional packages.
+The public names below need NumPy only. Submodules such as `saccade.reference` are imported when they are
+first used; some of them need optional packages.
 """
 
 from __future__ import annotations
@@ -68,17 +68,19 @@ _SUBMODULES = (
 )
 
 if TYPE_CHECKING:
-    import saccade.bench
-    import saccade.checkpoints
-    import saccade.comparison
-    import saccade.integrations
-    import saccade.maps
-    import saccade.observation
-    import saccade.reference
-    import saccade.robots
-    import saccade.sim
-    import saccade.study
-    import saccade.torch
+    from saccade import (
+        bench,
+        checkpoints,
+        comparison,
+        integrations,
+        maps,
+        observation,
+        reference,
+        robots,
+        sim,
+        study,
+        torch,
+    )
 else:  # so that a type checker still reports names that do not exist
 
     def __getattr__(name: str) -> Any:

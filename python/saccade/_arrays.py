@@ -1,4 +1,4 @@
-"""Converts arguments to the arrays that the engine takes, and results to NumPy or torch as the caller uses."""
+"""Converts arguments to the arrays of the engine, and results to NumPy or torch like the arguments."""
 
 from __future__ import annotations
 

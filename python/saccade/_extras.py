@@ -29,13 +29,14 @@ EXTRAS: dict[str, dict[str, str]] = {
         "PIL": "pillow",
         "matplotlib": "matplotlib",
         "threadpoolctl": "threadpoolctl",
+        "jinja2": "jinja2",
+        "scipy": "scipy",
     },
     "study": {
-        "jinja2": "jinja2",
         "joblib": "joblib",
+        "markdown_it": "markdown-it-py",
         "pandas": "pandas",
         "sklearn": "scikit-learn",
-        "scipy": "scipy",
     },
     "ray": {"ray": "ray"},
 }

@@ -16,8 +16,8 @@ class Chunking:
     While a robot executes a chunk, the next one is computed. The first actions of the next chunk must agree
     with the actions that the robot executes meanwhile. Otherwise the robot jerks at the transition.
 
-    The last ``overlap`` of the first ``horizon`` actions of the previous chunk become the first actions of the
-    new one, in place of noise. The velocity of action ``j`` is multiplied by a factor: 0 for the first
+    The last ``overlap`` of the first ``horizon`` actions of the previous chunk become the first actions of
+    the new one, in place of noise. The velocity of action ``j`` is multiplied by a factor: 0 for the first
     ``frozen`` actions, which do not change; ``(1 - exp(-a r)) / (1 - exp(-a))`` for the rest of the overlap,
     with ``a = ramp_rate`` and ``r = (j - frozen + 1) / (overlap - frozen + 1)``, which increases from 0 to 1;
     and 1 from ``overlap`` on. This is the rule of GR00T N1.7 (its options ``rtc_overlap_steps``,

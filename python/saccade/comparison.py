@@ -1,4 +1,4 @@
-"""How much the actions of two runs of a head differ: between a checkpoint and its resized copy, for example."""
+"""Compares the actions of two runs, for example of a checkpoint and its resized copy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 
 from saccade._arrays import Float32Array, integer
 from saccade.checkpoints.description import Config, Source, open_published

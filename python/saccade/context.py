@@ -65,8 +65,8 @@ class Context:
 
     def __reduce__(self) -> NoReturn:
         raise DtypeError(
-            "a Context cannot be pickled, because it belongs to one loaded head: pickle the backbone features "
-            "and call head.encode again"
+            "a Context cannot be pickled, because it belongs to one loaded head: pickle the backbone "
+            "features and call head.encode again"
         )
 
     def __repr__(self) -> str:

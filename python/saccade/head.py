@@ -26,11 +26,11 @@ from saccade._arrays import (
     optional_integers,
     result,
 )
-from saccade.hub import resolve
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig, to_json
 from saccade.context import Context
 from saccade.errors import DtypeError, InputError
+from saccade.hub import resolve
 from saccade.integrator import check_integrator
 from saccade.intervention import Intervention
 from saccade.options import (
@@ -184,9 +184,7 @@ class ActionHead:
         config_text = to_json(config)
         ids = optional_integers("embodiment_ids", embodiment_ids)
         threads = optional_integer("num_threads", num_threads)
-        return cls(
-            _saccade.ActionHead.from_tensors(as_stored(tensors), config_text, ids, precision, threads)
-        )
+        return cls(_saccade.ActionHead.from_tensors(as_stored(tensors), config_text, ids, precision, threads))
 
     @property
     def config(self) -> HeadConfig:
@@ -550,8 +548,8 @@ class ActionHead:
     def __reduce__(self) -> tuple[Any, ...]:
         if self._source is None:
             raise DtypeError(
-                "a head made by ActionHead.from_tensors cannot be pickled or copied, because it has no file to "
-                "be loaded from: write its tensors to a checkpoint and use ActionHead.load"
+                "a head made by ActionHead.from_tensors cannot be pickled or copied, because it has no file "
+                "to be loaded from: write its tensors to a checkpoint and use ActionHead.load"
             )
         return _load, (self._source, self._options)
 

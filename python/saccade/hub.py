@@ -63,8 +63,8 @@ def _snapshot(name: str, revision: str | None) -> Path:
         from huggingface_hub import snapshot_download
     except ImportError:
         raise FileNotFoundError(
-            f"{start}huggingface_hub, which downloads published checkpoints, is not installed. Install it with: "
-            f"{pip_install('huggingface_hub')}, then run: {download}"
+            f"{start}huggingface_hub, which downloads published checkpoints, is not installed. Install it "
+            f"with: {pip_install('huggingface_hub')}, then run: {download}"
         ) from None
     try:
         folder = Path(snapshot_download(name, revision=revision, local_files_only=True))
@@ -77,8 +77,8 @@ def _snapshot(name: str, revision: str | None) -> Path:
     missing = _missing(folder)
     if missing:
         raise FileNotFoundError(
-            f"{start}the cache contains only a part of it ({folder} lacks {', '.join(missing)}). Download the "
-            f"rest with: {download}"
+            f"{start}the cache contains only a part of it ({folder} lacks {', '.join(missing)}). Download "
+            f"the rest with: {download}"
         )
     return folder
 

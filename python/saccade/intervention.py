@@ -169,7 +169,9 @@ def _number(name: str, bias: Any) -> Any:
     try:
         return float(bias)
     except OverflowError:
-        raise InputError(f"{name}: expected a number below infinity, got one beyond the range of float") from None
+        raise InputError(
+            f"{name}: expected a number below infinity, got one beyond the range of float"
+        ) from None
 
 
 def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | None:
@@ -192,7 +194,9 @@ def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | 
             name = f"patch[{key}][{tokens!r}]"
             chosen = _chosen(name, tokens)
             if chosen[0] == "vl":
-                raise InputError(f"{name}: expected state, future or action, got 'vl', which blocks do not change")
+                raise InputError(
+                    f"{name}: expected state, future or action, got 'vl', which blocks do not change"
+                )
             values = float32(name, rows)
             if values.ndim not in (2, 3):
                 raise ShapeError(

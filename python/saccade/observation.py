@@ -71,7 +71,7 @@ class Observation:
 
     @property
     def clusters(self) -> npt.NDArray[np.int64]:
-        """The bootstrap cluster of each row, ``(batch,)``: its episode, or the row itself if that is unknown."""
+        """The bootstrap cluster of each row, ``(batch,)``: its episode, or the row itself if unknown."""
         return np.arange(len(self)) if self.episode is None else self.episode
 
     def row(self, row: int) -> Observation:
@@ -309,11 +309,11 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Reads a file of backbone features.
 
     It holds ``backbone_features (batch, T_vl, context_dim)``, ``state (batch, state_dim)`` and
-    ``embodiment_id``, and may hold ``noise (batch, action_horizon, encoder_action_dim)``; ``input_ids``,
-    ``image_mask``, ``attention_mask`` and ``drop_vl``, each ``(batch, T_vl)``; ``images (batch, cameras, H, W,
-    3)`` uint8; ``tokens (batch, T_vl)`` strings; ``episode (batch,)`` integers. A file with one row may leave
-    out the batch axis of the optional arrays. Names may be prefixed with ``_in.``. A safetensors file holds no
-    strings; there ``tokens`` is a JSON list in the metadata.
+    ``embodiment_id``. It may hold ``noise (batch, action_horizon, encoder_action_dim)``; ``input_ids``,
+    ``image_mask``, ``attention_mask`` and ``drop_vl``, each ``(batch, T_vl)``; ``images (batch, cameras, H,
+    W, 3)`` uint8; ``tokens (batch, T_vl)`` strings; ``episode (batch,)`` integers. A file with one row may
+    leave out the batch axis of the optional arrays. Names may be prefixed with ``_in.``. A safetensors file
+    holds no strings; there ``tokens`` is a JSON list in the metadata.
 
     Args:
         path: ``.npz`` or ``.safetensors``.

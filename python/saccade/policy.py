@@ -113,9 +113,9 @@ class Policy:
             )
         if normalizer.state_dim != config.state_dim or normalizer.action_width > config.action_dim:
             raise InputError(
-                f"normalizer: expected one for states of width {config.state_dim} and actions of at most width "
-                f"{config.action_dim}, as this head has them, got one for states of width "
-                f"{normalizer.state_dim} and actions of width {normalizer.action_width}"
+                f"normalizer: expected states of width {config.state_dim} and actions of at most width "
+                f"{config.action_dim}, as this head has them, got states of width {normalizer.state_dim} "
+                f"and actions of width {normalizer.action_width}"
             )
         self.head = head
         self.normalizer = normalizer

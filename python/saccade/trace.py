@@ -51,7 +51,9 @@ class Trace(Generic[ArrayT]):
 
     def __repr__(self) -> str:
         nbytes = _nbytes(self.attention, self.hidden) + getattr(self.actions, "nbytes", 0)
-        rows = ", ".join(f"{group} {_span(range(*span.indices(span.stop)))}" for group, span in self.rows.items())
+        rows = ", ".join(
+            f"{group} {_span(range(*span.indices(span.stop)))}" for group, span in self.rows.items()
+        )
         lines = [
             f"<saccade.Trace {_size(nbytes)}",
             *_listed("attention", self.attention),

@@ -1,4 +1,4 @@
-"""What a checkpoint contains, from its config and the headers of its files; and reading tensors without torch."""
+"""Describes a checkpoint from its config and the headers of its files, and reads tensors without torch."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._arrays import Float32Array
-from saccade.hub import resolve
 from saccade.config import HeadConfig, to_json
+from saccade.hub import resolve
 
 #: A checkpoint: a directory, one ``.safetensors`` file, or a published id.
 Source = str | os.PathLike[str]

@@ -73,9 +73,9 @@ def from_noise(
         found[side].append(_of_tokens(tokens))
         if tokens.count != PUBLISHED_TOKENS:
             found["neither"].append(
-                f"{tokens.count} future tokens, whereas published checkpoints have {PUBLISHED_TOKENS}: a loader "
-                "that refuses different shapes drops this checkpoint, or a published one for a model with "
-                f"{tokens.count}"
+                f"{tokens.count} future tokens, whereas published checkpoints have {PUBLISHED_TOKENS}: a "
+                "loader that refuses different shapes drops this checkpoint, or a published one for a model "
+                f"with {tokens.count}"
             )
     if version == "n1.5" and len(embodiments) == 32:
         for name in PRETRAINED:
@@ -90,7 +90,9 @@ def from_noise(
         for name, resemblance in reference.parts.items():
             side, what = _likeness(resemblance)
             found[side].append(f"{name} compared with the reference: {what}")
-        found["neither"] += [f"a shape differs from the reference: {shape}" for shape in reference.different_shapes]
+        found["neither"] += [
+            f"a shape differs from the reference: {shape}" for shape in reference.different_shapes
+        ]
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from saccade.checkpoints.description import Description
 
@@ -34,7 +33,7 @@ class Part:
     judged: int = 0
     """Number of tensors that are large enough to compare their distribution."""
     as_drawn: int = 0
-    """How many of these are distributed as before any training, see :mod:`saccade.checkpoints.initialisation`."""
+    """How many of these are distributed as before training (:mod:`saccade.checkpoints.initialisation`)."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,8 @@ class Embodiment:
     norm: float
     """Norm of all weights and biases."""
     robust_z: float | None
-    """Distance of the norm from the median over all ids, in units of 1.4826 median absolute deviations. None if
-    the deviation is 0."""
+    """Distance of the norm from the median over all ids, in units of 1.4826 median absolute deviations. None
+    if the deviation is 0."""
     looks: str
     """``"zero"``, ``"as initialised"`` (biases are zero, weights are distributed as before any training) or
     ``"trained"``."""
@@ -124,8 +123,8 @@ class PartResemblance:
     """How similar one part is to the same part of the reference."""
 
     pieces: int
-    """Number of tensors that were compared. Each embodiment's slice counts separately. Tensors that the reference
-    has as initialised (biases, norms) are left out."""
+    """Number of tensors that were compared. Each embodiment's slice counts separately. Tensors that the
+    reference has as initialised (biases, norms) are left out."""
     identical: int
     """How many of them are equal."""
     cosine: Spread | None

@@ -1,9 +1,9 @@
 """The distributions that a head's tensors have before training, and how far a tensor is from them.
 
 The released constructors initialise tensors as follows. ``nn.Linear`` draws weight and bias uniformly from
-±1 / sqrt(inputs). The category-specific layers draw weights from a normal distribution with standard deviation
-0.02, and their biases are zero. Future tokens and positions are normal with standard deviation 0.02. Norms
-start with weight one and bias zero.
+±1 / sqrt(inputs). The category-specific layers draw weights from a normal distribution with standard
+deviation 0.02, and their biases are zero. Future tokens and positions are normal with standard deviation
+0.02. Norms start with weight one and bias zero.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def draw(name: str, inputs: int) -> Draw:
 
 
 def is_norm(name: str) -> bool:
-    """Whether a tensor is the weight or bias of a layer norm. ``norm1.linear`` of a block is a linear layer."""
+    """Whether a tensor belongs to a layer norm. ``norm1.linear`` of a block is a linear layer."""
     module = name.rpartition(".")[0]
     return module.rpartition(".")[2] in ("vlln", "norm1", "norm3")
 
@@ -92,8 +92,8 @@ def sample(values: Array) -> Array:
 def distance(values: Array, drawn: Draw) -> float:
     """The Kolmogorov-Smirnov statistic of a sample, from 0 to 1.
 
-    This is the largest difference between the cumulative distribution functions of sample and distribution. For
-    a constant, it is the share of values that differ from it.
+    This is the largest difference between the cumulative distribution functions of sample and distribution.
+    For a constant, it is the share of values that differ from it.
     """
     if drawn.kind == "constant":
         return float(np.mean(values != drawn.scale))

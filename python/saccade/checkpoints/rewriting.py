@@ -12,9 +12,9 @@ import saccade._saccade as _saccade
 from saccade._arrays import integer, optional_integers, text
 from saccade._files import sha256_of
 from saccade.checkpoints.description import Config, Source
-from saccade.hub import resolve
 from saccade.config import to_json
 from saccade.errors import InputError
+from saccade.hub import resolve
 
 Progress = Callable[[int, int], object] | None
 
@@ -26,7 +26,7 @@ class Written:
     files: tuple[Path, ...]
     """The files with tensors. ``config.json`` is in the same directory."""
     carried: tuple[Path, ...]
-    """Other files of the source's directory that were copied, such as statistics; paths in the new directory."""
+    """Other files that were copied, such as statistics; paths in the new directory."""
     left: tuple[Path, ...]
     """Files of the source's directory that were not copied: other weights, optimizer states, other
     checkpoints."""
@@ -65,8 +65,8 @@ class ConvertReport(Written):
     embodiment_ids: tuple[int, ...] | None
     """The embodiments that were kept, in ascending order; None for all."""
     zeroed_bytes: int
-    """Size of the layers of the other embodiments, which are zero now. They are holes in the file, if the file
-    system supports holes."""
+    """Size of the layers of the other embodiments, which are zero now. They are holes in the file, if the
+    file system supports holes."""
     bytes_before: int
     """Size of all tensors of the source, in bytes."""
     bytes_after: int
@@ -82,8 +82,8 @@ class ResizeReport(Written):
     num_after: int
     """Number of future tokens of the copy."""
     sources: tuple[tuple[int, ...], ...]
-    """For each token of the copy, the tokens of the source that it represents: one if it is a copy, several if
-    they were merged."""
+    """For each token of the copy, the tokens of the source that it represents: one if it is a copy, several
+    if they were merged."""
     future_key_bias: tuple[float, ...] | None
     """What saccade adds to the logits of the tokens' keys; None if nothing."""
     is_exact: bool

@@ -1,8 +1,8 @@
 """The same action head in plain torch: it is trained, and the Rust head is tested against it.
 
 It favours clarity over speed: nothing is cached, and every row is computed in every block. `head` is the
-sampler and the loss, `layers` the modules, `intervene` the effect of an intervention in each block. Needs torch
-and safetensors.
+sampler and the loss, `layers` the modules, `intervene` the effect of an intervention in each block. Needs
+torch and safetensors.
 """
 
 from saccade._extras import require

@@ -57,10 +57,10 @@ if TYPE_CHECKING:
 class ActionHead(nn.Module):
     """A GR00T action head in torch.
 
-    The head computes in the dtype of its parameters (`.double()` for float64) and is differentiable. Inputs may
-    be NumPy arrays and are converted to that dtype. Wrap calls in `torch.no_grad()` if no gradient is needed. A
-    new head has the initial distribution of the released code. Unlike the released training, there is no
-    dropout, and states are neither dropped nor made noisy.
+    The head computes in the dtype of its parameters (`.double()` for float64) and is differentiable. Inputs
+    may be NumPy arrays and are converted to that dtype. Wrap calls in `torch.no_grad()` if no gradient is
+    needed. A new head has the initial distribution of the released code. Unlike the released training, there
+    is no dropout, and states are neither dropped nor made noisy.
 
     Args:
         config: sizes and switches.
@@ -184,8 +184,8 @@ class ActionHead(nn.Module):
                 places remain and are zero, so `velocity`, `sample` and `trace` need `drop_vl` as well.
 
         Returns:
-            `vl_embs (B, S, context_dim)`. These are the features themselves if the head has neither `vlln` nor
-            VL self-attention.
+            `vl_embs (B, S, context_dim)`. These are the features themselves if the head has neither `vlln`
+            nor VL self-attention.
         """
         features = self.as_input(backbone_features)
         check_shape("backbone_features", features, (None, None, self.config.context_dim))
@@ -343,21 +343,21 @@ class ActionHead(nn.Module):
     ) -> Trace[Tensor]:
         """Samples as `sample` does, and records attention and hidden states, which are part of the graph.
 
-        The gradient with stopped edges is the sum over all paths from the result back to an input that use none
-        of these edges. With `[("state", "future"), ("action", "future")]`, it is the part that does not pass
-        through future rows. The total gradient minus this is the part that does.
+        The gradient with stopped edges is the sum over all paths from the result back to an input that use
+        none of these edges. With `[("state", "future"), ("action", "future")]`, it is the part that does not
+        pass through future rows. The total gradient minus this is the part that does.
 
         Args:
             vl_embs, state, embodiment_id, noise, num_steps: as in `sample`.
             drop_vl: bool `(B, S)`, as given to `encode`: no row attends to these tokens.
             attention_mask: bool `(B, S)`, True where a token is attended. Default: everywhere. A head that
                 ignores padding accepts an all-true mask only.
-            image_mask: bool `(B, S)`, True for image tokens. Required for N1.6 and N1.7, whose cross-attention
-                blocks attend to text and images in turn.
+            image_mask: bool `(B, S)`, True for image tokens. Required for N1.6 and N1.7, whose
+                cross-attention blocks attend to text and images in turn.
             intervention: one or several :class:`saccade.Intervention`.
-            stop_gradient: pairs (reader, source) as in `Intervention.cut`, in all blocks, steps and heads. The
-                result is unchanged up to rounding, but in the backward pass the rows of the reader treat the
-                keys and values of the source as constants.
+            stop_gradient: pairs (reader, source) as in `Intervention.cut`, in all blocks, steps and heads.
+                The result is unchanged up to rounding, but in the backward pass the rows of the reader treat
+                the keys and values of the source as constants.
             record: what is recorded, any of "attention" and "hidden".
             blocks: the blocks that are recorded. Default: all.
             steps: the steps that are recorded. Default: all.

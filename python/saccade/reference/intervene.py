@@ -330,8 +330,8 @@ class Run:
         kind = "cross-attention" if group == "vl" else "self-attention"
         where = ", ".join(map(str, existing)) or "none in this head"
         raise InputError(
-            f"intervention: a {what} has no effect in blocks {', '.join(map(str, blocks))}: these keys exist in "
-            f"{kind} blocks only ({where})"
+            f"intervention: a {what} has no effect in blocks {', '.join(map(str, blocks))}: these keys exist "
+            f"in {kind} blocks only ({where})"
         )
 
     def count(self, name: str, chosen: Chosen) -> int:

@@ -39,8 +39,8 @@ def tensor_names(checkpoint: Description) -> list[str]:
 def read_tensors(
     checkpoint: Description, expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """Reads the head's tensors in `dtype`, by their names without prefix. int8 weights are multiplied by their
-    scales.
+    """Reads the head's tensors in `dtype`, by their names without prefix. int8 weights are multiplied by
+    their scales.
 
     Raises:
         CheckpointError: tensors are missing, unknown inside the prefix, or of the wrong shape. The message
@@ -75,7 +75,9 @@ def read_tensors(
         if name in integers and scale is not None and tuple(scale.shape) == rows and tensors[name].ndim == 2:
             tensors[name] *= scale.to(dtype)[:, None]
         else:
-            problems.append(f"{name}: expected an int8 matrix with scales {name}{SCALE_SUFFIX} {rows}, or neither")
+            problems.append(
+                f"{name}: expected an int8 matrix with scales {name}{SCALE_SUFFIX} {rows}, or neither"
+            )
     for name, shape in expected.items():
         if shape.numel() == 0:  # an empty table of future tokens need not be stored
             tensors.setdefault(name, torch.empty(shape, dtype=dtype))

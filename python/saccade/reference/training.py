@@ -1,4 +1,4 @@
-"""What training adds to the head: the distribution of times, the loss, and parameters that inference ignores."""
+"""What training adds to the head: the distribution of times, the loss, and unused parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ LOG_SIGMA = "task_log_sigma."  # the fork: learned weights of its decoders' loss
 class TimeDistribution:
     """The distribution of flow times in training: `scale * (1 - b)` with `b ~ Beta(alpha, beta)`.
 
-    This is the form of the later releases. Times are in [0, scale], and most are near 0, where the actions are
-    mostly noise.
+    This is the form of the later releases. Times are in [0, scale], and most are near 0, where the actions
+    are mostly noise.
     """
 
     alpha: float = 1.5

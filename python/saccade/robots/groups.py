@@ -90,9 +90,7 @@ class Group:
             values = np.clip(values, -1.0, 1.0)
         return ((values + 1) / 2 * (second - first) + first).astype(np.float32)
 
-    def _statistics_for(
-        self, values: Float32Array
-    ) -> tuple[Statistics, Statistics, npt.NDArray[np.bool_]]:
+    def _statistics_for(self, values: Float32Array) -> tuple[Statistics, Statistics, npt.NDArray[np.bool_]]:
         """The statistics, with one row for each step of the chunk if each step has its own."""
         assert self.first is not None
         assert self.second is not None

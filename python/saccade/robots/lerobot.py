@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from saccade.errors import CheckpointError
-
 from saccade.robots.building import Builder, Dims, Options, finished, size_of
 from saccade.robots.files import read_json, read_small_tensors
 from saccade.robots.groups import Group, Robot
@@ -125,7 +124,9 @@ def _statistics(folder: Path, step: Mapping[str, Any]) -> dict[str, dict[str, An
     if name is None:
         return {}
     if not isinstance(name, str) or not name or Path(name).name != name:
-        raise CheckpointError(f"{folder}: state_file: expected the name of a file in this folder, got {name!r}")
+        raise CheckpointError(
+            f"{folder}: state_file: expected the name of a file in this folder, got {name!r}"
+        )
     found: dict[str, dict[str, Any]] = {}
     for full, values in read_small_tensors(folder / name).items():
         key, _, statistic = full.rpartition(".")

@@ -141,7 +141,9 @@ class Normalizer(Robot):
                 invertible (``"sin_cos"``), or the head gets zeros in place of a state.
         """
         if self.zero_state:
-            raise InputError("state: cannot be converted back, because this head gets zeros in place of a state")
+            raise InputError(
+                "state: cannot be converted back, because this head gets zeros in place of a state"
+            )
         values = self._head("state", state, self.state_groups)
         return like_features(_mapped(values, self.state_groups, Group.to_robot), is_torch(state))
 
@@ -208,7 +210,9 @@ class Normalizer(Robot):
             return np.zeros(self.action_width, np.float32)
         if state is None:
             keys = ", ".join(group.key for group in relative)
-            raise InputError(f"state: expected the robot's state, because {keys} are relative to it, got None")
+            raise InputError(
+                f"state: expected the robot's state, because {keys} are relative to it, got None"
+            )
         latest = self._robot("state", state, self.state_groups)
         if latest.ndim > 2:
             latest = latest[:, -1]  # the newest of a history

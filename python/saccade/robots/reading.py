@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from saccade.hub import resolve
 from saccade.errors import CheckpointError
+from saccade.hub import resolve
 from saccade.robots.building import Dims, Options, size_of
 from saccade.robots.files import read_json
 from saccade.robots.flat import flat_robot
@@ -68,7 +68,8 @@ def _own(folder: Path, values: Mapping[str, Any], options: Options) -> Robot | N
     return _from_values(values, options, str(folder / "config.json")) if "policy_cfg" in values else None
 
 
-#: Files of a checkpoint that have statistics, in the order in which they are tried. A new layout is one more line.
+#: Files of a checkpoint that have statistics, in the order in which they are tried. A new layout is one more
+#: line.
 FILES: dict[str, Callable[[Path, Mapping[str, Any], Options], Robot | None]] = {
     "policy_preprocessor.json": lerobot_robot,
     "processor_config.json": _processor,
@@ -77,9 +78,7 @@ FILES: dict[str, Callable[[Path, Mapping[str, Any], Options], Robot | None]] = {
 }
 
 
-def _from_values(
-    values: Mapping[str, Any], options: Options, where: str, dims: Dims = (None, None)
-) -> Robot:
+def _from_values(values: Mapping[str, Any], options: Options, where: str, dims: Dims = (None, None)) -> Robot:
     """The robot of a mapping, or of the contents of a JSON file."""
     if isinstance(values.get("policy_cfg"), Mapping):
         statistics = values["policy_cfg"].get("statistics")

@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import json
-import math
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import joblib
-import numpy as np
 import pandas as pd
 
 import saccade
 from saccade._files import sha256_of, writable_directory, write_json
 from saccade.environment import cpu_name
 from saccade.errors import InputError, SaccadeError
-from saccade.study.tables import (
+from saccade.study.cell import Cell, Rows, digest, plain, sortable
+from saccade.study.study import Study
+from saccade.study.table import (
     Provenance,
     provenance_path,
     read_provenance,
@@ -37,39 +36,10 @@ from saccade.study.tables import (
 BACKENDS = ("loky", "ray")
 ROUND = 4  # cells a worker between two looks at what Ray has done
 RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld", "scikit-learn")
-Key: TypeAlias = tuple["str | int | float", ...]
-Rows: TypeAlias = list[dict[str, Any]]
 
 
 class StudyError(SaccadeError):
     """Some cells of a study failed; those that are done are kept, and the next run tries the others again."""
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One unit of work.
-
-    Attributes:
-        key: What it is within its study, such as task, seed and arm. The table is sorted by it.
-        settings: What else its result depends on, for JSON. A cell with other settings is another cell.
-
-    Example:
-        >>> Cell(("reach", 3, "none"), {"engine": "rust"}).name
-        'reach 3 none'
-    """
-
-    key: Key
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        return " ".join(str(part) for part in self.key)
-
-    @property
-    def digest(self) -> str:
-        """Of key and settings; the name of its file."""
-        return digest({"key": list(self.key), "settings": self.settings})
 
 
 @dataclass(frozen=True)
@@ -88,6 +58,38 @@ OnDone: TypeAlias = Callable[[Finished, int, int], None]
 
 def silent(finished: Finished, done: int, total: int) -> None:
     """An `OnDone` that says nothing."""
+
+
+def run(
+    study: Study, out: Path, *, backend: str = "loky", jobs: int = 1, on_done: OnDone = silent
+) -> pd.DataFrame:
+    """Works through all stages of a study.
+
+    Args:
+        study: what is measured.
+        out, backend, jobs, on_done: as in `run_cells`.
+
+    Returns:
+        The table.
+
+    Raises:
+        InputError, StudyError: as `run_cells`.
+    """
+    stage: Study | None = study.begin(out)
+    while stage is not None:
+        table = run_cells(
+            stage.name,
+            stage.cells(),
+            stage.measure,
+            out,
+            settings=stage.settings(),
+            backend=backend,
+            jobs=jobs,
+            on_done=on_done,
+            expected=stage.num_cells,
+        )
+        stage = stage.then(table)
+    return table
 
 
 def run_cells(
@@ -310,52 +312,6 @@ def spread(
         raise StudyError(
             "a worker process died, perhaps for want of memory; what is done is kept, run again to go on"
         ) from None
-
-
-def digest(value: Any) -> str:
-    """The first 16 hexadecimal digits of the SHA-256 of a value's JSON.
-
-    Example:
-        >>> digest({"a": 1, "b": (2, 3)}) == digest({"b": [2, 3], "a": 1})
-        True
-    """
-    text = json.dumps(plain(value), sort_keys=True, ensure_ascii=False)
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
-
-
-def plain(value: Any) -> Any:
-    """The value as it comes back from JSON: NumPy's numbers become Python's, tuples lists, NaN None.
-
-    Raises:
-        TypeError: something has no form in JSON.
-
-    Example:
-        >>> plain({"steps": np.int64(3), "rate": np.float32("nan"), "blocks": (0, 1)})
-        {'steps': 3, 'rate': None, 'blocks': [0, 1]}
-    """
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        if math.isnan(value):
-            return None
-        raise TypeError(f"{value} has no form in JSON")
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    raise TypeError(f"{type(value).__name__} has no form in JSON: {value!r}")
-
-
-def sortable(key: Sequence[str | int | float]) -> list[tuple[bool, float, str]]:
-    """A key in a form that compares: numbers by size before text by letters.
-
-    Example:
-        >>> sorted([["reach", 10], ["push", 9], ["reach", 9]], key=sortable)
-        [['push', 9], ['reach', 9], ['reach', 10]]
-    """
-    return [(True, 0.0, part) if isinstance(part, str) else (False, float(part), "") for part in key]
 
 
 @functools.cache

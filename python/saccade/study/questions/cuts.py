@@ -1,34 +1,22 @@
-"""`saccade study cuts`: closed loop with parts of the head cut or replaced, on equal seeds and noise."""
+"""`saccade study cuts`: parts of the head cut or replaced, on equal episodes and noise."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 
-from saccade.intervention import Intervention
-from saccade.sim import graphics
-from saccade.sim.policy import ENGINES, Float32Array
+from saccade.cli.arguments import add_list, add_rollout_arguments, check_known
+from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.study import figures
-from saccade.study.arguments import check_known, names
-from saccade.study.arms import ARMS, BASELINE, SHUFFLED, control_line
-from saccade.study.cells import Cell, OnDone, run_cells
-from saccade.study.closed_loop import ArmWork
-from saccade.study.features import (
-    Changes,
-    Recording,
-    change_section,
-    from_file,
-    head_and_observations,
-    recording_of,
-)
-from saccade.study.loaded import describe_checkpoint
-from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
-from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate, too_few
+from saccade.study.arms import Arm, ArmStudy, control_line
+from saccade.study.changes import change_section
+from saccade.study.section import Figure, Grid, Section, effect, not_measured, number, rate, too_few
+from saccade.study.source import Float32Array, source_of
 from saccade.study.statistics import (
     Estimate,
     PairedDifference,
@@ -39,103 +27,169 @@ from saccade.study.statistics import (
     scaled,
     wilson,
 )
-from saccade.study.tables import Provenance, truths
+from saccade.study.table import Provenance, from_file, truths
 
-STUDY = "cuts"
 SHARES = (0.1, 0.25)  # of discordant pairs, for what can be detected
 
 EPILOG = """\
-Every arm runs the same episodes: the same layouts, words and noise. Success is compared in pairs with the
-arm "none", which is always run. The change of the chunk is measured on what "none" saw, look by look. With
---features it is measured on the observations of a file, for any checkpoint; there is no success then.
+Every arm runs the same episodes: the same layouts, instructions and noise. Success is compared in pairs with
+the arm "none", which is always run. The change of the chunk is measured on the observations of "none". With
+--features it is measured on the observations of a file, for any checkpoint; success is then unknown.
 
 arms:
 {arms}
 
 examples:
   saccade study cuts --episodes 15 --out out/study
-  saccade study cuts --arms future-unread,future-blind --tasks push --jobs 2 --out out/study
+  saccade study cuts --arms future-unread future-blind --tasks push --jobs 2 --out out/study
   saccade study cuts --checkpoint checkpoint/ --features looks.npz --out out/study
 """
 
 
+def cut(*pairs: tuple[str, str]) -> Callable[[Float32Array, np.random.Generator], Intervention]:
+    """An intervention of an arm: `(reader, source)` pairs cut in every block."""
+    return lambda tokens, rng: Intervention(cut=pairs)
+
+
+def shuffled(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+    """The learned tokens in another order."""
+    return Intervention(future_tokens=tokens[rng.permutation(len(tokens))])
+
+
+def averaged(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+    """As many copies of their mean."""
+    return Intervention(future_tokens=np.tile(tokens.mean(axis=0), (len(tokens), 1)))
+
+
+def zeroed(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+    """Zeros in their place."""
+    return Intervention(future_tokens=np.zeros_like(tokens))
+
+
+def redrawn(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+    """Random numbers with the mean and the standard deviation of theirs."""
+    drawn = rng.normal(tokens.mean(), tokens.std(), tokens.shape)
+    return Intervention(future_tokens=drawn.astype(np.float32))
+
+
+ALL_ARMS = (
+    Arm("none", "nothing changed", "The policy as it is.", lambda tokens, rng: None, needs_future=False),
+    Arm(
+        "future-unread",
+        "{state, action} <- future cut",
+        "State and action rows do not see the future rows. This removes every effect of the future tokens, "
+        "like N = 0 without training anew.",
+        cut(("state", "future"), ("action", "future")),
+    ),
+    Arm(
+        "future-blind",
+        "future <- vl cut",
+        "The future rows do not see the vision-language tokens: are they a summary of what is seen?",
+        cut(("future", "vl")),
+    ),
+    Arm(
+        "future-alone",
+        "future <- {state, action} cut",
+        "The future rows see neither state nor action rows: are they a scratchpad for them?",
+        cut(("future", "state"), ("future", "action")),
+    ),
+    Arm(
+        "action-blind",
+        "action <- vl cut",
+        "The action rows do not see the vision-language tokens. What is seen reaches them through the future "
+        "rows, and also through the state row.",
+        cut(("action", "vl")),
+        needs_future=False,
+    ),
+    Arm(
+        "rows-blind",
+        "{state, action} <- vl cut",
+        "Neither state nor action rows see the vision-language tokens: all that is seen must pass through "
+        "the future rows.",
+        cut(("state", "vl"), ("action", "vl")),
+    ),
+    Arm(
+        "all-blind",
+        "{state, future, action} <- vl cut",
+        "No row sees the vision-language tokens. A control that must fail: it shows what these tasks are "
+        "worth without sight.",
+        cut(*((row, "vl") for row in ROW_GROUPS)),
+        needs_future=False,
+    ),
+    Arm(
+        "future-shuffled",
+        "future tokens shuffled",
+        "The learned tokens in another order. A control: they have no positions, so nothing may change but "
+        "rounding.",
+        shuffled,
+    ),
+    Arm(
+        "future-averaged",
+        "future tokens averaged",
+        "N copies of the mean of the learned tokens: do they need to differ?",
+        averaged,
+    ),
+    Arm(
+        "future-zeroed",
+        "future tokens zeroed",
+        "Zeros in place of the learned tokens; the rows still read and are read.",
+        zeroed,
+    ),
+    Arm(
+        "future-redrawn",
+        "future tokens re-drawn",
+        "Random tokens with the mean and the standard deviation of the learned ones, others in every "
+        "episode: does it matter what was learned?",
+        redrawn,
+    ),
+)
+ARMS = {arm.name: arm for arm in ALL_ARMS}
+BASELINE = "none"
+SHUFFLED = "future-shuffled"
+
+
 @dataclass(frozen=True)
-class Settings:
-    """What is run.
+class Cuts(ArmStudy):
+    """What the actions and success lose when parts of the head are cut or replaced.
 
     Attributes:
-        rollouts: The episodes, which each arm runs.
-        arms: Names, of `saccade.study.arms.ARMS`.
-        engine: Computes the head.
+        source, arms, metrics: See `ArmStudy`; arms default to all of `ARMS`.
     """
 
-    rollouts: Rollouts
-    arms: tuple[str, ...] = tuple(ARMS)
-    engine: str = "rust"
+    arms: Sequence[Arm] = ALL_ARMS
+    name: ClassVar[str] = "cuts"
+    baseline: ClassVar[Arm] = ARMS[BASELINE]
+    control: ClassVar[str] = SHUFFLED
 
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """See `Study`."""
+        width = max(len(name) for name in ARMS)
+        parser.epilog = EPILOG.format(
+            arms="\n".join(f"  {arm.name:{width}}  {arm.label}" for arm in ARMS.values())
+        )
+        add_rollout_arguments(parser, episodes=15)
+        add_list(parser, "--arms", help="arms (default: all)")
+        parser.add_argument(
+            "--engine", choices=("rust", "torch"), help="what computes the action head (default: rust)"
+        )
 
-@dataclass(frozen=True)
-class FileSettings:
-    """What is run on a file of features; attributes as in `Settings`."""
+    @classmethod
+    def from_arguments(cls, args: argparse.Namespace) -> Cuts:
+        """See `Study`."""
+        chosen = tuple(args.arms or ARMS)
+        check_known("--arms", chosen, ARMS)
+        return cls(source_of(args, "engine"), tuple(ARMS[name] for name in chosen))
 
-    recording: Recording
-    arms: tuple[str, ...]
+    def settings(self) -> Mapping[str, Any]:
+        """See `Study`."""
+        engine = {"engine": self.source.engine_name} if self.source.closed_loop else {}
+        return {**super().settings(), **engine}
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declares the arguments."""
-    width = max(len(name) for name in ARMS)
-    parser.epilog = EPILOG.format(
-        arms="\n".join(f"  {arm.name:{width}}  {arm.label}" for arm in ARMS.values())
-    )
-    add_rollout_arguments(parser, episodes=15)
-    parser.add_argument("--arms", metavar="NAME,...", help="arms, separated by commas (default: all)")
-    parser.add_argument("--engine", choices=ENGINES, help="what computes the action head (default: rust)")
-
-
-def settings(args: argparse.Namespace) -> Settings | FileSettings:
-    """From the arguments; raises what is wrong with them."""
-    arms = tuple(ARMS) if args.arms is None else names("--arms", args.arms)
-    check_known("arms", arms, ARMS)
-    if args.features is not None:
-        recording = recording_of(args, "engine")
-        head_and_observations(recording)
-        return FileSettings(recording, arms)
-    rollouts = rollouts_of(args)
-    graphics.check()
-    return Settings(rollouts, arms, args.engine or "rust")
-
-
-def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
-    """A cell is an episode of one arm. Arms of one episode lie side by side, for they share what it saw."""
-    if isinstance(settings, FileSettings):
-        CHANGES.run(settings.recording, settings.arms, out, backend=backend, jobs=jobs, on_done=on_done)
-        return
-    arms = dict.fromkeys((BASELINE, *settings.arms))
-    checkpoint = settings.rollouts.checkpoint
-    run_cells(
-        STUDY,
-        [Cell((*episode, arm)) for episode in settings.rollouts.episodes for arm in arms],
-        ArmWork(checkpoint, settings.engine, intervention_of, why_not),
-        out,
-        settings={"checkpoint": describe_checkpoint(checkpoint), "engine": settings.engine},
-        backend=backend,
-        jobs=jobs,
-        on_done=on_done,
-    )
-
-
-def intervention_of(arm: str, tokens: Float32Array, rng: np.random.Generator) -> Intervention | None:
-    """What an arm does."""
-    return ARMS[arm].intervention(tokens, rng)
-
-
-def why_not(arm: str, num_future_tokens: int) -> str | None:
-    """See `Arm.why_not`."""
-    return ARMS[arm].why_not(num_future_tokens)
-
-
-CHANGES = Changes(STUDY, BASELINE, SHUFFLED, intervention_of, why_not)
+    @classmethod
+    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
+        """See `Study`."""
+        return section(table, provenance)
 
 
 @dataclass(frozen=True)
@@ -165,7 +219,7 @@ def arm_results(table: pd.DataFrame) -> list[ArmResult]:
     by_arm = {str(name): rows.set_index(["task", "seed"]) for name, rows in table.groupby("arm")}
     baseline = by_arm.get(BASELINE, pd.DataFrame(columns=["success"]))["success"].dropna()
     results = []
-    for name in [name for name in ARMS if name in by_arm]:
+    for name in sorted(by_arm, key=[*ARMS].index):
         rows = by_arm[name]
         measured = rows[rows["success"].notna()]
         note = None if len(measured) else str(rows["note"].iloc[0])
@@ -201,7 +255,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         labels = {arm.name: arm.label for arm in ARMS.values()}
         about = [f"{arm.label}: {arm.about}" for arm in ARMS.values() if arm.name in set(table["arm"])]
         title = "Cuts: actions with parts of the head cut or replaced"
-        return change_section(CHANGES, title, labels, about, NOT_SHOWN_OF_CUTS, table, provenance)
+        return change_section(Cuts, title, labels, about, NOT_SHOWN_OF_CUTS, table, provenance)
     results = arm_results(table)
     measured = [result for result in results if result.episodes]
     compared = [result for result in measured if result.pairs is not None]

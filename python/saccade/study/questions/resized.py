@@ -33,7 +33,7 @@ from saccade.study.features import (
 )
 from saccade.study.loaded import describe_checkpoint
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
-from saccade.study.report import Figure, Grid, Section, effect, not_measured, number, rate
+from saccade.study.section import Figure, Grid, Section, effect, not_measured, number, rate
 from saccade.study.statistics import Estimate, bootstrap, paired_difference, scaled, wilson
 from saccade.study.tables import Provenance, truths
 

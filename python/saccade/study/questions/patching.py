@@ -37,7 +37,7 @@ from saccade.study.features import (
 from saccade.study.features import summary as file_summary
 from saccade.study.loaded import describe_checkpoint, environment_of, head_of, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
-from saccade.study.report import Figure, Grid, Section, not_measured, number, too_few
+from saccade.study.section import Figure, Grid, Section, not_measured, number, too_few
 from saccade.study.statistics import Estimate, bootstrap_ratio
 from saccade.study.tables import Provenance
 

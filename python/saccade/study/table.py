@@ -129,3 +129,13 @@ def table_path(out: Path, study: str) -> Path:
 def provenance_path(out: Path, study: str) -> Path:
     """Where it says what the table comes from."""
     return out / f"{study}.json"
+
+
+def clusters_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """Of each row what it stands and falls with: its episode, in a table of the simulator the seed."""
+    return list(zip(table["task"], table["episode" if "episode" in table else "seed"], strict=True))
+
+
+def from_file(provenance: Provenance) -> bool:
+    """Whether a table was measured on a file of features."""
+    return "features" in provenance.settings

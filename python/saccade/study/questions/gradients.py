@@ -48,7 +48,7 @@ from saccade.study.features import (
 from saccade.study.features import summary as file_summary
 from saccade.study.loaded import describe_checkpoint, environment_of, policy_of
 from saccade.study.observations import Rollouts, add_rollout_arguments, record_looks, rollouts_of
-from saccade.study.report import Figure, Grid, Section, not_measured, number
+from saccade.study.section import Figure, Grid, Section, not_measured, number
 from saccade.study.statistics import Estimate, bootstrap
 from saccade.study.tables import Provenance
 

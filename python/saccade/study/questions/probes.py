@@ -31,7 +31,7 @@ from saccade.study import figures
 from saccade.study.cells import Cell, OnDone, Rows, digest, run_cells
 from saccade.study.loaded import describe_checkpoint, environment_of, head_of, policy_of
 from saccade.study.observations import Look, Rollouts, add_rollout_arguments, record_looks, rollouts_of
-from saccade.study.report import Figure, Grid, Section, number
+from saccade.study.section import Figure, Grid, Section, number
 from saccade.study.statistics import CONFIDENCE, Estimate
 from saccade.study.tables import Provenance
 
