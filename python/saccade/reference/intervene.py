@@ -288,57 +288,75 @@ class Run:
         check_indices("steps", edit.steps, self.num_steps)
         check_indices("heads", edit.heads, self.config.num_heads)
         self.check_edges("cut", edit)
+        for reader, source in edit.cut:
+            self.some("cut", reader)
+            self.some("cut", source)
+            self.check_acts(f"cut: {reader[0]} reads {source[0]}", source[0], edit.blocks)
         for chosen, biases in edit.key_bias.items():
-            size = self.count("key_bias", chosen)
+            size = self.some("key_bias", chosen)
+            self.check_acts(f"key_bias: {chosen[0]} is read", chosen[0], edit.blocks)
             check_shape(f"key_bias: {chosen[0]}", biases, (size,) if biases.ndim == 1 else ())
-        self.check_effect(edit)
         for (step, block), groups in edit.patch.items():
             check_indices("patch: step", [step], self.num_steps)
             check_indices("patch: block", [block], self.config.num_layers)
             for chosen, rows in groups.items():
                 name = f"patch[({step}, {block})]"
                 batch = (self.batch,) if rows.ndim == 3 else ()
-                count = self.count(name, chosen)
+                count = self.some(name, chosen)
                 check_shape(f"{name}: {chosen[0]}", rows, (*batch, count, self.config.width))
                 evaluations = range(step * self.in_step, (step + 1) * self.in_step)
-                if count and chosen[0] != "action" and any(map(self.first_row, evaluations)):
+                if chosen[0] != "action" and any(map(self.first_row, evaluations)):
                     raise InputError(
                         f"{name}: {chosen[0]} tokens, expected action tokens, since with future_refresh "
                         f"{self.future_refresh} the others do not always run at step {step}"
                     )
 
     def check_edges(self, name: str, edit: Edit) -> None:
-        """Refuses tokens that are not there."""
+        """Refuses edges of tokens that do not exist."""
         for pair in edit.cut:
             for chosen in pair:
                 self.count(name, chosen)
 
-    def check_effect(self, edit: Edit) -> None:
-        """Refuses cuts and biases none of which exists in any of the blocks where they apply.
+    def check_acts(self, edge: str, group: str, blocks: tuple[int, ...] | None) -> None:
+        """Refuses a cut or bias that has no effect in any of the blocks where it applies.
+
+        Args:
+            edge: what is changed, for the message.
+            group: the group of the keys.
+            blocks: where it applies.
 
         Raises:
-            InputError: Says in which blocks the edges exist.
+            InputError: says in which blocks the keys are read.
         """
-        edges = [(f"cut of {source[0]} keys", source[0]) for _, source in edit.cut]
-        edges += [(f"key_bias on {chosen[0]} keys", chosen[0]) for chosen in edit.key_bias]
-        blocks = range(self.config.num_layers) if edit.blocks is None else edit.blocks
-        kinds = {is_cross(self.config, block) for block in blocks}
-        if not edges or any((group == "vl") in kinds for _, group in edges):
-            return
-        what, group = edges[0]
-        existing = [b for b in range(self.config.num_layers) if is_cross(self.config, b) == (group == "vl")]
-        kind = "cross-attention" if group == "vl" else "self-attention"
-        where = ", ".join(map(str, existing)) or "none in this head"
-        raise InputError(
-            f"intervention: a {what} has no effect in blocks {', '.join(map(str, blocks))}: these keys exist "
-            f"in {kind} blocks only ({where})"
-        )
+        kind = "cross" if group == "vl" else "self"
+        existing = [
+            block
+            for block in range(self.config.num_layers)
+            if is_cross(self.config, block) == (group == "vl")
+        ]
+        if not existing:
+            raise InputError(f"{edge} in {kind}-attention blocks only, and this head has none")
+        if blocks is not None and not set(blocks) & set(existing):
+            raise InputError(
+                f"{edge} in {kind}-attention blocks only, which are {existing}; expected blocks with at least "
+                f"one of them, got {list(blocks)}"
+            )
 
     def count(self, name: str, chosen: Chosen) -> int:
         """How many tokens these are; refuses those that the group does not have."""
         group, indices = chosen
         check_indices(f"{name}: {group}", indices, self.sizes[group])
         return self.sizes[group] if indices is None else len(indices)
+
+    def some(self, name: str, chosen: Chosen) -> int:
+        """The number of these tokens. Refuses an empty choice, and a group without tokens."""
+        count = self.count(name, chosen)
+        if count > 0:
+            return count
+        group, indices = chosen
+        if indices is None:
+            raise InputError(f"{name}: expected tokens, but this call has no {group} tokens")
+        raise InputError(f"{name}: expected at least one {group} token, got an empty list")
 
 
 def is_cross(config: HeadConfig, block: int) -> bool:
