@@ -11,14 +11,14 @@ use numpy::{
     Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
     PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyFileNotFoundError;
+use pyo3::exceptions::{PyFileNotFoundError, PyMemoryError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
 use saccade::{
-    Arithmetic, Array, Checkpoint, Chunking, ConvertOptions, ElementsRef, Error, Features, Group, Integrator,
-    Isa, Keep, LoadOptions, OwnedArray, Part, Patch, Profile, Recorded, ResizeOptions, RewriteOptions,
-    Sampling, TensorFacts, TensorView, TensorViews, Tokens, TraceOptions, Written, peak,
+    Arithmetic, Array, Checkpoint, Chunking, ConvertOptions, ElementsRef, Error, ErrorKind, Features, Group,
+    Integrator, Isa, Keep, LoadOptions, OwnedArray, Part, Patch, Profile, Recorded, ResizeOptions,
+    RewriteOptions, Sampling, TensorFacts, TensorView, TensorViews, Tokens, TraceOptions, Written, peak,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -36,10 +36,11 @@ fn raise(error: Error) -> PyErr {
     static CHECKPOINT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     let message = error.to_string();
     Python::attach(|py| {
-        let class = match error {
-            Error::NotFound { .. } => return PyFileNotFoundError::new_err(message),
-            Error::Shape(_) => exception(py, &SHAPE, "ShapeError"),
-            Error::Checkpoint(_) | Error::Output(_) => exception(py, &CHECKPOINT, "CheckpointError"),
+        let class = match error.kind() {
+            ErrorKind::NotFound => return PyFileNotFoundError::new_err(message),
+            ErrorKind::Memory => return PyMemoryError::new_err(message),
+            ErrorKind::Shape => exception(py, &SHAPE, "ShapeError"),
+            ErrorKind::Checkpoint | ErrorKind::Output => exception(py, &CHECKPOINT, "CheckpointError"),
             _ => exception(py, &INPUT, "InputError"),
         };
         class.map_or_else(|error| error, |class| PyErr::from_type(class.clone(), message))
@@ -644,10 +645,10 @@ fn take_profile(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
 
 #[pyfunction]
 fn read_tensors<'py>(py: Python<'py>, source: PathBuf, prefix: &str) -> PyResult<Bound<'py, PyDict>> {
-    let checkpoint = Checkpoint::open(&source).map_err(raise)?;
+    let checkpoint = Checkpoint::open(&source).map_err(|error| raise(error.into()))?;
     let dict = PyDict::new(py);
     for name in checkpoint.names().filter(|name| name.starts_with(prefix)) {
-        let data = checkpoint.read_f32(name).map_err(raise)?;
+        let data = checkpoint.read_f32(name).map_err(|error| raise(error.into()))?;
         let shape = checkpoint
             .shape(name)
             .expect("the name is one of the checkpoint's");
@@ -709,7 +710,7 @@ impl Published {
 
     /// The embodiments that are left, if others were taken out.
     fn kept_embodiments(&self) -> PyResult<Option<Vec<i64>>> {
-        self.lock().checkpoint.kept_embodiments().map_err(raise)
+        self.lock().kept_embodiments().map_err(raise)
     }
 
     fn tensors(&self) -> Vec<PyTensorFacts> {
@@ -737,8 +738,8 @@ impl Published {
                 Some(index) => checkpoint.read_slices(name, index..index.saturating_add(1)),
             };
             elements
-                .map(|elements| (elements.into_f32(), shape))
-                .map_err(raise)
+                .and_then(|elements| Ok((elements.try_into_f32()?, shape)))
+                .map_err(|error| raise(error.into()))
         })?;
         to_numpy(py, data, &shape[usize::from(index.is_some())..])
     }

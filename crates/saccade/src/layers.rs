@@ -7,11 +7,11 @@ use faer::{Accum, Mat, MatMut, MatRef, Par};
 use half::bf16;
 use saccade_kernels::{Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
 
-use crate::checkpoint::Elements;
 use crate::error::{Error, Result};
 use crate::layout::{CategoryLinearNames, LinearNames, NormNames, Role};
 use crate::precision::Precision;
 use crate::profile::{Part, apply, layer_norm};
+use saccade_checkpoint::Elements;
 
 /// Which instruction set and how many threads the kernels use, and how precisely they compute.
 #[derive(Clone, Copy, Debug)]

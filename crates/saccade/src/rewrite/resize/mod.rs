@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use crate::layout::FUTURE_TOKENS;
 use crate::rewrite::convert::Float;
 use crate::rewrite::{RewriteOptions, Source, Written};
-use crate::writer::OWN_CONFIG;
+use saccade_checkpoint::OWN_CONFIG;
 
 use merge::resized;
 pub use merge::{MergedTokens, merge_future_tokens};
@@ -76,7 +76,7 @@ pub fn resize(
     let config = &source.config;
     let plan = plan(config, &source.given_config, options.num_future_tokens)?;
     let name = format!("{}{FUTURE_TOKENS}", source.prefix);
-    let tokens = source.checkpoint.read(&name)?.into_f32();
+    let tokens = source.checkpoint.read(&name)?.try_into_f32()?;
     if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
         return Err(Error::Checkpoint(format!(
             "source: {name} holds {bad}, expected finite numbers"
@@ -116,7 +116,7 @@ pub fn resize(
     let rewrite = &options.rewrite;
     let written = source.write(out, rewrite, &small, planned, &mut progress, |other, writer| {
         if other == name {
-            writer.tensor(&name, &bytes)
+            Ok(writer.tensor(&name, &bytes)?)
         } else {
             source.copy(other, writer)
         }
