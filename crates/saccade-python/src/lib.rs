@@ -774,13 +774,12 @@ impl PyRewrite {
         work: impl FnOnce(&Path, &Path, RewriteOptions, &mut dyn FnMut(u64, u64) -> bool) -> saccade::Result<R>
         + Send,
     ) -> PyResult<R> {
-        let options = RewriteOptions {
-            config: self.config,
-            head_only: self.head_only,
-            force: self.force,
-            metadata: self.metadata,
-            max_shard_bytes: self.max_shard_bytes,
-        };
+        let mut options = RewriteOptions::new();
+        options.config = self.config;
+        options.head_only = self.head_only;
+        options.force = self.force;
+        options.metadata = self.metadata;
+        options.max_shard_bytes = self.max_shard_bytes;
         let mut raised = None;
         let result = py.detach(|| {
             work(&self.source, &self.out, options, &mut |done, total| {
@@ -828,11 +827,8 @@ fn convert<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let dtype = dtype.map(|name| name.parse()).transpose().map_err(raise)?;
     let report = rewrite.run(py, |source, out, rewrite, progress| {
-        let options = ConvertOptions {
-            rewrite,
-            embodiment_ids,
-            dtype,
-        };
+        let mut options = ConvertOptions::new(rewrite);
+        (options.embodiment_ids, options.dtype) = (embodiment_ids, dtype);
         saccade::convert(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;
@@ -857,12 +853,8 @@ fn resize<'py>(
     seed: u64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let report = rewrite.run(py, |source, out, rewrite, progress| {
-        let options = ResizeOptions {
-            rewrite,
-            num_future_tokens,
-            perturbation,
-            seed,
-        };
+        let mut options = ResizeOptions::new(rewrite, num_future_tokens);
+        (options.perturbation, options.seed) = (perturbation, seed);
         saccade::resize(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;

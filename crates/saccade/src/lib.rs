@@ -47,7 +47,9 @@ pub use profile::{Counter, Part, Profile};
 pub use recognise::{Layout, Published, TensorFacts};
 pub use rewrite::convert::{ConvertOptions, ConvertReport, Float, convert};
 pub use rewrite::quantize::{QuantizeReport, quantize};
-pub use rewrite::resize::{MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize};
+pub use rewrite::resize::{
+    MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config,
+};
 pub use rewrite::{RewriteOptions, Written};
 pub use saccade_checkpoint::{self as files, Checkpoint, Elements};
 pub use saccade_kernels::{Arithmetic, Isa, default_num_threads, peak};

@@ -107,6 +107,7 @@ impl Float {
 
 /// How a checkpoint is converted.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct ConvertOptions {
     /// What is common to all rewriting.
     pub rewrite: RewriteOptions,
@@ -115,6 +116,17 @@ pub struct ConvertOptions {
     pub embodiment_ids: Option<Vec<i64>>,
     /// What floating point tensors become; default what they are. int8 and its scales stay.
     pub dtype: Option<Float>,
+}
+
+impl ConvertOptions {
+    /// A copy by these rules that changes nothing else, to be changed field by field.
+    #[must_use]
+    pub fn new(rewrite: RewriteOptions) -> Self {
+        Self {
+            rewrite,
+            ..Self::default()
+        }
+    }
 }
 
 /// What [`convert`] wrote.

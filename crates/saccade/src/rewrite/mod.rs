@@ -18,6 +18,7 @@ const MAX_SHARD_BYTES: u64 = 5_000_000_000;
 
 /// How a checkpoint is written from another.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct RewriteOptions {
     /// The source's config as JSON; default the `config.json` beside the weights.
     pub config: Option<String>,
@@ -29,6 +30,14 @@ pub struct RewriteOptions {
     pub metadata: BTreeMap<String, String>,
     /// A file is closed before it grows larger than this; default one file of one, and 5 GB of several, as they are published.
     pub max_shard_bytes: Option<u64>,
+}
+
+impl RewriteOptions {
+    /// The defaults, to be changed field by field.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 /// What was written.
