@@ -10,7 +10,7 @@ use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 
 use crate::elements::Elements;
-use crate::error::{Error, Result, reserve, show_shape};
+use crate::error::{Error, Result, granted, reserve, show_shape};
 use crate::header::Header;
 use crate::index::WeightFiles;
 use crate::source::SourceFile;
@@ -123,6 +123,8 @@ impl Checkpoint {
     /// # Errors
     /// As [`Checkpoint::read`].
     pub fn read_f32(&self, name: &str) -> Result<Vec<f32>> {
+        let elements: usize = self.entry(name)?.info.shape.iter().product();
+        granted("source", elements.saturating_mul(size_of::<f32>()))?;
         self.read(name)?.try_into_f32()
     }
 
