@@ -1,5 +1,6 @@
 //! What this machine has, what it can do at most, and where the time of calls goes.
 
+use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade::{Arithmetic, Error, Isa, Part, Profile, peak};
@@ -30,10 +31,9 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
     }
     let peaks = PyDict::new(py);
     peaks.set_item("macs_per_second", rates)?;
-    peaks.set_item(
-        "read_bytes_per_second",
-        call(py, || Ok(peak::read_bytes_per_second(num_threads)))?,
-    )?;
+    let read = call(py, || Ok(peak::read_bytes_per_second(num_threads)))?;
+    let read = read.map_err(|error| PyMemoryError::new_err(error.to_string()))?;
+    peaks.set_item("read_bytes_per_second", read)?;
     peaks.set_item("clock_hz", call(py, || Ok(peak::clock_hz()))?)?;
     Ok(peaks)
 }
