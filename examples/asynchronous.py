@@ -238,7 +238,7 @@ class Results:
             if pairs:
                 won = paired_difference(*([pair[i]["success"] for pair in pairs] for i in (0, 1)))
                 cells = [
-                    f"delay {first[0]} {first[1]}, less delay {second[0]} {second[1]}",
+                    f"delay {first[0]} {first[1]}, minus delay {second[0]} {second[1]}",
                     str(len(pairs)),
                     percent(won.difference),
                     *(self.change(pairs, what) for what in ("seam", "bend")),
