@@ -1,4 +1,4 @@
-"""Writes constraints.txt anew: one exact version of every Python package that saccade's environment holds.
+"""Writes constraints.txt: one exact version of every Python package in the development environment.
 
 Each interpreter given resolves `.[all]` to the newest versions that fit it. Where they differ, lines carry a
 marker: the last interpreter's versions also hold for every newer Python.
