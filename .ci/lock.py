@@ -1,7 +1,7 @@
 """Writes constraints.txt: one exact version of every Python package in the development environment.
 
-Each given interpreter resolves `.[all]` to the newest compatible versions. Where the versions differ, lines carry
-a marker. The last interpreter's versions also apply to every newer Python.
+Each given interpreter resolves `.[all]` to the newest compatible versions. Where the versions differ, lines
+carry a marker. The last interpreter's versions also apply to every newer Python.
 
     python .ci/lock.py python3.10 python3.11
 """
@@ -20,8 +20,8 @@ RELEASED_HEAD = "lerobot==0.4.4"  # installed without its requirements, so it is
 # The numbers in the docs were measured with these versions. Change them deliberately, not in a refresh.
 HELD = ("torch==2.13.0", "gymnasium==1.4.0")
 HEADER = f"""\
-# One exact version of every Python package in the development environment. Every pip call of the Makefile uses it.
-# Written by `python .ci/lock.py python3.10 python3.11`; do not edit. After an update, run `make test` and check the diff.
+# One exact version of every Python package in the development environment; every pip call of the Makefile
+# uses it. Do not edit: `python .ci/lock.py python3.10 python3.11` writes it. Then run `make test`.
 {RELEASED_HEAD}
 """
 

@@ -3,10 +3,10 @@
     python -m benches.accelerate                    N1.5's size, 2 threads; three minutes
     python -m benches.accelerate --size small       one second, to check that it runs
 
-A chunk is one call of `get_action`. Calls of the released head and of the same head accelerated alternate; medians
-are printed. lerobot's head has float32 weights and runs in float32, and under autocast to bfloat16, its policy's
-default. The weights are random, for two embodiments; their number does not affect the time. `check` is the time that an
-accelerated call spends on checking whether weights have changed.
+A chunk is one call of `get_action`. Calls of the released head and of the same head accelerated alternate;
+medians are printed. lerobot's head has float32 weights and runs in float32, and under autocast to bfloat16,
+its policy's default. The weights are random, for two embodiments; their number does not affect the time.
+`check` is the time that an accelerated call spends on checking whether weights have changed.
 """
 
 from __future__ import annotations

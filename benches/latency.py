@@ -4,15 +4,15 @@
     python -m benches.latency loaded --chunks 40    one section: loaded, callers, small or overhead
     python -m benches.latency report                prints the results in out/latency/results.json
 
-- `loaded`: chunks (encode and sample) at N1.5's size while other processes, one per core, are busy; compared with
-  lerobot's head. The fair share of the machine is then half of it, which means twice the idle time.
+- `loaded`: chunks (encode and sample) at N1.5's size while other processes, one per core, are busy; compared
+  with lerobot's head. The fair share of the machine is then half of it, which means twice the idle time.
 - `callers`: 8 Python threads that sample at the same time, compared with one thread that does all the work.
 - `small`: a head of the bundled policy's sizes, compared with torch.
 - `overhead`: a head so small that its arithmetic takes no time; what remains is dispatch and binding.
 
-Each contender runs in a process of its own, as in `benches.peers`, and they take turns. Run it on an idle machine.
-Results are kept as JSON. A section that runs again replaces its results, except that `loaded` adds its chunks, so
-it can be measured in several sessions.
+Each contender runs in a process of its own, as in `benches.peers`, and they take turns. Run it on an idle
+machine. Results are kept as JSON. A section that runs again replaces its results, except that `loaded` adds
+its chunks, so it can be measured in several sessions.
 """
 
 from __future__ import annotations
@@ -359,7 +359,7 @@ def overhead_table(report: Report) -> list[str]:
 
 
 def policy_config() -> dict[str, Any]:
-    """The config of the bundled policy's head, with the number of embodiments that `benches.peers` expects."""
+    """Config of the bundled policy's head, with the number of embodiments that `benches.peers` expects."""
     file = importlib.resources.files("saccade") / "sim" / "demo" / "config.json"
     config: dict[str, Any] = json.loads(file.read_text())["action_head_cfg"]
     return config | {"max_num_embodiments": inputs.NUM_EMBODIMENTS}
@@ -407,7 +407,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=2, help="threads of every head (default 2)")
     parser.add_argument("--busy", type=int, help="busy processes (default: the cores)")
     parser.add_argument("--chunks", type=int, default=200, help="loaded: chunks under load (default 200)")
-    parser.add_argument("--chunks-a-turn", type=int, default=10, help="loaded: consecutive chunks per turn (default 10)")
+    parser.add_argument(
+        "--chunks-a-turn", type=int, default=10, help="loaded: consecutive chunks per turn (default 10)"
+    )
     parser.add_argument("--rounds", type=int, default=9, help="rounds of the other sections (default 9)")
     parser.add_argument("--contenders", nargs="+", choices=CONTENDERS, metavar="NAME", help="instead of all")
     parser.add_argument("--size", choices=("full", "small"), default="full", help="small: for a quick trial")

@@ -95,9 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("checkpoint", nargs="?", type=Path)
     parser.add_argument("--full", action="store_true", help="random weights of N1.5's size")
-    parser.add_argument(
-        "--outliers", action="store_true", help="scale a few input channels and outputs"
-    )
+    parser.add_argument("--outliers", action="store_true", help="scale a few input channels and outputs")
     parser.add_argument("--embodiment-id", type=int, default=0)
     parser.add_argument("--num-vl-tokens", type=int, default=296)
     parser.add_argument("--seed", type=int, default=0)
@@ -109,7 +107,9 @@ def main() -> None:
         head = random_weights.random_head(config, args.seed)
     if args.outliers:
         add_outliers(head)
-    inputs = random_weights.random_inputs(head.config, args.seed + 1, batch=1, num_vl_tokens=args.num_vl_tokens)
+    inputs = random_weights.random_inputs(
+        head.config, args.seed + 1, batch=1, num_vl_tokens=args.num_vl_tokens
+    )
     inputs["embodiment_id"] = torch.tensor([args.embodiment_id])
 
     def chunk() -> Tensor:

@@ -3,13 +3,14 @@
     python examples/real_time.py                          the bundled policy's head, 50 chunks per second
     python examples/real_time.py --size n1.5 --rate 0.5   GR00T N1.5's size, 1.5 GB of random weights
 
-Two threads share one head. The slow thread (System 2) gets features from the vision-language backbone and encodes
-them, as often as it can. The fast thread (System 1) samples a chunk of actions at control rate from the latest
-`Context` and the newest state. The threads exchange a reference, because a `Context` never changes. Both release the
-interpreter, so the next observation is encoded while chunks are sampled from the last one.
+Two threads share one head. The slow thread (System 2) gets features from the vision-language backbone and
+encodes them, as often as it can. The fast thread (System 1) samples a chunk of actions at control rate from
+the latest `Context` and the newest state. The threads exchange a reference, because a `Context` never
+changes. Both release the interpreter, so the next observation is encoded while chunks are sampled from the
+last one.
 
-Replace `Robot` by your own: here its backbone sleeps for some milliseconds, as if a GPU were working, and returns
-noise.
+Replace `Robot` by your own: here its backbone sleeps for some milliseconds, as if a GPU were working, and
+returns noise.
 """
 
 from __future__ import annotations

@@ -26,7 +26,9 @@ def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_real_time_counts_every_tick() -> None:
-    finished = run("real_time.py", "--seconds", "0.5", "--rate", "40", "--backbone-ms", "1", "--num-threads", "2")
+    finished = run(
+        "real_time.py", "--seconds", "0.5", "--rate", "40", "--backbone-ms", "1", "--num-threads", "2"
+    )
     assert finished.returncode == 0, finished.stderr
     counts = re.search(r"40 per second for 0.5 s, (\d+) chunks, (\d+) deadlines missed", finished.stdout)
     assert counts is not None, finished.stdout
