@@ -4,8 +4,8 @@
 
 Runs: a fresh environment with the wheel and one NumPy, for each CPython and NumPy; one environment with each
 instruction set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with the extra
-`sim`. A failure is named in its row, and the exit status is then 1. Needs the environment that built the wheel,
-the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
+`sim`. A failure is named in its row, and the exit status is then 1. Needs the environment that built the
+wheel, the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
 """
 
 from __future__ import annotations
