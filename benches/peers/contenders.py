@@ -124,7 +124,7 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         ),
     },
 }
-"""Contenders by arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds."""
+"""By arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds."""
 
 CONTENDERS: Mapping[str, Contender] = {
     name: contender for group in GROUPS.values() for name, contender in group.items()
