@@ -1,6 +1,4 @@
-"""The benchmark beside peers: everybody computes the same, runs go on where they stopped, README and docs
-hold what was measured.
-"""
+"""The comparison with peers: equal results, resumed runs, the page of the committed measurements."""
 
 from __future__ import annotations
 
@@ -191,7 +189,7 @@ def test_what_is_done_is_not_started_again(tmp_path: Path) -> None:
 
 def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     results = measured(tmp_path / "results.json")
-    rows = [line for line in report.readme(results).splitlines() if line.startswith("| saccade bf")]
+    rows = [line for line in report.overview(results).splitlines() if line.startswith("| saccade bf")]
     assert rows == ["| saccade bfloat16 | 1600 | 800 | 1e-06 |"]
     rows = goals.goals(results).splitlines()
     assert any(
@@ -216,13 +214,6 @@ def test_a_result_that_is_wrong_is_marked_and_not_ranked(tmp_path: Path) -> None
     assert "**not correct**" in report.section(results, CASE)
 
 
-def test_the_table_goes_between_its_markers() -> None:
-    page = f"above\n{report.BEGIN}\nold\n{report.END}\nbelow\n"
-    assert report.between_markers(page, "| new |") == f"above\n{report.BEGIN}\n| new |\n{report.END}\nbelow\n"
-    with pytest.raises(SystemExit, match="lacks"):
-        report.between_markers("no markers", "| new |")
-
-
 def test_figures_of_known_numbers(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     results = measured(tmp_path / "results.json")
@@ -243,7 +234,7 @@ def test_the_picture_shows_the_numbers_of_the_table() -> None:
     pytest.importorskip("matplotlib")
     results = Results(report.COMMITTED)
     cases = report.usual(results, "head")
-    table = [line.split(" | ") for line in report.readme(results).splitlines()[2:] if line.startswith("| ")]
+    table = [line.split(" | ") for line in report.overview(results).splitlines()[2:] if line.startswith("| ")]
     both, sample = (
         {cells[0].removeprefix("| "): cells[start : start + len(cases)] for cells in table}
         for start in (1, 1 + len(cases))
@@ -261,12 +252,10 @@ def test_the_picture_shows_the_numbers_of_the_table() -> None:
             assert {(label, int(cells[number])), (label, int(sample[label][number]))} <= ends
 
 
-def test_readme_and_docs_hold_what_was_measured() -> None:
+def test_the_page_is_the_report_of_the_committed_results() -> None:
     results = Results(report.COMMITTED)
     assert results.cases
     assert report.PAGE.read_text() == report.document(results, "images")
-    readme = (ROOT / "README.md").read_text()
-    assert readme == report.between_markers(readme, report.readme(results))
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -277,7 +266,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_it_runs_and_resumes(tmp_path: Path) -> None:
     chosen = ["--only", "head", "--contenders", "saccade-float32", "torch-float32", "saccade-bfloat16"]
     done = run(tmp_path, *chosen, "--rounds", "1")
     assert done.returncode == 0, done.stderr
