@@ -182,7 +182,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--results",
         type=Path,
-        help="the JSON file (default: results.json in the folder of --work; report --write: the committed one)",
+        help="the JSON file (default: results.json in --work; for report --write: the committed one)",
     )
     parser.add_argument("--write", action="store_true", help="report: write docs/performance.md")
     args = parser.parse_args(arguments)
