@@ -1,4 +1,4 @@
-"""Asynchronous inference: the effect of inference delay in closed loop, with and without real-time chunking.
+"""Asynchronous inference: the effect of delay in closed loop, with and without real-time chunking.
 
     python examples/asynchronous.py                     2 episodes of each task in each arm, a minute
     python examples/asynchronous.py --episodes 30       the run of docs/asynchronous.md; resumes after a stop
