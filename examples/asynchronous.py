@@ -34,11 +34,11 @@ from matplotlib.figure import Figure as Picture
 from numpy.typing import NDArray
 
 import saccade
+from saccade._files import writable_directory, write_json
+from saccade.environment import cpu_name
 from saccade.errors import InputError
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.files import writable_directory, write_json
 from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Policy
-from saccade.sim.report import cpu_name
 from saccade.sim.rollout import Episode, environment_for
 from saccade.sim.tasks import DEMO_TASKS, TASKS, check_evaluation_seeds
 from saccade.sim.video import VideoWriter

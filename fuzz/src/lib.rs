@@ -43,7 +43,7 @@ use std::path::{Path, PathBuf};
 
 use checkpoint::Checkpoint;
 use config::HeadConfig;
-use layout::HeadNames;
+use layout::tensor_specs;
 use recognise::Published;
 use resize::ResizeOptions;
 

@@ -21,7 +21,7 @@ use crate::companions::is_processor;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, show_shape};
 use crate::fit::{self, Problem};
-use crate::layout::{HeadNames, is_unused};
+use crate::layout::{is_unused, tensor_specs};
 
 /// A longer header, index or config is hostile: the released head has 314 tensors in 40 kB.
 const MAX_HEADER_BYTES: u64 = 100_000_000;
@@ -207,7 +207,7 @@ impl Checkpoint {
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
     pub(crate) fn check(&self, prefix: &str, config: &HeadConfig) -> Result<()> {
-        let expected = HeadNames::new(config).tensors();
+        let expected = tensor_specs(config);
         let is_known = |name: &str, shape: &[usize]| is_unused(config, name, shape);
         let mut problems = fit::problems(
             self.names(),

@@ -9,7 +9,7 @@ use safetensors::Dtype;
 use crate::checkpoint::{KEPT_EMBODIMENTS, SCALE_SUFFIX};
 use crate::error::{Error, Result};
 use crate::head::chosen_embodiments;
-use crate::layout::HeadNames;
+use crate::layout::tensor_specs;
 use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::CheckpointWriter;
 
@@ -171,7 +171,7 @@ pub fn convert(
         kept = Some(ids.iter().copied().collect::<BTreeSet<usize>>());
         report.embodiment_ids = Some(ids);
     }
-    let specs = HeadNames::new(&source.config).tensors();
+    let specs = tensor_specs(&source.config);
     let per_embodiment: BTreeSet<String> = specs
         .iter()
         .filter(|spec| spec.per_embodiment)

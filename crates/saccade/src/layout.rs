@@ -117,7 +117,7 @@ pub(crate) struct HeadNames {
 /// Name, without a prefix, and shape of every tensor that a head's checkpoint must hold.
 #[must_use]
 pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
-    let tensors = HeadNames::new(config).tensors();
+    let tensors = tensor_specs(config);
     tensors
         .into_iter()
         // A head without future tokens may come with an empty tensor of them, and need not.
@@ -125,6 +125,14 @@ pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
         .map(|tensor| (tensor.name, tensor.shape))
         .collect()
 }
+
+/// Every tensor that a checkpoint of a head of this config must hold, by its name without a prefix.
+pub(crate) fn tensor_specs(config: &HeadConfig) -> Vec<TensorSpec> {
+    HeadNames::new(config).tensors()
+}
+
+/// The name, without a prefix, of the future tokens.
+pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
 
 /// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
 /// logarithms of loss weights, what N1.6 puts in place of a state that it hides, how often N1.7 hides one.
@@ -181,10 +189,7 @@ impl HeadNames {
                     ]
                 })
                 .collect(),
-            future_tokens: (
-                "future_tokens.weight".to_owned(),
-                vec![config.num_future_tokens, width],
-            ),
+            future_tokens: (FUTURE_TOKENS.to_owned(), vec![config.num_future_tokens, width]),
             position_embedding: config.add_pos_embed.then(|| {
                 (
                     "position_embedding.weight".to_owned(),

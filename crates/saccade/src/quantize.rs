@@ -9,7 +9,7 @@ use safetensors::Dtype;
 use crate::checkpoint::{Checkpoint, SCALE_SUFFIX};
 use crate::error::{Error, Result};
 use crate::layers::weight_view;
-use crate::layout::{HeadNames, TensorSpec};
+use crate::layout::{TensorSpec, tensor_specs};
 use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::{CheckpointWriter, Planned};
 
@@ -46,7 +46,7 @@ pub fn quantize(
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<QuantizeReport> {
     let source = Source::open(source, options.config.as_deref())?;
-    let specs = HeadNames::new(&source.config).tensors();
+    let specs = tensor_specs(&source.config);
     let int8: BTreeMap<String, &TensorSpec> = specs
         .iter()
         .filter(|spec| spec.may_be_int8)

@@ -14,7 +14,7 @@ use crate::checkpoint::UniqueMap;
 use crate::config::HeadConfig;
 use crate::convert::Float;
 use crate::error::{Error, Result};
-use crate::layout::HeadNames;
+use crate::layout::FUTURE_TOKENS;
 use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::OWN_CONFIG;
 
@@ -82,8 +82,7 @@ pub fn resize(
     let source = Source::open(source, options.rewrite.config.as_deref())?;
     let config = &source.config;
     let plan = plan(config, &source.given_config, options.num_future_tokens)?;
-    let (spec_name, _) = HeadNames::new(config).future_tokens;
-    let name = format!("{}{spec_name}", source.prefix);
+    let name = format!("{}{FUTURE_TOKENS}", source.prefix);
     let tokens = source.checkpoint.read(&name)?.into_f32();
     if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
         return Err(Error::Checkpoint(format!(

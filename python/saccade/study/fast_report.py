@@ -11,8 +11,7 @@ from matplotlib.figure import Figure as Picture
 
 from saccade.study import features, figures
 from saccade.study.features import NO_LOOP, from_file
-from saccade.study.report import (
-    LOSS_THAT_MATTERS,
+from saccade.study.section import (
     Figure,
     Grid,
     Section,
@@ -23,6 +22,7 @@ from saccade.study.report import (
 )
 from saccade.study.statistics import (
     CONFIDENCE,
+    LOSS_THAT_MATTERS,
     Estimate,
     PairedDifference,
     bootstrap_ratio,

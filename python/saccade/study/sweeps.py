@@ -34,7 +34,7 @@ from saccade.study.arguments import UNLIMITED, names, numbers
 from saccade.study.cells import Cell, OnDone, Rows, run_cells
 from saccade.study.loaded import environment_of, policy_of
 from saccade.study.observations import task_names
-from saccade.study.report import Section
+from saccade.study.section import Section
 from saccade.study.statistics import bootstrap, detectable_between_runs, detectable_difference
 from saccade.study.sweeps_report import PLAIN, statement_lines, sweep_section
 from saccade.study.tables import Provenance

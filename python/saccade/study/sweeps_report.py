@@ -13,7 +13,7 @@ import pandas as pd
 from scipy import stats
 
 from saccade.study import figures
-from saccade.study.report import Figure, Grid, Section, effect, number, rate
+from saccade.study.section import Figure, Grid, Section, effect, number, rate
 from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, scaled, tango, wilson
 from saccade.study.tables import truths
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from saccade._files import sha256_of
 from saccade.errors import InputError
-from saccade.sim.files import sha256_of
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
 SETTINGS_FILE = "settings.json"
