@@ -51,7 +51,7 @@ def path_derivatives(
         noise: `(1, T, action_dim)`.
         cotangents: `(projections, T, action_dim)`; each is multiplied with the actions and summed up.
         embodiment_id: of the robot.
-        masks: of the tokens, `(1, T_vl)` bool: `drop_vl`, `attention_mask`, `image_mask`, as `sample` takes them.
+        masks: of `sample`, by name: `drop_vl`, `attention_mask`, `image_mask`, `(1, T_vl)` bool.
 
     Returns:
         Each path of `PATHS` and their sum `ALL_PATHS`, `(projections, T_vl, context_dim)`.
