@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import saccade.sim.rollout
+from saccade._intervals import wilson
 from saccade.cli import main
 from saccade.sim import graphics, report
 from saccade.sim.policy import DEMO_CHECKPOINT
@@ -239,8 +240,8 @@ def test_demos_then_train_as_commands(tmp_path: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_wilson_interval(successes: int, trials: int, low: float, high: float) -> None:
-    np.testing.assert_allclose(report.wilson_interval(successes, trials), (low, high), atol=1e-5)
+    np.testing.assert_allclose(wilson(successes, trials), (low, high), atol=1e-5)
 
 
 def test_wilson_interval_of_nothing_is_everything() -> None:
-    assert report.wilson_interval(0, 0) == (0.0, 1.0)
+    assert wilson(0, 0) == (0.0, 1.0)

@@ -28,14 +28,15 @@ EXTRAS: dict[str, dict[str, str]] = {
         "imageio_ffmpeg": "imageio-ffmpeg",
         "PIL": "pillow",
         "matplotlib": "matplotlib",
+        "scipy": "scipy",
         "threadpoolctl": "threadpoolctl",
     },
     "study": {
         "jinja2": "jinja2",
         "joblib": "joblib",
+        "markdown_it": "markdown-it-py",
         "pandas": "pandas",
         "sklearn": "scikit-learn",
-        "scipy": "scipy",
     },
     "ray": {"ray": "ray"},
 }

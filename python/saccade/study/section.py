@@ -1,17 +1,19 @@
-"""A study's part of the report: its text, pictures and tables, and how numbers are written."""
+"""One section of a report: its text from a template, its figures, its tables, and how numbers are written."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure as Picture
 
-from saccade.study.statistics import Estimate
+from saccade.study.statistics import LOSS_THAT_MATTERS, Estimate, scaled, verdict
 
-LOSS_THAT_MATTERS = 0.05  # of success; "no difference" is not said where an interval reaches further
-FEWEST = 10  # clusters for a bootstrap
+FEWEST = 10  # clusters that a bootstrap needs
 
 
 @dataclass(frozen=True)
@@ -19,8 +21,8 @@ class Figure:
     """A picture in a section.
 
     Attributes:
-        name: of its file, unique in its section: lower-case words with hyphens.
-        caption: What is drawn, with units, and what the whiskers are.
+        name: Of its file, unique in its section: lower-case words separated by hyphens.
+        caption: What is drawn, with units, and what the error bars are.
         picture: From :mod:`saccade.study.figures`.
     """
 
@@ -31,12 +33,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Grid:
-    """A table for people.
+    """A table for readers.
 
     Attributes:
         caption: What its numbers are.
         columns: Headings.
-        rows: As many texts each.
+        rows: One text per column in each row.
     """
 
     caption: str
@@ -46,14 +48,14 @@ class Grid:
 
 @dataclass(frozen=True)
 class Section:
-    """A study's part of the report. All text is plain, a paragraph each.
+    """A study's part of the report. All text is Markdown without line breaks.
 
     Attributes:
         title: A few words.
-        summary: What was done: on what, how much of it, how it was measured.
-        figures, grids: What was found.
-        concluded: What the intervals allow to be said.
-        not_shown: What this study cannot show, whatever its numbers are.
+        summary: Paragraphs: what was measured, on what, and how.
+        figures, grids: The results.
+        concluded: Sentences: what the intervals show.
+        not_shown: Sentences: what the study cannot show, whatever its numbers are.
     """
 
     title: str
@@ -64,7 +66,7 @@ class Section:
     not_shown: Sequence[str] = ()
 
 
-def number(estimate: Estimate, *, digits: int) -> str:
+def number(estimate: Estimate, digits: int) -> str:
     """A number with its interval.
 
     Example:
@@ -79,59 +81,126 @@ def number(estimate: Estimate, *, digits: int) -> str:
 
 
 def rate(estimate: Estimate) -> str:
-    """A share in percent with its interval.
+    """A rate in percent with its interval.
 
     Example:
         >>> rate(Estimate(0.9, 0.699, 0.972))
         '90 (70 to 97)'
     """
-    return number(Estimate(*(100 * part for part in (estimate.value, estimate.low, estimate.high))), digits=0)
+    return number(scaled(estimate), digits=0)
 
 
-def not_measured(reason: str) -> str:
-    """What stands where there is no number."""
-    return f"not measured, {reason}"
+def points(difference: Estimate) -> str:
+    """A difference of rates in percentage points with its interval.
+
+    Example:
+        >>> points(Estimate(-0.2, -0.31, -0.1))
+        '-20.0 (-31.0 to -10.0)'
+    """
+    return number(scaled(difference), digits=1)
+
+
+@functools.cache
+def templates() -> Environment:
+    """The templates of `pages/`, with the filters that write numbers."""
+    environment = Environment(
+        loader=PackageLoader("saccade.study", "pages"),
+        autoescape=lambda name: bool(name and name.endswith(".html.jinja")),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "number": number,
+        "points": points,
+        "rate": rate,
+        "row": markdown_row,
+        "verdict": verdict,
+    }
+    environment.globals["margin"] = f"{100 * LOSS_THAT_MATTERS:.0f}"
+    return environment
+
+
+class Prose:
+    """The text of a section: the macros of `pages/NAME.md.jinja`, with the values that they print.
+
+    A macro's text may be wrapped over lines: `paragraphs` are separated by blank lines, and each of the
+    `points` begins with a hyphen.
+
+    Args:
+        name: Of the template.
+        values: Variables of the template.
+
+    Example:
+        >>> Prose("words").line("not_measured", "there are no demonstrations")
+        'not measured, there are no demonstrations'
+    """
+
+    def __init__(self, name: str, **values: Any) -> None:
+        self._module = templates().get_template(f"{name}.md.jinja").make_module(values)
+
+    def line(self, macro: str, *arguments: Any, **named: Any) -> str:
+        """The text of a macro on one line."""
+        return " ".join(self._text(macro, *arguments, **named).split())
+
+    def paragraphs(self, macro: str, *arguments: Any) -> list[str]:
+        """The paragraphs of a macro, each on one line."""
+        return [" ".join(one.split()) for one in self._text(macro, *arguments).split("\n\n") if one.strip()]
+
+    def points(self, macro: str, *arguments: Any) -> list[str]:
+        """The points of a macro's list, each on one line and without its hyphen."""
+        found = f"\n{self._text(macro, *arguments)}".split("\n- ")
+        return [" ".join(one.split()) for one in found if one.strip()]
+
+    def section(self, figures: Sequence[Figure] = (), grids: Sequence[Grid] = ()) -> Section:
+        """The section that the macros `title`, `summary`, `concluded` and `not_shown` describe."""
+        return Section(
+            title=self.line("title"),
+            summary=self.paragraphs("summary"),
+            figures=figures,
+            grids=grids,
+            concluded=self.points("concluded"),
+            not_shown=self.points("not_shown"),
+        )
+
+    def _text(self, macro: str, *arguments: Any, **named: Any) -> str:
+        return str(getattr(self._module, macro)(*arguments, **named))
 
 
 def effect(what: str, difference: Estimate) -> str:
-    """What the interval of a difference of two rates allows to be said.
+    """A verdict on a difference of two rates, with the numbers that it follows from.
 
     Example:
         >>> effect("success", Estimate(-0.2, -0.31, -0.1))
-        'success is lower by 20.0 points (95 % interval: lower by 10.0 to 31.0)'
+        'success: worse, -20.0 points (-31.0 to -10.0)'
         >>> effect("success", Estimate(-0.02, -0.08, 0.04))
-        'no effect on success was found; a loss of up to 8.0 and a gain of up to 4.0 points are not excluded'
-        >>> effect("success", Estimate(0.0, -0.04, 0.04))
-        'no effect on success was found, and by itself this excludes one of 5 points or more (-4.0 to 4.0)'
+        'success: undecided, -2.0 points (-8.0 to 4.0)'
         >>> effect("success", Estimate(0.0, math.nan, math.nan))
-        'success: too few episodes for an interval, so nothing can be said'
+        'success: undecided, too few episodes for an interval'
     """
-    if math.isnan(difference.low) or math.isnan(difference.high):
-        return f"{what}: too few episodes for an interval, so nothing can be said"
-    value, low, high = (100 * part for part in (difference.value, difference.low, difference.high))
-    if high < 0 or low > 0:
-        direction, near, far = ("lower", -high, -low) if high < 0 else ("higher", low, high)
-        return (
-            f"{what} is {direction} by {abs(value):.1f} points "
-            f"(95 % interval: {direction} by {near:.1f} to {far:.1f})"
-        )
-    found = f"no effect on {what} was found"
-    matters = 100 * LOSS_THAT_MATTERS
-    if max(-low, high) < matters:
-        return (
-            f"{found}, and by itself this excludes one of {matters:.0f} points or more "
-            f"({low:.1f} to {high:.1f})"
-        )
-    return f"{found}; a loss of up to {abs(low):.1f} and a gain of up to {high:.1f} points are not excluded"
+    return Prose("words").line("effect", what, difference)
+
+
+def not_measured(reason: str) -> str:
+    """What is written where there is no number."""
+    return Prose("words").line("not_measured", reason)
 
 
 def too_few(count: int, what: str) -> list[str]:
-    """A warning where a bootstrap interval rests on too few of something.
+    """A warning if a bootstrap interval is computed from too few clusters, else nothing.
 
     Example:
         >>> too_few(3, "episodes")
-        ['Only 3 episodes: bootstrap intervals are too narrow below about 10.']
+        ['Only 3 episodes: bootstrap intervals are too narrow with fewer than about 10.']
     """
-    if count >= FEWEST:
-        return []
-    return [f"Only {count} {what}: bootstrap intervals are too narrow below about {FEWEST}."]
+    return [] if count >= FEWEST else [Prose("words").line("too_few", count, what, FEWEST)]
+
+
+def markdown_row(cells: Sequence[str]) -> str:
+    """A row of a Markdown table.
+
+    Example:
+        >>> markdown_row(["a", "|b|"])
+        '| a | \\\\|b\\\\| |'
+    """
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
