@@ -207,8 +207,9 @@ def test_a_run_in_training_is_not_measured(policies: Path, tmp_path: Path) -> No
 def test_equal_mass_is_repeated_tokens() -> None:
     """Tokens with the weight of twice as many are each token twice (spec, I2)."""
     head, context, state = shipped()
-    tokens = learned_tokens(str(DEMO_CHECKPOINT))
-    twice = resized.resized(resized.TWICE, tokens, np.random.default_rng(0))
+    tokens = head.future_tokens
+    assert tokens is not None
+    twice = resized.repeated(tokens)
     plain, heavier, repeated = (
         np.asarray(head.sample(context, state, 0, seed=1, intervention=change))
         for change in (None, sweeps.equal_mass(len(tokens), 2 * len(tokens)), twice)
@@ -283,15 +284,15 @@ def test_one_directory_holds_policies_that_may_be_compared(policies: Path, tmp_p
 def test_what_is_merged_and_drawn() -> None:
     rng = np.random.default_rng(0)
     two = rng.standard_normal((2, 6)).astype(np.float32)
-    tokens = two[[0, 1, 0, 0, 1]]
-    merged, counts = resized.merge(tokens, 2)
+    merged = resized.merge(two[[0, 1, 0, 0, 1]], 2)
+    rows, bias = np.asarray(merged.future_tokens), merged.key_bias
+    assert bias is not None
+    counts = np.exp(np.asarray(bias["future", None]))  # type: ignore[index]
     order = np.argsort(counts)
-    np.testing.assert_allclose(merged[order], two[[1, 0]], rtol=1e-6)
-    assert counts[order].tolist() == [2, 3]
-    whole, ones = resized.merge(tokens, 5)
-    np.testing.assert_array_equal(whole, tokens)
-    assert ones.tolist() == [1] * 5
-    drawn = resized.resized("3 drawn, equal mass", np.arange(16, dtype=np.float32).reshape(8, 2), rng)
+    np.testing.assert_allclose(rows[order], two[[1, 0]], rtol=1e-6)
+    np.testing.assert_allclose(counts[order], [2, 3], rtol=1e-6)
+    arm = resized.drawn(3, equal_mass=True)
+    drawn = arm.intervention(np.arange(16, dtype=np.float32).reshape(8, 2), rng)
     assert drawn is not None
     assert drawn.future_tokens is not None
     assert np.asarray(drawn.future_tokens).shape == (3, 2)
@@ -302,31 +303,30 @@ def test_what_is_merged_and_drawn() -> None:
 def test_merging_equal_tokens_changes_nothing() -> None:
     """A head whose tokens are copies of four of them, merged to four: exact, by I2."""
     head, context, state = shipped()
-    copies = learned_tokens(str(DEMO_CHECKPOINT))[np.random.default_rng(0).integers(4, size=11)]
-    merged, counts = resized.merge(copies, 4)
-    assert len(merged) == 4
+    tokens = head.future_tokens
+    assert tokens is not None
+    copies = tokens[np.random.default_rng(0).integers(4, size=11)]
+    merged = resized.merge(copies, 4)
+    assert len(np.asarray(merged.future_tokens)) == 4
     whole, smaller = (
         np.asarray(head.sample(context, state, 0, seed=3, intervention=change))
-        for change in (
-            Intervention(future_tokens=copies),
-            Intervention(future_tokens=merged, key_bias={"future": np.log(counts)}),
-        )
+        for change in (Intervention(future_tokens=copies), merged)
     )
     np.testing.assert_allclose(smaller, whole, atol=1e-5)
 
 
 def test_resized_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--tasks", TASK, "--episodes", "1", "--sizes", "4", "--out", str(tmp_path)]
+    arguments = ["--tasks", TASK, "--episodes", "1", "--num-future-tokens", "4", "--out", str(tmp_path)]
     assert study("n-runtime", *arguments) == 0
     printed = capsys.readouterr().out
     assert "Control, every token twice, equal mass: the chunk changed by" in printed
     assert "as it must be" in printed
     table: Any = read_table(tmp_path / "n-runtime.csv")
-    assert set(table["arm"]) == set(resized.arms_of([4]))
+    assert set(table["arm"]) == {resized.BASELINE, *(arm.name for arm in resized.arms_of([4]))}
     by_arm = table.groupby("arm")["chunk_change"].mean()
     assert by_arm[resized.BASELINE] == 0.0
     assert by_arm["4 drawn"] > 1e-3
-    section = resized.section(table, read_provenance(tmp_path / "n-runtime.json"))
+    section = resized.Resized.summarise(table, read_provenance(tmp_path / "n-runtime.json"))
     assert [row[0] for row in section.grids[0].rows] == [
         "4 drawn",
         "4 drawn, equal mass",
@@ -342,7 +342,7 @@ def test_resizing_a_policy_without_tokens(recording: Path, tmp_path: Path) -> No
     arguments = ["--checkpoint", str(tmp_path / "policy"), "--episodes", "1", "--out", str(tmp_path)]
     assert study("n-runtime", *arguments) == 0
     table: Any = read_table(tmp_path / "n-runtime.csv")
-    section = resized.section(table, read_provenance(tmp_path / "n-runtime.json"))
+    section = resized.Resized.summarise(table, read_provenance(tmp_path / "n-runtime.json"))
     assert section.concluded == ["Not measured, the checkpoint has no future tokens."]
 
 
@@ -364,7 +364,11 @@ def test_bad_input(
     assert "expected one: all runs see the same" in refused("n", *training, *training)
     assert "--training-steps: given 0" in refused("n", *training, "--training-steps", "0")
     assert "--alignment-weights: given -1" in refused("n", *training, "--alignment-weights", "-1")
-    assert "invalid weight value: 'much'" in refused("n", *training, "--alignment-weights", "much")
-    assert "invalid weight value: 'inf'" in refused("n", *training, "--alignment-weights", "inf")
-    assert "sizes: given 40, expected 1 to 31" in refused("n-runtime", "--sizes", "40")
+    for word in ("much", "inf", "nan"):
+        with pytest.raises(SystemExit, match="2"):
+            study("n", *training, "--alignment-weights", word)
+        assert f"invalid weight value: '{word}'" in capsys.readouterr().err
+    assert "--num-future-tokens: given 40, expected 1 to 31" in refused(
+        "n-runtime", "--num-future-tokens", "40"
+    )
     assert not (tmp_path / "out").exists()
