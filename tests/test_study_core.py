@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from saccade.errors import InputError
-from saccade.study import STUDIES, load_study, tables
+from saccade.study import table as tables
 from saccade.study.cell import Cell, Rows, digest
 from saccade.study.run import BACKENDS, StudyError, run_cells
 from saccade.study.study import STUDIES, load_study
