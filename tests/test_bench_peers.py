@@ -1,4 +1,4 @@
-"""The comparison with peers: equal results, resumed runs, the page of the committed measurements."""
+"""The benchmark of peers: all compute the same, runs continue where they stopped, docs have the results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 import saccade
 from benches.peers import __main__ as command
-from benches.peers import figures, goals, inputs, report
+from benches.peers import figures, goals, inputs, report, text
 from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS
 from benches.peers.engines import Task
@@ -199,11 +199,11 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     # Of float32 OpenVINO is the faster one (1.5 s and 1.6 s in turn); torch in bfloat16 is not.
     assert report.faster_peers(results).count("OpenVINO float32") == 3
     assert "torch" not in report.faster_peers(results)
-    text = report.document(results, "images")
+    page = report.document(results, "images")
     # 156 G at 100 G/s over 1.6 s and 3.2 s, whose median is 2.4 s.
     floor = exact_macs(N15, CASE)["both"] / 1e11 / 2.4
-    assert f"| {100 * floor:.0f} % |" in text
-    assert "Some CPU" in text
+    assert f"| {100 * floor:.0f} % |" in page
+    assert "Some CPU" in page
 
 
 def test_a_result_that_is_wrong_is_marked_and_not_ranked(tmp_path: Path) -> None:
@@ -233,7 +233,7 @@ def test_the_picture_shows_the_numbers_of_the_table() -> None:
     """A median of sums is not the sum of medians, so the picture takes it from where the table does."""
     pytest.importorskip("matplotlib")
     results = Results(report.COMMITTED)
-    cases = report.usual(results, "head")
+    cases = text.usual(results, "head")
     table = [line.split(" | ") for line in report.overview(results).splitlines()[2:] if line.startswith("| ")]
     both, sample = (
         {cells[0].removeprefix("| "): cells[start : start + len(cases)] for cells in table}
@@ -242,17 +242,15 @@ def test_the_picture_shows_the_numbers_of_the_table() -> None:
     panels = figures.head_figure(results).axes
     labels = [label.get_text() for label in panels[0].get_yticklabels()]
     for number, panel in enumerate(panels):
-        drawn = {labels[round(text.get_position()[1])]: text.get_text().strip() for text in panel.texts}
-        ends = {
-            (labels[round(bar.get_y() + bar.get_height() / 2)], round(bar.get_width()))
-            for bar in panel.patches
-        }
+        drawn = {labels[round(one.get_position()[1])]: one.get_text().strip() for one in panel.texts}
+        bars: Any = panel.patches
+        ends = {(labels[round(bar.get_y() + bar.get_height() / 2)], round(bar.get_width())) for bar in bars}
         for label, cells in both.items():
             assert drawn[label] == cells[number]
             assert {(label, int(cells[number])), (label, int(sample[label][number]))} <= ends
 
 
-def test_the_page_is_the_report_of_the_committed_results() -> None:
+def test_the_page_contains_what_was_measured() -> None:
     results = Results(report.COMMITTED)
     assert results.cases
     assert report.PAGE.read_text() == report.document(results, "images")
@@ -266,7 +264,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_it_runs_and_resumes(tmp_path: Path) -> None:
+def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     chosen = ["--only", "head", "--contenders", "saccade-float32", "torch-float32", "saccade-bfloat16"]
     done = run(tmp_path, *chosen, "--rounds", "1")
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The report of `make bench-peers`: Markdown and figures."""
+"""The report of `make bench-peers`: Markdown and figures; docs/performance.md is one of them."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ from benches.peers.text import (
 )
 from saccade.bench.timing import quartiles
 
-ROOT = Path(__file__).resolve().parents[2]
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE, IMAGES = DOCS / "performance.md", DOCS / "images"
 NOTES = Path(__file__).with_name("notes.md")
-PAGE = ROOT / "docs" / "performance.md"
-IMAGES = ROOT / "docs" / "images"
 COMMITTED = Path(__file__).with_name("results.json")
 OVERVIEW_ROWS = (
     "saccade-float32",
@@ -92,13 +91,13 @@ def document(results: Results, images: str) -> str:
 
 
 def overview(results: Results) -> str:
-    """The first table: the whole head at the released size in every engine."""
+    """A table of the whole head at the released size in every engine."""
     cases = usual(results, "head")
     if not cases:
         return "Nothing measured yet."
     threads = [case.threads for case in cases]
     titles = [f"encode + sample, {plural(count)}" for count in threads]
-    titles += [f"sample from a cached context, {plural(count)}" for count in threads]
+    titles += [f"sample on a held context, {plural(count)}" for count in threads]
     rows = []
     for name in OVERVIEW_ROWS:
         if not any(name in results.names(case) for case in cases):
