@@ -444,7 +444,12 @@ def test_the_command(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     options = ["--dtype", "bfloat16", "--embodiment-ids", "3,31", "--max-shard-size", "2MB"]
     assert cli.main(["convert", str(source), "--out", out, *options]) == 0
     printed = capsys.readouterr().out
-    for part in ("kept embodiments 3, 31", "numbers: largest error", "not copied: optimizer.pt", "other file"):
+    for part in (
+        "kept embodiments 3, 31",
+        "numbers: largest error",
+        "not copied: optimizer.pt",
+        "other file",
+    ):
         assert part in printed
     assert cli.main(["convert", str(source), "--out", out, "--force", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
