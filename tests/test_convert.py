@@ -24,7 +24,8 @@ from torch import Tensor
 
 import saccade
 from saccade import cli
-from saccade.checkpoints import action_changes, convert, quantize, resize
+from saccade.checkpoints import convert, quantize, resize
+from saccade.comparison import action_changes
 from saccade.errors import CheckpointError, InputError
 from saccade.reference.random_weights import random_inputs
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 import saccade
 from saccade import cli
-from saccade.checkpoints import action_changes, convert, resize
+from saccade.checkpoints import convert, resize
+from saccade.comparison import action_changes
 from saccade.errors import CheckpointError, InputError
 
 TOKENS = "action_head.future_tokens.weight"

@@ -28,7 +28,6 @@ EXTRAS: dict[str, dict[str, str]] = {
         "imageio_ffmpeg": "imageio-ffmpeg",
         "PIL": "pillow",
         "matplotlib": "matplotlib",
-        "scipy": "scipy",
         "threadpoolctl": "threadpoolctl",
         "jinja2": "jinja2",
         "scipy": "scipy",

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from saccade.cli import EXIT_OK, _output, arguments
+
+if TYPE_CHECKING:
+    from saccade.checkpoints.findings import Embodiment, Inspection, Resemblance, Spread, TokenStatistics
 
 HELP = "show what a checkpoint contains"
 
@@ -48,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Reads the checkpoint and prints what it contains."""
-    from saccade.inspection import inspect
+    from saccade.checkpoints.inspection import inspect
 
     with _output.progress_bar("reading", in_bytes=True, transient=True) as update:
         report = inspect(
@@ -60,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda done, total: update(done, total),
         )
     if args.json:
-        _output.print_json(report, indent=1)
+        _output.print_json(dataclasses.asdict(report), indent=1)
     else:
         show(sections(report))
     return EXIT_OK
@@ -109,75 +113,73 @@ def plain(section: Section) -> str:
     return "\n".join([section.title, *lines])
 
 
-def sections(report: Mapping[str, Any]) -> list[Section]:
+def sections(report: Inspection) -> list[Section]:
     """All tables, top to bottom."""
     found = [checkpoint(report), sizes(report), parts(report), memory(report), embodiments(report)]
-    if report["future_tokens"] is not None:
-        found.append(future_tokens(report["future_tokens"]))
-    if report["reference"] is not None:
-        found.append(reference(report["reference"]))
-    odd = [[sentence] for sentence in report["odd"]] or [["nothing"]]
-    return [*found, Section("Unusual", [""], odd), from_noise(report["from_noise"])]
+    if report.future_tokens is not None:
+        found.append(future_tokens(report.future_tokens))
+    if report.reference is not None:
+        found.append(reference(report.reference))
+    odd = [[sentence] for sentence in report.odd] or [["nothing"]]
+    return [*found, Section("Unusual", [""], odd), from_noise(report.from_noise)]
 
 
-def checkpoint(report: Mapping[str, Any]) -> Section:
+def checkpoint(report: Inspection) -> Section:
     """What the checkpoint is, and the evidence for it."""
-    size = sum(file["nbytes"] for file in report["files"])
-    outside = [f"{counts['tensors']} tensors, {megabytes(counts['nbytes'])} MB of {name}"
-              for name, counts in report["outside"].items()]  # fmt: skip
+    size = sum(file.nbytes for file in report.files)
+    outside = [f"{counts.tensors} tensors, {megabytes(counts.nbytes)} MB of {name}"
+              for name, counts in report.outside.items()]  # fmt: skip
     rows = [
-        ["version", f"GR00T {report['version'].upper()}"],
-        ["layout", report["layout"]],
-        ["files", f"{len(report['files'])}, {megabytes(size)} MB"],
-        ["prefix of the head", report["prefix"] or "none"],
+        ["version", f"GR00T {report.version.upper()}"],
+        ["layout", report.layout],
+        ["files", f"{len(report.files)}, {megabytes(size)} MB"],
+        ["prefix of the head", report.prefix or "none"],
         ["outside the head", "; ".join(outside) or "nothing"],
-        *([["evidence" if index == 0 else "", what] for index, what in enumerate(report["evidence"])]),
+        *([["evidence" if index == 0 else "", what] for index, what in enumerate(report.evidence)]),
     ]
-    return Section(str(report["source"]), ["", ""], rows)
+    return Section(str(report.source), ["", ""], rows)
 
 
-def sizes(report: Mapping[str, Any]) -> Section:
+def sizes(report: Inspection) -> Section:
     """The sizes that users need."""
-    config = report["config"]
+    config = report.config
     rows = [
-        ["future tokens (N)", str(config["num_future_tokens"])],
-        ["actions in a chunk (T)", str(config["action_horizon"])],
-        ["width of an action", str(config["action_dim"])],
-        ["decoders", ", ".join(f"{name} {width}" for name, width in config["decoders"])],
-        ["width of a state", str(config["state_dim"])],
-        ["embodiments", str(config["num_embodiments"])],
-        ["blocks", f"{config['num_layers']}, {config['num_heads']} heads of {config['head_dim']}"],
-        ["VL self-attention", f"{config['vl_num_layers']} blocks" if config["vl_num_layers"] else "none"],
-        ["width of VL tokens", str(config["context_dim"])],
-        ["Euler steps", str(config["num_steps"])],
+        ["future tokens (N)", str(config.num_future_tokens)],
+        ["actions in a chunk (T)", str(config.action_horizon)],
+        ["width of an action", str(config.action_dim)],
+        ["decoders", ", ".join(f"{name} {width}" for name, width in config.decoders)],
+        ["width of a state", str(config.state_dim)],
+        ["embodiments", str(config.num_embodiments)],
+        ["blocks", f"{config.num_layers}, {config.num_heads} heads of {config.head_dim}"],
+        ["VL self-attention", f"{config.vl_num_layers} blocks" if config.vl_num_layers else "none"],
+        ["width of VL tokens", str(config.context_dim)],
+        ["Euler steps", str(config.num_steps)],
     ]
-    if config["encoder_action_dim"] != config["action_dim"]:
-        rows.insert(3, ["width of an action while denoised", str(config["encoder_action_dim"])])
-    if config["state_history"] != 1:
-        rows.insert(5, ["states in a history", str(config["state_history"])])
+    if config.encoder_action_dim != config.action_dim:
+        rows.insert(3, ["width of an action while denoised", str(config.encoder_action_dim)])
+    if config.state_history != 1:
+        rows.insert(5, ["states in a history", str(config.state_history)])
     return Section("Sizes", ["", ""], rows)
 
 
-def parts(report: Mapping[str, Any]) -> Section:
+def parts(report: Inspection) -> Section:
     """Tensors, parameters and bytes by part."""
     rows = []
-    for name, part in report["parts"].items():
-        types = ", ".join(f"{count} {dtype}" for dtype, count in part["dtypes"].items())
-        fresh = f"{part['as_drawn']} of {part['judged']}" if part["judged"] else "-"
-        rows.append(
-            [name, str(part["tensors"]), f"{part['parameters']:,}", megabytes(part["nbytes"]), types, fresh]
-        )
-    tensors = sum(part["tensors"] for part in report["parts"].values())
-    nbytes = sum(part["nbytes"] for part in report["parts"].values())
-    rows.append(["head", str(tensors), f"{report['parameters']:,}", megabytes(nbytes), "", ""])
+    for name, part in report.parts.items():
+        types = ", ".join(f"{count} {dtype}" for dtype, count in part.dtypes.items())
+        fresh = f"{part.as_drawn} of {part.judged}" if part.judged else "-"
+        rows.append([name, str(part.tensors), f"{part.parameters:,}", megabytes(part.nbytes), types, fresh])
+    tensors = sum(part.tensors for part in report.parts.values())
+    nbytes = sum(part.nbytes for part in report.parts.values())
+    rows.append(["head", str(tensors), f"{report.parameters:,}", megabytes(nbytes), "", ""])
     return Section("Parts", ["", ">tensors", ">parameters", ">MB", "types", ">as initialised"], rows)
 
 
-def memory(report: Mapping[str, Any]) -> Section:
+def memory(report: Inspection) -> Section:
     """Memory, and expected time, at each precision."""
-    rows, seconds = [], report["seconds"]
-    for precision, nbytes in report["memory"].items():
-        row = [precision, megabytes(nbytes["all"]), megabytes(nbytes["one"])]
+    rows, seconds = [], report.seconds
+    for precision, nbytes in report.memory.items():
+        row = [precision, megabytes(nbytes.all), megabytes(nbytes.one)]
         if seconds is not None:
             times = [seconds[precision][name] for name in ("encode", "sample")]
             row += [f"{1000 * time:.1f}" for time in (*times, sum(times))]
@@ -185,31 +187,29 @@ def memory(report: Mapping[str, Any]) -> Section:
     columns = ["", ">MB, all embodiments", ">MB, one"]
     if seconds is None:
         return Section("Memory", columns, rows)
-    machine = report["machine"]
+    machine = report.machine
     title = (
-        f"Memory, and expected time of a chunk with {report['num_vl_tokens']} VL tokens "
-        f"({machine['isa']}, {machine['num_threads']} threads, by the cost model)"
+        f"Memory, and expected time of a chunk with {report.num_vl_tokens} VL tokens "
+        f"({machine.isa}, {machine.num_threads} threads, by the cost model)"
     )
     return Section(title, [*columns, ">ms, encode", ">ms, sample", ">ms, chunk"], rows)
 
 
-def embodiments(report: Mapping[str, Any]) -> Section:
+def embodiments(report: Inspection) -> Section:
     """Which embodiments look trained; consecutive ids without a name that look alike share a row."""
     rows: list[list[str]] = []
-    run: list[Mapping[str, Any]] = []
+    run: list[Embodiment] = []
 
     def close() -> None:
         if not run:
             return
-        ids = str(run[0]["id"]) if len(run) == 1 else f"{run[0]['id']} to {run[-1]['id']}"
-        norms, scores = [one["norm"] for one in run], [one["robust_z"] for one in run]
-        rows.append(
-            [ids, ", ".join(run[0]["names"]), span(norms, ".2f"), span(scores, ".1f"), run[0]["looks"]]
-        )
+        ids = str(run[0].id) if len(run) == 1 else f"{run[0].id} to {run[-1].id}"
+        norms, scores = [one.norm for one in run], [one.robust_z for one in run]
+        rows.append([ids, ", ".join(run[0].names), span(norms, ".2f"), span(scores, ".1f"), run[0].looks])
         run.clear()
 
-    for entry in report["embodiments"]:
-        if run and (entry["names"] or run[-1]["names"] or entry["looks"] != run[-1]["looks"]):
+    for entry in report.embodiments:
+        if run and (entry.names or run[-1].names or entry.looks != run[-1].looks):
             close()
         run.append(entry)
     close()
@@ -229,49 +229,45 @@ def span(values: Sequence[float | None], form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def future_tokens(tokens: Mapping[str, Any]) -> Section:
+def future_tokens(tokens: TokenStatistics) -> Section:
     """Statistics of the future tokens, next to those of a random draw."""
-    drawn = tokens["drawn"]
-
-    def row(what: str, key: str) -> list[str]:
-        return [what, *(spread(values[key]) for values in (tokens, drawn))]
-
+    drawn = tokens.drawn
     rows = [
-        row("norm", "norm"),
-        row("cosine of pairs", "cosine"),
+        ["norm", spread(tokens.norm), spread(drawn.norm)],
+        ["cosine of pairs", spread(tokens.cosine), spread(drawn.cosine)],
         [
             "effective rank",
-            f"{tokens['effective_rank']:.2f} of {tokens['count']}",
-            f"{drawn['effective_rank']:.2f}",
+            f"{tokens.effective_rank:.2f} of {tokens.count}",
+            f"{drawn.effective_rank:.2f}",
         ],
-        ["standard deviation", f"{tokens['std']:.4f}", "0.0200"],
-        ["distance from N(0, 0.02)", f"{tokens['distance']:.4f}", ""],
+        ["standard deviation", f"{tokens.std:.4f}", "0.0200"],
+        ["distance from N(0, 0.02)", f"{tokens.distance:.4f}", ""],
     ]
     return Section("Future tokens: mean (smallest to largest)", ["", "these", "a random draw"], rows)
 
 
-def spread(values: Mapping[str, float] | None) -> str:
+def spread(values: Spread | None) -> str:
     """Mean, minimum and maximum on one line."""
     if values is None:
         return "-"
-    return f"{values['mean']:.4f} ({values['min']:.4f} to {values['max']:.4f})"
+    return f"{values.mean:.4f} ({values.min:.4f} to {values.max:.4f})"
 
 
-def reference(found: Mapping[str, Any]) -> Section:
+def reference(found: Resemblance) -> Section:
     """The comparison with the reference checkpoint."""
     rows = [
         [
             name,
-            f"{part['identical']} of {part['pieces']}",
-            spread(part["cosine"]),
-            f"{part['largest_change']:.3g}" if part["cosine"] else "-",
+            f"{part.identical} of {part.pieces}",
+            spread(part.cosine),
+            f"{part.largest_change:.3g}" if part.cosine else "-",
         ]
-        for name, part in found["parts"].items()
+        for name, part in found.parts.items()
     ]
-    rows += [[what, "", "different shape", ""] for what in found["different_shapes"]]
-    modules = dict.fromkeys(name.partition(".")[0] for name in found["not_in_reference"])
+    rows += [[what, "", "different shape", ""] for what in found.different_shapes]
+    modules = dict.fromkeys(name.partition(".")[0] for name in found.not_in_reference)
     rows += [[module, "", "not in the reference", ""] for module in modules]
-    title = f"Compared with {found['source']}: tensors, one slice per embodiment"
+    title = f"Compared with {found.source}: tensors, one slice per embodiment"
     return Section(title, ["", ">identical", "cosine of other weights", ">largest change"], rows)
 
 

@@ -225,7 +225,7 @@ def head_config(source: Path) -> saccade.HeadConfig:
     """The config of the head in a checkpoint, whichever layout it has."""
     from saccade.reference import loading
 
-    return saccade.HeadConfig.from_dict(loading.described(source)["head_config"])
+    return saccade.HeadConfig.from_dict(loading.described(source).head_config)
 
 
 def engines(
@@ -272,7 +272,7 @@ def run_rust(source: Path, inputs: Observation, args: argparse.Namespace, isa: s
     with forced_isa(isa):
         head = saccade.ActionHead.load(
             source,
-            config=loading.described(source)["head_config"],
+            config=loading.described(source).head_config,
             precision=args.precision,
             num_threads=args.num_threads,
         )

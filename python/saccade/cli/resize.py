@@ -10,7 +10,8 @@ from saccade.cli import EXIT_OK, _output, arguments
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
 if TYPE_CHECKING:
-    from saccade.checkpoints import ActionChanges, ResizeReport
+    from saccade.checkpoints import ResizeReport
+    from saccade.comparison import ActionChanges
 
 HELP = "write a checkpoint with another number of future tokens"
 
@@ -57,7 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains and how far actions move."""
-    from saccade.checkpoints import action_changes, resize
+    from saccade.checkpoints import resize
+    from saccade.comparison import action_changes
 
     with copying("resizing") as progress:
         report = resize(
