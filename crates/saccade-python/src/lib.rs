@@ -880,6 +880,32 @@ fn resize<'py>(
     Ok(dict)
 }
 
+/// The rows, the tokens that each stands for, and the biases of their keys.
+type PyMergedTokens<'py> = (Bound<'py, PyArrayDyn<f32>>, Vec<Vec<usize>>, Option<Vec<f32>>);
+
+/// Merges `tokens (count, width)` by the rule of `resize`.
+#[pyfunction]
+#[pyo3(signature = (tokens, num_future_tokens, key_bias=None))]
+fn merge_future_tokens<'py>(
+    py: Python<'py>,
+    tokens: PyReadonlyArrayDyn<'py, f32>,
+    num_future_tokens: usize,
+    key_bias: Option<Vec<f32>>,
+) -> PyResult<PyMergedTokens<'py>> {
+    let (rows, &[_, width]) = (tokens.as_slice()?, tokens.shape()) else {
+        let shape = tokens.shape();
+        return Err(raise(Error::Shape(format!(
+            "tokens: expected two axes, got {}",
+            shape.len()
+        ))));
+    };
+    let merged =
+        py.detach(|| saccade::merge_future_tokens(rows, width, num_future_tokens, key_bias.as_deref()));
+    let merged = merged.map_err(raise)?;
+    let tokens = to_numpy(py, merged.tokens, &[merged.sources.len(), width])?;
+    Ok((tokens, merged.sources, merged.key_bias))
+}
+
 #[pyfunction]
 fn available_isas() -> Vec<String> {
     Isa::available().iter().map(Isa::to_string).collect()
@@ -913,8 +939,9 @@ mod _saccade {
     use super::{ActionHead, Context, CrossAttention, KeyValues, Published};
     #[pymodule_export]
     use super::{
-        available_isas, convert, default_num_threads, dot_products, measure_peaks, parse_config, quantize,
-        read_tensors, resize, selected_isa, start_profile, take_profile, tensor_shapes,
+        available_isas, convert, default_num_threads, dot_products, measure_peaks, merge_future_tokens,
+        parse_config, quantize, read_tensors, resize, selected_isa, start_profile, take_profile,
+        tensor_shapes,
     };
 
     #[pymodule_export]

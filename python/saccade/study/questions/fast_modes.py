@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,19 +13,20 @@ import numpy.typing as npt
 
 from saccade.errors import InputError
 from saccade.head import ActionHead, Context
-from saccade.sim.policy import EMBODIMENT_ID, Float32Array, Interventions
-from saccade.study.cells import digest
+from saccade.observation import Observation
+from saccade.study.cell import digest
+from saccade.study.source import Float32Array
 
 BoolArray = npt.NDArray[np.bool_]
-#: From noisy actions `(1, horizon, encoder_action_dim)` and a time in 0..1 to `(1, horizon, action_dim)`.
+#: Noisy actions `(1, horizon, encoder_action_dim)` and a time in 0..1 -> `(1, horizon, action_dim)`.
 Velocity = Callable[[Float32Array, float], npt.NDArray[np.floating[Any]]]
 
 PRECISIONS = ("float32", "bfloat16", "int8")
-# With how often each asks for the velocity in a step.
-INTEGRATORS = {"euler": 1, "midpoint": 2, "heun": 2, "adams": 1, "times": 1}
-OF_THE_HEAD = ("euler", "midpoint")  # the others are done here, by `velocity`
-EXACT_STEPS = 16  # of the midpoint rule, for what many steps lead to
+INTEGRATORS = {"euler": 1, "midpoint": 2, "heun": 2, "adams": 1, "times": 1}  # evaluations per step
+OF_THE_HEAD = ("euler", "midpoint")  # the others are computed here, from `ActionHead.velocity`
+EXACT_STEPS = 16  # of the midpoint rule: the reference for small steps
 SEARCH_STRIDES = (0.1, 0.04, 0.02, 0.01)  # by which step times are moved, one after the other
+CROSS_MASS_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,12 @@ class Mode:
 
     Attributes:
         precision: Of the head.
-        integrator: Of `INTEGRATORS`. `midpoint` and `heun` ask for the velocity twice a step; `adams`
-            (Adams-Bashforth, second order) asks once and goes on from the last answer; `times` is Euler at
-            step times that were optimised for the checkpoint.
+        integrator: One of `INTEGRATORS`. `midpoint` and `heun` evaluate the velocity twice per step. `adams`
+            (Adams-Bashforth, second order) evaluates it once and extrapolates from the previous value.
+            `times` is Euler at step times that are optimised for the checkpoint.
         num_steps: Of the integrator.
-        refresh: State and future rows are computed anew at every so many evaluations; 1 is exact.
-        drop: Percent of the vision-language tokens that are removed, those with the least attention.
+        refresh: State and future rows are recomputed every `refresh` evaluations; 1 is exact.
+        drop: Percentage of the vision-language tokens that are removed, those with the least attention.
 
     Example:
         >>> Mode.parse("int8-euler-4-refresh-2").name
@@ -65,12 +66,12 @@ class Mode:
 
     @property
     def evaluations(self) -> int:
-        """How often the velocity is asked for."""
+        """How often the velocity is evaluated."""
         return self.num_steps * INTEGRATORS[self.integrator]
 
     @property
     def calibrated(self) -> bool:
-        """Whether it takes numbers that are found on observations first."""
+        """Whether it depends on numbers that are first found on other observations."""
         return self.integrator == "times" or self.drop > 0
 
     @classmethod
@@ -78,7 +79,7 @@ class Mode:
         """The mode of that name.
 
         Raises:
-            InputError: it is none.
+            InputError: There is none.
         """
         words = name.split("-")
         options = dict(zip(words[3::2], words[4::2], strict=False))
@@ -93,8 +94,8 @@ class Mode:
         )
         if not fits:
             raise InputError(
-                f"mode: given {name!r}, expected PRECISION-INTEGRATOR-STEPS, then -refresh-NUMBER and "
-                f"-drop-PERCENT if wanted; precisions {', '.join(PRECISIONS)}; integrators "
+                f"mode: given {name!r}, expected PRECISION-INTEGRATOR-STEPS, optionally with -refresh-NUMBER "
+                f"and -drop-PERCENT; precisions {', '.join(PRECISIONS)}; integrators "
                 f"{', '.join(INTEGRATORS)}"
             )
         mode = cls(
@@ -112,22 +113,22 @@ class Mode:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What calibrated modes take.
+    """The numbers that calibrated modes depend on.
 
     Attributes:
-        times: By number of steps, the times at which steps begin, from 0 on, and 1 at the end.
-        mass: Of each vision-language position, its share of the cross-attention.
+        times: The step times for each number of steps, from 0 to 1.
+        mass: Share of the cross-attention of each vision-language position.
     """
 
     times: tuple[tuple[float, ...], ...] = ()
     mass: tuple[float, ...] = ()
 
     def grid(self, num_steps: int) -> tuple[float, ...]:
-        """The times for so many steps."""
+        """The times of `num_steps` steps."""
         return next(grid for grid in self.times if len(grid) == num_steps + 1)
 
     def least(self, percent: int, removed: BoolArray | None) -> BoolArray:
-        """Which positions go, `(1, T_vl)`: so many percent of those not yet `removed`, rounded down."""
+        """Which positions are removed, `(1, T_vl)`: `percent` of those not `removed` yet, rounded down."""
         gone = np.zeros((1, len(self.mass)), bool) if removed is None else removed.copy()
         there = np.flatnonzero(~gone[0])
         order = there[np.argsort(np.asarray(self.mass)[there], kind="stable")]
@@ -135,91 +136,72 @@ class Calibration:
         return gone
 
     def of(self, mode: Mode) -> str:
-        """A digest of what the mode takes of it, to tell apart what was measured with other numbers."""
+        """A digest of what the mode depends on, to distinguish measurements with different calibrations."""
         times = self.grid(mode.num_steps) if mode.integrator == "times" else ()
         return digest([times, self.mass if mode.drop else ()])
 
 
-@functools.lru_cache(maxsize=len(PRECISIONS))
-def head_of(source: str, config: str | None, precision: str, num_threads: int | None) -> ActionHead:
-    """A head; one of each precision is kept."""
-    return ActionHead.load(source, config=config, precision=precision, num_threads=num_threads)
-
-
-def encode(
-    head: ActionHead, mode: Mode, calibration: Calibration, features: Float32Array, removed: BoolArray | None
-) -> Context:
-    """An observation `(1, T_vl, context_dim)` as the mode encodes it; `removed (1, T_vl)` are not there."""
+def encode(head: ActionHead, mode: Mode, calibration: Calibration, observation: Observation) -> Context:
+    """A single observation as the mode encodes it."""
     if mode.drop:
-        removed = calibration.least(mode.drop, removed)
-    return head.encode(features, drop_vl=removed)
+        removed = calibration.least(mode.drop, observation.drop_vl)
+        observation = dataclasses.replace(observation, drop_vl=removed)
+    return observation.encode(head)
 
 
 def sample(
-    head: ActionHead,
-    mode: Mode,
-    calibration: Calibration,
-    context: Context,
-    state: Float32Array,
-    embodiment_id: int,
-    noise: Float32Array,
+    head: ActionHead, mode: Mode, calibration: Calibration, context: Context, observation: Observation
 ) -> Float32Array:
-    """A chunk `(batch, horizon, action_dim)` as the mode computes it."""
+    """A chunk `(1, horizon, action_dim)` as the mode computes it, from the observation's noise."""
     if mode.integrator in OF_THE_HEAD:
-        found = head.sample(
+        return observation.sample(
+            head,
             context,
-            state,
-            embodiment_id,
-            noise=noise,
             num_steps=mode.num_steps,
             integrator=mode.integrator,
             future_refresh=mode.refresh,
         )
-        return np.asarray(found)
     times = calibration.grid(mode.num_steps) if mode.integrator == "times" else even_times(mode.num_steps)
-    velocity = velocity_of(head, context, state, embodiment_id)
-    return integrate(velocity, noise, mode.integrator, times)[..., : head.config.action_dim]
+    assert observation.noise is not None
+    chunk = integrate(velocity_of(head, context, observation), observation.noise, mode.integrator, times)
+    return chunk[..., : head.config.action_dim]
 
 
-def many_steps(
-    head: ActionHead, context: Context, state: Float32Array, embodiment_id: int, noise: Float32Array
-) -> Float32Array:
-    """What many small steps lead to, `(batch, horizon, action_dim)`."""
-    found = head.sample(
-        context, state, embodiment_id, noise=noise, num_steps=EXACT_STEPS, integrator="midpoint"
-    )
-    return np.asarray(found)
+def many_steps(head: ActionHead, context: Context, observation: Observation) -> Float32Array:
+    """The chunk for many small steps, `(1, horizon, action_dim)`."""
+    return observation.sample(head, context, num_steps=EXACT_STEPS, integrator="midpoint")
 
 
-def velocity_of(head: ActionHead, context: Context, state: Float32Array, embodiment_id: int) -> Velocity:
-    """The head's velocity as a function of time in 0..1, which it knows in whole buckets."""
+def velocity_of(head: ActionHead, context: Context, observation: Observation) -> Velocity:
+    """The head's velocity as a function of time in 0..1, which the head rounds down to a bucket."""
     buckets = head.config.num_timestep_buckets
 
     def velocity(actions: Float32Array, time: float) -> Float32Array:
         bucket = min(int(time * buckets), buckets - 1)
-        return np.asarray(head.velocity(context, state, embodiment_id, actions, bucket))
+        found = head.velocity(context, observation.state, observation.embodiment_id, actions, bucket)
+        return np.asarray(found)
 
     return velocity
 
 
 def even_times(num_steps: int) -> tuple[float, ...]:
-    """Where steps of one length begin, and 1."""
+    """The times of steps of equal length, from 0 to 1."""
     return tuple(step / num_steps for step in range(num_steps + 1))
 
 
 def integrate(
     velocity: Velocity, start: Float32Array, integrator: str, times: Sequence[float]
 ) -> Float32Array:
-    """Follows a velocity from noise at time 0 to actions at time 1.
+    """Integrates a velocity from noise at time 0 to actions at time 1.
 
     Args:
-        velocity: of the first `action_dim` numbers; the others stay as they are.
+        velocity: Of the first `action_dim` numbers; the others are not changed.
         start: `(batch, horizon, encoder_action_dim)`.
-        integrator: of `INTEGRATORS`, but for `midpoint`.
-        times: where steps begin, and 1. `adams` takes steps of one length.
+        integrator: One of `INTEGRATORS`, except `midpoint`.
+        times: Step times from 0 to 1. `adams` needs steps of equal length.
 
     Returns:
-        Like `start`.
+        An array of the shape of `start`.
 
     Example:
         A velocity that grows with time, for which Heun's rule is exact:
@@ -236,7 +218,7 @@ def integrate(
     for now, after in itertools.pairwise(times):
         length = after - now
         slope = velocity(x, now)
-        moving = x[..., : slope.shape[-1]]  # a view: what is added to it is added to x
+        moving = x[..., : slope.shape[-1]]  # a view: adding to it changes x
         if integrator == "heun":
             slope = (slope + velocity(moved(x, slope, length), after)) / 2
         elif integrator == "adams":
@@ -246,18 +228,18 @@ def integrate(
 
 
 def moved(x: Float32Array, slope: npt.NDArray[np.floating[Any]], length: float) -> Float32Array:
-    """`x` a step of that length further."""
+    """`x` after a step of that length along `slope`."""
     further = x.copy()
     further[..., : slope.shape[-1]] += np.float32(length) * slope
     return further
 
 
 def best_times(error: Callable[[tuple[float, ...]], float], num_steps: int) -> tuple[float, ...]:
-    """Step times with a small error: from even ones, one is moved at a time as long as that helps.
+    """Step times with a small error: starting from even ones, one at a time is moved while that helps.
 
     Args:
-        error: of a grid of times, from 0 to 1.
-        num_steps: at least 2.
+        error: Of step times from 0 to 1.
+        num_steps: At least 2.
     """
     best = even_times(num_steps)
     least = error(best)
@@ -276,47 +258,14 @@ def best_times(error: Callable[[tuple[float, ...]], float], num_steps: int) -> t
     return best
 
 
-def cross_mass(
-    head: ActionHead, context: Context, state: Float32Array, embodiment_id: int, noise: Float32Array
-) -> Float32Array:
-    """Of each vision-language position its share of the cross-attention, `(T_vl,)`.
+def cross_mass(head: ActionHead, context: Context, observation: Observation) -> Float32Array:
+    """The share of the cross-attention of each vision-language position, `(T_vl,)`.
 
     The mean over rows, heads, blocks and four Euler steps.
     """
     cross = range(0, head.config.num_layers, 2 if head.config.interleave_self_attention else 1)
-    trace = head.trace(context, state, embodiment_id, noise=noise, num_steps=4, blocks=list(cross))
+    trace = observation.trace(head, context, num_steps=CROSS_MASS_STEPS, blocks=list(cross))
     shares: Float32Array = np.mean(
         [np.asarray(one).mean(axis=(0, 1, 2)) for one in trace.attention.values()], axis=0
     )
     return shares
-
-
-class ModeEngine:
-    """A policy's head in one of the modes, on one thread.
-
-    Args:
-        checkpoint: directory of the policy.
-        mode: how it is computed.
-        calibration: what the mode takes.
-    """
-
-    def __init__(self, checkpoint: str, mode: Mode, calibration: Calibration) -> None:
-        self._head = head_of(checkpoint, None, mode.precision, 1)
-        self._mode = mode
-        self._calibration = calibration
-
-    def encode(self, features: Float32Array) -> Context:
-        """See `saccade.sim.policy.HeadEngine`."""
-        return encode(self._head, self._mode, self._calibration, features, None)
-
-    def sample(
-        self, context: Context, state: Float32Array, noise: Float32Array, intervention: Interventions = None
-    ) -> Float32Array:
-        """See `saccade.sim.policy.HeadEngine`; takes no intervention."""
-        if intervention is not None:
-            raise InputError("intervention: given one, expected None with a faster mode")
-        return sample(self._head, self._mode, self._calibration, context, state, EMBODIMENT_ID, noise)
-
-    def describe(self) -> dict[str, Any]:
-        """See `saccade.sim.policy.HeadEngine`."""
-        return {"name": "rust", "mode": self._mode.name, "isa": self._head.isa, "num_threads": 1}

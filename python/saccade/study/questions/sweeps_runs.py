@@ -1,4 +1,4 @@
-"""Runs of `saccade train` as the sweeps read them."""
+"""Reading runs of `saccade train` for the sweeps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 from saccade._files import sha256_of
 from saccade.errors import InputError
-from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
 SETTINGS_FILE = "settings.json"
 
@@ -21,10 +20,10 @@ class Run:
 
     Attributes:
         name: Of its directory.
-        directory: Where it is.
-        settings: Of `settings.json`.
-        history: Of `history.json`.
-        point: What the sweep varies: names and values.
+        directory: The run's directory.
+        settings: Contents of `settings.json`.
+        history: Contents of `history.json`.
+        point: Names and values of what the sweep varies.
     """
 
     name: str
@@ -35,22 +34,24 @@ class Run:
 
     @property
     def seed(self) -> int:
-        """Of the training."""
+        """The training seed."""
         return int(self.settings["seed"])
 
     @property
     def step(self) -> int:
-        """How far the training came."""
+        """The last step of the training so far."""
         return int(self.history[-1]["step"]) if self.history else 0
 
     @property
     def checkpoint_sha256(self) -> str:
-        """Of config and tensors, as `Policy.checkpoint_sha256` has it."""
+        """Hash of config and tensors, equal to `Policy.checkpoint_sha256`."""
+        from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE
+
         return sha256_of(self.directory / CONFIG_FILE, self.directory / TENSOR_FILE)
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end."""
+        """Whether the training is complete."""
         return self.step == int(self.settings["steps"])
 
 
@@ -58,9 +59,11 @@ def read_run(directory: Path, varied: Sequence[str]) -> Run:
     """A run of `saccade train`.
 
     Raises:
-        FileNotFoundError: there is none.
-        InputError: its files are not what `saccade train` writes.
+        FileNotFoundError: There is none.
+        InputError: Its files are not what `saccade train` writes.
     """
+    from saccade.sim.settings import CONFIG_FILE, PolicyConfig
+
     if not (directory / SETTINGS_FILE).is_file():
         raise FileNotFoundError(
             f"{directory / SETTINGS_FILE}: no such file; expected a run of `saccade train`"
@@ -77,13 +80,15 @@ def read_run(directory: Path, varied: Sequence[str]) -> Run:
 
 
 def find_runs(directories: Iterable[Path], varied: Sequence[str]) -> list[Run]:
-    """All runs in directories of runs, by what varies and then by seed.
+    """All runs in directories of runs, sorted by what varies and then by seed.
 
-    A run that has not written its policy yet is passed over.
+    A run that has not written its policy yet is skipped.
 
     Raises:
-        FileNotFoundError: a directory is not there, or there is no run in any of them.
+        FileNotFoundError: A directory does not exist, or none of them contains a run.
     """
+    from saccade.sim.settings import TENSOR_FILE
+
     found = []
     for directory in directories:
         if not directory.is_dir():
@@ -91,12 +96,12 @@ def find_runs(directories: Iterable[Path], varied: Sequence[str]) -> list[Run]:
         written = sorted(path.parent for path in directory.glob(f"*/{SETTINGS_FILE}"))
         found += [read_run(path, varied) for path in written if (path / TENSOR_FILE).is_file()]
     if not found:
-        raise FileNotFoundError(f"{', '.join(map(str, directories))}: no runs of `saccade train` there")
+        raise FileNotFoundError(f"{', '.join(map(str, directories))}: contain no runs of `saccade train`")
     return sorted(found, key=lambda run: (*run.point.values(), run.seed))
 
 
 def describe_run(run: Run) -> dict[str, Any]:
-    """The columns that name a policy."""
+    """The columns of the table that identify a policy."""
     return {
         "policy": run.name,
         **run.point,

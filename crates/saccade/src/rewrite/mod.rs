@@ -1,5 +1,9 @@
 //! What all commands that write a checkpoint from another have in common: opening it, what they keep of it, writing it.
 
+pub(crate) mod convert;
+pub(crate) mod quantize;
+pub(crate) mod resize;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
