@@ -41,7 +41,20 @@ def test_versions_are_those_of_the_random_weights() -> None:
 
 def test_json_has_every_engine(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
-        cli.main([*SMALL, "--json", "--batch", "2", "--num-steps", "2", "--dtype", "bfloat16", "--embodiment-id", "1"])
+        cli.main(
+            [
+                *SMALL,
+                "--json",
+                "--batch",
+                "2",
+                "--num-steps",
+                "2",
+                "--dtype",
+                "bfloat16",
+                "--embodiment-id",
+                "1",
+            ]
+        )
         == 0
     )
     report = json.loads(capsys.readouterr().out)

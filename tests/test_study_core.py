@@ -15,8 +15,10 @@ import pandas as pd
 import pytest
 
 from saccade.errors import InputError
-from saccade.study import STUDIES, load_study, tables
-from saccade.study.cells import BACKENDS, Cell, Rows, StudyError, digest, run_cells
+from saccade.study import table as tables
+from saccade.study.cell import Cell, Rows, digest
+from saccade.study.run import BACKENDS, StudyError, run_cells
+from saccade.study.study import STUDIES, load_study
 
 SETTINGS = {"checkpoint": "abc", "width": 0.1}
 
@@ -229,7 +231,7 @@ def test_tables_that_are_none(tmp_path: Path) -> None:
 def test_studies_are_found_by_name() -> None:
     with pytest.raises(InputError, match=f"unknown name 'cut', expected one of {', '.join(STUDIES)}"):
         load_study("cut")
-    assert load_study("cuts").STUDY == "cuts"
+    assert load_study("cuts").name == "cuts"
 
 
 def test_ray_gives_the_same_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

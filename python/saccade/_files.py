@@ -7,10 +7,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from saccade import _saccade
 from saccade._json import dumps
 
 
@@ -72,11 +68,3 @@ def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
     config = [directory / "config.json"] if (directory / "config.json").is_file() else []
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
     return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}
-
-
-def read_future_tokens(checkpoint: Path) -> npt.NDArray[np.float32]:
-    """The future tokens stored in a checkpoint, `(N, width)`; `(0, 0)` where it has none."""
-    for prefix in ("action_head.", "_groot_model.action_head.", ""):  # those that ActionHead.load knows
-        for tokens in _saccade.read_tensors(str(checkpoint), f"{prefix}future_tokens.").values():
-            return tokens
-    return np.zeros((0, 0), np.float32)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from saccade import observation
-from saccade._files import checkpoint_identity, read_future_tokens, sha256_of
+from saccade._files import checkpoint_identity, sha256_of
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.head import ActionHead
@@ -79,13 +79,6 @@ class Recording(Source):
     def head(self, precision: str = "float32") -> ActionHead:
         """See `Source`."""
         return head_of(self.checkpoint, self.config_file, precision, self.num_threads)
-
-    @property
-    def future_tokens(self) -> Float32Array:
-        """See `Source`."""
-        if not self.config.num_future_tokens:
-            return np.zeros((0, self.config.width), np.float32)
-        return read_future_tokens(Path(self.checkpoint))
 
     @property
     def all(self) -> Observation:

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from saccade._files import read_future_tokens
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
 from saccade.head import ActionHead
@@ -84,11 +83,6 @@ class Simulator(Source):
         """See `Source`; on one thread, because cells are spread over processes."""
         return head_of(self.checkpoint, precision)
 
-    @property
-    def future_tokens(self) -> Float32Array:
-        """See `Source`."""
-        return read_future_tokens(Path(self.checkpoint))
-
     def recorded(self, task: str, seed: int) -> Recorded:
         """An episode of the unchanged policy."""
         return recorded(self.checkpoint, self.engine, task, seed)
@@ -100,6 +94,15 @@ class Simulator(Source):
     def rng(self, task: str, seed: int) -> np.random.Generator:
         """See `Source`."""
         return episode_rng(task, seed)
+
+    def first(self, task: str, seed: int, instruction: str) -> Observation:
+        """The first observation of an episode under other words, without noise."""
+        environment = environment_of(self.checkpoint, task)
+        environment.restart(seed)
+        environment.instruction = instruction
+        seen = environment.observe()
+        ids = np.array([EMBODIMENT_ID])
+        return Observation(self.policy.features(seen), self.policy.state(seen), ids)
 
     def encode(self, observation: Observation) -> Any:
         """See `Source`."""

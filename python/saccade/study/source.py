@@ -30,9 +30,11 @@ class Source(ABC):
 
     Attributes:
         closed_loop: Whether episodes can be run, so that success is known.
+        checkpoint: Path of the checkpoint.
     """
 
     closed_loop: ClassVar[bool]
+    checkpoint: str
 
     @property
     def engine_name(self) -> str:
@@ -58,9 +60,9 @@ class Source(ABC):
         """The head; loaded once in a process for each precision."""
 
     @property
-    @abstractmethod
     def future_tokens(self) -> Float32Array:
         """The learned future tokens, `(N, width)`; N is 0 where the checkpoint has none."""
+        return self.head().future_tokens
 
     @abstractmethod
     def observed(self, task: str, seed: int) -> Observation:
@@ -169,8 +171,8 @@ def simulator_of(args: argparse.Namespace) -> Any:
     """The simulator, for studies that need what only it knows; raises as `source_of`."""
     if args.features is not None:
         raise InputError(
-            "--features: this study needs what only the simulator knows; cuts, patching, gradients, n-runtime "
-            "and fast take a file of features"
+            "--features: this study needs what only the simulator knows; cuts, patching, gradients, "
+            "n-runtime and fast take a file of features"
         )
     from saccade.sim import graphics
     from saccade.sim.tasks import check_evaluation_seeds

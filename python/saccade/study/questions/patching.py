@@ -1,51 +1,39 @@
-"""`saccade study patching`: rows of one observation put into another's run; do the actions follow?"""
+"""`saccade study patching`: rows of one observation patched into another's run; do the actions follow?"""
 
 from __future__ import annotations
 
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from saccade.config import HeadConfig
-from saccade.head import ActionHead, Context
+from saccade.cli.arguments import add_list, add_rollout_arguments, check_known, indices
+from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention, Tokens
-from saccade.sim import graphics
-from saccade.sim.policy import EMBODIMENT_ID, Float32Array
-from saccade.sim.tasks import check_evaluation_seeds, find_task
+from saccade.observation import Observation
 from saccade.study import figures
-from saccade.study.arguments import check_known, names, numbers
-from saccade.study.arms import episode_rng
-from saccade.study.cells import Cell, OnDone, Rows, run_cells
-from saccade.study.features import (
-    TASK,
-    Recording,
-    cautions,
-    clusters_of,
-    describe,
-    encode,
-    from_file,
-    head_and_observations,
-    recording_of,
-)
-from saccade.study.features import summary as file_summary
-from saccade.study.loaded import describe_checkpoint, environment_of, head_of, policy_of
-from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
+from saccade.study.arms import NO_TOKENS
+from saccade.study.cell import Cell, Rows
+from saccade.study.changes import cautions
+from saccade.study.changes import summary as file_summary
 from saccade.study.section import Figure, Grid, Section, not_measured, number, too_few
+from saccade.study.source import Source, source_of
 from saccade.study.statistics import Estimate, bootstrap_ratio
-from saccade.study.tables import Provenance
+from saccade.study.study import Study
+from saccade.study.table import Provenance, clusters_of, from_file
 
-STUDY = "patching"
+if TYPE_CHECKING:
+    from saccade.study.recording import Recording
+    from saccade.study.simulator import Simulator
+
 ALL = "all"  # every block at once
 CONTROL = "all rows"
-NO_FUTURE = "the checkpoint has no future tokens"
-SAME = 1e-6  # a squared way between two chunks that are equal but for rounding
+SAME = 1e-6  # a squared distance between two chunks that are equal up to rounding
 EXACT = 1e-3  # how far from 1 the control may be
 
 # What the donor's observation has that the receiver's has not.
@@ -54,8 +42,8 @@ KINDS = {
     "words": "the same picture, told another task of the same objects",
     "task": "another task: other objects, other words",
 }
-FROM_FILE = {"observation": "an observation of another episode of the file, same embodiment"}
-ABOUT = {**KINDS, **FROM_FILE}
+FROM_FILE = "observation"
+ABOUT = {**KINDS, FROM_FILE: "an observation of another episode of the file, same embodiment"}
 GROUPS: dict[str, tuple[str, ...]] = {
     "future": ("future",),
     "state": ("state",),
@@ -65,7 +53,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 EPILOG = """\
 Two observations, donor and receiver, start from the same noise. Rows that the donor's run had after a block
-are put into the receiver's run, and the change of the chunk is measured along the way from the receiver's
+replace those of the receiver's run, and the change of the chunk is measured along the way from the receiver's
 chunk to the donor's: 0 is no effect, 1 is the donor's chunk.
 
 kinds of donors:
@@ -79,195 +67,178 @@ examples:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What is run.
+class Patching(Study):
+    """How far the actions follow rows of another observation.
 
     Attributes:
-        rollouts: The receivers: the first observation of each episode. Donors have the seeds that follow.
-        kinds: Of donors, names of `KINDS`.
+        source: The receivers: the first observation of each episode, or each row of a file.
         blocks: Are patched one by one, and all of them at once.
         steps: Euler steps in which they are patched.
+        kinds: Of donors, names of `KINDS`; a file has one kind of its own. In the simulator donors have the
+            seeds that follow those of the receivers.
     """
 
-    rollouts: Rollouts
-    kinds: tuple[str, ...]
+    source: Source
     blocks: tuple[int, ...]
     steps: tuple[int, ...]
+    kinds: tuple[str, ...] = tuple(KINDS)
+    name: ClassVar[str] = "patching"
 
-
-@dataclass(frozen=True)
-class FileSettings:
-    """What is run on a file of features; attributes as in `Settings`."""
-
-    recording: Recording
-    blocks: tuple[int, ...]
-    steps: tuple[int, ...]
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declares the arguments."""
-    width = max(len(name) for name in KINDS)
-    parser.epilog = EPILOG.format(
-        kinds="\n".join(f"  {name:{width}}  {about}" for name, about in KINDS.items())
-    )
-    add_rollout_arguments(parser, episodes=15)
-    parser.add_argument("--kinds", metavar="NAME,...", help="kinds of donors (default: all)")
-    parser.add_argument("--blocks", metavar="B,...", help="blocks: one by one, and together (default: all)")
-    parser.add_argument("--steps", metavar="K,...", help="Euler steps (default: all)")
-
-
-def settings(args: argparse.Namespace) -> Settings | FileSettings:
-    """From the arguments; raises what is wrong with them."""
-    if args.features is not None:
-        recording = recording_of(args, "kinds")
-        config = head_and_observations(recording)[0].config
-        return FileSettings(
-            recording,
-            numbers("--blocks", args.blocks, config.num_layers),
-            numbers("--steps", args.steps, config.num_steps),
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """See `Study`."""
+        width = max(len(name) for name in KINDS)
+        parser.epilog = EPILOG.format(
+            kinds="\n".join(f"  {name:{width}}  {about}" for name, about in KINDS.items())
         )
-    kinds = tuple(KINDS) if args.kinds is None else names("--kinds", args.kinds)
-    check_known("kinds", kinds, KINDS)
-    rollouts = rollouts_of(args)
-    check_evaluation_seeds(args.seed, 2 * len(rollouts.seeds))  # donors have the later half
-    head = HeadConfig.from_dict(policy_of(rollouts.checkpoint).config.head)
-    blocks = numbers("--blocks", args.blocks, head.num_layers)
-    steps = numbers("--steps", args.steps, head.num_steps)
-    graphics.check()
-    return Settings(rollouts, kinds, blocks, steps)
+        add_rollout_arguments(parser, episodes=15)
+        add_list(parser, "--kinds", help="kinds of donors (default: all)")
+        add_list(
+            parser, "--blocks", item=int, metavar="N", help="blocks, one by one and together (default: all)"
+        )
+        add_list(parser, "--steps", item=int, metavar="N", help="Euler steps (default: all)")
 
+    @classmethod
+    def from_arguments(cls, args: argparse.Namespace) -> Patching:
+        """See `Study`."""
+        kinds = tuple(args.kinds or KINDS)
+        check_known("--kinds", kinds, KINDS)
+        source = source_of(args, "kinds")
+        if source.closed_loop:
+            from saccade.sim.tasks import check_evaluation_seeds
 
-def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
-    """A cell is a pair of donor and receiver."""
-    if isinstance(settings, FileSettings):
-        run_on_file(settings, out, backend=backend, jobs=jobs, on_done=on_done)
-        return
-    rollouts = settings.rollouts
-    run_cells(
-        STUDY,
-        [
-            Cell((kind, task, seed), {"donor_seed": seed + len(rollouts.seeds)})
-            for task, seed in rollouts.episodes
-            for kind in settings.kinds
-        ],
-        Work(rollouts.checkpoint, settings.blocks, settings.steps),
-        out,
-        settings={
-            "checkpoint": describe_checkpoint(rollouts.checkpoint),
-            "blocks": settings.blocks,
-            "steps": settings.steps,
-        },
-        backend=backend,
-        jobs=jobs,
-        on_done=on_done,
-    )
+            episodes = args.default_episodes if args.episodes is None else args.episodes
+            check_evaluation_seeds(args.seed, 2 * episodes)  # donors have the later half
+        return cls(
+            source,
+            indices("--blocks", args.blocks, source.config.num_layers),
+            indices("--steps", args.steps, source.config.num_steps),
+            kinds if source.closed_loop else (FROM_FILE,),
+        )
 
+    def settings(self) -> Mapping[str, Any]:
+        """See `Study`."""
+        return {**self.source.describe(), "blocks": self.blocks, "steps": self.steps}
 
-def run_on_file(settings: FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
-    """A cell is a receiver; its donor follows from the file."""
-    head, observations = head_and_observations(settings.recording)
-    described = describe(settings.recording, head.config)
-    (kind,) = FROM_FILE
-    run_cells(
-        STUDY,
-        [Cell((kind, TASK, row), {}) for row in range(len(observations))],
-        FileWork(settings),
-        out,
-        settings={**described, "blocks": settings.blocks, "steps": settings.steps},
-        backend=backend,
-        jobs=jobs,
-        on_done=on_done,
-    )
+    def cells(self) -> Sequence[Cell]:
+        """A pair of donor and receiver each."""
+        offset = len({seed for _, seed in self.source.units})
+        return [
+            Cell((kind, task, seed), {"donor_seed": seed + offset} if self.source.closed_loop else {})
+            for task, seed in self.source.units
+            for kind in self.kinds
+        ]
 
-
-@dataclass(frozen=True)
-class Seen:
-    """One observation as the head gets it."""
-
-    context: Context
-    state: Float32Array
-    embodiment_id: int = EMBODIMENT_ID
-
-
-@dataclass(frozen=True)
-class Work:
-    """Patches every group of rows, block by block, from one donor into one receiver."""
-
-    checkpoint: str
-    blocks: tuple[int, ...]
-    steps: tuple[int, ...]
-
-    def __call__(self, cell: Cell) -> Rows:
-        """A row for each group and block, or a note why there is none."""
+    def measure(self, cell: Cell) -> Rows:
+        """A row for each group of rows and block, or a note why there is none."""
         kind, task, seed = str(cell.key[0]), str(cell.key[1]), int(cell.key[2])
-        row = {"kind": kind, "task": task, "seed": seed}
-        policy, head = policy_of(self.checkpoint), head_of(self.checkpoint)
-        donor_task = find_donor(kind, task, policy.config.tasks)
-        if donor_task is None:
-            return [{**row, "note": f"the policy knows no task for it ({KINDS[kind]})"}]
-        donor_seed = seed if kind == "words" else int(cell.settings["donor_seed"])
-        receiver = self.see(task, seed, find_task(task).instruction(seed))
-        if kind == "task":
-            donor = self.see(donor_task, donor_seed, find_task(donor_task).instruction(donor_seed))
-        else:
-            donor = self.see(task, donor_seed, find_task(donor_task).instruction(seed))
-        noise = policy.noise(episode_rng(task, seed))
-        row |= {"donor_task": donor_task, "donor_seed": donor_seed}
-        return patched(head, donor, receiver, noise, self.blocks, self.steps, row)
+        row: dict[str, Any] = {"kind": kind, "task": task, "seed": seed, **self.source.labels(task, seed)}
+        pair = pair_of(self.source, kind, task, seed, cell.settings.get("donor_seed"))
+        if isinstance(pair, str):
+            return [{**row, "note": pair}]
+        return patched(self.source.head(), pair, self.blocks, self.steps, {**row, **pair.labels})
 
-    def see(self, task: str, seed: int, instruction: str) -> Seen:
-        """The first observation of an episode, told these words."""
-        policy = policy_of(self.checkpoint)
-        environment = environment_of(self.checkpoint, task)
-        environment.restart(seed)
-        environment.instruction = instruction
-        observation = environment.observe()
-        context = head_of(self.checkpoint).encode(policy.features(observation))
-        return Seen(context, policy.state(observation))
+    @classmethod
+    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
+        """See `Study`."""
+        return section(table, provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two observations.
+
+    Attributes:
+        donor, receiver: One row each; the run of both starts from the receiver's noise.
+        labels: Columns that name the donor.
+    """
+
+    donor: Observation
+    receiver: Observation
+    labels: Mapping[str, Any]
+
+
+def pair_of(source: Source, kind: str, task: str, seed: int, donor_seed: int | None) -> Pair | str:
+    """Donor and receiver, or why there is no donor."""
+    from saccade.study.recording import Recording
+
+    if isinstance(source, Recording):
+        return recorded_pair(source, kind, task, seed)
+    from saccade.study.simulator import Simulator  # imports MuJoCo
+
+    assert isinstance(source, Simulator)
+    assert donor_seed is not None
+    return simulated_pair(source, kind, task, seed, donor_seed)
+
+
+def simulated_pair(source: Simulator, kind: str, task: str, seed: int, donor_seed: int) -> Pair | str:
+    """First observations of two episodes, or why there is no donor."""
+    from saccade.sim.tasks import find_task
+
+    donor_task = find_donor(kind, task, source.policy.config.tasks)
+    if donor_task is None:
+        return f"the policy knows no task for it ({KINDS[kind]})"
+    if kind == "words":
+        donor_seed = seed
+    receiver = source.first(task, seed, find_task(task).instruction(seed))
+    if kind == "task":
+        donor = source.first(donor_task, donor_seed, find_task(donor_task).instruction(donor_seed))
+    else:
+        donor = source.first(task, donor_seed, find_task(donor_task).instruction(seed))
+    receiver = receiver.with_noise(source.rng(task, seed), source.config)
+    return Pair(donor, receiver, {"donor_task": donor_task, "donor_seed": donor_seed})
+
+
+def recorded_pair(source: Recording, kind: str, task: str, row: int) -> Pair | str:
+    """A row of a file, and the next one, going round, of another episode with the same embodiment."""
+    found = source.all
+    others = (np.arange(1, len(found)) + row) % len(found)
+    fitting = (found.clusters[others] != found.clusters[row]) & (
+        found.embodiment_id[others] == found.embodiment_id[row]
+    )
+    if not fitting.any():
+        return f"the file has no donor for it ({ABOUT[kind]})"
+    number = int(others[fitting][0])
+    donor, receiver = found.row(number), source.observed(task, row).with_draw(0)
+    return Pair(donor, receiver, {"donor_task": task, "donor_seed": number})
 
 
 def patched(
-    head: ActionHead,
-    donor: Seen,
-    receiver: Seen,
-    noise: Float32Array,
-    blocks: Sequence[int],
-    steps: Sequence[int],
-    row: Mapping[str, Any],
+    head: ActionHead, pair: Pair, blocks: Sequence[int], steps: Sequence[int], row: Mapping[str, Any]
 ) -> Rows:
-    """A row for each group and block: what the donor's rows do in the receiver's run.
+    """A row for each group of rows and block: what the donor's rows do in the receiver's run.
 
     Args:
         head: computes.
-        donor, receiver: two observations.
-        noise: from which both start.
+        pair: donor and receiver.
         blocks: after which rows are patched, one by one and all at once.
         steps: in which they are patched.
-        row: what the rows have in common.
+        row: columns that all rows have.
     """
-    trace = head.trace(
-        donor.context,
-        donor.state,
-        donor.embodiment_id,
-        noise=noise,
-        record=("hidden",),
-        blocks=blocks,
-        steps=steps,
+    receiver = pair.receiver
+    context = receiver.encode(head)
+
+    def chunk(intervention: Intervention | None) -> npt.NDArray[np.float64]:
+        """The head's own, normalised actions, `(horizon, action_dim)`."""
+        return receiver.sample(head, context, intervention=intervention).astype(np.float64)[0]
+
+    trace = replace(pair.donor, noise=receiver.noise).trace(
+        head, record=("hidden",), blocks=blocks, steps=steps
     )
     hidden = {place: np.asarray(rows)[0] for place, rows in trace.hidden.items()}
-    before = chunk(head, receiver, noise, None)
+    before = chunk(None)
     way = np.asarray(trace.actions)[0] - before
     found: Rows = []
     for group, members in GROUPS.items():
         if "future" in members and head.config.num_future_tokens == 0 and members != ROW_GROUPS:
-            found.append({**row, "group": group, "note": NO_FUTURE})
+            found.append({**row, "group": group, "note": NO_TOKENS})
             continue
         for block in (None, *blocks):
             places = [(step, one) for step in steps for one in blocks if block in (None, one)]
-            patch: dict[tuple[int, int], dict[Tokens, Float32Array]] = {
+            patch: dict[tuple[int, int], dict[Tokens, npt.NDArray[np.float32]]] = {
                 place: {name: hidden[place][trace.rows[name]] for name in members} for place in places
             }
-            change = chunk(head, receiver, noise, Intervention(patch=patch)) - before
+            change = chunk(Intervention(patch=patch)) - before
             found.append(
                 {
                     **row,
@@ -282,28 +253,6 @@ def patched(
     return found
 
 
-@dataclass(frozen=True)
-class FileWork:
-    """Patches rows of another episode's observation into the run of one of the file."""
-
-    settings: FileSettings
-
-    def __call__(self, cell: Cell) -> Rows:
-        """A row for each group and block, or a note why there is none."""
-        kind, task, place = str(cell.key[0]), str(cell.key[1]), int(cell.key[2])
-        head, observations = head_and_observations(self.settings.recording)
-        observed = observations.observation(place, self.settings.recording.seed)
-        row = {"kind": kind, "task": task, "seed": place, "episode": observed.episode}
-        number = observations.donor_of(place)
-        if number is None:
-            return [{**row, "note": f"the file has no donor for it ({ABOUT[kind]})"}]
-        other = observations.observation(number, self.settings.recording.seed)
-        receiver, donor = (Seen(encode(head, one), one.state, one.embodiment_id) for one in (observed, other))
-        noise = observed.noise[:, 0]
-        row |= {"donor_task": task, "donor_seed": number}
-        return patched(head, donor, receiver, noise, self.settings.blocks, self.settings.steps, row)
-
-
 def find_donor(kind: str, task: str, known: Sequence[str]) -> str | None:
     """The task of the donor: the next one that fits among those that the policy knows, or None.
 
@@ -313,6 +262,8 @@ def find_donor(kind: str, task: str, known: Sequence[str]) -> str | None:
         >>> find_donor("task", "push", ["reach", "drawer-open", "push"])
         'drawer-open'
     """
+    from saccade.sim.tasks import find_task
+
     if kind == "layout":
         return task
     start = known.index(task)
@@ -320,17 +271,6 @@ def find_donor(kind: str, task: str, known: Sequence[str]) -> str | None:
     same = kind == "words"
     fitting = [one for one in others if (find_task(one).objects == find_task(task).objects) == same]
     return fitting[0] if fitting else None
-
-
-def chunk(
-    head: ActionHead, seen: Seen, noise: Float32Array, intervention: Intervention | None
-) -> npt.NDArray[np.float64]:
-    """The head's own, normalised actions, `(horizon, action_dim)`."""
-    actions = head.sample(
-        seen.context, seen.state, seen.embodiment_id, noise=noise, intervention=intervention
-    )
-    normalised: npt.NDArray[np.float64] = np.asarray(actions, dtype=np.float64)[0]
-    return normalised
 
 
 def shares(rows: pd.DataFrame) -> tuple[Estimate, float]:
@@ -496,7 +436,7 @@ def conclusions(
             if (kind, group, ALL) in found:
                 lines.append(f"{kind}, {group} rows in all blocks: {following(found[kind, group, ALL][0])}.")
             elif kind in found_kinds:  # pairs there were, but no such rows in the head
-                lines.append(f"{kind}, {group} rows: {not_measured(NO_FUTURE)}.")
+                lines.append(f"{kind}, {group} rows: {not_measured(NO_TOKENS)}.")
         if (kind, "future", "0") in found:
             share = found[kind, "future", "0"][0]
             lines.append(

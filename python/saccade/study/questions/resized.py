@@ -1,7 +1,7 @@
 """`saccade study n-runtime`: a policy's number of future tokens changed at run time, without training.
 
 Some of the learned tokens, tokens merged with those like them, tokens repeated: in closed loop on equal
-seeds, with and without the weight in the softmax that the learned number of tokens would have.
+episodes, with and without the weight in the softmax that the learned number of tokens would have.
 """
 
 from __future__ import annotations
@@ -9,186 +9,147 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
-from scipy.cluster.hierarchy import fcluster, linkage
 
+from saccade import _saccade
+from saccade.cli.arguments import add_list, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import Intervention
-from saccade.sim.policy import Float32Array
 from saccade.study import figures
-from saccade.study.arguments import UNLIMITED, numbers
-from saccade.study.arms import NO_TOKENS, control_line
-from saccade.study.cells import Cell, OnDone, run_cells
-from saccade.study.closed_loop import ArmWork
-from saccade.study.features import (
-    Changes,
-    Recording,
-    change_section,
-    from_file,
-    head_and_observations,
-    recording_of,
-)
-from saccade.study.loaded import describe_checkpoint
-from saccade.study.observations import Rollouts, add_rollout_arguments, rollouts_of
+from saccade.study.arms import NO_TOKENS, Arm, ArmStudy, control_line
+from saccade.study.cell import Cell
+from saccade.study.changes import change_section
 from saccade.study.section import Figure, Grid, Section, effect, not_measured, number, rate
+from saccade.study.source import Float32Array, source_of
 from saccade.study.statistics import Estimate, bootstrap, paired_difference, scaled, wilson
-from saccade.study.tables import Provenance, truths
+from saccade.study.table import Provenance, from_file, truths
 
-STUDY = "n-runtime"
 BASELINE = "as learned"
 TWICE, TWICE_EQUAL = "every token twice", "every token twice, equal mass"
 ARMS_ARE = (
-    "Drawn: others in every episode. Merged: by the cosine between learned tokens; each counts as many "
-    "times as it stands for. Equal mass: the keys together weigh in the softmax as much as all learned "
-    "tokens would."
+    "Drawn: a random choice of the learned tokens, another one in every episode. Merged: as `saccade resize` "
+    "merges them, by their directions; each merged token counts as often as the tokens that it replaces. "
+    "Equal mass: the keys together weigh in the softmax as much as all learned tokens would."
 )
 
 EPILOG = """\
-Arms, for each number K of --sizes: K of the tokens, drawn anew for every episode; the same with the mass of
-all (their keys count N / K times); tokens merged to K with those like them, each counting as many times as
-it stands for. And every token twice, with twice the mass, and with the same (which must change nothing).
+Arms, for each number K of --num-future-tokens: K of the tokens, drawn at random for every episode; the same
+with the mass of all (their keys count N / K times); tokens merged to K as `saccade resize` merges them. And
+every token twice, with twice the mass, and with the same mass (which must change nothing).
 
 examples:
   saccade study n-runtime --out out/study
-  saccade study n-runtime --checkpoint out/policy --sizes 1,4,16 --episodes 20 --out out/study
+  saccade study n-runtime --checkpoint out/policy --num-future-tokens 1 4 16 --episodes 20 --out out/study
   saccade study n-runtime --checkpoint checkpoint/ --features looks.npz --out out/study
 """
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What to run.
+class Resized(ArmStudy):
+    """What actions and success lose with another number of future tokens at run time.
 
     Attributes:
-        rollouts: The episodes of every arm.
-        sizes: Numbers of tokens to go down to; empty if the policy has no tokens.
+        source, arms, metrics: See `ArmStudy`; `arms_of` makes the arms.
     """
 
-    rollouts: Rollouts
-    sizes: tuple[int, ...]
+    name: ClassVar[str] = "n-runtime"
+    baseline: ClassVar[Arm] = Arm(BASELINE, needs_future=False)
+    control: ClassVar[str] = TWICE_EQUAL
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """See `Study`."""
+        parser.epilog = EPILOG
+        add_rollout_arguments(parser, episodes=15)
+        add_list(
+            parser,
+            "--num-future-tokens",
+            item=int,
+            metavar="N",
+            minimum=1,
+            help="numbers of tokens to go down to (default: N/8, N/4 and N/2 of the checkpoint's N)",
+        )
+
+    @classmethod
+    def from_arguments(cls, args: argparse.Namespace) -> Resized:
+        """See `Study`."""
+        source = source_of(args)
+        return cls(source, arms_of(sizes_of(args.num_future_tokens, source.config.num_future_tokens)))
+
+    def cells(self) -> Sequence[Cell]:
+        """See `ArmStudy`. A policy without tokens is not run: one cell for each episode says so."""
+        if self.source.closed_loop and not self.source.config.num_future_tokens:
+            return [Cell((*unit, TWICE)) for unit in self.source.units]
+        return super().cells()
+
+    @classmethod
+    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
+        """See `Study`."""
+        return section(table, provenance)
 
 
-@dataclass(frozen=True)
-class FileSettings:
-    """What to run on a file of features; attributes as in `Settings`."""
+def sizes_of(given: Sequence[int] | None, count: int) -> tuple[int, ...]:
+    """The numbers of tokens to go down to from `count`, in increasing order; none if there are no tokens.
 
-    recording: Recording
-    sizes: tuple[int, ...]
-
-
-def arms_of(sizes: Sequence[int]) -> list[str]:
-    """The arms, by name."""
-    down = [arm for size in sizes for arm in (f"{size} drawn", f"{size} drawn, equal mass", f"{size} merged")]
-    return [BASELINE, *down, TWICE, TWICE_EQUAL]
-
-
-def resized(arm: str, tokens: Float32Array, rng: np.random.Generator) -> Intervention | None:
-    """What an arm does.
-
-    Args:
-        arm: of `arms_of`.
-        tokens: the learned ones, `(N, width)`.
-        rng: draws tokens.
+    Raises:
+        InputError: one of those given is not below `count`.
     """
-    count = len(tokens)
-    if arm == BASELINE:
-        return None
-    if arm == TWICE:
-        return Intervention(future_tokens=np.repeat(tokens, 2, axis=0))
-    if arm == TWICE_EQUAL:
-        return Intervention(future_tokens=np.repeat(tokens, 2, axis=0), key_bias={"future": -np.log(2)})
-    size = int(arm.split()[0])
-    if arm.endswith("merged"):
-        merged, counts = merge(tokens, size)
-        return Intervention(future_tokens=merged, key_bias={"future": np.log(counts)})
-    drawn = tokens[np.sort(rng.choice(count, size, replace=False))]
-    if arm.endswith("equal mass"):
-        return Intervention(future_tokens=drawn, key_bias={"future": np.log(count / size)})
-    return Intervention(future_tokens=drawn)
-
-
-def merge(tokens: Float32Array, size: int) -> tuple[Float32Array, Float32Array]:
-    """Tokens merged to at most `size`, those in the most similar directions first.
-
-    Equal tokens are merged without loss: copies of a token are one token with the logarithm of their number
-    on its key. Others become their mean, which is an approximation.
-
-    Returns:
-        `(size, width)`, and `(size,)` how many tokens each stands for.
-    """
-    if size >= len(tokens):
-        return tokens, np.ones(len(tokens), np.float32)
-    groups = fcluster(linkage(tokens, "average", metric="cosine"), size, "maxclust")
-    names, counts = np.unique(groups, return_counts=True)
-    merged = np.stack([tokens[groups == name].mean(axis=0) for name in names])
-    return merged, counts.astype(np.float32)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declares the arguments."""
-    parser.epilog = EPILOG
-    add_rollout_arguments(parser, episodes=15)
-    parser.add_argument(
-        "--sizes", metavar="NUMBER,...", help="numbers of tokens to go down to (default: N/8, N/4 and N/2)"
-    )
-
-
-def settings(args: argparse.Namespace) -> Settings | FileSettings:
-    """The settings, checked."""
-    if args.features is not None:
-        recording = recording_of(args)
-        head, _ = head_and_observations(recording)
-        return FileSettings(recording, sizes_of(args, head.config.num_future_tokens))
-    rollouts = rollouts_of(args)
-    return Settings(
-        rollouts, sizes_of(args, int(describe_checkpoint(rollouts.checkpoint)["num_future_tokens"]))
-    )
-
-
-def sizes_of(args: argparse.Namespace, count: int) -> tuple[int, ...]:
-    """The numbers of tokens to go down to from `count`; none if there are no tokens."""
     if count == 0:
         return ()
-    if args.sizes is None:
+    if given is None:
         return tuple(sorted({count // 8, count // 4, count // 2} - {0}))
-    sizes = numbers("--sizes", args.sizes, UNLIMITED)
-    if not all(1 <= size < count for size in sizes):
+    if max(given) >= count:
+        shown = ", ".join(map(str, given))
         raise InputError(
-            f"sizes: given {args.sizes}, expected 1 to {count - 1}; the policy has {count} tokens"
+            f"--num-future-tokens: given {shown}, expected 1 to {count - 1}; the checkpoint has {count}"
         )
-    return sizes
+    return tuple(sorted(given))
 
 
-def run(settings: Settings | FileSettings, out: Path, *, backend: str, jobs: int, on_done: OnDone) -> None:
-    """A cell is an episode of one arm; those of one episode lie side by side, for they share what it saw."""
-    if isinstance(settings, FileSettings):
-        arms = arms_of(settings.sizes)
-        CHANGES.run(settings.recording, arms, out, backend=backend, jobs=jobs, on_done=on_done)
-        return
-    rollouts = settings.rollouts
-    described = describe_checkpoint(rollouts.checkpoint)
-    arms = arms_of(settings.sizes) if described["num_future_tokens"] else [TWICE]
-    run_cells(
-        STUDY,
-        [Cell((*episode, arm)) for episode in rollouts.episodes for arm in arms],
-        ArmWork(rollouts.checkpoint, "rust", resized, why_not),
-        out,
-        settings={"checkpoint": described},
-        backend=backend,
-        jobs=jobs,
-        on_done=on_done,
+def arms_of(sizes: Sequence[int]) -> tuple[Arm, ...]:
+    """The arms that go down to each size, and those with every token twice."""
+    return (
+        *(arm for size in sizes for arm in (drawn(size), drawn(size, equal_mass=True), merged(size))),
+        Arm(TWICE, intervention=lambda tokens, rng: repeated(tokens)),
+        Arm(TWICE_EQUAL, intervention=lambda tokens, rng: repeated(tokens, -np.log(2))),
     )
 
 
-def why_not(arm: str, num_future_tokens: int) -> str | None:
-    """Why an arm cannot be measured on a head with so many tokens, or None."""
-    return None if num_future_tokens or arm == BASELINE else NO_TOKENS
+def drawn(size: int, *, equal_mass: bool = False) -> Arm:
+    """`size` of the tokens, others in every episode; with `equal_mass` their keys weigh as much as all."""
+
+    def intervention(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+        chosen = tokens[np.sort(rng.choice(len(tokens), size, replace=False))]
+        bias = {"future": np.log(len(tokens) / size)} if equal_mass else None
+        return Intervention(future_tokens=chosen, key_bias=bias)
+
+    return Arm(f"{size} drawn, equal mass" if equal_mass else f"{size} drawn", intervention=intervention)
 
 
-CHANGES = Changes(STUDY, BASELINE, TWICE_EQUAL, resized, why_not)
+def merged(size: int) -> Arm:
+    """Tokens merged to `size` as `saccade resize` does it."""
+    return Arm(
+        f"{size} merged",
+        intervention=lambda tokens, rng: merge(tokens, size),
+        settings={"rule": "resize"},  # tables of earlier versions have another rule under the same name
+    )
+
+
+def merge(tokens: Float32Array, size: int) -> Intervention:
+    """Tokens `(N, width)` merged to `size`, with a bias on their keys that keeps the mass in the softmax."""
+    rows, _, key_bias = _saccade.merge_future_tokens(tokens, size)
+    bias = None if key_bias is None else {"future": np.array(key_bias, np.float32)}
+    return Intervention(future_tokens=rows, key_bias=bias)
+
+
+def repeated(tokens: Float32Array, bias: float | None = None) -> Intervention:
+    """Every token twice, with a bias on the keys."""
+    return Intervention(
+        future_tokens=np.repeat(tokens, 2, axis=0), key_bias=None if bias is None else {"future": bias}
+    )
 
 
 @dataclass(frozen=True)
@@ -226,7 +187,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     title = "Number of future tokens changed without training"
     if from_file(provenance):
         names = {arm: arm for arm in sorted(dict.fromkeys(table["arm"]), key=arm_order)}
-        return change_section(CHANGES, title, names, (ARMS_ARE,), NOT_SHOWN, table, provenance)
+        return change_section(Resized, title, names, (ARMS_ARE,), NOT_SHOWN, table, provenance)
     if table["note"].notna().any() or not (table["arm"] == BASELINE).any():
         return Section(title, concluded=[f"{not_measured(NO_TOKENS).capitalize()}."])
     checkpoint = provenance.settings["checkpoint"]

@@ -1,0 +1,162 @@
+//! Which tensors a model needs, and whether those of a checkpoint fit, by their names, shapes and types alone.
+
+use std::collections::BTreeSet;
+
+use safetensors::Dtype;
+
+use crate::error::show_shape;
+
+/// What the name of a tensor's scales adds to its own: `X.weight` of int8 has `X.weight_scale`.
+pub const SCALE_SUFFIX: &str = "_scale";
+
+/// A tensor that a checkpoint must hold.
+#[derive(Clone, Debug)]
+pub struct TensorSpec {
+    /// Its name, without the prefix of the model in the checkpoint.
+    pub name: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Whether it may be stored as int8 with a scale for each row.
+    pub may_be_int8: bool,
+    /// Whether its first axis is of embodiments.
+    pub per_embodiment: bool,
+}
+
+impl TensorSpec {
+    /// A floating-point tensor that all embodiments share.
+    #[must_use]
+    pub fn plain(name: &str, shape: &[usize]) -> Self {
+        Self {
+            name: name.to_owned(),
+            shape: shape.to_vec(),
+            may_be_int8: false,
+            per_embodiment: false,
+        }
+    }
+}
+
+/// One thing that is wrong.
+#[derive(Clone, Debug)]
+pub enum Problem {
+    /// A tensor of another shape.
+    Shape(String),
+    /// A tensor that is missing, unknown or of another type.
+    Other(String),
+}
+
+impl Problem {
+    /// The tensor, what it is and what was expected.
+    #[must_use]
+    pub fn text(&self) -> &str {
+        match self {
+            Self::Shape(text) | Self::Other(text) => text,
+        }
+    }
+}
+
+/// All that is wrong with the tensors `names`, whose type and shape `describe` gives. Under `prefix` there must be the `expected` ones, and
+/// there may be those for which `is_unused(name without the prefix, shape)` is true.
+pub fn problems<'a>(
+    names: impl Iterator<Item = &'a str>,
+    describe: impl Fn(&str) -> Option<(Dtype, &'a [usize])>,
+    prefix: &str,
+    expected: &[TensorSpec],
+    is_unused: impl Fn(&str, &[usize]) -> bool,
+) -> Vec<Problem> {
+    let mut problems = Vec::new();
+    let mut known = BTreeSet::new();
+    for spec in expected {
+        let name = format!("{prefix}{}", spec.name);
+        let scale = format!("{name}{SCALE_SUFFIX}");
+        match describe(&name) {
+            // A tensor without elements carries nothing, and some writers leave it out.
+            None if spec.shape.contains(&0) => {}
+            None => problems.push(Problem::Other(format!(
+                "{name} is missing, expected {}",
+                show_shape(&spec.shape)
+            ))),
+            Some((_, shape)) if shape != spec.shape => problems.push(Problem::Shape(format!(
+                "{name} has shape {}, expected {}",
+                show_shape(shape),
+                show_shape(&spec.shape)
+            ))),
+            Some((Dtype::I8, _)) if spec.may_be_int8 => {
+                problems.extend(scale_problem(
+                    &describe,
+                    &name,
+                    &scale,
+                    spec.shape.first().copied().unwrap_or(1),
+                ));
+                known.insert(scale);
+            }
+            Some((dtype, _)) if !is_readable(dtype) => {
+                let int8 = if spec.may_be_int8 {
+                    ", or I8 with its scale"
+                } else {
+                    ""
+                };
+                problems.push(Problem::Other(format!(
+                    "{name} is {dtype:?}, expected F32, BF16 or F16{int8}"
+                )));
+            }
+            Some((dtype, _)) if spec.may_be_int8 && describe(&scale).is_some() => {
+                problems.push(Problem::Other(format!(
+                    "{scale} is there, but {name} is {dtype:?}, expected I8"
+                )));
+                known.insert(scale);
+            }
+            Some(_) => {}
+        }
+        known.insert(name);
+    }
+    for name in names.filter(|name| name.starts_with(prefix) && !known.contains(*name)) {
+        let shape = describe(name).map_or(&[] as &[usize], |(_, shape)| shape);
+        if !is_unused(&name[prefix.len()..], shape) {
+            problems.push(Problem::Other(format!("{name} is unknown")));
+        }
+    }
+    problems
+}
+
+/// What is wrong with the tensor `scale`, the scales of the int8 tensor `name` of `rows` rows.
+pub(crate) fn scale_problem<'a>(
+    describe: impl Fn(&str) -> Option<(Dtype, &'a [usize])>,
+    name: &str,
+    scale: &str,
+    rows: usize,
+) -> Option<Problem> {
+    match describe(scale) {
+        None => Some(Problem::Other(format!(
+            "{name} is I8 and {scale} is missing, expected ({rows},)"
+        ))),
+        Some((_, shape)) if shape != [rows] => Some(Problem::Shape(format!(
+            "{scale} has shape {}, expected ({rows},)",
+            show_shape(shape)
+        ))),
+        Some((dtype, _)) if dtype != Dtype::F32 => {
+            Some(Problem::Other(format!("{scale} is {dtype:?}, expected F32")))
+        }
+        Some(_) => None,
+    }
+}
+
+/// Whether a tensor of this type holds floating-point numbers that can be read.
+fn is_readable(dtype: Dtype) -> bool {
+    matches!(dtype, Dtype::F32 | Dtype::BF16 | Dtype::F16)
+}
+
+/// The problems, one on a line, of tensors that should fit `what`.
+#[must_use]
+pub fn list(problems: &[Problem], what: &str) -> String {
+    let lines: Vec<&str> = problems.iter().map(Problem::text).collect();
+    let noun = if problems.len() == 1 {
+        "tensor does"
+    } else {
+        "tensors do"
+    };
+    format!(
+        "{} {noun} not fit {what}:\n  {}",
+        problems.len(),
+        lines.join("\n  ")
+    )
+}

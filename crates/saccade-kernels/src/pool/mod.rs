@@ -1,0 +1,339 @@
+//! The private thread pool: one loop over tasks, shared by the caller and by workers that live as long as the process.
+//!
+//! Nothing is started until a call wants more than one thread. A call puts a [`Job`] that lives on its own stack into one of a few slots,
+//! wakes workers, and takes tasks itself; tasks are dealt from one counter, so that whoever is free takes the next. The caller never
+//! waits for a worker that has not begun: it needs only itself to finish, then closes the slot and waits for those that are inside.
+//!
+//! On a machine with more to run than cores a worker can lose its core within a task, and then the caller waits for a scheduler's tick (4 ms
+//! here). It sleeps meanwhile, as idle workers do: on Linux a thread that sleeps keeps what is due to it, and one that is woken runs soon,
+//! so that caller and workers come to run at the same time and to pause at the same time. Measured on 2 cores with 2 busy processes, 328 tasks of
+//! 60 us in 5 loops: 2.12 times as long as alone, where 2.0 is the fair share; 2.5 with a caller that spins and yields.
+
+mod interrupt;
+mod place;
+mod slot;
+
+use std::cell::Cell;
+use std::panic::resume_unwind;
+use std::sync::atomic::{AtomicPtr, AtomicU32, AtomicUsize, Ordering};
+use std::sync::{Condvar, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+pub(crate) use interrupt::is_stopped;
+pub use interrupt::{Interrupted, interrupted, interruptible};
+
+use interrupt::Scope;
+use place::Place;
+use slot::{Job, Slot, lock};
+
+/// Calls that can have workers at the same time; more of them run on their own thread only.
+const SLOTS: usize = 8;
+
+/// How long a worker without work spins before it sleeps: about the longest pause between two loops of one forward pass.
+/// Waking a sleeping thread costs some 5 us of the caller's time, and as much again until it runs.
+const SPIN: Duration = Duration::from_micros(50);
+
+/// How long a caller spins at most for workers inside, whatever its tasks took: some hundredths of a scheduler's slice.
+const LONGEST_WAIT: Duration = Duration::from_micros(500);
+
+/// Upper bound of threads a call can have; a guard against nonsense, not a limit that anyone meets.
+const MAX_THREADS: usize = 1024;
+
+struct Pool {
+    /// Where its workers live. A child of `fork` has this memory but not the threads.
+    process: u32,
+    /// Workers started.
+    workers: AtomicUsize,
+    slots: [Slot; SLOTS],
+    /// Grows with every job offered, so that a worker about to sleep sees that it should look again.
+    offers: AtomicU32,
+    sleepers: AtomicUsize,
+    bed: Mutex<()>,
+    wake: Condvar,
+}
+
+impl Pool {
+    const fn new(process: u32) -> Self {
+        Self {
+            process,
+            workers: AtomicUsize::new(0),
+            slots: [const { Slot::new() }; SLOTS],
+            offers: AtomicU32::new(0),
+            sleepers: AtomicUsize::new(0),
+            bed: Mutex::new(()),
+            wake: Condvar::new(),
+        }
+    }
+
+    /// Sees to it that there are this many workers, as far as the system grants them.
+    fn start_workers(&'static self, wanted: usize) {
+        while self.workers.load(Ordering::Relaxed) < wanted {
+            let take = |count: usize| (count < wanted).then_some(count + 1);
+            let Ok(index) = self
+                .workers
+                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
+            else {
+                return;
+            };
+            let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));
+            if thread.spawn(|| self.work()).is_err() {
+                // The caller manages alone; a later call tries again.
+                self.workers.fetch_sub(1, Ordering::Relaxed);
+                return;
+            }
+        }
+    }
+
+    /// What a worker does all its life.
+    fn work(&self) -> ! {
+        INSIDE.set(true);
+        let mut place = Place::new();
+        loop {
+            let seen = self.offers.load(Ordering::SeqCst);
+            if self.help(&mut place) {
+                continue;
+            }
+            let idle_since = Instant::now();
+            while self.offers.load(Ordering::Relaxed) == seen && idle_since.elapsed() < SPIN {
+                for _ in 0..32 {
+                    std::hint::spin_loop();
+                }
+            }
+            if self.offers.load(Ordering::SeqCst) == seen {
+                self.sleep(seen);
+            }
+        }
+    }
+
+    fn help(&self, place: &mut Place) -> bool {
+        let mut helped = false;
+        // Not `any`, which stops at the first: a worker visits all slots before it looks for new offers.
+        for slot in &self.slots {
+            helped |= slot.help(place);
+        }
+        helped
+    }
+
+    fn sleep(&self, seen: u32) {
+        let mut bed = lock(&self.bed);
+        self.sleepers.fetch_add(1, Ordering::SeqCst);
+        while self.offers.load(Ordering::SeqCst) == seen {
+            bed = self.wake.wait(bed).unwrap_or_else(PoisonError::into_inner);
+        }
+        self.sleepers.fetch_sub(1, Ordering::SeqCst);
+    }
+
+    /// Tells workers that there is a new job.
+    fn ring(&self, wanted: usize) {
+        self.offers.fetch_add(1, Ordering::SeqCst);
+        // A worker counts itself before it looks at `offers` for the last time: it sees this offer, or is seen here.
+        let sleepers = self.sleepers.load(Ordering::SeqCst);
+        if sleepers == 0 {
+            return;
+        }
+        // With the lock held, a worker between its last look and its sleep is not missed.
+        let _bed = lock(&self.bed);
+        if wanted >= sleepers {
+            self.wake.notify_all();
+        } else {
+            (0..wanted).for_each(|_| self.wake.notify_one());
+        }
+    }
+
+    fn run(&self, threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
+        let helpers = threads.min(tasks).min(MAX_THREADS) - 1;
+        let scope = Scope::current();
+        let job = Job {
+            f,
+            tasks,
+            next: AtomicUsize::new(0),
+            threads: helpers + 1,
+            processor: place::processor(),
+            seats: AtomicUsize::new(helpers),
+            stop: scope.map(Scope::flag),
+            panic: Mutex::new(None),
+        };
+        let slot = self
+            .slots
+            .iter()
+            .find(|slot| !slot.taken.swap(true, Ordering::Acquire));
+        if let Some(slot) = slot {
+            slot.job
+                .store((&raw const job).cast_mut().cast(), Ordering::SeqCst);
+            self.ring(helpers);
+        }
+        // Panics of tasks are kept in the job, so that this thread always comes to the end of this function.
+        INSIDE.set(true);
+        let since = Instant::now();
+        let taken = job.run(|| scope.is_some_and(Scope::asks_to_stop));
+        INSIDE.set(false);
+        if let Some(slot) = slot {
+            // No worker can come to the job from here on, and those inside are waited for: after that nobody knows it but this thread.
+            slot.job.store(std::ptr::null_mut(), Ordering::SeqCst);
+            // A worker that runs ends its last task in about the time that ours took; one that does not has lost its core.
+            let patience = SPIN + 2 * since.elapsed() / taken.max(1);
+            slot.wait_until_empty(patience.min(LONGEST_WAIT));
+            slot.taken.store(false, Ordering::Release);
+        }
+        if let Some(panic) = job.panic.into_inner().unwrap_or_else(PoisonError::into_inner) {
+            resume_unwind(panic);
+        }
+    }
+}
+
+thread_local! {
+    /// Whether this thread is running a task: a loop inside runs on this thread alone.
+    static INSIDE: Cell<bool> = const { Cell::new(false) };
+}
+
+/// The pool of this process, or of the one that it was forked from; null before anyone needed one. Never freed.
+static POOL: AtomicPtr<Pool> = AtomicPtr::new(std::ptr::null_mut());
+
+/// The pool, made at first use. No lock is involved: in a child of `fork` a lock could be held by a thread that does not exist there.
+fn pool() -> &'static Pool {
+    let process = std::process::id();
+    loop {
+        let known = POOL.load(Ordering::Acquire);
+        // SAFETY: null, or a pool that was leaked below.
+        match unsafe { known.as_ref() } {
+            Some(pool) if pool.process == process => return pool,
+            _ => {
+                let fresh = Box::into_raw(Box::new(Pool::new(process)));
+                if POOL
+                    .compare_exchange(known, fresh, Ordering::AcqRel, Ordering::Acquire)
+                    .is_err()
+                {
+                    // SAFETY: another thread was faster; nobody has seen this one.
+                    drop(unsafe { Box::from_raw(fresh) });
+                }
+            }
+        }
+    }
+}
+
+/// Runs `f(task)` for every `task` in `0..tasks`, on up to `threads` threads of which the caller is one.
+///
+/// Tasks are dealt one by one to whoever is free. With one thread, one task, or within a task of another loop, everything runs on the
+/// calling thread and nothing is started. The pool belongs to the process and may be used from many threads at once, after `fork`, and
+/// with more threads than there are cores. Once its threads run, a call allocates nothing.
+///
+/// Within [`interruptible`] some tasks may not run: then the result is not used.
+///
+/// # Panics
+/// If a task panics: with the first panic, once all other tasks are done.
+///
+/// ```
+/// use std::sync::atomic::{AtomicUsize, Ordering};
+/// let sum = AtomicUsize::new(0);
+/// saccade_kernels::parallel_for(2, 5, &|task| {
+///     sum.fetch_add(task, Ordering::Relaxed);
+/// });
+/// assert_eq!(sum.into_inner(), 10);
+/// ```
+pub fn parallel_for(threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
+    if threads <= 1 || tasks <= 1 || INSIDE.get() {
+        match Scope::current() {
+            None => (0..tasks).for_each(f),
+            Some(scope) => (0..tasks).take_while(|_| !scope.asks_to_stop()).for_each(f),
+        }
+    } else {
+        let pool = pool();
+        pool.start_workers(threads.min(tasks).min(MAX_THREADS) - 1);
+        pool.run(threads, tasks, f);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::panic::{AssertUnwindSafe, catch_unwind};
+
+    use super::*;
+
+    fn visits(threads: usize, tasks: usize) -> Vec<usize> {
+        let visits: Vec<AtomicUsize> = (0..tasks).map(|_| AtomicUsize::new(0)).collect();
+        parallel_for(threads, tasks, &|task| {
+            visits[task].fetch_add(1, Ordering::Relaxed);
+        });
+        visits.into_iter().map(AtomicUsize::into_inner).collect()
+    }
+
+    #[test]
+    fn every_task_runs_once() {
+        for threads in [0, 1, 2, 3, 8, 33] {
+            for tasks in [0, 1, 2, 3, 7, 100, 5000] {
+                assert_eq!(
+                    visits(threads, tasks),
+                    vec![1; tasks],
+                    "{threads} threads, {tasks} tasks"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn many_short_loops_in_a_row() {
+        for _ in 0..20_000 {
+            assert_eq!(visits(2, 3), [1, 1, 1]);
+        }
+    }
+
+    #[test]
+    fn many_callers_at_once() {
+        std::thread::scope(|scope| {
+            for _ in 0..2 * SLOTS {
+                scope.spawn(|| {
+                    for _ in 0..200 {
+                        assert_eq!(visits(3, 17), vec![1; 17]);
+                    }
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn a_loop_within_a_task_runs_on_its_thread() {
+        parallel_for(2, 8, &|_| {
+            let here = std::thread::current().id();
+            parallel_for(2, 8, &|_| assert_eq!(std::thread::current().id(), here));
+        });
+    }
+
+    #[test]
+    fn a_panic_reaches_the_caller_after_all_tasks_and_the_pool_lives_on() {
+        for threads in [2, 8] {
+            let done = AtomicUsize::new(0);
+            let outcome = catch_unwind(AssertUnwindSafe(|| {
+                parallel_for(threads, 50, &|task| {
+                    assert_ne!(task, 20, "this one fails");
+                    done.fetch_add(1, Ordering::Relaxed);
+                });
+            }));
+            let message = outcome.unwrap_err();
+            assert!(
+                message
+                    .downcast_ref::<String>()
+                    .unwrap()
+                    .contains("this one fails")
+            );
+            assert_eq!(done.into_inner(), 49);
+            assert_eq!(visits(threads, 50), vec![1; 50]);
+        }
+    }
+
+    #[test]
+    fn workers_that_slept_come_back() {
+        for _ in 0..20 {
+            std::thread::sleep(4 * SPIN);
+            let threads = Mutex::new(std::collections::HashSet::new());
+            let since = Instant::now();
+            parallel_for(2, 2, &|_| {
+                lock(&threads).insert(std::thread::current().id());
+                // Neither of the two goes on before the other is there, so that a busy machine only makes this longer.
+                while lock(&threads).len() < 2 && since.elapsed() < Duration::from_secs(20) {
+                    std::thread::yield_now();
+                }
+            });
+            assert_eq!(lock(&threads).len(), 2);
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! What all commands that write a checkpoint from another have in common: opening it, what they keep of it, writing it.
+
+pub(crate) mod convert;
+pub(crate) mod quantize;
+pub(crate) mod resize;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use saccade_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTensor};
+
+use crate::config::HeadConfig;
+use crate::error::{Error, Result};
+use crate::recognise::Published;
+
+/// Published checkpoints are cut into files of this size.
+const MAX_SHARD_BYTES: u64 = 5_000_000_000;
+
+/// How a checkpoint is written from another.
+#[derive(Clone, Debug, Default)]
+#[non_exhaustive]
+pub struct RewriteOptions {
+    /// The source's config as JSON; default the `config.json` beside the weights.
+    pub config: Option<String>,
+    /// Whether tensors outside the head's prefix, such as a backbone's, are left out; otherwise they are copied.
+    pub head_only: bool,
+    /// Whether a checkpoint that is there is replaced.
+    pub force: bool,
+    /// What the files' metadata say, besides what the source's do.
+    pub metadata: BTreeMap<String, String>,
+    /// A file is closed before it grows larger than this; default one file of one, and 5 GB of several, as they are published.
+    pub max_shard_bytes: Option<u64>,
+}
+
+impl RewriteOptions {
+    /// The defaults, to be changed field by field.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+}
+
+/// What was written.
+#[derive(Clone, Debug, Default)]
+pub struct Written {
+    /// The files with tensors.
+    pub files: Vec<PathBuf>,
+    /// Files beside the weights that were copied, by their path in the directory.
+    pub carried: Vec<PathBuf>,
+    /// Files and folders beside the weights that were not: other weights, states of an optimizer, other checkpoints.
+    pub left: Vec<PathBuf>,
+    /// Tensors outside the head that were left out.
+    pub num_dropped: usize,
+}
+
+/// A checkpoint that another is written from: open, and its tensors checked against its config.
+pub(crate) struct Source {
+    path: PathBuf,
+    pub checkpoint: Checkpoint,
+    pub prefix: &'static str,
+    pub config: HeadConfig,
+    /// The config as it was given, or as it stands in `config.json`.
+    pub given_config: String,
+}
+
+/// Calls itself with bytes done and bytes in all; false stops the work.
+pub(crate) type Progress<'a> = &'a mut dyn FnMut(u64, u64) -> bool;
+
+impl Source {
+    /// # Errors
+    /// As [`ActionHead::load`](crate::ActionHead::load).
+    pub(crate) fn open(path: &Path, config: Option<&str>) -> Result<Self> {
+        let published = Published::open(path, config)?;
+        published.check()?;
+        Ok(Self {
+            path: path.to_owned(),
+            checkpoint: published.checkpoint,
+            prefix: published.prefix,
+            config: published.config,
+            given_config: published.given_config,
+        })
+    }
+
+    /// The tensors that are kept, sorted by name.
+    pub(crate) fn names(&self, options: &RewriteOptions) -> Vec<&str> {
+        let is_kept = |name: &&str| !options.head_only || self.is_head(name);
+        self.checkpoint.names().filter(is_kept).collect()
+    }
+
+    /// Whether a tensor is the head's.
+    pub(crate) fn is_head(&self, name: &str) -> bool {
+        name.starts_with(self.prefix)
+    }
+
+    /// Tensor `name` as it is.
+    pub(crate) fn as_it_is(&self, name: &str) -> Result<PlannedTensor> {
+        Ok(PlannedTensor {
+            name: name.to_owned(),
+            dtype: self.checkpoint.dtype(name)?,
+            shape: self.shape(name).to_vec(),
+        })
+    }
+
+    pub(crate) fn shape(&self, name: &str) -> &[usize] {
+        let shape = self.checkpoint.shape(name);
+        shape.expect("the name is one of the checkpoint's")
+    }
+
+    pub(crate) fn copy(&self, name: &str, writer: &mut CheckpointWriter) -> Result<()> {
+        Ok(self
+            .checkpoint
+            .read_bytes(name, |bytes| writer.tensor(name, bytes))?)
+    }
+
+    /// Writes a checkpoint to the directory `out`: the `small` files by name and contents (`config.json` is one), what else lies beside the
+    /// source's weights, and the `planned` tensors, by calling `write` for each tensor that is kept.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source, and where
+    /// `progress` says stop; [`Error::Output`] if it cannot be written.
+    pub(crate) fn write(
+        &self,
+        out: &Path,
+        options: &RewriteOptions,
+        small: &[(&str, Option<&str>)],
+        planned: Vec<PlannedTensor>,
+        progress: Progress<'_>,
+        mut write: impl FnMut(&str, &mut CheckpointWriter) -> Result<()>,
+    ) -> Result<Written> {
+        check_apart(&self.path, self.checkpoint.files(), out)?;
+        let mut companions = Companions::of(&self.path, self.checkpoint.files())?;
+        for (name, _) in small {
+            companions = companions.without(name);
+        }
+        let default = match self.checkpoint.files().count() {
+            1 => u64::MAX,
+            _ => MAX_SHARD_BYTES,
+        };
+        let mut metadata = self.checkpoint.metadata().clone();
+        metadata.extend(options.metadata.clone());
+        let mut writer = CheckpointWriter::create(
+            out,
+            planned,
+            &metadata,
+            &companions,
+            options.max_shard_bytes.unwrap_or(default),
+            options.force,
+        )?;
+        for (name, contents) in small {
+            if let Some(contents) = contents {
+                writer.file(name, contents)?;
+            }
+        }
+        let names = self.names(options);
+        let (mut done, mut total) = (0, 0);
+        for name in &names {
+            total += self.checkpoint.nbytes(name)?;
+        }
+        for name in &names {
+            write(name, &mut writer)?;
+            done += self.checkpoint.nbytes(name)?;
+            if !progress(done, total) {
+                return Err(Error::Input("stopped; nothing was written".to_owned()));
+            }
+        }
+        Ok(Written {
+            files: writer.finish()?.into_iter().map(|file| out.join(file)).collect(),
+            carried: companions.all_paths().into_iter().collect(),
+            left: companions.left().to_vec(),
+            num_dropped: self.checkpoint.names().count() - names.len(),
+        })
+    }
+}
+
+/// That neither the source nor a file that it links to is in what would be replaced.
+fn check_apart<'a>(source: &'a Path, files: impl Iterator<Item = &'a Path>, out: &Path) -> Result<()> {
+    // Of what is not a directory the writer says so.
+    let Some(to) = out.canonicalize().ok().filter(|to| to.is_dir()) else {
+        return Ok(());
+    };
+    let is_inside = |path: &Path| path.canonicalize().is_ok_and(|from| from.starts_with(&to));
+    if std::iter::once(source).chain(files).any(is_inside) {
+        return Err(Error::Input(format!(
+            "out: {} holds the source, expected another directory",
+            out.display()
+        )));
+    }
+    Ok(())
+}

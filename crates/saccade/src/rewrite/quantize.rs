@@ -1,0 +1,128 @@
+//! Quantised checkpoints: the weights that int8 runs in int8, stored so.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use saccade_checkpoint::spec::SCALE_SUFFIX;
+use saccade_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec};
+use saccade_kernels::quantize_rows;
+
+use crate::error::{Error, Result};
+use crate::layers::weight_view;
+use crate::layout::tensor_specs;
+use crate::rewrite::{RewriteOptions, Source, Written};
+
+/// What [`quantize`] wrote.
+#[derive(Clone, Debug)]
+pub struct QuantizeReport {
+    /// The files.
+    pub written: Written,
+    /// Weights that are int8 now.
+    pub num_quantized: usize,
+    /// Tensors copied bit for bit.
+    pub num_copied: usize,
+    /// Bytes of the head's tensors before.
+    pub head_bytes_before: u64,
+    /// Bytes of the head's tensors now, scales included.
+    pub head_bytes_after: u64,
+}
+
+/// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in int8, `X.weight (out, in)`
+/// beside float32 `X.weight_scale (out)`, by [`quantize_rows`]: what [`Precision::Int8`](crate::Precision::Int8) computes with, so that
+/// loading the result at that precision gives the same bits as loading `source` at it. All other tensors are copied bit for bit.
+///
+/// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; where it returns false, nothing
+/// is written.
+///
+/// # Errors
+/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a source that is quantised already or whose weights are not
+/// finite; [`Error::Input`] if `out` is there and `force` is not given, holds anything but a checkpoint, or is the source;
+/// [`Error::Output`] if it cannot be written.
+pub fn quantize(
+    source: &Path,
+    out: &Path,
+    options: &RewriteOptions,
+    mut progress: impl FnMut(u64, u64) -> bool,
+) -> Result<QuantizeReport> {
+    let source = Source::open(source, options.config.as_deref())?;
+    let specs = tensor_specs(&source.config);
+    let int8: BTreeMap<String, &TensorSpec> = specs
+        .iter()
+        .filter(|spec| spec.may_be_int8)
+        .map(|spec| (format!("{}{}", source.prefix, spec.name), spec))
+        .collect();
+    if let Some(name) = int8
+        .keys()
+        .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
+    {
+        return Err(Error::Checkpoint(format!(
+            "source: it is quantised already: {name} is I8, expected F32, BF16 or F16"
+        )));
+    }
+    let mut planned = Vec::new();
+    let mut report = QuantizeReport {
+        written: Written::default(),
+        num_quantized: 0,
+        num_copied: 0,
+        head_bytes_before: 0,
+        head_bytes_after: 0,
+    };
+    for name in source.names(options) {
+        let mut tensors = vec![source.as_it_is(name)?];
+        if int8.contains_key(name) {
+            report.num_quantized += 1;
+            tensors[0].dtype = Dtype::I8;
+            tensors.push(PlannedTensor {
+                name: format!("{name}{SCALE_SUFFIX}"),
+                dtype: Dtype::F32,
+                shape: vec![source.shape(name)[0]],
+            });
+        } else {
+            report.num_copied += 1;
+        }
+        if source.is_head(name) {
+            report.head_bytes_before += source.checkpoint.nbytes(name)?;
+            report.head_bytes_after += tensors.iter().map(PlannedTensor::nbytes).sum::<usize>() as u64;
+        }
+        planned.extend(tensors);
+    }
+    let config = [("config.json", Some(source.given_config.as_str()))];
+    report.written = source.write(
+        out,
+        options,
+        &config,
+        planned,
+        &mut progress,
+        |name, writer| match int8.get(name) {
+            Some(spec) => write_quantized(&source.checkpoint, name, spec, writer),
+            None => source.copy(name, writer),
+        },
+    )?;
+    Ok(report)
+}
+
+fn write_quantized(
+    checkpoint: &Checkpoint,
+    name: &str,
+    spec: &TensorSpec,
+    writer: &mut CheckpointWriter,
+) -> Result<()> {
+    let [out_features, in_features] = *spec.shape else {
+        unreachable!("a linear layer's weight has two axes")
+    };
+    let weight = checkpoint.read(name)?;
+    let (mut values, mut scales) = (vec![0; out_features * in_features], vec![0.0; out_features]);
+    quantize_rows(
+        weight_view(&weight, out_features, in_features),
+        &mut values,
+        &mut scales,
+    );
+    if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
+        return Err(Error::Checkpoint(format!(
+            "source: {name} holds NaN or infinity in row {row}, expected finite weights"
+        )));
+    }
+    writer.tensor(name, bytemuck::cast_slice(&values))?;
+    let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
+    Ok(writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)?)
+}
