@@ -479,7 +479,7 @@ def test_mappings_may_be_lerobots_or_plain() -> None:
     plain = Normalizer.load({"state": row(3, 0), "action": row(2, 1)}, 7)
     theirs = Normalizer.load({"observation.state": row(3, 0), "action": row(2, 1)}, "gr1")
     assert (plain.embodiment, plain.embodiment_id) == (None, 7)
-    with pytest.raises(saccade.InputError, match="embodiment: expected None .*, got 3"):
+    with pytest.raises(saccade.InputError, match=r"embodiment: expected None .*, got 3"):
         Normalizer.load(DEMO_CHECKPOINT, 3)
     assert (theirs.embodiment, theirs.embodiment_id) == ("gr1", 24)
     assert np.array_equal(as_array(plain.state(draw(2, 3))), as_array(theirs.state(draw(2, 3))))
@@ -658,7 +658,7 @@ def test_all_that_is_wrong_with_statistics_is_listed() -> None:
 
 
 def test_options_that_do_not_fit(tmp_path: Path) -> None:
-    with pytest.raises(saccade.InputError, match=r"state_keys: expected keys in source \(arm, gripper\), got leg"):
+    with pytest.raises(saccade.InputError, match=r"state_keys: expected keys in source .*, got leg"):
         Normalizer.load(metadata(), state_keys=["leg"])
     with pytest.raises(saccade.InputError, match="state_keys: expected distinct names"):
         Normalizer.load(metadata(), state_keys="arm")
@@ -668,7 +668,7 @@ def test_options_that_do_not_fit(tmp_path: Path) -> None:
         saccade.InputError, match=r"modes: action\.arm: expected one of min_max.*, got 'sin_cos'"
     ):
         Normalizer.load(metadata(), modes="sin_cos")
-    with pytest.raises(saccade.InputError, match="embodiment: expected one of those in .*, got 'gr1'"):
+    with pytest.raises(saccade.InputError, match=r"embodiment: expected one of those in .*, got 'gr1'"):
         Normalizer.load(metadata(), "gr1")
     with pytest.raises(saccade.InputError, match="state_dim"):
         Normalizer.load(metadata(), state_dim=0)
@@ -679,7 +679,7 @@ def test_options_that_do_not_fit(tmp_path: Path) -> None:
         Normalizer.load(tmp_path, modes="q99")
     with pytest.raises(saccade.InputError, match=r"state_dim: expected 12, the head's in .*, got 64"):
         Normalizer.load(tmp_path, state_dim=64)
-    with pytest.raises(saccade.InputError, match="embodiment: expected 'new_embodiment' .*, got 5"):
+    with pytest.raises(saccade.InputError, match=r"embodiment: expected 'new_embodiment' .*, got 5"):
         Normalizer.load(tmp_path, 5)
 
 

@@ -18,7 +18,8 @@ from saccade.errors import CheckpointError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from saccade.config import HeadConfig
-    from saccade.head import ActionHead, Context
+    from saccade.context import Context
+    from saccade.head import ActionHead
     from saccade.trace import Trace
 
 Float32Array = npt.NDArray[np.float32]
