@@ -1,10 +1,10 @@
 """Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
 
-A run lives in a directory: `training.pt` (all that is needed to go on), `config.json` and `model.safetensors`
-(the policy so far), `settings.json` (how and on what it is trained), `history.json` and `loss.png`. They are
-written about once a minute, each under a temporary name that is then renamed, so a run can be stopped at any
-time and goes on where it was. Every step draws its samples and noise from the seed and its own number, so a
-resumed run gives what an uninterrupted one gives.
+A run is a directory with `training.pt` (all that is needed to continue), `config.json` and
+`model.safetensors` (the policy so far), `settings.json` (settings and demonstrations), `history.json` and
+`loss.png`. They are written about once a minute, each under a temporary name that is then renamed, so that a
+run can be interrupted at any time and continued. Every step draws its samples and noise from the seed and the
+number of the step, so that a continued run gives the same weights as an uninterrupted one.
 """
 
 # Calls of torch modules are untyped.
@@ -34,6 +34,7 @@ from saccade.sim.instructions import Tokenizer, build_vocabulary, words
 from saccade.sim.learner import Learner
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
+from saccade.sim.training_settings import TrainingSettings
 
 STATE_FILE = "training.pt"
 CHECKPOINT_SECONDS = 60.0
@@ -42,76 +43,6 @@ WARMUP_STEPS = 200
 MAX_GRADIENT_NORM = 1.0
 WEIGHT_DECAY = 0.01
 BETAS = (0.9, 0.95)
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """What a run depends on besides the demonstrations.
-
-    Attributes:
-        steps: Optimiser steps; the learning rate falls to zero over them.
-        batch_size: Frames per step. More small steps beat fewer large ones at equal time.
-        learning_rate: Of AdamW, after the warm-up.
-        ema_decay: Of the averaged weights, which are the ones that are kept.
-        target_weight: Weight of the loss that finds object and goal.
-        alignment_weight: Weight of the loss that pulls the hidden rows of the future tokens towards what the
-            averaged backbone says of the observation one horizon later; as in FLARE, which used 0.2.
-        alignment_block: Block of the head after which those rows are taken. Default the middle one: as many
-            blocks for the rows to read the pictures as for the actions to read the rows.
-        absent_share: Share of frames that are told a task whose object is not there, and shown to stand
-            still. Without them the pictures alone tell most tasks apart, and their words go unread.
-        start_sha256: Of the tensors that it starts from; empty for random ones. `train` sets it.
-        seed: Of initial weights, order and noise.
-        width, num_layers, num_heads: Of the head; the backbone has its width and heads.
-        backbone_layers: Transformer blocks of the backbone.
-        vl_num_layers: Of the head's VL self-attention.
-        num_future_tokens: N.
-        horizon: Actions per chunk.
-        execute_steps: Of them carried out before the next look.
-        num_steps: Euler steps at run time.
-        patch_size: Pixels along each side of an image token's patch.
-    """
-
-    steps: int = 8000
-    batch_size: int = 16
-    learning_rate: float = 6e-4
-    ema_decay: float = 0.999
-    target_weight: float = 1.0
-    alignment_weight: float = 0.0
-    alignment_block: int | None = None
-    absent_share: float = 0.0
-    start_sha256: str = ""
-    seed: int = 0
-    width: int = 128
-    num_layers: int = 4
-    num_heads: int = 4
-    backbone_layers: int = 2
-    vl_num_layers: int = 1
-    num_future_tokens: int = 32
-    horizon: int = 16
-    execute_steps: int = 8
-    num_steps: int = 4
-    patch_size: int = 16
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.alignment_weight < math.inf:
-            raise InputError(f"alignment_weight: given {self.alignment_weight}, expected at least 0")
-        if self.alignment_weight and self.num_future_tokens == 0:
-            raise InputError(
-                f"alignment_weight: given {self.alignment_weight}, expected 0 with num_future_tokens 0: "
-                "there is no row to align"
-            )
-        if self.alignment_block is not None and not 0 <= self.alignment_block < self.num_layers:
-            raise InputError(
-                f"alignment_block: given {self.alignment_block}, expected 0 to {self.num_layers - 1}"
-            )
-
-    @property
-    def aligned_block(self) -> int | None:
-        """The block whose future rows are aligned; None if none are."""
-        if self.alignment_weight == 0:
-            return None
-        return (self.num_layers - 1) // 2 if self.alignment_block is None else self.alignment_block
 
 
 @dataclass
