@@ -47,7 +47,7 @@ BETAS = (0.9, 0.95)
 
 @dataclass
 class Progress:
-    """Where a run is, for a progress bar."""
+    """The state of a run, for a progress bar."""
 
     step: int
     steps: int
@@ -113,7 +113,7 @@ def policy_config(
 
 
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
-    """A run before its first step; `demonstrations` says what it trains on, see `dataset.describe`."""
+    """A run before its first step; for `demonstrations` see `dataset.describe`."""
     torch.manual_seed(settings.seed)
     learner = Learner(config.backbone, HeadConfig.from_dict(config.head), settings.aligned_block)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
@@ -129,7 +129,7 @@ def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: di
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """Linear warm-up, then half a cosine down to zero."""
+    """Linear warm-up, then a half cosine to zero."""
     warmup = min(1.0, (step + 1) / WARMUP_STEPS)
     return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
 
@@ -138,12 +138,12 @@ class Batches:
     """Draws normalised batches.
 
     Args:
-        samples: what to draw from.
-        config: for statistics and vocabulary.
-        target_statistics: of the positions.
+        samples: the samples to draw from.
+        config: of the policy, for statistics and vocabulary.
+        target_statistics: statistics of the positions.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
-        with_later: whether batches have the images seen when the chunk has been carried out.
+        with_later: whether batches contain the images after the chunk was executed.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class Batches:
         self._still = config.action.normalize(np.zeros(samples.actions.shape[1:], np.float32))
 
     def draw(self, *key: int) -> dict[str, Tensor]:
-        """The batch that belongs to `key`, with a wording drawn anew for each frame."""
+        """The batch of `key`, with a wording drawn for each frame."""
         rng = np.random.default_rng(key)
         rows = rng.integers(len(self._samples), size=self._batch_size)
         tasks, later = self._samples.tasks[rows], self._samples.later[rows]
@@ -214,7 +214,7 @@ def train_step(run: Run, batches: Batches) -> dict[str, float]:
     total.backward()
     torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
     run.optimizer.step()
-    # A short memory at first, so that the average is not held back by the initial weights.
+    # A short memory at first, so that the initial weights do not dominate the average.
     decay = min(settings.ema_decay, (1 + run.step) / (10 + run.step))
     with torch.no_grad():
         current = run.learner.policy_tensors()
@@ -225,7 +225,7 @@ def train_step(run: Run, batches: Batches) -> dict[str, float]:
 
 @torch.no_grad()
 def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
-    """The losses of the averaged weights on the same held-out frames and noise each time."""
+    """The losses of the averaged weights, each time on the same held-out frames and noise."""
     current = {name: tensor.clone() for name, tensor in run.learner.policy_tensors().items()}
     run.learner.load_state_dict(run.average, strict=False)
     losses = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0), run.average)
@@ -236,8 +236,7 @@ def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
 def export(run: Run, out: Path) -> None:
     """Writes the averaged weights as a policy.
 
-    They are stored as bfloat16, which the head reads without loss: half the size, and the rounding is far
-    below what training with noise leaves undecided.
+    They are stored as bfloat16, which halves the size. The rounding is far below the noise of training.
     """
     tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
     with write_atomically(out / TENSOR_FILE) as temporary:
@@ -268,7 +267,7 @@ def save(run: Run, out: Path) -> None:
 
 
 def resume(run: Run, path: Path) -> None:
-    """Takes up a run where it was saved.
+    """Continues a run from a saved state.
 
     Raises:
         InputError: it was started with other settings or other demonstrations.
@@ -288,11 +287,11 @@ def resume(run: Run, path: Path) -> None:
 
 
 def start_from(run: Run, policy: Path) -> None:
-    """Takes the weights of a policy as the initial ones.
+    """Starts from the weights of a policy.
 
     Raises:
-        FileNotFoundError: no policy there.
-        InputError: it has other sizes, tasks or statistics.
+        FileNotFoundError: there is no policy.
+        InputError: the policy has other sizes, tasks or statistics.
     """
     if PolicyConfig.from_file(policy / CONFIG_FILE) != run.config:
         raise InputError(f"{policy}: was trained with other sizes or other demonstrations")
@@ -309,21 +308,21 @@ def train(
     *,
     start: Path | None = None,
 ) -> PolicyConfig:
-    """Trains a policy, going on from what lies in `out`.
+    """Trains a policy, or continues the run in `out`.
 
     Args:
         demonstrations: directory written by `saccade demos`.
         out: directory of the run.
         settings: of the run.
         on_step: called after each step.
-        start: a policy to start from; default random weights.
+        start: a policy to start from; None for random weights.
 
     Returns:
         The config of the policy.
 
     Raises:
-        FileNotFoundError: no demonstrations there, or no policy to start from.
-        InputError: demonstrations of several kinds, or a run with other settings in `out`.
+        FileNotFoundError: there are no demonstrations, or no policy to start from.
+        InputError: demonstrations with different settings, or `out` contains a run with other settings.
     """
     tasks = demos.recorded_tasks(demonstrations)
     recording = demos.read_settings(demonstrations, tasks)
@@ -353,7 +352,7 @@ def train(
 def loop(
     run: Run, batches: Batches, held_out: Batches, out: Path, on_step: Callable[[Progress], None]
 ) -> None:
-    """Trains to the last step, saving about once a minute."""
+    """Trains to the last step and saves about once a minute."""
     saved, steps = time.monotonic(), list[dict[str, float]]()
     latest: float | None = None
     while run.step < run.settings.steps:
@@ -370,7 +369,7 @@ def loop(
 
 
 def plot_history(history: list[dict[str, Any]], path: Path) -> None:
-    """Draws the losses over the steps, on a logarithmic scale."""
+    """Plots the losses over the steps on a logarithmic scale."""
     import matplotlib
 
     matplotlib.use("agg")
