@@ -59,6 +59,17 @@ EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 
+EPILOG = """\
+Lists take commas, spaces or both: --tasks reach,push or --tasks reach push. Bad arguments, paths that cannot
+be used and missing packages give one line on standard error and exit status 2.
+
+examples:
+  saccade rollout --help
+  saccade rollout --tasks reach --episodes 2
+  saccade inspect checkpoint/
+"""
+
+
 class UsageError(Exception):
     """Arguments that a command cannot follow; printed as one line, without a traceback."""
 
@@ -119,10 +130,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
         prog="saccade",
         description="GR00T-style action heads on CPUs: run and train policies, inspect and convert "
         "checkpoints.",
-        epilog="examples:\n"
-        "  saccade rollout --help\n"
-        "  saccade rollout --tasks reach --episodes 2\n"
-        "  saccade inspect checkpoint/",
+        epilog=EPILOG,
     )
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command", title="commands", parser_class=Parser)
