@@ -46,14 +46,16 @@ def test_a_video_without_its_end_is_an_error(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_video_that_ffmpeg_gave_up_is_an_error(environment: TaskEnvironment, tmp_path: Path) -> None:
+def test_a_video_that_ffmpeg_gave_up_is_an_error(
+    environment: TaskEnvironment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(picture: object) -> None:
         raise OSError("Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y ...")
 
     def write_and_fail() -> None:
         with video.VideoWriter(tmp_path / "a.mp4") as writer:
             writer.add(environment, EPISODE)
-            writer._writer.append_data = fail  # type: ignore[method-assign]
+            monkeypatch.setattr(writer._writer, "append_data", fail)
             writer.add(environment, EPISODE)
 
     with pytest.raises(OSError, match=r"the video cannot be written; is the disk full\?") as caught:
