@@ -8,6 +8,7 @@ standard error for bad input, missing packages, and paths or streams that cannot
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import importlib
 import os
@@ -237,6 +238,7 @@ def dispatch(argv: list[str]) -> int:
 
 
 def refuse(message: str) -> int:
-    """Prints one line to standard error; returns the status of bad input."""
-    print(f"saccade: {message}", file=sys.stderr)
+    """Prints one line to standard error, if that can be written; returns the status of bad input."""
+    with contextlib.suppress(OSError):
+        print(f"saccade: {message}", file=sys.stderr)
     return EXIT_BAD_INPUT
