@@ -97,6 +97,14 @@ class Observation:
         """Every row as a batch of one."""
         return (self.row(row) for row in range(len(self)))
 
+    def repeated(self, count: int) -> Observation:
+        """One row, `count` times."""
+
+        def repeat(array: npt.NDArray[Any] | None) -> Any:
+            return None if array is None else np.repeat(array, count, axis=0)
+
+        return Observation(*(repeat(getattr(self, field.name)) for field in dataclasses.fields(self)))
+
     def with_noise(
         self, rng: np.random.Generator, config: HeadConfig, draws: int | None = None
     ) -> Observation:
