@@ -20,10 +20,11 @@ from PIL import Image
 from saccade._files import sha256_of
 from saccade.cli import main
 from saccade.errors import InputError
-from saccade.study import STUDIES, cuts, patching
-from saccade.study.arms import ARMS
+from saccade.study.questions import cuts, patching
+from saccade.study.questions.cuts import ARMS
 from saccade.study.report import write_report
-from saccade.study.tables import (
+from saccade.study.study import STUDIES
+from saccade.study.table import (
     Provenance,
     read_provenance,
     read_table,
@@ -186,7 +187,7 @@ def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_p
         rows.append(cut_row("push", seed, "future-blind", seed >= 6, 0.1))
         rows += [cut_row("push", seed, arm, True, 0.1) for arm in ("future-alone", "future-zeroed")]
     write_study(tmp_path, "cuts", rows, {"engine": "rust"})
-    section = cuts.section(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
+    section = cuts.Cuts.summarise(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
     line = next(line for line in section.concluded if line.startswith(ARMS["future-blind"].label))
     # McNemar: 2 / 2**6 = 0.031; of three arms, 0.094.
     assert "success: worse, -8.0 points" in line
@@ -229,7 +230,7 @@ def test_arms_without_a_partner_are_not_compared(tmp_path: Path) -> None:
     """A half-finished table in which an arm has episodes that the unchanged policy has not yet run."""
     rows = [cut_row("push", 0, "none", True, 0.0), cut_row("push", 1, "future-blind", False, 0.1)]
     write_study(tmp_path, "cuts", rows, {"engine": "rust"}, done=2, total=4)
-    section = cuts.section(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
+    section = cuts.Cuts.summarise(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
     assert all("lower" not in line and "no effect" not in line for line in section.concluded)
     write_report(tmp_path)
 

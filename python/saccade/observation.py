@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade.errors import CheckpointError, InputError, ShapeError
 
 if TYPE_CHECKING:
