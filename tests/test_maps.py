@@ -311,6 +311,7 @@ def test_a_file_of_features(tmp_path: Path) -> None:
     drawn = taken(written(tmp_path / "g.npz", {f"_in.{name}": array for name, array in arrays.items()}))
     assert drawn.images == {}
     expected = np.random.default_rng(5).standard_normal((16, 32), dtype=np.float32)
+    assert drawn.observation.noise is not None
     np.testing.assert_array_equal(drawn.observation.noise[0], expected)
 
 
@@ -403,6 +404,7 @@ def test_maps_are_those_of_the_reference(head: saccade.ActionHead, pushed: View)
     rows, attention = record.look(head, pushed, selection)
     assert rows == {"state": slice(0, 1), "future": slice(1, 33), "action": slice(33, 49)}
     assert list(attention) == [(1, 0), (1, 3)]
+    assert pushed.observation.noise is not None
     reference = ReferenceHead.load(DEMO_CHECKPOINT, dtype=torch.float64)
     tokens = record.random_tokens(head.future_tokens, seed=4)
     other = record.look_redrawn(head, pushed, selection, tokens)
