@@ -88,8 +88,11 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the study, or makes the report."""
-    require("study")
-    return run_report(args) if args.study == "report" else measure(args)
+    if args.study == "report":
+        require("study report")
+        return run_report(args)
+    require("study" if getattr(args, "features", None) is None else "study --features")
+    return measure(args)
 
 
 def measure(args: argparse.Namespace) -> int:
