@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from saccade.reference import ActionHead, random_weights
-from saccade.reference.model import CategoryLinear
+from saccade.reference.layers import CategoryLinear
 
 VL, DIT = r"vl_self_attention\.transformer_blocks\.\d+\.", r"model\.transformer_blocks\.\d+\."
 EVEN, ODD = r"model\.transformer_blocks\.\d*[02468]\.", r"model\.transformer_blocks\.\d*[13579]\."

@@ -28,11 +28,11 @@ EXTRAS: dict[str, dict[str, str]] = {
         "imageio_ffmpeg": "imageio-ffmpeg",
         "PIL": "pillow",
         "matplotlib": "matplotlib",
-        "scipy": "scipy",
         "threadpoolctl": "threadpoolctl",
+        "jinja2": "jinja2",
+        "scipy": "scipy",
     },
     "study": {
-        "jinja2": "jinja2",
         "joblib": "joblib",
         "markdown_it": "markdown-it-py",
         "pandas": "pandas",

@@ -1,32 +1,42 @@
 """Files: written so that a reader never sees half of one, and hashed."""
 
 import hashlib
-import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from saccade._json import dumps
 
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """Gives a temporary path in the same directory, renamed to `path` at the end and removed after an error.
+    """Gives a temporary path in the same directory, which is renamed to `path` at the end.
 
-    The temporary name keeps the suffix, because some writers choose the format by it.
+    After an error it is removed. The temporary name keeps the suffix, because some writers choose the format
+    by it.
+
+    Raises:
+        OSError: the file cannot be written; names `path`.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         yield temporary
         temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            # A failed write, such as to a full disk, does not know the name of the file.
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes indented JSON with a final newline."""
+    """Writes indented JSON with a final newline; numbers that are not finite become ``null``."""
     with write_atomically(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def writable_directory(path: Path) -> Path:

@@ -59,11 +59,12 @@ class StoreList(argparse.Action):
     """Stores the items of a list as a tuple, in the order given, each once.
 
     Args:
-        item: makes an item of a word; a `ValueError` is an invalid value.
+        item: makes an item of a word, and raises `ValueError` for one that is not a number.
         minimum: of items that are numbers.
 
     Raises:
-        UsageError: when the argument is parsed; the list is empty, or a number is below `minimum`.
+        UsageError: when the argument is parsed; the list is empty, or holds something else than numbers of at
+            least `minimum`.
     """
 
     def __init__(
@@ -85,10 +86,10 @@ class StoreList(argparse.Action):
             try:
                 items.append(self.item(word))
             except ValueError:
-                message = f"invalid {self.item.__name__} value: {word!r}"
-                raise argparse.ArgumentError(self, message) from None
+                raise UsageError(f"{option_string}: given {word!r}, expected numbers") from None
         if not items:
-            raise UsageError(f"{option_string}: expected at least one {self.metavar}")
+            kind = "name" if self.item is str else "number"
+            raise UsageError(f"{option_string}: expected at least one {kind}")
         if self.minimum is not None and not all(number >= self.minimum for number in items):
             given = ", ".join(map(str, items))
             raise UsageError(f"{option_string}: given {given}, expected numbers from {self.minimum:g} on")
@@ -292,9 +293,14 @@ def check_tasks(names: Iterable[str]) -> None:
     Raises:
         InputError: one is unknown; lists those that are known.
     """
+    check_known("--tasks", names, known_tasks())
+
+
+def known_tasks() -> tuple[str, ...]:
+    """The names of all tasks; needs no simulator."""
     from saccade.sim.tasks import TASKS
 
-    check_known("--tasks", names, TASKS)
+    return tuple(TASKS)
 
 
 def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:

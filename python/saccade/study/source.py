@@ -7,7 +7,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,9 @@ from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
+
+if TYPE_CHECKING:
+    from saccade.study.simulator import Simulator
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -167,7 +170,7 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
     return simulator_of(args)
 
 
-def simulator_of(args: argparse.Namespace) -> Any:
+def simulator_of(args: argparse.Namespace) -> Simulator:
     """The simulator, for studies that need what only it knows; raises as `source_of`."""
     if args.features is not None:
         raise InputError(

@@ -160,6 +160,7 @@ class Gradients(Study):
 
         from saccade.study import derivatives
 
+        assert observation.noise is not None
         masks = {name: getattr(observation, name) for name in MASKS}
         masks = {name: torch.from_numpy(mask) for name, mask in masks.items() if mask is not None}
         inputs = (
@@ -172,7 +173,7 @@ class Gradients(Study):
         # In a head of full size, which a file may be for, the graph takes a gigabyte for each projection.
         size = self.projections if self.source.closed_loop else 1
         sensitivities, paths = [], []
-        for some in cotangents.split(size):
+        for some in torch.split(cotangents, size):
             given = (head, *inputs, some, int(observation.embodiment_id[0]), masks)
             sensitivities.append(derivatives.action_sensitivity(*given))
             if head.config.num_future_tokens:
@@ -260,12 +261,12 @@ def reference_of(source: Source) -> ActionHead:
     from saccade.reference import ActionHead
     from saccade.study.recording import Recording
 
-    checkpoint, config, num_threads = source.checkpoint, None, 1
-    if isinstance(source, Recording):
-        config, num_threads = source.config_file, source.num_threads
+    recording = source if isinstance(source, Recording) else None
+    num_threads = 1 if recording is None else recording.num_threads
     if num_threads is not None:
         torch.set_num_threads(num_threads)
-    head = ActionHead.load(checkpoint, config=config)
+    config = None if recording is None else recording.config_file
+    head = ActionHead.load(source.checkpoint, config=config)
     head.requires_grad_(False)
     return head
 

@@ -197,7 +197,7 @@ def patched(
 
     def chunk(intervention: Intervention | None) -> npt.NDArray[np.float64]:
         """The head's own, normalised actions, `(horizon, action_dim)`."""
-        return receiver.sample(head, context, intervention=intervention).astype(np.float64)[0]
+        return np.asarray(receiver.sample(head, context, intervention=intervention)[0], dtype=np.float64)
 
     trace = replace(pair.donor, noise=receiver.noise).trace(
         head, record=("hidden",), blocks=blocks, steps=steps

@@ -117,8 +117,7 @@ def drawn(size: int, *, equal_mass: bool = False) -> Arm:
 
     def intervention(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
         chosen = tokens[np.sort(rng.choice(len(tokens), size, replace=False))]
-        bias = {"future": np.log(len(tokens) / size)} if equal_mass else None
-        return Intervention(future_tokens=chosen, key_bias=bias)
+        return with_bias(chosen, np.log(len(tokens) / size) if equal_mass else None)
 
     return Arm(f"{size} drawn, equal mass" if equal_mass else f"{size} drawn", intervention=intervention)
 
@@ -135,12 +134,14 @@ def merged(size: int) -> Arm:
 def merge(tokens: Float32Array, size: int) -> Intervention:
     """Tokens `(N, width)` merged to `size`, with a bias on their keys that keeps the mass in the softmax."""
     rows, _, key_bias = _saccade.merge_future_tokens(tokens, size)
-    bias = None if key_bias is None else {"future": np.array(key_bias, np.float32)}
-    return Intervention(future_tokens=rows, key_bias=bias)
+    return with_bias(rows, None if key_bias is None else np.array(key_bias, np.float32))
 
 
 def repeated(tokens: Float32Array, bias: float | None = None) -> Intervention:
     """Every token twice, with a bias on the keys."""
-    return Intervention(
-        future_tokens=np.repeat(tokens, 2, axis=0), key_bias=None if bias is None else {"future": bias}
-    )
+    return with_bias(np.repeat(tokens, 2, axis=0), bias)
+
+
+def with_bias(tokens: Float32Array, bias: float | Float32Array | None) -> Intervention:
+    """Other future tokens, with a bias on their keys."""
+    return Intervention(future_tokens=tokens, key_bias=None if bias is None else {"future": bias})

@@ -1,8 +1,9 @@
-"""How the released code draws a head's tensors before any training, and how far a tensor is from that.
+"""The distributions that a head's tensors have before training, and how far a tensor is from them.
 
-The constructors: ``nn.Linear`` draws weight and bias uniformly from ±1 / sqrt(inputs); the layers of the
-embodiments draw their weights from a normal distribution of standard deviation 0.02 and set biases to zero;
-future tokens and positions are normal with 0.02; norms begin at one and zero.
+The released constructors initialise tensors as follows. ``nn.Linear`` draws weight and bias uniformly from
+±1 / sqrt(inputs). The category-specific layers draw weights from a normal distribution with standard
+deviation 0.02, and their biases are zero. Future tokens and positions are normal with standard deviation
+0.02. Norms start with weight one and bias zero.
 """
 
 from __future__ import annotations
@@ -14,20 +15,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-#: Standard deviation of what is drawn from a normal distribution.
+#: Standard deviation of all normal distributions.
 NORMAL_STD = 0.02
 
-#: Numbers of a tensor that its distribution is judged by, evenly spaced.
+#: Number of values of a tensor that its distribution is judged by, evenly spaced.
 SAMPLE = 1 << 16
 
-#: A smaller sample tells a normal distribution from a uniform one too rarely: weights are larger, most biases
-#: are not.
+#: A smaller sample rarely distinguishes a normal distribution from a uniform one. Weights are larger, most
+#: biases are smaller.
 LEAST_SAMPLE = 2048
 
-#: The distance that one draw in a thousand exceeds is this over the square root of the sample (Kolmogorov).
+#: One draw in a thousand exceeds the distance CRITICAL / sqrt(sample size) (Kolmogorov).
 CRITICAL = 1.95
 
-#: What rounding to bfloat16 can add: 2^-9 of a value, times the density there, at most.
+#: Largest distance that rounding to bfloat16 can add: 2^-9 of a value times the density there.
 ROUNDING = 0.001
 
 _GRID = np.linspace(-6.0, 6.0, 6001)
@@ -41,8 +42,8 @@ class Draw:
     """A distribution.
 
     Attributes:
-        kind: ``"normal"`` (mean zero), ``"uniform"`` (around zero) or ``"constant"``.
-        scale: its standard deviation, its bound, or the constant.
+        kind: ``"normal"`` (with mean zero), ``"uniform"`` (symmetric about zero) or ``"constant"``.
+        scale: The standard deviation, the bound, or the constant.
     """
 
     kind: str
@@ -50,22 +51,22 @@ class Draw:
 
     @property
     def std(self) -> float:
-        """Its standard deviation."""
+        """Standard deviation of the distribution."""
         return {"normal": self.scale, "uniform": self.scale / math.sqrt(3.0), "constant": 0.0}[self.kind]
 
     def cdf(self, values: Array) -> Array:
-        """The share of draws below each value; not of constants."""
+        """Cumulative distribution function of a normal or uniform distribution."""
         if self.kind == "uniform":
             return np.asarray(np.clip((values / self.scale + 1.0) / 2.0, 0.0, 1.0))
         return np.asarray(np.interp(values / self.scale, _GRID, _NORMAL_CDF))
 
 
 def draw(name: str, inputs: int) -> Draw:
-    """How a tensor of the head is drawn.
+    """The distribution of a tensor of the head before training.
 
     Args:
-        name: without prefix.
-        inputs: of the linear layer that it belongs to; not used for others.
+        name: Name of the tensor without prefix.
+        inputs: Number of inputs of the linear layer that it belongs to. Not used for other tensors.
     """
     if name.endswith(".W") or name in ("future_tokens.weight", "position_embedding.weight"):
         return Draw("normal", NORMAL_STD)
@@ -77,20 +78,22 @@ def draw(name: str, inputs: int) -> Draw:
 
 
 def is_norm(name: str) -> bool:
-    """Whether it is a layer norm's weight or bias; ``norm1.linear`` of a block is a linear layer."""
+    """Whether a tensor belongs to a layer norm. ``norm1.linear`` of a block is a linear layer."""
     module = name.rpartition(".")[0]
     return module.rpartition(".")[2] in ("vlln", "norm1", "norm3")
 
 
 def sample(values: Array) -> Array:
-    """Up to `SAMPLE` numbers of a tensor, evenly spaced, in float64."""
+    """Up to `SAMPLE` values of a tensor, evenly spaced, in float64."""
     flat = values.reshape(-1)
     return flat[:: max(1, -(-flat.size // SAMPLE))].astype(np.float64)
 
 
 def distance(values: Array, drawn: Draw) -> float:
-    """The largest difference between the shares of numbers below a value, in a sample and in the distribution
-    (Kolmogorov and Smirnov's statistic): 0 to 1. Of a constant, the share of numbers that are another.
+    """The Kolmogorov-Smirnov statistic of a sample, from 0 to 1.
+
+    This is the largest difference between the cumulative distribution functions of sample and distribution.
+    For a constant, it is the share of values that differ from it.
     """
     if drawn.kind == "constant":
         return float(np.mean(values != drawn.scale))
@@ -101,8 +104,10 @@ def distance(values: Array, drawn: Draw) -> float:
 
 
 def is_as_drawn(values: Array, drawn: Draw) -> bool | None:
-    """Whether a sample is what the constructor draws, as far as its distribution tells: 999 of 1000 fresh
-    tensors are. None where there are too few numbers.
+    """Whether a sample may come from a distribution. This holds for 999 of 1000 untrained tensors.
+
+    Returns:
+        None if the sample is too small.
     """
     if drawn.kind == "constant":
         return distance(values, drawn) == 0.0

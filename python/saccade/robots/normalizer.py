@@ -1,4 +1,4 @@
-"""A robot's units to the head's and back, with the statistics that a checkpoint brings."""
+"""Converts between a robot's units and the normalised values of the head."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ import numpy as np
 
 from saccade._arrays import Array, ArrayLike, Float32Array, float32, integer, is_torch, like_features
 from saccade.errors import InputError, ShapeError
-from saccade.robot_statistics import Group, Options, Robot, checked_modes, key_names, read
+from saccade.robots.building import Options
+from saccade.robots.groups import Group, Robot
+from saccade.robots.reading import read
 
 
 class Normalizer(Robot):
-    """Turns a robot's state into what the head takes, and what the head gives into the robot's actions.
+    """Converts a robot's state to the input of the head, and the output of the head to the robot's actions.
 
-    The head works on numbers around -1 to 1, zero-padded to widths that all robots share. How a robot's
-    numbers get there is in the statistics beside the weights; :meth:`load` reads them, and does with them
-    what the code does that trained the checkpoint.
+    The head works on values of about -1 to 1, zero-padded to widths that all robots share. The statistics for
+    the conversion are stored with the weights. :meth:`load` reads them and applies them as the code that
+    trained the checkpoint does.
 
-    Its attributes are those of :class:`saccade.robot_statistics.Robot`.
+    The attributes are those of :class:`saccade.robots.Robot`.
 
     Example:
-        Two joints and a gripper that never moved:
+        Two joints and a gripper that never moved in the data:
 
         >>> import numpy as np, saccade
         >>> statistics = {"min": [-1.0, 0.0, 0.5], "max": [1.0, 4.0, 0.5]}
@@ -49,114 +51,119 @@ class Normalizer(Robot):
     ) -> Normalizer:
         """Reads the statistics of a checkpoint.
 
-        What is read, and what is then done, is looked for in this order:
+        These layouts are tried in this order:
 
-        - lerobot: ``policy_preprocessor.json``, ``policy_postprocessor.json`` and the ``.safetensors`` that
-          they name. Min-max; N1.7 also with the groups and relative actions of Isaac-GR00T.
+        - lerobot: ``policy_preprocessor.json``, ``policy_postprocessor.json`` and the ``.safetensors`` files
+          that they name. Min-max; for N1.7 also with the groups and relative actions of Isaac-GR00T.
         - Isaac-GR00T N1.6 and N1.7: ``processor_config.json``, ``statistics.json``, ``embodiment_id.json``.
-        - Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``. The checkpoint does not say which keys
-          the data config had, in which order, and how it normalised them: the default is all, in the order of
-          the file, min-max, and binary where a key is not continuous.
+        - Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``. The checkpoint does not contain the keys
+          of the data config, their order and their modes. The default is all keys in the order of the file,
+          min-max for continuous keys and binary for others.
         - saccade: ``policy_cfg`` in ``config.json``.
-        - A mapping, or a JSON file: any of these files' contents; or ``{"state": {"min": ..., "max": ...},
-          "action": ...}``, with mean and standard deviation where there is no minimum.
+        - A mapping or a JSON file: the contents of any of these files, or ``{"state": {"min": ..., "max":
+          ...}, "action": ...}``, or the same with ``"mean"`` and ``"std"``.
 
         Args:
-            source: A checkpoint's directory or id, one of these files, or a mapping.
-            embodiment: Tag or id of the robot; needed where the statistics are of several.
-            state_dim: Width of the head's state. Default: what the checkpoint says, else the robot's width.
-            action_dim: Width of the head's actions, likewise.
-            state_keys: The keys that the state is made of, in order. ``metadata.json`` only, as the next two.
-            action_keys: Those of the action.
+            source: The directory or id of a checkpoint, one of these files, or a mapping.
+            embodiment: Tag or id of the robot. Required if the statistics are of several robots.
+            state_dim: Width of the head's state. Default: as in the checkpoint, else the width of the robot's
+                state.
+            action_dim: Width of the head's actions. Default: likewise.
+            state_keys: The keys of the state in their order. For ``metadata.json`` only, as the next two.
+            action_keys: The keys of the action in their order.
             modes: How to normalise: one of ``"min_max"``, ``"q99"``, ``"mean_std"``, ``"binary"``,
                 ``"sin_cos"`` (states only) and ``"none"``, for all keys or by key (``"state.left_arm"``).
-                A key that holds a rotation needs one: Isaac-GR00T's data configs may turn rotations into
-                another representation, which is not done here.
+                Required for a key that is a rotation, because the data configs of Isaac-GR00T may convert
+                rotations to another representation, which is not supported here.
 
         Raises:
-            FileNotFoundError: ``source`` is not there.
-            CheckpointError: there are no statistics, or they are broken; all that is wrong is listed.
-            InputError: an option does not fit the statistics.
+            FileNotFoundError: ``source`` does not exist.
+            CheckpointError: There are no statistics, or they are damaged. The message lists every problem.
+            InputError: An option does not fit the statistics.
         """
         options = Options(
             embodiment,
             None if state_dim is None else integer("state_dim", state_dim),
             None if action_dim is None else integer("action_dim", action_dim),
-            key_names("state_keys", state_keys),
-            key_names("action_keys", action_keys),
-            checked_modes(modes),
+            _key_names("state_keys", state_keys),
+            _key_names("action_keys", action_keys),
+            _checked_modes(modes),
         )
         return cls(**vars(read(source, options)))
 
     @property
     def state_slices(self) -> dict[str, slice]:
-        """Where each key lies in the robot's state."""
+        """Slice of the robot's state by key."""
         return _slices(self.state_groups)
 
     @property
     def action_slices(self) -> dict[str, slice]:
-        """Where each key lies in the robot's action."""
+        """Slice of the robot's action by key."""
         return _slices(self.action_groups)
 
     @property
     def state_width(self) -> int:
-        """Numbers of the robot's state."""
+        """Number of values of the robot's state."""
         return sum(group.size for group in self.state_groups)
 
     @property
     def action_width(self) -> int:
-        """Numbers of the robot's action."""
+        """Number of values of the robot's action."""
         return sum(group.size for group in self.action_groups)
 
     def state(self, state: ArrayLike) -> Array:
-        """A state for the head.
+        """Converts the robot's state to the input of the head.
 
         Args:
-            state: ``(..., state_width)`` in the robot's units, keys one after the other.
+            state: ``(..., state_width)`` in the robot's units, with the keys in order.
 
         Returns:
-            ``(..., state_dim)`` float32, normalised and zero-padded; torch if ``state`` was.
+            ``(..., state_dim)`` float32, normalised and zero-padded; a torch tensor if ``state`` was one.
 
         Raises:
-            ShapeError, DtypeError, InputError: ``state`` does not fit; NaN or infinity.
+            ShapeError, DtypeError, InputError: ``state`` does not fit or is not finite.
         """
         values = self._robot("state", state, self.state_groups)
         if self.zero_state:
             normalised = np.zeros((*values.shape[:-1], self.state_dim), np.float32)
         else:
-            # Isaac-GR00T and lerobot cut a state off that is wider than the head's.
+            # Isaac-GR00T and lerobot cut off a state that is wider than the head's.
             normalised = padded(_mapped(values, self.state_groups, Group.to_head), self.state_dim)
         return like_features(normalised, is_torch(state))
 
     def unstate(self, state: ArrayLike) -> Array:
         """The inverse of :meth:`state`: ``(..., state_dim)`` to ``(..., state_width)``.
 
-        Constant dimensions come back as the constant, cut off values as where they were cut.
+        Constant dimensions are returned as the constant, and clipped values stay clipped.
 
         Raises:
-            ShapeError, DtypeError, InputError: ``state`` does not fit; NaN or infinity; a key is not
-            invertible (``"sin_cos"``), or the head gets no state.
+            ShapeError, DtypeError, InputError: ``state`` does not fit or is not finite, a key is not
+                invertible (``"sin_cos"``), or the head gets zeros in place of a state.
         """
         if self.zero_state:
-            raise InputError("state: this head gets zeros, which tell nothing of the robot's state")
+            raise InputError(
+                "state: cannot be converted back, because this head gets zeros in place of a state"
+            )
         values = self._head("state", state, self.state_groups)
         return like_features(_mapped(values, self.state_groups, Group.to_robot), is_torch(state))
 
     def actions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
-        """A chunk for the robot.
+        """Converts a chunk of the head to the robot's actions.
 
         Args:
-            actions: ``(..., horizon, action_dim)`` as the head gives it; what is beyond the robot's own
-                numbers, and beyond ``action_horizon``, is padding and cut off.
-            state: Where actions are relative to the state: the robot's, in its units, that the chunk was
-                sampled for; ``(state_width,)``, ``(batch, state_width)`` or ``(batch, history,
-                state_width)``.
+            actions: ``(..., horizon, action_dim)`` as the head returns it. Padding is cut off: dimensions
+                beyond the robot's action, and steps beyond ``action_horizon``.
+            state: The state that the chunk was sampled for, in the robot's units: ``(state_width,)``,
+                ``(batch, state_width)`` or ``(batch, history, state_width)``. Required if actions are
+                relative to the state.
 
         Returns:
-            ``(..., horizon, action_width)`` float32 in the robot's units; torch if ``actions`` was.
+            ``(..., horizon, action_width)`` float32 in the robot's units; a torch tensor if ``actions`` was
+            one.
 
         Raises:
-            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; no ``state``.
+            ShapeError, DtypeError, InputError: An argument does not fit or is not finite, or ``state`` is
+                missing.
         """
         values = self._head("actions", actions, self.action_groups)
         if self.action_horizon is not None and values.ndim > 1:
@@ -165,26 +172,27 @@ class Normalizer(Robot):
         return like_features(robot + self._reference(state, robot), is_torch(actions))
 
     def unactions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
-        """The inverse of :meth:`actions`, to train: zero-padded on the right, and cut off where the code that
-        trained the head cuts off.
+        """The inverse of :meth:`actions`, for training.
+
+        The result is zero-padded on the right, and clipped as in the code that trained the head.
 
         Args:
             actions: ``(..., horizon, action_width)`` in the robot's units.
-            state: As in :meth:`actions`; that of the observation which the result is for.
+            state: The state of the observation that the result is for, as in :meth:`actions`.
 
         Returns:
-            ``(..., horizon, action_dim)`` float32; torch if ``actions`` was.
+            ``(..., horizon, action_dim)`` float32; a torch tensor if ``actions`` was one.
 
         Raises:
-            ShapeError, DtypeError, InputError: an argument does not fit; NaN or infinity; no ``state``.
+            ShapeError, DtypeError, InputError: An argument does not fit or is not finite, or ``state`` is
+                missing.
         """
         return self._to_head(actions, state, self.action_groups)
 
     def previous_chunk(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
-        """What :meth:`saccade.ActionHead.sample` takes as ``previous_chunk``: as :meth:`unactions`, but
-        nothing is cut off, so that actions which do not change stay what they were.
+        """Converts a chunk to the ``previous_chunk`` of :meth:`saccade.ActionHead.sample`.
 
-        Args, returns, raises: as :meth:`unactions`.
+        This is :meth:`unactions` without clipping, so that frozen actions keep their values.
         """
         groups = tuple(replace(group, clips=False) for group in self.action_groups)
         return self._to_head(actions, state, groups)
@@ -196,18 +204,22 @@ class Normalizer(Robot):
         return like_features(normalised, is_torch(actions))
 
     def _reference(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array:
-        """What is added to the robot's actions: the state, where they are relative to it."""
+        """What is added to the robot's actions: the state for relative groups, else zero."""
         relative = [group for group in self.action_groups if group.reference is not None]
         if not relative:
             return np.zeros(self.action_width, np.float32)
         if state is None:
             keys = ", ".join(group.key for group in relative)
-            raise InputError(f"state: expected the robot's state, which {keys} are relative to, got None")
+            raise InputError(
+                f"state: expected the robot's state, because {keys} are relative to it, got None"
+            )
         latest = self._robot("state", state, self.state_groups)
         if latest.ndim > 2:
-            latest = latest[:, -1]  # of a history, the newest
+            latest = latest[:, -1]  # the newest of a history
         if latest.ndim >= actions.ndim or (latest.ndim == 2 and len(latest) != len(actions)):
-            raise ShapeError(f"state: shape {latest.shape} does not fit actions of shape {actions.shape}")
+            raise ShapeError(
+                f"state: expected a shape that fits actions of shape {actions.shape}, got {latest.shape}"
+            )
         where = self.state_slices
         parts = [
             np.zeros((*latest.shape[:-1], group.size), np.float32)
@@ -220,7 +232,7 @@ class Normalizer(Robot):
         return joined.reshape(*joined.shape[:-1], *steps, self.action_width)
 
     def _robot(self, name: str, given: ArrayLike, groups: tuple[Group, ...]) -> Float32Array:
-        """An array in the robot's units, checked."""
+        """An array in the robot's units, after checking its width."""
         values = _finite(name, given)
         width = sum(group.size for group in groups)
         if values.ndim < 1 or values.shape[-1] != width:
@@ -233,12 +245,12 @@ class Normalizer(Robot):
         return values
 
     def _head(self, name: str, given: ArrayLike, groups: tuple[Group, ...]) -> Float32Array:
-        """An array as the head has it, checked; without its padding."""
+        """An array of the head without its padding, after checking its width."""
         values = _finite(name, given)
         width = sum(group.width for group in groups)
         if values.ndim < 1 or values.shape[-1] < width:
             raise ShapeError(
-                f"{name}: the Normalizer expected (..., at least {width}) as the head has it, "
+                f"{name}: the Normalizer expected (..., at least {width}) as the head returns it, "
                 f"got {values.shape}"
             )
         return values[..., :width]
@@ -257,7 +269,7 @@ class Normalizer(Robot):
 def _mapped(
     values: Float32Array, groups: tuple[Group, ...], direction: Callable[[Group, Float32Array], Float32Array]
 ) -> Float32Array:
-    """Every group's numbers by `Group.to_head` or `Group.to_robot`, one after the other."""
+    """Applies `Group.to_head` or `Group.to_robot` to every group, and concatenates the results."""
     parts, start = [], 0
     for group in groups:
         size = group.size if direction is Group.to_head else group.width
@@ -267,7 +279,7 @@ def _mapped(
 
 
 def padded(values: Float32Array, width: int) -> Float32Array:
-    """With zeros on the right, or cut off there."""
+    """Pads the last axis with zeros on the right, or cuts it off there."""
     given = values.shape[-1]
     if given >= width:
         return np.ascontiguousarray(values[..., :width])
@@ -284,3 +296,18 @@ def _finite(name: str, given: ArrayLike) -> Float32Array:
     if not np.isfinite(values).all():
         raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
     return values
+
+
+def _checked_modes(modes: str | Mapping[str, str] | None) -> str | Mapping[str, str] | None:
+    if modes is not None and not isinstance(modes, (str, Mapping)):
+        raise InputError(f"modes: expected a name, or names by key, got {type(modes).__name__}")
+    return modes
+
+
+def _key_names(name: str, given: Sequence[str] | None) -> tuple[str, ...] | None:
+    if given is None:
+        return None
+    keys = () if isinstance(given, str) else tuple(given)
+    if not keys or len(set(keys)) != len(keys) or not all(isinstance(key, str) for key in keys):
+        raise InputError(f"{name}: expected distinct names, at least one, got {given!r}")
+    return keys
