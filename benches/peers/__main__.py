@@ -5,8 +5,7 @@
     make bench-peers PEERS_ARGS="--full"                   every piece at every size: hours
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
     python -m benches.peers report                         the report of what was measured, again
-    python -m benches.peers report --readme                the README's table, and nothing else
-    python -m benches.peers report --write                 the tables of README and docs/performance.md
+    python -m benches.peers report --write                 docs/performance.md, from the committed results
 
 Every contender lives in a process of its own with the thread count it is asked for and waits while another
 works; a round lets each do every piece of work once, in an order that rotates. Before it is timed its result
@@ -181,15 +180,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--results",
         type=Path,
-        help="the JSON file (default results.json in the folder of --work; report --readme and --write: the "
-        "committed one)",
+        help="the JSON file (default results.json in the folder of --work; report --write: the committed "
+        "one)",
     )
-    parser.add_argument("--readme", action="store_true", help="report: print the README's table only")
-    parser.add_argument(
-        "--write", action="store_true", help="report: write README.md and docs/performance.md"
-    )
+    parser.add_argument("--write", action="store_true", help="report: write docs/performance.md")
     args = parser.parse_args(arguments)
-    committed = args.command == "report" and (args.readme or args.write)
+    committed = args.command == "report" and args.write
     args.results = args.results or (report.COMMITTED if committed else args.work / "results.json")
     if args.contenders is None:
         args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]

@@ -1,9 +1,8 @@
-"""The report of `make bench-peers`: Markdown and figures; README and docs contain the same text."""
+"""The report of `make bench-peers`: Markdown and figures; docs/performance.md is one of them."""
 
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 
 from benches.peers.cases import LINEAR_SHAPES, Case, exact_macs
@@ -26,28 +25,11 @@ from benches.peers.text import (
 )
 from saccade.bench.timing import quartiles
 
-ROOT = Path(__file__).resolve().parents[2]
-
-
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE, IMAGES = DOCS / "performance.md", DOCS / "images"
 NOTES = Path(__file__).with_name("notes.md")
-
-
-PAGE = ROOT / "docs" / "performance.md"
-
-
-IMAGES = ROOT / "docs" / "images"
-
-
 COMMITTED = Path(__file__).with_name("results.json")
-
-
-BEGIN, END = (
-    "<!-- performance: written by `python -m benches.peers report --write` -->",
-    "<!-- /performance -->",
-)
-
-
-README_ROWS = (
+OVERVIEW_ROWS = (
     "saccade-float32",
     "saccade-bfloat16",
     "saccade-int8",
@@ -71,14 +53,9 @@ def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report`."""
     if not results.data["machine"]:
         raise SystemExit(f"bench-peers: {args.results} has no measurements; run `make bench-peers`")
-    if args.readme:
-        print(readme(results))
-    elif args.write:
-        page, images = PAGE, IMAGES
-        page.write_text(document(results, "images"))
-        write_figures(results, images)
-        path = ROOT / "README.md"
-        path.write_text(between_markers(path.read_text(), readme(results)))
+    if args.write:
+        PAGE.write_text(document(results, "images"))
+        write_figures(results, IMAGES)
     else:
         write(results, args.results.parent)
     return 0
@@ -91,21 +68,13 @@ def write(results: Results, folder: Path) -> None:
     print(folder / "report.md")
 
 
-def between_markers(text: str, table: str) -> str:
-    """Replaces what is between the two markers of README.md with the table."""
-    pattern = re.compile(f"{re.escape(BEGIN)}\n.*?{re.escape(END)}", re.DOTALL)
-    if not pattern.search(text):
-        raise SystemExit(f"bench-peers: README.md lacks the lines\n{BEGIN}\n{END}")
-    return pattern.sub(lambda _: f"{BEGIN}\n{table}\n{END}", text)
-
-
 def document(results: Results, images: str) -> str:
     """The whole report; `images` is the folder of the figures, relative to it."""
     parts = [
         "# Performance",
         "Written by `python -m benches.peers report --write` from `benches/peers/results.json`, which "
         "`make bench-peers` wrote to `out/peers/results.json` on the machine below.",
-        readme(results),
+        overview(results),
         machine(results),
         NOTES.read_text().strip(),
         "## Targets",
@@ -121,8 +90,8 @@ def document(results: Results, images: str) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def readme(results: Results) -> str:
-    """The README's table: the whole head at the released size in every engine."""
+def overview(results: Results) -> str:
+    """A table of the whole head at the released size in every engine."""
     cases = usual(results, "head")
     if not cases:
         return "Nothing measured yet."
@@ -130,7 +99,7 @@ def readme(results: Results) -> str:
     titles = [f"encode + sample, {plural(count)}" for count in threads]
     titles += [f"sample on a held context, {plural(count)}" for count in threads]
     rows = []
-    for name in README_ROWS:
+    for name in OVERVIEW_ROWS:
         if not any(name in results.names(case) for case in cases):
             continue
         cells = [CONTENDERS[name].label]

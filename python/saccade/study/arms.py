@@ -157,9 +157,3 @@ def between_draws(chunks: Float32Array) -> float | None:
         return None
     one, two = np.triu_indices(len(drawn), k=1)
     return float(np.abs(drawn[one] - drawn[two]).mean())
-
-
-def control_line(label: str, largest: float) -> str:
-    """Whether a control, which may change actions by rounding only, did so."""
-    verdict = "as it must be" if largest < ROUNDING else "WHICH IT MUST NOT: do not trust the other arms"
-    return f"Control, {label}: the chunk changed by {largest:.1g} at most, {verdict}."
