@@ -41,7 +41,7 @@ class StudyParser(Parser):
     ) -> tuple[argparse.Namespace, list[str]]:
         """See argparse, which calls this for the chosen study only."""
         if self.study is not None:
-            require("study")
+            require("study --features")  # what declaring the arguments imports
             load_study(self.study).add_arguments(self)
             add_common_arguments(self)
             self.study = None
