@@ -37,14 +37,15 @@ _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
 # The optional packages that each command needs, checked once its arguments have been: a message then names
 # all that are missing. Commands without an entry need NumPy only. See `saccade._extras` for the extras.
 NEEDS: dict[str, tuple[str, ...]] = {
-    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg"),
+    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
     "study": (
         *("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors"),
-        *("jinja2", "joblib", "pandas", "scipy", "sklearn"),
+        *("jinja2", "joblib", "markdown_it", "pandas", "scipy", "sklearn"),
     ),
+    "study report": ("jinja2", "markdown_it", "matplotlib", "pandas", "scipy", "sklearn"),
     "parity": ("torch", "safetensors"),
 }
 

@@ -88,8 +88,11 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the study, or makes the report."""
+    if args.study == "report":
+        require("study report")  # no simulator, and no torch
+        return run_report(args)
     require("study")
-    return run_report(args) if args.study == "report" else measure(args)
+    return measure(args)
 
 
 def measure(args: argparse.Namespace) -> int:
