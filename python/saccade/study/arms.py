@@ -138,7 +138,12 @@ class ArmStudy(Study):
             return [{**row, "success": None, "note": note}]
         intervention = arm.intervention(tokens, source.rng(task, seed))
         before = unchanged(source, task, seed).actions
-        after = changed(source, task, seed, intervention)
+        try:
+            after = changed(source, task, seed, intervention)
+        except (
+            InputError
+        ) as error:  # a change that this head cannot have, such as one in blocks that it lacks
+            return [{**row, "success": None, "note": str(error)}]
         row |= source.outcome(task, seed, intervention)
         row |= {metric.name: float(metric.function(before, after)) for metric in self.metrics}
         if not source.closed_loop:

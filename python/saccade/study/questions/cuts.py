@@ -176,7 +176,14 @@ class Cuts(ArmStudy):
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
         if not from_file(provenance):
-            return section(ARMS, table, provenance)
-        labels = {arm.name: arm.label for arm in ARMS.values()}
-        prose = Prose("cuts", arms=[arm for arm in ARMS.values() if arm.name in set(table["arm"])])
-        return change_section(cls, prose, labels, table, provenance)
+            return section(arms_in(table), table, provenance)
+        arms = arms_in(table)
+        labels = {name: arm.label for name, arm in arms.items()}
+        return change_section(cls, Prose("cuts", arms=list(arms.values())), labels, table, provenance)
+
+
+def arms_in(table: pd.DataFrame) -> dict[str, Arm]:
+    """The arms of a table: those of `ARMS` in their order, then arms of the user's own by their names."""
+    named = dict.fromkeys(str(name) for name in table["arm"])
+    known = {name: arm for name, arm in ARMS.items() if name in named}
+    return known | {name: Arm(name) for name in named if name not in ARMS}
