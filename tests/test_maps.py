@@ -364,7 +364,7 @@ FILES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"backbone_features": np.zeros((296, 128), np.float32)}, ShapeError, "backbone_features: shape"),
     ({"backbone_features": np.zeros((0, 296, 128), np.float32)}, InputError, "expected no empty axis"),
     ({"backbone_features": np.zeros((1, 296, 128), np.int64)}, InputError, "floating point"),
-    ({"input_ids": None}, InputError, "neither input_ids nor image_mask; --layout"),
+    ({"input_ids": None}, InputError, "neither input_ids nor image_mask; give the positions"),
     ({"input_ids": np.zeros((1, 295), np.int64)}, ShapeError, r"input_ids: shape .* expected \(1, 296\)"),
     ({"input_ids": np.zeros((1, 296))}, InputError, "input_ids: expected integers"),
     ({"image_mask": np.full((1, 296), 2)}, InputError, "image_mask: expected booleans"),
