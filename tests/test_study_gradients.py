@@ -200,7 +200,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
         "2",
     ]
     assert main([*arguments, "--demos", str(recording), "--out", str(tmp_path)]) == 0
-    assert "runs by state and action rows alone" in capsys.readouterr().out
+    assert "runs through state and action rows only" in capsys.readouterr().out
     table = read_table(tmp_path / "gradients.csv")
     provenance = read_provenance(tmp_path / "gradients.json")
     assert provenance.complete

@@ -107,7 +107,8 @@ ALL_ARMS = (
     Arm(
         "future-shuffled",
         "future tokens shuffled",
-        "The learned tokens in another order. A control: they have no positions, so only rounding may change.",
+        "The learned tokens in another order. A control: they have no positions, so nothing may change "
+        "except rounding.",
         shuffled,
     ),
     Arm(
