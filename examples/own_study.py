@@ -31,9 +31,9 @@ def without_longest(tokens: Float32Array, rng: np.random.Generator) -> Intervent
     return Intervention(future_tokens=tokens[kept])
 
 
-def first_action(before: Float32Array, after: Float32Array) -> np.floating:
+def first_action(before: Float32Array, after: Float32Array) -> float:
     """How far the first action of a chunk moves; both are `(observations, draws, horizon, action_dim)`."""
-    return np.abs(after - before)[:, :, 0].mean()
+    return float(np.abs(after - before)[:, :, 0].mean())
 
 
 ARM = Arm(
@@ -70,9 +70,7 @@ def main() -> None:
     for line in Cuts.summarise(table, read_provenance(provenance_path(args.out, Cuts.name))).concluded:
         print(f"- {line}")
     moved = table[table["arm"] == ARM.name]["first_action"]
-    print(
-        f"The first action moves by {moved.mean():.4f} on average, by {moved.max():.4f} at most per episode."
-    )
+    print(f"The first action moves by {moved.mean():.4f} on average (per episode up to {moved.max():.4f}).")
 
 
 if __name__ == "__main__":

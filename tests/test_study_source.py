@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from saccade.study.run import run
 from saccade.study.study import STUDIES, Study, load_study
 from saccade.study.table import read_provenance
 
+EXAMPLE = Path(__file__).parents[1] / "examples" / "own_study.py"
 BARE = """
 import sys
 
@@ -76,6 +79,20 @@ def test_an_arm_and_a_metric_of_ones_own(tmp_path: Path) -> None:
     assert provenance.settings["metrics"] == ["first_action"]
     section = Cuts.summarise(table, provenance)
     assert any("future-doubled: actions change by" in line for line in section.concluded)
+
+
+def test_the_example_runs_on_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint, file = write_case(tmp_path)
+    given = ["--checkpoint", str(checkpoint), "--features", str(file), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["own_study.py", *given])
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert "without-longest: actions change by" in printed
+    assert "The first action moves by" in printed
+    assert main(["study", "report", str(tmp_path / "out")]) == 0
+    assert "without-longest" in (tmp_path / "out" / "report.md").read_text()
 
 
 def test_a_changed_arm_is_measured_again(tmp_path: Path) -> None:

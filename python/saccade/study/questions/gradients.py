@@ -22,12 +22,14 @@ from saccade.cli.arguments import add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS
 from saccade.observation import MASKS, Observation
+from saccade.study.arguments import source_of
 from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
 from saccade.study.paths import PATHS
 from saccade.study.questions.gradients_section import section
+from saccade.study.recording import Recording
 from saccade.study.section import Section
-from saccade.study.source import Source, source_of
+from saccade.study.source import Source
 from saccade.study.study import Study
 from saccade.study.table import Provenance
 
@@ -187,8 +189,6 @@ class Gradients(Study):
         """Of the random projections of a cell."""
         import torch
 
-        from saccade.study.recording import Recording
-
         given = (self.source.seed, seed) if isinstance(self.source, Recording) else (seed, *map(ord, task))
         return torch.Generator().manual_seed(int(np.random.default_rng(given).integers(2**31)))
 
@@ -259,7 +259,6 @@ def reference_of(source: Source) -> ActionHead:
     import torch
 
     from saccade.reference import ActionHead
-    from saccade.study.recording import Recording
 
     recording = source if isinstance(source, Recording) else None
     num_threads = 1 if recording is None else recording.num_threads

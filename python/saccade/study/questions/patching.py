@@ -15,16 +15,17 @@ from saccade.cli.arguments import add_list, add_rollout_arguments, check_known, 
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention, Tokens
 from saccade.observation import Observation
+from saccade.study.arguments import source_of
 from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.patching_section import ABOUT, ALL, FROM_FILE, GROUPS, KINDS, section
+from saccade.study.recording import Recording
 from saccade.study.section import Section
-from saccade.study.source import Source, source_of
+from saccade.study.source import Source
 from saccade.study.study import Study
 from saccade.study.table import Provenance
 
 if TYPE_CHECKING:
-    from saccade.study.recording import Recording
     from saccade.study.simulator import Simulator
 
 
@@ -137,8 +138,6 @@ class Pair:
 
 def pair_of(source: Source, kind: str, task: str, seed: int, donor_seed: int | None) -> Pair | str:
     """Donor and receiver, or why there is no donor."""
-    from saccade.study.recording import Recording
-
     if isinstance(source, Recording):
         return recorded_pair(source, kind, task, seed)
     from saccade.study.simulator import Simulator  # imports MuJoCo

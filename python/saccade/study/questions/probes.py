@@ -21,6 +21,7 @@ from saccade.cli.arguments import add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS
+from saccade.study.arguments import simulator_of
 from saccade.study.cell import Cell, Rows, digest
 from saccade.study.linear_probes import (
     FOLDS,
@@ -36,7 +37,6 @@ from saccade.study.linear_probes import (
 )
 from saccade.study.questions.probes_section import ALL_TASKS, section
 from saccade.study.section import Section
-from saccade.study.source import simulator_of
 from saccade.study.study import Study
 from saccade.study.table import Provenance
 

@@ -18,12 +18,13 @@ from saccade import _saccade
 from saccade.cli.arguments import add_list, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import Intervention
+from saccade.study.arguments import source_of
 from saccade.study.arms import Arm, ArmStudy
 from saccade.study.cell import Cell
 from saccade.study.changes import change_section
 from saccade.study.questions.resized_section import BASELINE, TWICE, TWICE_EQUAL, arm_order, section
 from saccade.study.section import Prose, Section
-from saccade.study.source import Float32Array, source_of
+from saccade.study.source import Float32Array
 from saccade.study.table import Provenance, from_file
 
 EPILOG = """\

@@ -1,0 +1,79 @@
+"""The source that the arguments of a study ask for, checked."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from saccade.cli.arguments import check_tasks
+from saccade.errors import InputError
+from saccade.study.recording import Recording
+from saccade.study.source import Source
+
+if TYPE_CHECKING:
+    from saccade.study.simulator import Simulator
+
+
+def source_of(args: argparse.Namespace, *refused: str) -> Source:
+    """The source that the arguments ask for, checked.
+
+    Args:
+        args: as `saccade.cli.arguments.add_rollout_arguments` declares them.
+        refused: options of the study that cannot be used with a file of features.
+
+    Raises:
+        InputError: an argument is wrong, or cannot be combined with another one.
+        FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
+        GraphicsError: the simulator is needed and cannot draw here.
+    """
+    if args.features is not None:
+        return recording_of(args, *refused)
+    if args.config is not None:
+        raise InputError("--config: only with --features; a policy of the simulator has its own")
+    return simulator_of(args)
+
+
+def simulator_of(args: argparse.Namespace) -> Simulator:
+    """The simulator, for studies that need what only it knows; raises as `source_of`."""
+    if args.features is not None:
+        raise InputError(
+            "--features: this study needs what only the simulator knows; cuts, patching, gradients, "
+            "n-runtime and fast take a file of features"
+        )
+    from saccade.sim import graphics
+    from saccade.sim.tasks import check_evaluation_seeds
+
+    episodes = args.default_episodes if args.episodes is None else args.episodes
+    seeds = check_evaluation_seeds(args.seed, episodes)
+    check_tasks(args.tasks or ())
+    graphics.check()  # before MuJoCo is imported, which ends in a traceback without OpenGL
+    from saccade.study.simulator import simulator
+
+    return simulator(args.checkpoint, args.tasks, seeds, getattr(args, "engine", None) or "rust")
+
+
+def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
+    """The recording that the arguments ask for, read and checked; arguments and errors as `source_of`."""
+    given = [name for name in ("tasks", "episodes", *refused) if getattr(args, name) is not None]
+    if given:
+        raise InputError(
+            f"{', '.join(f'--{name}' for name in given)}: not with --features, whose observations are all "
+            "measured as they are, without a simulator"
+        )
+    if args.seed < 0:
+        raise InputError(f"--seed: given {args.seed}, expected at least 0")
+    if args.checkpoint is None:
+        from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
+    else:
+        checkpoint = args.checkpoint
+    found = Recording(
+        checkpoint=str(checkpoint),
+        file=str(args.features),
+        config_file=None if args.config is None else str(args.config),
+        seed=args.seed,
+        # The bits do not depend on it. One process may use all cores; several share them.
+        num_threads=None if args.jobs == 1 else 1,
+    )
+    found.head()
+    _ = found.all
+    return found
