@@ -40,7 +40,7 @@ class Trace(Generic[ArrayT]):
         <saccade.Trace 0.3 MB
           attention[step, block]: steps 0-3, blocks 0, 2: (1, 4, 33, 60)
           hidden: not recorded
-          rows: state 0, future 1-16, action 17-32
+          rows: state 0, future 1-32, action 33-48
           actions: (1, 16, 4)>
     """
 
