@@ -8,8 +8,8 @@ what the actions depend on.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,10 @@ import numpy.typing as npt
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.maps.layout import Camera, Layout
-from saccade.sim.policy import EMBODIMENT_ID, Policy
+from saccade.observation import Observation
+
+if TYPE_CHECKING:
+    from saccade.sim.policy import Policy
 
 Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
@@ -68,50 +71,45 @@ class Occlusion:
 
 
 class BlankedPixels:
-    """Takes patches away in the picture: their pixels get the picture's mean colour.
+    """Removes patches from the picture: their pixels get the mean colour of the picture.
 
     Args:
         policy: has the backbone.
-        observation: of the simulator.
-        noise: `(1, horizon, action_dim)`, for all chunks.
+        seen: observation of the simulator.
+        observation: the same as the head takes it; its state and noise are used for all chunks.
     """
 
     method = "the patch's pixels are replaced by the picture's mean colour, before the backbone"
 
-    def __init__(self, policy: Policy, observation: Mapping[str, Any], noise: Float32Array) -> None:
+    def __init__(self, policy: Policy, seen: Mapping[str, Any], observation: Observation) -> None:
         self._policy = policy
+        self._seen = seen
         self._observation = observation
-        self._noise = noise
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
         """See `Occluder`."""
         features = np.concatenate([self._policy.features(self._without(place)) for place in places])
-        count = len(places)
-        state = np.repeat(self._policy.state(self._observation), count, axis=0)
-        noise = np.repeat(self._noise, count, axis=0)
-        return np.asarray(head(features, state, EMBODIMENT_ID, noise=noise))
+        repeated = self._observation.repeated(len(places))
+        return replace(repeated, backbone_features=features).sample(head)
 
     def _without(self, place: Place | None) -> Mapping[str, Any]:
         if place is None:
-            return self._observation
-        picture: UInt8Array = self._observation["images"][place.camera.name].copy()
+            return self._seen
+        picture: UInt8Array = self._seen["images"][place.camera.name].copy()
         size = picture.shape[0] // place.camera.rows
         blanked = (
             slice(place.rows.start * size, place.rows.stop * size),
             slice(place.columns.start * size, place.columns.stop * size),
         )
         picture[blanked] = np.rint(picture.mean(axis=(0, 1))).astype(np.uint8)
-        return {**self._observation, "images": {**self._observation["images"], place.camera.name: picture}}
+        return {**self._seen, "images": {**self._seen["images"], place.camera.name: picture}}
 
 
 class DroppedPositions:
-    """Takes patches away in T_vl: their positions are removed by `drop_vl`, as if they had not been there.
+    """Removes patches from T_vl: `drop_vl` removes their positions, as if they had not been there.
 
     Args:
-        features: `(1, T_vl, context_dim)`.
-        state: `(1, state_dim)` or `(1, history, state_dim)`.
-        embodiment_id: of the robot.
-        noise: `(1, horizon, encoder_action_dim)`, for all chunks.
+        observation: one row, with noise.
     """
 
     method = (
@@ -119,28 +117,18 @@ class DroppedPositions:
         "already mixed into other positions stays"
     )
 
-    def __init__(
-        self, features: Float32Array, state: Float32Array, embodiment_id: int, noise: Float32Array
-    ) -> None:
-        self._features, self._state, self._embodiment_id, self._noise = features, state, embodiment_id, noise
+    def __init__(self, observation: Observation) -> None:
+        self._observation = observation
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
         """See `Occluder`."""
-        count = len(places)
-        dropped = np.zeros((count, self._features.shape[1]), dtype=np.bool_)
+        repeated = self._observation.repeated(len(places))
+        dropped = np.zeros((len(places), repeated.num_vl_tokens), dtype=np.bool_)
         for row, place in zip(dropped, places, strict=True):
             if place is not None:
                 grid = row[place.camera.positions].reshape(place.camera.rows, place.camera.columns)
                 grid[place.rows, place.columns] = True
-        return np.asarray(
-            head(
-                np.repeat(self._features, count, axis=0),
-                np.repeat(self._state, count, axis=0),
-                np.full(count, self._embodiment_id),
-                noise=np.repeat(self._noise, count, axis=0),
-                drop_vl=dropped,
-            )
-        )
+        return replace(repeated, drop_vl=dropped).sample(head)
 
 
 def cell_for(layout: Layout, cell: int | None) -> int:

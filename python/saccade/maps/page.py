@@ -34,7 +34,7 @@ def render_page(maps: Maps) -> str:
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # groups keep their order
     # `tojson` escapes what would end the script element; token strings such as </img> are common here.
     return environment.from_string(source).render(
-        title=maps.inputs.title, caveat=maps.caveat, notes=notes(maps), data=page_data(maps)
+        title=maps.view.title, caveat=maps.caveat, notes=notes(maps), data=page_data(maps)
     )
 
 
@@ -43,9 +43,9 @@ def notes(maps: Maps) -> list[str]:
     found = []
     if not maps.num_future_tokens:
         found.append(NO_FUTURE)
-    if not maps.inputs.layout.cameras:
+    if not maps.view.layout.cameras:
         found.append(NO_IMAGES)
-    elif not maps.inputs.images:
+    elif not maps.view.images:
         found.append("The file has no pictures: maps are drawn on white.")
     if not maps.selection.shown_heads:
         found.append(
@@ -61,7 +61,7 @@ def page_data(maps: Maps) -> dict[str, Any]:
     return {
         "checkpoint": maps.checkpoint,
         "numFuture": maps.num_future_tokens,
-        "layout": maps.inputs.layout.to_dict(),
+        "layout": maps.view.layout.to_dict(),
         "rows": {name: [rows.start, rows.stop] for name, rows in maps.rows.items()},
         "blocks": [{"block": block, "readsVl": maps.reads_vl(block)} for block in selection.blocks],
         "steps": list(selection.steps),
@@ -70,7 +70,7 @@ def page_data(maps: Maps) -> dict[str, Any]:
             f"{step},{block}": _packed(_shown(maps, attention))
             for (step, block), attention in maps.attention.items()
         },
-        "images": {name: _data_url(picture) for name, picture in maps.inputs.images.items()},
+        "images": {name: _data_url(picture) for name, picture in maps.view.images.items()},
         "occlusion": None if maps.occlusion is None else maps.occlusion.to_dict(),
         "summaries": [
             {

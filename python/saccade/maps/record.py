@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,15 +12,13 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 import saccade
-from saccade._files import sha256_of
-from saccade.checkpoints import read_tensors
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention
-from saccade.maps.inputs import Inputs
 from saccade.maps.occlusion import Occlusion
 from saccade.maps.summary import Overlap, overlap, summarize
+from saccade.maps.view import View
 
 Float32Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
@@ -33,8 +30,6 @@ CAVEAT = (
     "position holds more than its patch, so what is read there need not come from that patch of the picture."
 )
 BESIDE = "The occlusion map beside it shows what the actions depend on."
-FUTURE_TOKENS = "future_tokens."
-PREFIXES = ("action_head.", "_groot_model.action_head.", "")  # those that ActionHead.load knows
 MEAN = "mean"
 
 
@@ -61,7 +56,7 @@ class Maps:
     Attributes:
         checkpoint: Where the head was loaded from, and its hash.
         config: Of the head.
-        inputs: The observation.
+        view: The observation.
         selection: Which maps.
         rows: Where the groups lie; a group without rows is left out.
         attention: By step and block, `(heads, rows, keys)`, heads in the selection's order.
@@ -72,7 +67,7 @@ class Maps:
 
     checkpoint: dict[str, str]
     config: HeadConfig
-    inputs: Inputs
+    view: View
     selection: Selection
     rows: dict[str, slice]
     attention: Attention
@@ -111,7 +106,7 @@ class Maps:
 
     def parts(self, block: int) -> dict[str, Indices]:
         """The block's keys by what they are: cameras and kinds of tokens, or groups of rows."""
-        return self.inputs.layout.parts() if self.reads_vl(block) else self._row_parts()
+        return self.view.layout.parts() if self.reads_vl(block) else self._row_parts()
 
     def agreement(self, keys: Float32Array) -> float | None:
         """Spearman's rank correlation over all patches between a map `(T_vl,)` and the occlusion map.
@@ -120,7 +115,7 @@ class Maps:
         """
         if self.occlusion is None:
             return None
-        cameras = self.inputs.layout.cameras
+        cameras = self.view.layout.cameras
         read = np.concatenate([keys[camera.positions] for camera in cameras])
         change = np.concatenate([self.occlusion.change[camera.name].ravel() for camera in cameras])
         if np.ptp(read) == 0 or np.ptp(change) == 0:
@@ -153,7 +148,7 @@ class Maps:
         entries = []
         for (step, block), attention in self.attention.items():
             parts = self.parts(block)
-            within = self.inputs.layout.kinds() if self.reads_vl(block) else parts
+            within = self.view.layout.kinds() if self.reads_vl(block) else parts
             for group, rows in self.rows.items():
                 redrawn = (
                     self.redrawn[step, block] if group == "future" and self.redrawn is not None else None
@@ -184,11 +179,11 @@ class Maps:
         return {
             "saccade": saccade.__version__,
             "checkpoint": self.checkpoint,
-            "source": self.inputs.source,
+            "source": self.view.source,
             "num_future_tokens": self.num_future_tokens,
             "rows": {name: [rows.start, rows.stop] for name, rows in self.rows.items()},
             "selection": asdict(self.selection),
-            "layout": self.inputs.layout.to_dict(),
+            "layout": self.view.layout.to_dict(),
             "caveat": self.caveat,
             "baselines": BASELINES,
             "occlusion": None if self.occlusion is None else self.occlusion.to_dict(),
@@ -243,28 +238,25 @@ def choose(name: str, given: Sequence[int] | None, count: int) -> tuple[int, ...
 
 
 def look(
-    head: ActionHead, inputs: Inputs, selection: Selection
+    head: ActionHead, view: View, selection: Selection
 ) -> tuple[dict[str, slice], dict[tuple[int, int], Float32Array]]:
     """Where the groups of rows lie, and the chosen maps, for the learned future tokens."""
-    return _trace(head, inputs, selection, None)
+    return _trace(head, view, selection, None)
 
 
 def look_redrawn(
-    head: ActionHead, inputs: Inputs, selection: Selection, tokens: Float32Array
+    head: ActionHead, view: View, selection: Selection, tokens: Float32Array
 ) -> dict[tuple[int, int], Float32Array]:
     """The chosen maps of the future rows, with other future tokens."""
-    rows, attention = _trace(head, inputs, selection, Intervention(future_tokens=tokens))
+    rows, attention = _trace(head, view, selection, Intervention(future_tokens=tokens))
     return {place: maps[:, rows["future"]] for place, maps in attention.items()}
 
 
 def _trace(
-    head: ActionHead, inputs: Inputs, selection: Selection, intervention: Intervention | None
+    head: ActionHead, view: View, selection: Selection, intervention: Intervention | None
 ) -> tuple[dict[str, slice], dict[tuple[int, int], Float32Array]]:
-    trace = head.trace(
-        head.encode(inputs.features),
-        inputs.state,
-        inputs.embodiment_id,
-        noise=inputs.noise,
+    trace = view.observation.trace(
+        head,
         intervention=intervention,
         record=("attention",),
         blocks=selection.blocks,
@@ -277,24 +269,9 @@ def _trace(
     return {name: where for name, where in rows.items() if where.stop > where.start}, attention
 
 
-def learned_tokens(checkpoint: Path) -> Float32Array:
-    """The checkpoint's future tokens, `(N, width)`; it must have some."""
-    tables = [read_tensors(checkpoint, prefix + FUTURE_TOKENS) for prefix in PREFIXES]
-    return next(table["weight"] for table in tables if "weight" in table)
-
-
-def random_tokens(checkpoint: Path, seed: int) -> Float32Array:
-    """Random directions with the lengths of the checkpoint's future tokens, `(N, width)`."""
-    learned = learned_tokens(checkpoint)
+def random_tokens(learned: Float32Array, seed: int) -> Float32Array:
+    """Random directions with the lengths of the learned future tokens; both `(N, width)`."""
     drawn = np.random.default_rng(seed).standard_normal(learned.shape, dtype=np.float32)
     lengths = np.linalg.norm(learned, axis=-1, keepdims=True)
     random: Float32Array = drawn * (lengths / np.linalg.norm(drawn, axis=-1, keepdims=True))
     return random
-
-
-def describe_checkpoint(checkpoint: Path) -> dict[str, str]:
-    """Name and hash of a checkpoint; the hash is over the config beside it, if any, and then the tensors."""
-    directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
-    config = [directory / "config.json"] if (directory / "config.json").is_file() else []
-    tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
-    return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}

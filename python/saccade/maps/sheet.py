@@ -78,7 +78,7 @@ class Sheet:
 
     def __init__(self, maps: Maps) -> None:
         self.maps = maps
-        self.cameras = maps.inputs.layout.cameras
+        self.cameras = maps.view.layout.cameras
         self._drawn: list[tuple[Axes, tuple[float, float, float, float]]] = []
         self._figure = Figure(figsize=(WIDTH, 1.0))
         self._texts: list[tuple[float, float, str, dict[str, Any]]] = []
@@ -92,7 +92,7 @@ class Sheet:
             self.pictures()
         if cross and self.cameras:
             self.camera_maps(cross)
-        if cross and self.maps.inputs.layout.tokens:
+        if cross and self.maps.view.layout.tokens:
             self.named_tokens(cross)
         if cross and self.cameras and self.maps.num_future_tokens:
             self.token_maps(cross[-1])
@@ -137,18 +137,18 @@ class Sheet:
     def header(self) -> None:
         """What was looked at, and the caveat."""
         maps, selection = self.maps, self.maps.selection
-        self._text(MARGIN, self._top, maps.inputs.title, fontsize=13, weight="bold")
+        self._text(MARGIN, self._top, maps.view.title, fontsize=13, weight="bold")
         self._top += 0.3
         self._note(
             f"checkpoint {maps.checkpoint['name']} (sha256 {maps.checkpoint['sha256'][:12]}), N = "
-            f"{maps.num_future_tokens} future tokens, T_vl = {maps.inputs.layout.num_tokens}; means over "
+            f"{maps.num_future_tokens} future tokens, T_vl = {maps.view.layout.num_tokens}; means over "
             f"heads {ranges(selection.heads)} and Euler steps {ranges(selection.steps)}"
         )
         if not maps.num_future_tokens:
             self._note(NO_FUTURE, weight="bold", color="black")
         if not self.cameras:
             self._note(NO_IMAGES, weight="bold", color="black")
-        elif not maps.inputs.images:
+        elif not maps.view.images:
             self._note("The file has no pictures: maps are drawn on white.", weight="bold", color="black")
         self._note(maps.caveat, fontsize=8.5, style="italic", color="#8c1d18")
 
@@ -225,7 +225,7 @@ class Sheet:
 
     def named_tokens(self, blocks: Sequence[int]) -> None:
         """Probability on each token that is no patch, by block and group."""
-        tokens: Sequence[Any] = self.maps.inputs.layout.tokens
+        tokens: Sequence[Any] = self.maps.view.layout.tokens
         lines = [(block, group) for block in blocks for group in self.maps.rows]
         positions = [token.position for token in tokens]
         values = np.array(
@@ -239,7 +239,7 @@ class Sheet:
         self._title(
             f"Words, special tokens (red) and padding (grey): attention in %{left_out}",
             note="An even share would be "
-            f"{100 / self.maps.inputs.layout.num_tokens:.2g} %. Special tokens often take attention that has "
+            f"{100 / self.maps.view.layout.num_tokens:.2g} %. Special tokens often take attention that has "
             "no better place to go (sinks).",
         )
         wide, high = INNER - 1.1, 0.19 * len(lines)
@@ -316,8 +316,8 @@ class Sheet:
         """Cameras, and runs of other tokens, by what stands under them in a matrix."""
         runs = [(camera.name, camera.positions) for camera in self.cameras]
         start: int | None = None
-        positions = {token.position for token in self.maps.inputs.layout.tokens}
-        for position in range(self.maps.inputs.layout.num_tokens + 1):
+        positions = {token.position for token in self.maps.view.layout.tokens}
+        for position in range(self.maps.view.layout.num_tokens + 1):
             if position in positions:
                 start = position if start is None else start
             elif start is not None:
@@ -410,7 +410,7 @@ class Sheet:
 
     def _aspect(self, camera: Camera) -> float:
         """Width by height."""
-        picture = self.maps.inputs.images.get(camera.name)
+        picture = self.maps.view.images.get(camera.name)
         return camera.columns / camera.rows if picture is None else picture.shape[1] / picture.shape[0]
 
     def _height_for(self, wide: float, strips: int, highest: float) -> float:
@@ -439,7 +439,7 @@ class Sheet:
         for camera, width in zip(self.cameras, wide, strict=True):
             heat = None if heats is None else heats[camera.name]
             extent = (start, start + width, high, 0.0)
-            _show(axes, extent, self.maps.inputs.images.get(camera.name), heat, most, colours)
+            _show(axes, extent, self.maps.view.images.get(camera.name), heat, most, colours)
             if names:
                 self._text(left + start, self._top - 0.16, camera.name, fontsize=8.5)
             start += width + gap

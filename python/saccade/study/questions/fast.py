@@ -14,6 +14,7 @@ import pandas as pd
 from saccade.cli.arguments import add_list, add_rollout_arguments, check_known
 from saccade.errors import InputError
 from saccade.observation import Observation
+from saccade.study.arguments import source_of
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.fast_modes import (
     PRECISIONS,
@@ -31,7 +32,7 @@ from saccade.study.questions.fast_results import BASELINE, ONE_STEP
 from saccade.study.questions.fast_section import section
 from saccade.study.questions.fast_times import FULL, OWN, times_at_full_size, times_of
 from saccade.study.section import Section
-from saccade.study.source import Float32Array, Source, source_of
+from saccade.study.source import Float32Array, Source
 from saccade.study.study import Study
 from saccade.study.table import Provenance
 
