@@ -38,7 +38,7 @@ LEROBOT_BF16 = ("lerobot-bfloat16", "lerobot-bfloat16-pure")
 GOALS = (
     Goal("float32, encode + sample", "head", "both", ("lerobot-float32",), "saccade-float32", 3.7, 4.0),
     Goal(
-        "float32, sample on a held context",
+        "float32, sample from a cached context",
         "head",
         "sample",
         ("lerobot-float32",),
@@ -47,9 +47,11 @@ GOALS = (
         5.5,
     ),
     Goal("bfloat16, encode + sample", "head", "both", LEROBOT_BF16, "saccade-bfloat16", 1.8, 2.0),
-    Goal("bfloat16, sample on a held context", "head", "sample", LEROBOT_BF16, "saccade-bfloat16", 2.5, 2.8),
     Goal(
-        "bfloat16, four DiT blocks with their keys and values",
+        "bfloat16, sample from a cached context", "head", "sample", LEROBOT_BF16, "saccade-bfloat16", 2.5, 2.8
+    ),
+    Goal(
+        "bfloat16, four DiT blocks including keys and values",
         "blocks",
         "both",
         ("openvino-bfloat16",),
@@ -60,7 +62,7 @@ GOALS = (
     Goal("int8, encode + sample", "head", "both", LEROBOT_BF16, "saccade-int8", 3.2, 3.6),
     *(
         Goal(
-            f"int8, future_refresh={refresh}, sample on a held context",
+            f"int8, future_refresh={refresh}, sample from a cached context",
             "head",
             "sample",
             LEROBOT_BF16,

@@ -97,7 +97,7 @@ def overview(results: Results) -> str:
         return "Nothing measured yet."
     threads = [case.threads for case in cases]
     titles = [f"encode + sample, {plural(count)}" for count in threads]
-    titles += [f"sample on a held context, {plural(count)}" for count in threads]
+    titles += [f"sample from a cached context, {plural(count)}" for count in threads]
     rows = []
     for name in OVERVIEW_ROWS:
         if not any(name in results.names(case) for case in cases):

@@ -18,12 +18,12 @@ PIECES = {
 
 WORK_TITLES = {
     "encode": "encode",
-    "sample": "sample on a held context",
+    "sample": "sample from a cached context",
     "both": "encode + sample",
 }
 
 
-PART_TITLES = {"held": "on held keys and values", "both": "with its keys and values"}
+PART_TITLES = {"held": "with cached keys and values", "both": "including keys and values"}
 
 
 def usual(results: Results, piece: str) -> list[Case]:

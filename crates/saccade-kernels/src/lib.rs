@@ -12,16 +12,19 @@ mod linear;
 mod norm;
 pub mod peak;
 mod pool;
+mod rows;
 mod simd;
 mod threads;
 
 pub use activation::{exp, gelu_tanh, relu, silu};
-pub use attention::{LogitBias, PackedKeyValues, attention};
+pub use aligned::AllocError;
+pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
 pub use half::bf16;
 pub use isa::{ISA_VARIABLE, Isa, IsaError};
 pub use linear::{
     Arithmetic, Element, Epilogue, KernelError, LinearScratch, PackedLinear, WeightRef, quantize_rows,
 };
 pub use norm::layer_norm;
-pub use pool::parallel_for;
+pub use pool::{Interrupted, interrupted, interruptible, parallel_for};
+pub use rows::{Matrix, Rows, RowsMut};
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};

@@ -10,12 +10,14 @@ mod product;
 mod rows;
 mod tile;
 
-use faer::{MatMut, MatRef};
+use std::ops::Range;
+
 use half::bf16;
 
-use crate::aligned::AlignedBuffer;
+use crate::aligned::{AlignedBuffer, AllocError};
 use crate::isa::Isa;
-use crate::pool::parallel_for;
+use crate::pool::{Interrupted, parallel_for};
+use crate::rows::{Matrix, Rows, RowsMut};
 use crate::simd::{dispatch, dispatch_dots};
 use pack::pack_panels;
 pub use pack::quantize_rows;
@@ -27,35 +29,37 @@ use tile::{Block, Job, Panel, PanelRun, ROW_BLOCK, Tiles, shape};
 #[derive(Clone, Copy, Debug)]
 pub enum WeightRef<'a> {
     /// float32.
-    F32(MatRef<'a, f32>),
+    F32(Matrix<'a, f32>),
     /// bfloat16.
-    Bf16(MatRef<'a, bf16>),
+    Bf16(Matrix<'a, bf16>),
     /// int8 as [`quantize_rows`] makes it: an element stands for itself times its row's scale.
     Int8 {
         /// -127 to 127.
-        values: MatRef<'a, i8>,
+        values: Matrix<'a, i8>,
         /// One for each row.
         scales: &'a [f32],
     },
 }
 
 impl WeightRef<'_> {
-    fn shape(&self) -> (usize, usize) {
+    /// `(out_features, in_features)`.
+    #[must_use]
+    pub fn shape(&self) -> (usize, usize) {
         match self {
-            Self::F32(view) => (view.nrows(), view.ncols()),
-            Self::Bf16(view) => (view.nrows(), view.ncols()),
-            Self::Int8 { values, .. } => (values.nrows(), values.ncols()),
+            Self::F32(view) => (view.num_rows(), view.num_columns()),
+            Self::Bf16(view) => (view.num_rows(), view.num_columns()),
+            Self::Int8 { values, .. } => (values.num_rows(), values.num_columns()),
         }
     }
 
-    /// `count` rows from `first` on.
-    fn subrows(&self, first: usize, count: usize) -> Self {
+    /// The rows in `rows`.
+    fn rows(&self, rows: Range<usize>) -> Self {
         match self {
-            Self::F32(view) => Self::F32(view.subrows(first, count)),
-            Self::Bf16(view) => Self::Bf16(view.subrows(first, count)),
+            Self::F32(view) => Self::F32(view.rows(rows)),
+            Self::Bf16(view) => Self::Bf16(view.rows(rows)),
             Self::Int8 { values, scales } => Self::Int8 {
-                values: values.subrows(first, count),
-                scales: &scales[first..first + count],
+                values: values.rows(rows.clone()),
+                scales: &scales[rows],
             },
         }
     }
@@ -101,7 +105,7 @@ pub enum Epilogue {
     Add,
 }
 
-/// Parts that cannot be packed together.
+/// Why a layer was not packed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum KernelError {
@@ -138,6 +142,12 @@ pub enum KernelError {
         /// Of the parts.
         given: usize,
     },
+    /// There is not enough memory.
+    #[error(transparent)]
+    Alloc(#[from] AllocError),
+    /// Packing was interrupted; see [`interruptible`](crate::interruptible).
+    #[error(transparent)]
+    Interrupted(#[from] Interrupted),
 }
 
 /// 255 * 127 times this is less than 2^31.
@@ -146,18 +156,16 @@ const MAX_INT8_INPUTS: usize = 1 << 16;
 /// A linear layer whose weights were packed for one instruction set.
 ///
 /// ```
-/// use faer::{MatMut, MatRef};
-/// use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
+/// use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef};
 ///
 /// let weight = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]; // (out_features 3, in_features 2)
-/// let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, 3, 2));
+/// let weight = WeightRef::F32(Matrix::new(&weight, 2));
 /// let parts = [(weight, Some(&[0.0, 0.0, 10.0][..]))];
 /// let layer = PackedLinear::pack(Isa::best(), Arithmetic::Float32, 1, &parts).unwrap();
 ///
-/// let x = MatRef::from_row_major_slice(&[1.0, 1.0], 1, 2);
 /// let mut out = [0.0; 3];
-/// let out_view = MatMut::from_row_major_slice_mut(&mut out, 1, 3);
-/// layer.apply(1, x, Epilogue::Store, out_view, &mut LinearScratch::new());
+/// let x = Rows::new(&[1.0, 1.0], 2);
+/// layer.apply(1, x, Epilogue::Store, RowsMut::new(&mut out, 3), &mut LinearScratch::new()).unwrap();
 /// assert_eq!(out, [3.0, 7.0, 21.0]);
 /// ```
 pub struct PackedLinear {
@@ -190,7 +198,8 @@ impl PackedLinear {
     /// For [`Arithmetic::Float32`] stored as bf16 only if every part is bf16; otherwise widened to f32, which is exact but for int8.
     ///
     /// # Errors
-    /// [`KernelError`] if there is no part, the parts do not fit together, or there are more than 65536 `in_features` for int8.
+    /// [`KernelError`] if there is no part, the parts do not fit together, there are more than 65536 `in_features` for int8, there is not
+    /// enough memory, or packing was interrupted.
     ///
     /// # Panics
     /// If this CPU lacks `isa`.
@@ -234,7 +243,7 @@ impl PackedLinear {
         }
         let (columns, _) = shape(isa, false);
         let num_panels = out_features.div_ceil(columns);
-        let mut bias = AlignedBuffer::zeroed(num_panels * columns);
+        let mut bias = AlignedBuffer::zeroed(num_panels * columns)?;
         let mut column = 0;
         for (weight, part) in parts {
             if let Some(part) = part {
@@ -254,7 +263,7 @@ impl PackedLinear {
             Arithmetic::Bfloat16 => Element::Bf16,
             Arithmetic::Int8 => Element::Int8,
         };
-        let (panels, scales, sums) = pack_panels(threads, element, columns, parts);
+        let (panels, scales, sums) = pack_panels(threads, element, columns, parts)?;
         Ok(Self {
             isa,
             arithmetic,
@@ -309,34 +318,33 @@ impl PackedLinear {
     /// For [`Arithmetic::Bfloat16`] and [`Arithmetic::Int8`] the rows are converted first, into `scratch`. A row with NaN or infinity gives NaN
     /// for int8.
     ///
+    /// # Errors
+    /// [`AllocError`] if `scratch` has to grow and there is not enough memory.
+    ///
     /// # Panics
-    /// If a shape does not fit, or columns are not contiguous.
+    /// If a shape does not fit.
     pub fn apply(
         &self,
         threads: usize,
-        x: MatRef<'_, f32>,
+        x: Rows<'_>,
         epilogue: Epilogue,
-        out: MatMut<'_, f32>,
+        mut out: RowsMut<'_>,
         scratch: &mut LinearScratch,
-    ) {
-        let rows = x.nrows();
-        assert_eq!(x.ncols(), self.in_features, "x: expected in_features columns");
+    ) -> Result<(), AllocError> {
+        let rows = x.num_rows();
         assert_eq!(
-            (out.nrows(), out.ncols()),
+            x.num_columns(),
+            self.in_features,
+            "x: expected in_features columns"
+        );
+        assert_eq!(
+            (out.num_rows(), out.num_columns()),
             (rows, self.out_features),
             "out: expected (rows, out_features)"
         );
         if rows == 0 || self.out_features == 0 {
-            return;
+            return Ok(());
         }
-        assert!(
-            x.col_stride() == 1 || x.ncols() <= 1,
-            "x: expected contiguous rows"
-        );
-        assert!(
-            out.col_stride() == 1 || out.ncols() <= 1,
-            "out: expected contiguous rows"
-        );
         let macs = rows * self.in_features * self.out_features;
         let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
         let (columns, tile_rows) = shape(self.isa, self.element == Element::Bf16 && !self.has_bf16_dot());
@@ -351,19 +359,19 @@ impl PackedLinear {
             .min(macs / (num_panels * MACS_FOR_THREADS));
         let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
         let blocks = rows.div_ceil(ROW_BLOCK).max(most);
-        let out_stride = out.row_stride();
+        let out_stride = out.row_stride() as isize;
         let mut job = Job {
             x: x.as_ptr().cast(),
-            x_stride: x.row_stride(),
+            x_stride: x.row_stride() as isize,
             tiles,
             in_features: self.in_features,
             quantized: &[],
-            out: out.as_ptr_mut(),
+            out: out.as_mut_ptr(),
             out_stride,
             epilogue,
         };
         if self.arithmetic != Arithmetic::Float32 {
-            let converted = scratch.convert(self.isa, self.arithmetic, threads, x);
+            let converted = scratch.convert(self.isa, self.arithmetic, threads, x)?;
             (job.x, job.x_stride) = (converted.words, converted.stride as isize);
             job.quantized = converted.quantized;
         }
@@ -376,6 +384,7 @@ impl PackedLinear {
             };
             self.run_panel(&job, block, columns, panel, threads);
         });
+        Ok(())
     }
 
     /// Whether its products are those of an instruction for bf16.

@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use std::sync::Barrier;
 use std::time::Instant;
 
-use crate::aligned::AlignedBuffer;
+use crate::aligned::{AlignedBuffer, AllocError};
 use crate::isa::Isa;
 use crate::linear::Arithmetic;
 use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots};
@@ -50,11 +50,13 @@ pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> 
 
 /// Bytes a second that `threads` threads read from memory together; takes a few tenths of a second.
 ///
+/// # Errors
+/// [`AllocError`] if there is not enough memory: 256 MiB are read.
+///
 /// # Panics
 /// If `threads` is 0.
-#[must_use]
-pub fn read_bytes_per_second(threads: usize) -> f64 {
-    let mut memory = AlignedBuffer::<u32>::zeroed(MEMORY / size_of::<u32>());
+pub fn read_bytes_per_second(threads: usize) -> Result<f64, AllocError> {
+    let mut memory = AlignedBuffer::<u32>::zeroed(MEMORY / size_of::<u32>())?;
     // Pages that were never written may all be the same page of zeros.
     memory.fill(1);
     let rate = |_| {
@@ -65,7 +67,7 @@ pub fn read_bytes_per_second(threads: usize) -> f64 {
         });
         (words * size_of::<u32>()) as f64 / start.elapsed().as_secs_f64()
     };
-    (0..CALLS).map(rate).fold(0.0, f64::max)
+    Ok((0..CALLS).map(rate).fold(0.0, f64::max))
 }
 
 /// Cycles a second, from a chain of dependent multiplications that take three cycles each on every x86-64 CPU since 2008; `None` where it is

@@ -1,7 +1,6 @@
 //! Multi-head attention with its projections, and the feed-forward: what VL blocks and DiT blocks share.
 
-use faer::MatRef;
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
+use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, Rows};
 
 use crate::error::Result;
 use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
@@ -174,8 +173,8 @@ impl Attention {
                     engine.threads,
                     &mut packed,
                     0,
-                    keys.subrows(first, count),
-                    values.subrows(first, count),
+                    keys.rows(first..first + count),
+                    values.rows(first..first + count),
                 );
                 first += count;
                 packed
@@ -190,10 +189,10 @@ impl Attention {
         source: &[f32],
         buffer: &'a mut Vec<f32>,
         scratch: &mut LinearScratch,
-    ) -> (MatRef<'a, f32>, MatRef<'a, f32>) {
+    ) -> (Rows<'a>, Rows<'a>) {
         let source = rows(source, self.to_kv.in_features());
         let both = self.to_kv.out_features();
-        let buffer = sized(buffer, source.nrows() * both); // (rows, keys | values)
+        let buffer = sized(buffer, source.num_rows() * both); // (rows, keys | values)
         apply(
             part,
             &self.to_kv,
@@ -203,7 +202,8 @@ impl Attention {
             rows_mut(buffer, both),
             scratch,
         );
-        rows(buffer, both).split_at_col(both / 2)
+        let buffer = rows(buffer, both);
+        (buffer.columns(0..both / 2), buffer.columns(both / 2..both))
     }
 
     /// `x += out(attention(y, held keys and values))`; `y` and `x` have `samples` sequences of equally many rows for each of `kv`.
@@ -292,7 +292,7 @@ impl Attention {
         let mix = sized(&mut buffers.mix, buffers.q.len());
         let (keys, values) =
             self.keys_values(engine, Part::ToKv, source, &mut buffers.kv, &mut buffers.linear);
-        let new = keys.nrows() / groups; // rows of a sequence whose keys and values these are
+        let new = keys.num_rows() / groups; // rows of a sequence whose keys and values these are
         // Those that are not held share one place.
         let (packed, places, first) = match held {
             None => (&mut buffers.packed, 1, 0),
@@ -312,10 +312,7 @@ impl Attention {
         for group in 0..groups {
             let packed = &mut packed[group % places];
             let new = group * new..(group + 1) * new;
-            let (keys, values) = (
-                keys.subrows(new.start, new.len()),
-                values.subrows(new.start, new.len()),
-            );
+            let (keys, values) = (keys.rows(new.clone()), values.rows(new));
             pack(engine.threads, packed, first, keys, values);
             let range = group * count * width..(group + 1) * count * width;
             attention(

@@ -7,12 +7,12 @@ use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
 use crate::array::Array;
 use crate::attention::{Attention, AttentionBuffers, Bias};
 use crate::error::{Error, Result, show_shape};
-use crate::fit;
 use crate::head::engine;
 use crate::layers::Engine;
 use crate::layout::AttentionNames;
 use crate::memory::{self, MemorySource, TensorViews};
 use crate::precision::Precision;
+use saccade_checkpoint::spec;
 
 /// Projected keys and values of a batch: immutable, for any number of calls.
 pub struct KeyValues {
@@ -77,7 +77,7 @@ impl CrossAttention {
         let names = AttentionNames::new("", width, context_dim);
         let problems = memory::problems(tensors, &names.tensors(), |_, _| false);
         if !problems.is_empty() {
-            let listed = fit::list(&problems, "the widths of to_q and to_k");
+            let listed = spec::list(&problems, "the widths of to_q and to_k");
             return Err(Error::Checkpoint(format!("tensors: {listed}")));
         }
         if width == 0 || context_dim == 0 {

@@ -12,7 +12,7 @@ use crate::error::Result;
 use crate::intervention::{Changes, Group, Groups};
 use crate::layers::{Engine, TensorSource, load_linear, rows, rows_mut, sized};
 use crate::layout::{DitBlockNames, HeadNames, LinearNames};
-use crate::profile::{Part, apply, layer_norm};
+use crate::profile::{Part, apply, layer_norm, out_of_memory};
 use crate::tables::{TIME_CHANNELS, embedding_time};
 use crate::trace::{Recorded, StepBlock};
 
@@ -174,13 +174,14 @@ impl Dit {
         let mut scratch = LinearScratch::new();
         let mut row = |layer: &PackedLinear, x: &[f32], epilogue| {
             let mut out = vec![0.0; layer.out_features()];
-            layer.apply(
+            let applied = layer.apply(
                 engine.threads,
                 rows(x, x.len()),
                 epilogue,
                 rows_mut(&mut out, layer.out_features()),
                 &mut scratch,
             );
+            applied.unwrap_or_else(|error| out_of_memory(error));
             out
         };
         let mut table = [0.0; TIME_CHANNELS];

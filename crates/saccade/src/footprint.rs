@@ -2,9 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use faer::Mat;
 use half::bf16;
-use saccade_kernels::{Arithmetic, Isa, PackedLinear, WeightRef};
+use saccade_kernels::{Arithmetic, Isa, Matrix, PackedLinear, WeightRef};
 use safetensors::Dtype;
 
 use crate::error::{Error, Result};
@@ -172,12 +171,12 @@ fn pack(
     let (wide, narrow);
     let weight = match stored {
         Stored::F32 => {
-            wide = Mat::from_fn(out_features, in_features, |_, _| 0.0);
-            WeightRef::F32(wide.as_ref())
+            wide = vec![0.0; out_features * in_features];
+            WeightRef::F32(Matrix::new(&wide, in_features))
         }
         Stored::Bf16 => {
-            narrow = Mat::from_fn(out_features, in_features, |_, _| bf16::ZERO);
-            WeightRef::Bf16(narrow.as_ref())
+            narrow = vec![bf16::ZERO; out_features * in_features];
+            WeightRef::Bf16(Matrix::new(&narrow, in_features))
         }
     };
     let layer = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]);

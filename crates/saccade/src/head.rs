@@ -8,13 +8,11 @@ use saccade_kernels::{Epilogue, Isa, LinearScratch, silu};
 
 use crate::array::{Array, OwnedArray};
 use crate::cache::Cache;
-use crate::checkpoint::grant;
 use crate::chunking::{Chunking, Seam};
 use crate::config::{HeadConfig, Reads};
 use crate::context::{Context, EncodeBuffers, Seen, VlEncoder, removed_keys};
 use crate::dit::{Dit, DitBuffers, Pass, Rows};
 use crate::error::{Error, Result, show_shape};
-use crate::fit::{self, Problem};
 use crate::intervention::{Changes, Extent, Intervention};
 use crate::layers::{ActionEncoder, CategoryLinear, Engine, TensorSource, sized};
 use crate::layout::{HeadNames, is_unused};
@@ -24,6 +22,8 @@ use crate::reading::HeadTensors;
 use crate::recognise::Published;
 use crate::tables::action_time;
 use crate::trace::{Keep, Recorded, Shapes, StepBlock, Trace, TraceOptions};
+use saccade_checkpoint::granted;
+use saccade_checkpoint::spec::{self, Problem};
 
 /// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
 const CACHED_BRACKETS: usize = 256;
@@ -198,11 +198,14 @@ impl ActionHead {
         let published = Published::open(source, options.config.as_deref())?;
         let embodiment_ids = chosen_embodiments(
             options.embodiment_ids.as_deref(),
-            published.checkpoint.kept_embodiments()?.as_deref(),
+            published.kept_embodiments()?.as_deref(),
             published.config.num_embodiments,
         )?;
         published.check()?;
-        grant(published.nbytes(options.precision, embodiment_ids.len())?)?;
+        granted(
+            "source",
+            published.nbytes(options.precision, embodiment_ids.len())?,
+        )?;
         let Published {
             checkpoint,
             prefix,
@@ -236,7 +239,7 @@ impl ActionHead {
             is_unused(&config, name, shape)
         });
         if !problems.is_empty() {
-            let message = format!("tensors: {}", fit::list(&problems, "the config"));
+            let message = format!("tensors: {}", spec::list(&problems, "the config"));
             let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
             return Err(if problems.iter().all(is_shape) {
                 Error::Shape(message)

@@ -3,15 +3,15 @@
 use std::ops::Range;
 
 use faer::linalg::matmul::matmul;
-use faer::{Accum, Mat, MatMut, MatRef, Par};
+use faer::{Accum, Mat, MatRef, Par};
 use half::bf16;
-use saccade_kernels::{Epilogue, Isa, LinearScratch, PackedLinear, WeightRef};
+use saccade_kernels::{Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef};
 
-use crate::checkpoint::Elements;
 use crate::error::{Error, Result};
 use crate::layout::{CategoryLinearNames, LinearNames, NormNames, Role};
 use crate::precision::Precision;
 use crate::profile::{Part, apply, layer_norm};
+use saccade_checkpoint::Elements;
 
 /// Which instruction set and how many threads the kernels use, and how precisely they compute.
 #[derive(Clone, Copy, Debug)]
@@ -34,14 +34,13 @@ pub(crate) trait TensorSource {
 }
 
 /// `data` as rows of `width`.
-pub(crate) fn rows(data: &[f32], width: usize) -> MatRef<'_, f32> {
-    MatRef::from_row_major_slice(data, data.len() / width, width)
+pub(crate) fn rows(data: &[f32], width: usize) -> Rows<'_> {
+    Rows::new(data, width)
 }
 
 /// `data` as rows of `width`, to be written.
-pub(crate) fn rows_mut(data: &mut [f32], width: usize) -> MatMut<'_, f32> {
-    let count = data.len() / width;
-    MatMut::from_row_major_slice_mut(data, count, width)
+pub(crate) fn rows_mut(data: &mut [f32], width: usize) -> RowsMut<'_> {
+    RowsMut::new(data, width)
 }
 
 /// Sets the length of a buffer that keeps its memory.
@@ -52,16 +51,16 @@ pub(crate) fn sized(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
 
 /// `(out_features, in_features)` as they are stored.
 pub(crate) fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> WeightRef<'_> {
-    match elements {
-        Elements::F32(data) => WeightRef::F32(MatRef::from_row_major_slice(data, out_features, in_features)),
-        Elements::Bf16(data) => {
-            WeightRef::Bf16(MatRef::from_row_major_slice(data, out_features, in_features))
-        }
+    let weight = match elements {
+        Elements::F32(data) => WeightRef::F32(Matrix::new(data, in_features)),
+        Elements::Bf16(data) => WeightRef::Bf16(Matrix::new(data, in_features)),
         Elements::Int8 { values, scales } => WeightRef::Int8 {
-            values: MatRef::from_row_major_slice(values, out_features, in_features),
+            values: Matrix::new(values, in_features),
             scales,
         },
-    }
+    };
+    debug_assert_eq!(weight.shape(), (out_features, in_features));
+    weight
 }
 
 /// Weights stored in-major `(in_features, out_features)`, as the category-specific layers are.
@@ -269,8 +268,13 @@ impl ActionEncoder {
             let time_half = submatrix(in_major_view(&second, 2 * width, width), width, width);
             time.push(Some(pack(engine, Role::Time, &[(time_half, Some(&constant))])?));
 
-            let fused = Mat::from_fn(fused.nrows(), fused.ncols(), |i, j| fused[(i, j)] as f32);
-            pack(engine, Role::Other, &[(WeightRef::F32(fused.as_ref()), None)])
+            let columns = 0..fused.ncols();
+            let fused: Vec<f32> = (0..fused.nrows())
+                .flat_map(|i| columns.clone().map(move |j| (i, j)))
+                .map(|(i, j)| fused[(i, j)] as f32)
+                .collect();
+            let fused = WeightRef::F32(Matrix::new(&fused, columns.len()));
+            pack(engine, Role::Other, &[(fused, None)])
         })?;
         let mut time = time.into_iter();
         let time = CategoryLinear::build(num_embodiments, embodiment_ids, |_| {
@@ -288,10 +292,10 @@ impl ActionEncoder {
 /// Columns `first .. first + count` of a `(out, in)` weight.
 fn submatrix(weight: WeightRef<'_>, first: usize, count: usize) -> WeightRef<'_> {
     match weight {
-        WeightRef::F32(view) => WeightRef::F32(view.subcols(first, count)),
-        WeightRef::Bf16(view) => WeightRef::Bf16(view.subcols(first, count)),
+        WeightRef::F32(view) => WeightRef::F32(view.columns(first..first + count)),
+        WeightRef::Bf16(view) => WeightRef::Bf16(view.columns(first..first + count)),
         WeightRef::Int8 { values, scales } => WeightRef::Int8 {
-            values: values.subcols(first, count),
+            values: values.columns(first..first + count),
             scales,
         },
     }
@@ -299,16 +303,22 @@ fn submatrix(weight: WeightRef<'_>, first: usize, count: usize) -> WeightRef<'_>
 
 fn widened(weight: WeightRef<'_>) -> Mat<f64> {
     match weight {
-        WeightRef::F32(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| f64::from(view[(i, j)])),
-        WeightRef::Bf16(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| view[(i, j)].to_f64()),
-        WeightRef::Int8 { values, scales } => Mat::from_fn(values.nrows(), values.ncols(), |i, j| {
-            f64::from(values[(i, j)]) * f64::from(scales[i])
+        WeightRef::F32(view) => Mat::from_fn(view.num_rows(), view.num_columns(), |i, j| {
+            f64::from(view.get(i, j))
         }),
+        WeightRef::Bf16(view) => Mat::from_fn(view.num_rows(), view.num_columns(), |i, j| {
+            view.get(i, j).to_f64()
+        }),
+        WeightRef::Int8 { values, scales } => {
+            Mat::from_fn(values.num_rows(), values.num_columns(), |i, j| {
+                f64::from(values.get(i, j)) * f64::from(scales[i])
+            })
+        }
     }
 }
 
 fn widened_rows(data: &[f32], width: usize) -> Mat<f64> {
-    widened(WeightRef::F32(rows(data, width)))
+    widened(WeightRef::F32(Matrix::new(data, width)))
 }
 
 fn product(lhs: MatRef<'_, f64>, rhs: MatRef<'_, f64>) -> Mat<f64> {

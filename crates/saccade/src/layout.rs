@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use saccade_checkpoint::{TensorSpec, Wanted};
+
 use crate::config::HeadConfig;
 
 /// `weight (out_features, in_features)` and `bias (out_features)`.
@@ -23,26 +25,6 @@ pub(crate) enum Role {
     Time,
     /// Encoders, decoder and output: under one percent.
     Other,
-}
-
-/// A tensor that a checkpoint must hold.
-#[derive(Clone, Debug)]
-pub(crate) struct TensorSpec {
-    pub name: String,
-    pub shape: Vec<usize>,
-    /// Whether it may be stored as int8 with a scale for each row: the weights that run so.
-    pub may_be_int8: bool,
-    /// Whether its first axis is of embodiments.
-    pub per_embodiment: bool,
-}
-
-/// A tensor to read, or some slices of its first axis.
-#[derive(Clone, Debug)]
-pub(crate) struct Wanted {
-    pub name: String,
-    pub slices: Option<Range<usize>>,
-    /// Whether its memory comes back to be read into again: only what is not kept may be read into larger memory than it needs.
-    pub is_given_back: bool,
 }
 
 /// One linear layer per embodiment: `W (num_embodiments, in_features, out_features)` and `b (num_embodiments, out_features)`.
@@ -258,13 +240,13 @@ impl HeadNames {
             list(&mut tensors);
             order.extend(tensors.into_iter().map(|spec| Wanted {
                 is_given_back: spec.may_be_int8,
-                ..Wanted::whole(spec.name)
+                ..wanted(spec.name)
             }));
         };
         let slices = |order: &mut Vec<Wanted>, layers: &[CategoryLinearNames]| {
             for &id in embodiment_ids {
                 for name in layers.iter().flat_map(|layer| [&layer.weight, &layer.bias]) {
-                    order.push(Wanted::slices(name, id..id + 1));
+                    order.push(wanted_slices(name, id..id + 1));
                 }
             }
         };
@@ -281,10 +263,10 @@ impl HeadNames {
         slices(&mut order, fused);
         slices(&mut order, std::slice::from_ref(last));
         if config.num_future_tokens > 0 {
-            order.push(Wanted::whole(self.future_tokens.0.clone()));
+            order.push(wanted(self.future_tokens.0.clone()));
         }
         if let Some((name, _)) = &self.position_embedding {
-            order.push(Wanted::slices(name, 0..config.action_horizon));
+            order.push(wanted_slices(name, 0..config.action_horizon));
         }
         for layer in &self.timestep_embedder {
             whole(&mut order, &|tensors| layer.list(tensors));
@@ -302,32 +284,18 @@ impl HeadNames {
     }
 }
 
-impl TensorSpec {
-    fn plain(name: &str, shape: &[usize]) -> Self {
-        Self {
-            name: name.to_owned(),
-            shape: shape.to_vec(),
-            may_be_int8: false,
-            per_embodiment: false,
-        }
+fn wanted(name: String) -> Wanted {
+    Wanted {
+        name,
+        slices: None,
+        is_given_back: false,
     }
 }
 
-impl Wanted {
-    pub(crate) fn whole(name: String) -> Self {
-        Self {
-            name,
-            slices: None,
-            is_given_back: false,
-        }
-    }
-
-    pub(crate) fn slices(name: &str, slices: Range<usize>) -> Self {
-        Self {
-            name: name.to_owned(),
-            slices: Some(slices),
-            is_given_back: false,
-        }
+fn wanted_slices(name: &str, slices: Range<usize>) -> Wanted {
+    Wanted {
+        slices: Some(slices),
+        ..wanted(name.to_owned())
     }
 }
 

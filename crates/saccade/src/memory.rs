@@ -8,11 +8,10 @@ use half::slice::HalfBitsSliceExt;
 use half::{bf16, f16};
 use safetensors::Dtype;
 
-use crate::checkpoint::Elements;
 use crate::error::{Error, Result, show_shape};
-use crate::fit::{self, Problem};
 use crate::layers::TensorSource;
-use crate::layout::TensorSpec;
+use saccade_checkpoint::spec::{self, Problem};
+use saccade_checkpoint::{Elements, TensorSpec};
 
 /// The elements of a tensor that someone else holds, row-major.
 #[derive(Clone, Copy, Debug)]
@@ -118,7 +117,7 @@ pub(crate) fn problems(
         Some((tensor.elements.dtype(), tensor.shape.as_slice()))
     };
     let names = tensors.keys().map(String::as_str);
-    fit::problems(names, describe, "", expected, is_unused)
+    spec::problems(names, describe, "", expected, is_unused)
 }
 
 /// Tensors in memory as layers take them: each is copied when it is asked for, and the memory of the last copy is used again.

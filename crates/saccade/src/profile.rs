@@ -3,8 +3,9 @@
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
-use faer::{MatMut, MatRef};
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
+use saccade_kernels::{
+    AllocError, Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, Rows, RowsMut,
+};
 
 use crate::layers::Engine;
 
@@ -139,40 +140,46 @@ pub(crate) fn apply(
     part: Part,
     layer: &PackedLinear,
     threads: usize,
-    x: MatRef<'_, f32>,
+    x: Rows<'_>,
     epilogue: Epilogue,
-    out: MatMut<'_, f32>,
+    out: RowsMut<'_>,
     scratch: &mut LinearScratch,
 ) {
-    let multiply_adds = x.nrows() * layer.in_features() * layer.out_features();
+    let multiply_adds = x.num_rows() * layer.in_features() * layer.out_features();
     counted(part, (multiply_adds, layer.nbytes()), || {
-        layer.apply(threads, x, epilogue, out, scratch);
+        let applied = layer.apply(threads, x, epilogue, out, scratch);
+        applied.unwrap_or_else(|error| out_of_memory(error));
     });
+}
+
+/// Until every caller passes the error on.
+pub(crate) fn out_of_memory(error: AllocError) -> ! {
+    panic!("{error}")
 }
 
 /// [`saccade_kernels::attention`], counted.
 pub(crate) fn attention(
     threads: usize,
-    queries: MatRef<'_, f32>,
+    queries: Rows<'_>,
     kv: &PackedKeyValues,
     scale: f32,
     bias: Option<LogitBias<'_>>,
     weights: Option<&mut [f32]>,
-    out: MatMut<'_, f32>,
+    out: RowsMut<'_>,
 ) {
-    let multiply_adds = 2 * queries.nrows() * kv.len() * queries.ncols();
+    let multiply_adds = 2 * queries.num_rows() * kv.len() * queries.num_columns();
     counted(Part::Attention, (multiply_adds, kv.nbytes()), || {
-        saccade_kernels::attention(threads, queries, kv, scale, bias, weights, out);
+        saccade_kernels::attention(threads, queries, kv, scale, bias.into(), weights, out);
     });
 }
 
 /// [`saccade_kernels::layer_norm`], counted.
 pub(crate) fn layer_norm(
     engine: Engine,
-    x: MatRef<'_, f32>,
+    x: Rows<'_>,
     eps: f32,
     scale_shift: Option<(&[f32], &[f32])>,
-    out: MatMut<'_, f32>,
+    out: RowsMut<'_>,
 ) {
     counted(Part::Norm, (0, 0), || {
         saccade_kernels::layer_norm(engine.isa, engine.threads, x, eps, scale_shift, out);
@@ -184,11 +191,13 @@ pub(crate) fn pack(
     threads: usize,
     packed: &mut PackedKeyValues,
     first: usize,
-    keys: MatRef<'_, f32>,
-    values: MatRef<'_, f32>,
+    keys: Rows<'_>,
+    values: Rows<'_>,
 ) {
     counted(Part::Pack, (0, 0), || match first {
-        0 => packed.pack(threads, keys, values),
+        0 => packed
+            .pack(threads, keys, values)
+            .unwrap_or_else(|error| out_of_memory(error)),
         _ => packed.pack_from(threads, first, keys, values),
     });
 }

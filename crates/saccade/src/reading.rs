@@ -1,102 +1,45 @@
-//! Reading ahead: a thread reads the next tensor while the layers are made of the last one.
+//! A head's tensors in a checkpoint, read ahead while its layers are made.
 
 use std::ops::Range;
-use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
-use std::thread::Builder;
 
-use crate::checkpoint::{Checkpoint, Elements};
+use saccade_checkpoint::{Checkpoint, Elements, ReadAhead, Wanted};
+
 use crate::error::Result;
 use crate::layers::TensorSource;
-use crate::layout::Wanted;
 
-/// A checkpoint in which the head stands under a prefix.
+/// The tensors under a prefix.
 pub(crate) struct HeadTensors<'a> {
-    checkpoint: &'a Checkpoint,
+    tensors: &'a ReadAhead<'a>,
     prefix: &'static str,
-    /// What the thread has read, in the order given to [`HeadTensors::read_ahead`]; none where the system grants no thread.
-    ahead: Option<Receiver<Read>>,
-    /// Memory of tensors that were used, for the thread.
-    spare: Sender<Elements>,
-}
-
-/// A tensor that was asked for, and what came of it.
-struct Read {
-    wanted: Wanted,
-    elements: Result<Elements>,
 }
 
 impl HeadTensors<'_> {
-    /// Calls `load` with tensors that are read ahead in the order `wanted`, in which it must ask for them.
-    ///
-    /// There are at most three tensors in memory: the one that the thread reads, one that waits, and the one that `load` has.
+    /// Calls `load` with tensors that are read ahead in the order `wanted`, whose names are without the prefix.
     pub(crate) fn read_ahead<R>(
         checkpoint: &Checkpoint,
         prefix: &'static str,
-        wanted: Vec<Wanted>,
+        mut wanted: Vec<Wanted>,
         load: impl FnOnce(&HeadTensors<'_>) -> Result<R>,
     ) -> Result<R> {
-        let (sender, receiver) = sync_channel(1);
-        let (spare, used) = channel();
-        std::thread::scope(|scope| {
-            let read = move || read_all(checkpoint, prefix, wanted, &sender, &used);
-            let thread = Builder::new()
-                .name("saccade-read".to_owned())
-                .spawn_scoped(scope, read);
-            // The receiver is dropped with these tensors, before the scope waits for the thread: a load that fails stops the reading.
-            load(&HeadTensors {
-                checkpoint,
-                prefix,
-                ahead: thread.is_ok().then_some(receiver),
-                spare,
-            })
-        })
-    }
-
-    fn take(&self, wanted: Wanted) -> Result<Elements> {
-        let Some(ahead) = &self.ahead else {
-            return read(self.checkpoint, self.prefix, &wanted, None);
-        };
-        let read = ahead.recv().expect("the thread reads all that was wanted");
-        assert_eq!(
-            (&read.wanted.name, &read.wanted.slices),
-            (&wanted.name, &wanted.slices),
-            "tensors are asked for in the order in which they are read"
-        );
-        read.elements
+        for one in &mut wanted {
+            one.name.insert_str(0, prefix);
+        }
+        checkpoint.read_ahead(wanted, |tensors| load(&HeadTensors { tensors, prefix }))
     }
 }
 
 impl TensorSource for HeadTensors<'_> {
     fn tensor(&self, name: &str) -> Result<Elements> {
-        self.take(Wanted::whole(name.to_owned()))
+        Ok(self.tensors.take(&format!("{}{name}", self.prefix), None)?)
     }
 
     fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements> {
-        self.take(Wanted::slices(name, slices))
+        Ok(self
+            .tensors
+            .take(&format!("{}{name}", self.prefix), Some(slices))?)
     }
 
     fn give_back(&self, used: Elements) {
-        // Without a thread nobody takes it.
-        let _ = self.spare.send(used);
+        self.tensors.give_back(used);
     }
-}
-
-fn read_all(
-    checkpoint: &Checkpoint,
-    prefix: &str,
-    wanted: Vec<Wanted>,
-    sender: &SyncSender<Read>,
-    used: &Receiver<Elements>,
-) {
-    for wanted in wanted {
-        let spare = wanted.is_given_back.then(|| used.try_recv().ok()).flatten();
-        let elements = read(checkpoint, prefix, &wanted, spare);
-        if sender.send(Read { wanted, elements }).is_err() {
-            return;
-        }
-    }
-}
-
-fn read(checkpoint: &Checkpoint, prefix: &str, wanted: &Wanted, spare: Option<Elements>) -> Result<Elements> {
-    checkpoint.read_into(&format!("{prefix}{}", wanted.name), wanted.slices.clone(), spare)
 }

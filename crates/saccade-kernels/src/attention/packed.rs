@@ -3,12 +3,11 @@
 use std::marker::PhantomData;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use faer::MatRef;
-
-use crate::aligned::AlignedBuffer;
+use crate::aligned::{AlignedBuffer, AllocError};
 use crate::isa::Isa;
 use crate::linear::Element;
 use crate::pool::parallel_for;
+use crate::rows::Rows;
 use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots, lanes, load};
 
 /// Elements from which packing on a second thread pays.
@@ -17,20 +16,20 @@ const ELEMENTS_FOR_THREADS: usize = 1 << 16;
 /// Keys and values of one sequence, all heads, in the layout that [`attention`](crate::attention()) reads.
 ///
 /// ```
-/// use faer::MatRef;
-/// use saccade_kernels::{Element, Isa, PackedKeyValues};
+/// use saccade_kernels::{Element, Isa, PackedKeyValues, Rows};
 /// let (keys, values) = ([1.0; 12], [2.0; 12]); // three keys of two heads of width 2
 /// let mut kv = PackedKeyValues::new(Isa::best(), Element::Bf16, 2, 2);
-/// kv.pack(1, MatRef::from_row_major_slice(&keys, 3, 4), MatRef::from_row_major_slice(&values, 3, 4));
+/// kv.pack(1, Rows::new(&keys, 4), Rows::new(&values, 4)).unwrap();
 /// assert_eq!(kv.len(), 3);
 /// ```
-#[derive(Clone)]
 pub struct PackedKeyValues {
     isa: Isa,
     element: Element,
-    num_heads: usize,
+    num_kv_heads: usize,
     head_dim: usize,
     len: usize,
+    /// Keys that each head has room for.
+    capacity: usize,
     /// `[head][vector of keys][step of head_dim][lane]`; lanes beyond the last key are zero. A word is an f32, or a pair of bf16, the
     /// even element in its low half: then a step is two elements, and an odd `head_dim` is padded with zero.
     keys: AlignedBuffer<u32>,
@@ -46,76 +45,78 @@ impl PackedKeyValues {
     /// # Panics
     /// If this CPU lacks `isa`, `head_dim` is 0, or `element` is neither [`Element::F32`] nor [`Element::Bf16`].
     #[must_use]
-    pub fn new(isa: Isa, element: Element, num_heads: usize, head_dim: usize) -> Self {
+    pub fn new(isa: Isa, element: Element, num_kv_heads: usize, head_dim: usize) -> Self {
         assert!(head_dim > 0, "head_dim: expected at least 1");
         assert!(isa.is_available(), "this CPU lacks {isa}");
         assert!(
             matches!(element, Element::F32 | Element::Bf16),
             "element: expected F32 or Bf16, got {element:?}"
         );
-        let empty = || AlignedBuffer::zeroed(0);
+        let empty = AlignedBuffer::empty;
         Self {
             isa,
             element,
-            num_heads,
+            num_kv_heads,
             head_dim,
             len: 0,
+            capacity: 0,
             keys: empty(),
             values: empty(),
             finite: true,
         }
     }
 
-    /// Replaces what is held by `keys` and `values`, `(len, num_heads * head_dim)` each, row-major with any row stride.
+    /// Replaces what is held by `keys` and `values`, `(len, num_kv_heads * head_dim)` each, row-major with any row stride.
     /// Memory is claimed only if this needs more than ever before.
     ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; nothing is held then.
+    ///
     /// # Panics
-    /// If a shape does not fit, or columns are not contiguous.
-    pub fn pack(&mut self, threads: usize, keys: MatRef<'_, f32>, values: MatRef<'_, f32>) {
-        self.len = keys.nrows();
-        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
-        reserve(&mut self.keys, self.num_heads * keys_size);
-        reserve(&mut self.values, self.num_heads * values_size);
+    /// If a shape does not fit.
+    pub fn pack(&mut self, threads: usize, keys: Rows<'_>, values: Rows<'_>) -> Result<(), AllocError> {
+        (self.len, self.capacity) = (0, 0);
         self.finite = true;
+        let needed = (
+            self.num_kv_heads * self.keys_of_head(keys.num_rows()),
+            self.num_kv_heads * self.values_of_head(keys.num_rows()),
+        );
+        grow(&mut self.keys, needed.0)?;
+        grow(&mut self.values, needed.1)?;
+        (self.len, self.capacity) = (keys.num_rows(), keys.num_rows());
         self.pack_from(threads, 0, keys, values);
+        Ok(())
     }
 
     /// Replaces the keys and values from number `first` on, all of them to the end, as [`Self::pack`] does; those before it stay.
     ///
     /// # Panics
-    /// If a shape does not fit, or columns are not contiguous.
-    pub fn pack_from(
-        &mut self,
-        threads: usize,
-        first: usize,
-        keys: MatRef<'_, f32>,
-        values: MatRef<'_, f32>,
-    ) {
-        let width = self.num_heads * self.head_dim;
-        let rows = keys.nrows();
+    /// If a shape does not fit.
+    pub fn pack_from(&mut self, threads: usize, first: usize, keys: Rows<'_>, values: Rows<'_>) {
+        let width = self.num_kv_heads * self.head_dim;
+        let rows = keys.num_rows();
         assert_eq!(
             first + rows,
             self.len,
             "keys: expected all that are held from number {first} on"
         );
-        assert_eq!(keys.ncols(), width, "keys: expected num_heads * head_dim columns");
         assert_eq!(
-            (values.nrows(), values.ncols()),
+            keys.num_columns(),
+            width,
+            "keys: expected num_kv_heads * head_dim columns"
+        );
+        assert_eq!(
+            (values.num_rows(), values.num_columns()),
             (rows, width),
             "values: expected the shape of keys"
-        );
-        assert!(
-            keys.col_stride() == 1 || width <= 1,
-            "keys: expected contiguous rows"
-        );
-        assert!(
-            values.col_stride() == 1 || width <= 1,
-            "values: expected contiguous rows"
         );
         if rows == 0 || width == 0 {
             return;
         }
-        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
+        let (keys_size, values_size) = (
+            self.keys_of_head(self.capacity),
+            self.values_of_head(self.capacity),
+        );
         let finite = AtomicBool::new(true);
         let job = Pack {
             keys,
@@ -131,7 +132,7 @@ impl PackedKeyValues {
         } else {
             threads
         };
-        parallel_for(threads, self.num_heads, &|head| {
+        parallel_for(threads, self.num_kv_heads, &|head| {
             // SAFETY: heads write their own parts of the two buffers, which have room for all of them.
             let head = unsafe {
                 Head {
@@ -155,6 +156,59 @@ impl PackedKeyValues {
         self.finite &= finite.into_inner();
     }
 
+    /// Adds `keys` and `values` after those that are held, as [`Self::pack`] would hold all of them together.
+    ///
+    /// Where there is no room left, room for twice as many is made; [`Self::reserve`] makes it ahead.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; what was held then stays.
+    ///
+    /// # Panics
+    /// If a shape does not fit.
+    pub fn append(&mut self, threads: usize, keys: Rows<'_>, values: Rows<'_>) -> Result<(), AllocError> {
+        let (first, len) = (self.len, self.len + keys.num_rows());
+        if len > self.capacity {
+            self.reserve(len.max(2 * self.capacity))?;
+        }
+        self.len = len;
+        self.pack_from(threads, first, keys, values);
+        Ok(())
+    }
+
+    /// Makes room for `capacity` keys, so that [`Self::append`] allocates nothing up to there. [`Self::pack`] gives it up.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; what was held then stays.
+    pub fn reserve(&mut self, capacity: usize) -> Result<(), AllocError> {
+        if capacity <= self.capacity {
+            return Ok(());
+        }
+        let keys = (self.keys_of_head(self.capacity), self.keys_of_head(capacity));
+        let values = (self.values_of_head(self.capacity), self.values_of_head(capacity));
+        let [keys, values] = [(&self.keys, keys), (&self.values, values)].map(|(from, (old, new))| {
+            let mut to = AlignedBuffer::zeroed(self.num_kv_heads * new)?;
+            for head in 0..self.num_kv_heads {
+                to[head * new..][..old].copy_from_slice(&from[head * old..][..old]);
+            }
+            Ok(to)
+        });
+        (self.keys, self.values) = (keys?, values?);
+        self.capacity = capacity;
+        Ok(())
+    }
+
+    /// A copy.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory.
+    pub fn try_clone(&self) -> Result<Self, AllocError> {
+        Ok(Self {
+            keys: self.keys.try_clone()?,
+            values: self.values.try_clone()?,
+            ..*self
+        })
+    }
+
     /// Number of keys.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -167,10 +221,10 @@ impl PackedKeyValues {
         self.len == 0
     }
 
-    /// Number of heads.
+    /// Number of heads of keys and values.
     #[must_use]
-    pub fn num_heads(&self) -> usize {
-        self.num_heads
+    pub fn num_kv_heads(&self) -> usize {
+        self.num_kv_heads
     }
 
     /// Width of a head's queries, keys and values.
@@ -205,14 +259,14 @@ impl PackedKeyValues {
         }
     }
 
-    /// Words of one head's keys.
-    fn keys_of_head(&self) -> usize {
-        self.len.next_multiple_of(lanes(self.isa)) * self.head_dim.div_ceil(self.step())
+    /// Words of one head's keys, where there is room for `capacity` of them.
+    fn keys_of_head(&self, capacity: usize) -> usize {
+        capacity.next_multiple_of(lanes(self.isa)) * self.head_dim.div_ceil(self.step())
     }
 
-    /// Words of one head's values.
-    fn values_of_head(&self) -> usize {
-        self.len.div_ceil(self.step()) * self.value_width()
+    /// Words of one head's values, where there is room for `capacity` of them.
+    fn values_of_head(&self, capacity: usize) -> usize {
+        capacity.div_ceil(self.step()) * self.value_width()
     }
 
     /// Words from one step of keys to the next in the values.
@@ -222,13 +276,13 @@ impl PackedKeyValues {
 
     /// The keys of one head.
     pub(super) fn head_keys(&self, head: usize) -> &[u32] {
-        let size = self.keys_of_head();
+        let size = self.keys_of_head(self.capacity);
         &self.keys[head * size..(head + 1) * size]
     }
 
     /// The values of one head.
     pub(super) fn head_values(&self, head: usize) -> &[u32] {
-        let size = self.values_of_head();
+        let size = self.values_of_head(self.capacity);
         &self.values[head * size..(head + 1) * size]
     }
 
@@ -238,15 +292,16 @@ impl PackedKeyValues {
     }
 }
 
-fn reserve(buffer: &mut AlignedBuffer<u32>, elements: usize) {
+fn grow(buffer: &mut AlignedBuffer<u32>, elements: usize) -> Result<(), AllocError> {
     if buffer.len() < elements {
-        *buffer = AlignedBuffer::zeroed(elements);
+        *buffer = AlignedBuffer::zeroed(elements)?;
     }
+    Ok(())
 }
 
 struct Pack<'a> {
-    keys: MatRef<'a, f32>,
-    values: MatRef<'a, f32>,
+    keys: Rows<'a>,
+    values: Rows<'a>,
     /// Number of the first key given.
     first: usize,
     keys_to: *mut u32,
@@ -379,9 +434,9 @@ impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
 
 impl Head<'_> {
     /// Columns of this head in a row of `of`.
-    fn row(&self, of: MatRef<'_, f32>, index: usize) -> *const f32 {
+    fn row(&self, of: Rows<'_>, index: usize) -> *const f32 {
         of.as_ptr()
-            .wrapping_offset(index as isize * of.row_stride())
+            .wrapping_add(index * of.row_stride())
             .wrapping_add(self.head * self.job.head_dim)
     }
 
@@ -401,7 +456,7 @@ impl Head<'_> {
     #[inline(always)]
     unsafe fn pack_keys<V: Vector, S: Store<V>>(&mut self) {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
-        let len = first + self.job.keys.nrows();
+        let len = first + self.job.keys.num_rows();
         let steps = head_dim.div_ceil(S::STEP);
         for panel in first / V::LANES..len.div_ceil(V::LANES) {
             let keys = panel * V::LANES..(panel + 1) * V::LANES;
@@ -433,7 +488,7 @@ impl Head<'_> {
     #[inline(always)]
     unsafe fn pack_values<V: Vector, S: Store<V>>(&mut self) -> bool {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
-        let len = first + self.job.values.nrows();
+        let len = first + self.job.values.num_rows();
         let width = head_dim.next_multiple_of(V::LANES);
         let mut finite = true;
         for step in first / S::STEP..len.div_ceil(S::STEP) {

@@ -5,7 +5,7 @@ use std::mem::MaybeUninit;
 
 use half::bf16;
 
-use super::{LogitBias, PackedKeyValues};
+use super::{Mask, PackedKeyValues};
 use crate::isa::Isa;
 use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots, load, store};
 
@@ -32,11 +32,13 @@ pub(super) fn tile_rows(isa: Isa) -> usize {
 
 pub(super) struct Job<'a> {
     pub kv: &'a PackedKeyValues,
+    /// Consecutive heads of queries that share a head of keys and values.
+    pub heads_per_kv_head: usize,
     pub queries: *const f32,
     pub queries_stride: isize,
     pub rows: usize,
     pub scale: f32,
-    pub bias: Option<LogitBias<'a>>,
+    pub mask: Mask<'a>,
     pub weights: Option<*mut f32>,
     pub out: *mut f32,
     pub out_stride: isize,
@@ -44,14 +46,6 @@ pub(super) struct Job<'a> {
 
 // SAFETY: tasks read the queries and write different (head, query) parts of `out` and `weights`; all views are borrowed for the whole call.
 unsafe impl Sync for Job<'_> {}
-
-impl Job<'_> {
-    /// The bias of one query, one element per key.
-    fn bias(&self, head: usize, row: usize) -> Option<&[f32]> {
-        let bias = self.bias.as_ref()?;
-        Some(&bias.values[head * bias.head_stride + row * bias.query_stride..][..self.kv.len()])
-    }
-}
 
 /// A few queries of one head.
 pub(super) struct Tile<'a> {
@@ -402,21 +396,25 @@ unsafe fn attend<V: Vector, A: Arithmetic<V>>(tile: &Tile<'_>, columns: &Columns
         sum: 0.0,
     }; MAX_ROWS];
     let running = &mut running[..tile.rows];
-    // Blocks of equal size, so that the last one is not a small rest.
-    let block = match len.div_ceil(KEY_BLOCK) {
-        0 => KEY_BLOCK,
-        blocks => len.div_ceil(blocks).next_multiple_of(V::LANES),
+    let block = match (job.mask, len.div_ceil(KEY_BLOCK)) {
+        // Where a block ends must not depend on how many keys follow.
+        (Mask::Causal { .. }, _) | (_, 0) => KEY_BLOCK,
+        // Blocks of equal size, so that the last one is not a small rest.
+        (_, blocks) => len.div_ceil(blocks).next_multiple_of(V::LANES),
     };
+    // Keys beyond are seen by none of these queries.
+    let visible = job.mask.visible(tile.first + tile.rows - 1, len);
+    let kv_head = tile.head / job.heads_per_kv_head;
     // SAFETY: the scratch holds as many rows as a tile may have, of MAX_DEPTH factors, KEY_BLOCK probabilities and `padded` sums; blocks end at the last key, whose
     // vector is padded in the keys; everything else is the caller's promise.
     unsafe {
         for i in (0..tile.rows * padded).step_by(V::LANES) {
             V::splat(0.0).store(sums.add(i));
         }
-        let keys = kv.head_keys(tile.head).as_ptr();
-        let values = kv.head_values(tile.head).as_ptr().add(columns.first);
-        for first in (0..len).step_by(block) {
-            let count = block.min(len - first);
+        let keys = kv.head_keys(kv_head).as_ptr();
+        let values = kv.head_values(kv_head).as_ptr();
+        for first in (0..visible).step_by(block) {
+            let count = block.min(visible - first);
             for from in (0..kv.head_dim()).step_by(MAX_DEPTH) {
                 let depth = MAX_DEPTH.min(kv.head_dim() - from);
                 // The queries stay for all blocks, unless they are too wide.
@@ -463,7 +461,7 @@ unsafe fn attend<V: Vector, A: Arithmetic<V>>(tile: &Tile<'_>, columns: &Columns
                 rows: tile.rows,
                 factors: probabilities,
                 factors_stride: KEY_BLOCK,
-                b: values.add(first / A::STEP * value_width),
+                b: values.add(first / A::STEP * value_width + columns.first),
                 b_step: value_width,
                 b_vector: V::LANES,
                 depth: count,
@@ -472,7 +470,7 @@ unsafe fn attend<V: Vector, A: Arithmetic<V>>(tile: &Tile<'_>, columns: &Columns
                 vectors: padded / V::LANES,
                 add: true,
             };
-            if kv.is_finite() || job.bias.is_none() {
+            if kv.is_finite() || matches!(job.mask, Mask::None) {
                 A::multiply(&product);
             } else {
                 product.without_removed::<V, A>(tile, first);
@@ -490,8 +488,9 @@ unsafe fn attend<V: Vector, A: Arithmetic<V>>(tile: &Tile<'_>, columns: &Columns
             if columns.first == 0
                 && let Some(weights) = job.weights(tile.head, tile.first + r)
             {
-                for i in (0..len).step_by(V::LANES) {
-                    let (at, lanes) = (weights.add(i), V::LANES.min(len - i));
+                weights.add(visible).write_bytes(0, len - visible);
+                for i in (0..visible).step_by(V::LANES) {
+                    let (at, lanes) = (weights.add(i), V::LANES.min(visible - i));
                     store(load::<V>(at, lanes).div(V::splat(divisor)), at, lanes);
                 }
             }
@@ -561,10 +560,12 @@ impl Row<'_> {
     /// of `V`.
     #[inline(always)]
     unsafe fn softmax<V: Vector, A: Arithmetic<V>>(&self, scores: *mut f32, running: &mut Running) -> f32 {
-        let bias = self
-            .job
-            .bias(self.head, self.query)
-            .map(|bias| bias[self.first..].as_ptr());
+        let len = self.job.kv.len();
+        let bias = self.job.mask.bias(self.head, self.query, len);
+        let bias = bias.map(|bias| bias[self.first..].as_ptr());
+        // Those of the block that this query sees; the rest is as if removed.
+        let seen = self.job.mask.visible(self.query, len).saturating_sub(self.first);
+        let seen = seen.min(self.count);
         // SAFETY: the caller's promise; the bias has `count` elements from here on.
         unsafe {
             let removed = V::splat(f32::NEG_INFINITY);
@@ -577,9 +578,10 @@ impl Row<'_> {
                     logits = logits.add(bias).replace_where(bias, removed);
                     logits.store(scores.add(i));
                 }
-                if lanes < V::LANES {
+                if i + V::LANES > seen {
                     // Lanes beyond the last key: as if removed.
-                    removed.store_partial(scores.add(self.count), V::LANES - lanes);
+                    let from = i.max(seen);
+                    removed.store_partial(scores.add(from), i + V::LANES - from);
                     logits = V::load(scores.add(i));
                 }
                 max = logits.max(max);
@@ -795,8 +797,10 @@ impl Product {
     #[inline(always)]
     unsafe fn without_removed<V: Vector, A: Arithmetic<V>>(&self, tile: &Tile<'_>, first: usize) {
         for r in 0..self.rows {
-            let bias = tile.job.bias(tile.head, tile.first + r);
-            for k in 0..self.depth {
+            let (query, len) = (tile.first + r, tile.job.kv.len());
+            let bias = tile.job.mask.bias(tile.head, query, len);
+            let seen = tile.job.mask.visible(query, len);
+            for k in 0..self.depth.min(seen.saturating_sub(first)) {
                 if bias.is_some_and(|bias| bias[first + k] == f32::NEG_INFINITY) {
                     continue;
                 }

@@ -1,10 +1,9 @@
 //! From weights as they are stored to panels.
 
-use faer::MatRef;
-
-use super::{Element, WeightRef};
+use super::{Element, KernelError, WeightRef};
 use crate::aligned::AlignedBuffer;
-use crate::pool::parallel_for;
+use crate::pool::{Interrupted, is_stopped, parallel_for};
+use crate::rows::Matrix;
 
 /// The panels of `columns` columns of `parts`, stacked; for int8 each column's scale and the sum of its weights, otherwise empty.
 pub(super) fn pack_panels(
@@ -12,7 +11,7 @@ pub(super) fn pack_panels(
     element: Element,
     columns: usize,
     parts: &[(WeightRef<'_>, Option<&[f32]>)],
-) -> (AlignedBuffer<u32>, AlignedBuffer<f32>, AlignedBuffer<i32>) {
+) -> Result<(AlignedBuffer<u32>, AlignedBuffer<f32>, AlignedBuffer<i32>), KernelError> {
     let in_features = parts[0].0.shape().1;
     let out_features: usize = parts.iter().map(|(weight, _)| weight.shape().0).sum();
     let num_panels = out_features.div_ceil(columns);
@@ -22,10 +21,10 @@ pub(super) fn pack_panels(
     } else {
         0
     };
-    // SAFETY: the tasks below write all of it.
-    let mut words = unsafe { AlignedBuffer::unwritten(num_panels * size) };
-    let mut scales = AlignedBuffer::zeroed(int8_columns);
-    let mut sums = AlignedBuffer::zeroed(int8_columns);
+    // SAFETY: the tasks below write all of it; where they were stopped, it is dropped.
+    let mut words = unsafe { AlignedBuffer::unwritten(num_panels * size)? };
+    let mut scales = AlignedBuffer::zeroed(int8_columns)?;
+    let mut sums = AlignedBuffer::zeroed(int8_columns)?;
     let to = To {
         words: words.pointer(),
         scales: scales.as_mut_ptr(),
@@ -51,12 +50,15 @@ pub(super) fn pack_panels(
             let part_end = part_first + weight.shape().0;
             let (from, until) = (part_first.max(first), part_end.min(end));
             if from < until {
-                panel.fill(from - first, weight.subrows(from - part_first, until - from));
+                panel.fill(from - first, weight.rows(from - part_first..until - part_first));
             }
             part_first = part_end;
         }
     });
-    (words, scales, sums)
+    if is_stopped() {
+        return Err(Interrupted.into());
+    }
+    Ok((words, scales, sums))
 }
 
 struct To {
@@ -102,7 +104,9 @@ impl Panel<'_> {
             (Element::Int8, WeightRef::Int8 { values, scales }) => {
                 self.put::<_, 4>(first, values, |_, value| u32::from(value.cast_unsigned()));
                 for (row, sum) in self.sums[first..first + scales.len()].iter_mut().enumerate() {
-                    *sum = (0..values.ncols()).map(|k| i32::from(values[(row, k)])).sum();
+                    *sum = (0..values.num_columns())
+                        .map(|k| i32::from(values.get(row, k)))
+                        .sum();
                 }
                 self.scales[first..first + scales.len()].copy_from_slice(scales);
             }
@@ -110,7 +114,7 @@ impl Panel<'_> {
                 let (rows, inputs) = weight.shape();
                 let (mut values, mut scales) = (vec![0; rows * inputs], vec![0.0; rows]);
                 quantize_rows(weight, &mut values, &mut scales);
-                let values = MatRef::from_row_major_slice(&values, rows, inputs);
+                let values = Matrix::new(&values, inputs);
                 let scales = &scales;
                 self.fill(first, WeightRef::Int8 { values, scales });
             }
@@ -124,12 +128,12 @@ impl Panel<'_> {
     fn put<T: Copy, const STEP: usize>(
         &mut self,
         first: usize,
-        view: MatRef<'_, T>,
+        view: Matrix<'_, T>,
         bits: impl Fn(usize, T) -> u32,
     ) {
         /// Rows, and words of a row: a cache line of each.
         const BLOCK: usize = 16;
-        let (rows, inputs) = (view.nrows(), view.ncols());
+        let (rows, inputs) = (view.num_rows(), view.num_columns());
         let words = inputs.div_ceil(STEP);
         let word = |row: usize, elements: &[T]| {
             let parts = elements.iter().enumerate();
@@ -145,10 +149,10 @@ impl Panel<'_> {
                 let mut block = [[0; BLOCK]; BLOCK];
                 for (index, block) in block[..block_rows].iter_mut().enumerate() {
                     let row = first_row + index;
-                    if view.col_stride() == 1 && k + BLOCK * STEP <= inputs {
-                        // SAFETY: the row has that many elements from `k` on, one beside the other.
-                        let elements =
-                            unsafe { std::slice::from_raw_parts(view.ptr_at(row, k), BLOCK * STEP) };
+                    if let Some(elements) = view.contiguous_row(row)
+                        && k + BLOCK * STEP <= inputs
+                    {
+                        let elements = &elements[k..][..BLOCK * STEP];
                         for (to, elements) in block.iter_mut().zip(elements.chunks_exact(STEP)) {
                             *to = word(row, elements);
                         }
@@ -157,7 +161,7 @@ impl Panel<'_> {
                             let k = k + index * STEP;
                             let count = STEP.min(inputs - k);
                             let elements: [T; STEP] =
-                                std::array::from_fn(|part| view[(row, k + part.min(count - 1))]);
+                                std::array::from_fn(|part| view.get(row, k + part.min(count - 1)));
                             *to = word(row, &elements[..count]);
                         }
                     }
@@ -190,9 +194,8 @@ fn rounded(value: f32) -> u32 {
 /// If `values` or `scales` have another length.
 ///
 /// ```
-/// use faer::MatRef;
-/// use saccade_kernels::{WeightRef, quantize_rows};
-/// let weight = WeightRef::F32(MatRef::from_row_major_slice(&[1.0, -0.5, 0.0, 0.25], 2, 2));
+/// use saccade_kernels::{Matrix, WeightRef, quantize_rows};
+/// let weight = WeightRef::F32(Matrix::new(&[1.0, -0.5, 0.0, 0.25], 2));
 /// let (mut values, mut scales) = ([0; 4], [0.0; 2]);
 /// quantize_rows(weight, &mut values, &mut scales);
 /// assert_eq!((values, scales), ([127, -64, 0, 127], [1.0 / 127.0, 0.25 / 127.0]));
@@ -214,7 +217,9 @@ pub fn quantize_rows(weight: WeightRef<'_>, values: &mut [i8], scales: &mut [f32
     {
         scales.copy_from_slice(from_scales);
         for (row, to) in values.chunks_exact_mut(inputs.max(1)).enumerate() {
-            to.iter_mut().enumerate().for_each(|(k, to)| *to = from[(row, k)]);
+            to.iter_mut()
+                .enumerate()
+                .for_each(|(k, to)| *to = from.get(row, k));
         }
         return;
     }
@@ -244,17 +249,15 @@ pub fn quantize_rows(weight: WeightRef<'_>, values: &mut [i8], scales: &mut [f32
 }
 
 /// Row `row` in float32.
-fn widen<T: Copy>(view: MatRef<'_, T>, row: usize, to: &mut [f32], convert: impl Fn(T) -> f32) {
-    if view.col_stride() == 1 {
-        // SAFETY: a row has as many elements as there are columns, here one beside the other.
-        let from = unsafe { std::slice::from_raw_parts(view.ptr_at(row, 0), view.ncols()) };
+fn widen<T: Copy>(view: Matrix<'_, T>, row: usize, to: &mut [f32], convert: impl Fn(T) -> f32) {
+    if let Some(from) = view.contiguous_row(row) {
         to.iter_mut()
             .zip(from)
             .for_each(|(to, &from)| *to = convert(from));
     } else {
         to.iter_mut()
             .enumerate()
-            .for_each(|(k, to)| *to = convert(view[(row, k)]));
+            .for_each(|(k, to)| *to = convert(view.get(row, k)));
     }
 }
 

@@ -1,18 +1,17 @@
 //! Activations in the element type that a layer multiplies: rounded to bf16, or quantised row by row.
 
-use faer::MatRef;
-
 use super::Arithmetic;
-use crate::aligned::AlignedBuffer;
+use crate::aligned::{AlignedBuffer, AllocError, Zeroable};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
+use crate::rows::Rows;
 use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots, load};
 
 /// Memory for activations on their way through [`PackedLinear::apply`](super::PackedLinear::apply): one for all layers that are called one
 /// after the other. It grows to what the largest of them needs.
 pub struct LinearScratch {
     words: AlignedBuffer<u32>,
-    quantized: Vec<Quantized>,
+    quantized: AlignedBuffer<Quantized>,
 }
 
 /// How a row was quantised: `x = scale * (byte - zero)`.
@@ -21,6 +20,9 @@ pub(super) struct Quantized {
     pub scale: f32,
     pub zero: i32,
 }
+
+// SAFETY: zero bytes are two numbers that are zero.
+unsafe impl Zeroable for Quantized {}
 
 /// Rows in the scratch.
 pub(super) struct Converted<'a> {
@@ -43,15 +45,15 @@ impl LinearScratch {
     #[must_use]
     pub fn new() -> Self {
         Self {
-            words: AlignedBuffer::zeroed(0),
-            quantized: Vec::new(),
+            words: AlignedBuffer::empty(),
+            quantized: AlignedBuffer::empty(),
         }
     }
 
     /// Bytes held.
     #[must_use]
     pub fn nbytes(&self) -> usize {
-        size_of::<u32>() * self.words.len() + size_of::<Quantized>() * self.quantized.capacity()
+        size_of::<u32>() * self.words.len() + size_of::<Quantized>() * self.quantized.len()
     }
 
     /// The rows of `x`, contiguous ones, as the kernels of `isa` want them.
@@ -60,9 +62,9 @@ impl LinearScratch {
         isa: Isa,
         arithmetic: Arithmetic,
         threads: usize,
-        x: MatRef<'_, f32>,
-    ) -> Converted<'_> {
-        let (rows, width) = (x.nrows(), x.ncols());
+        x: Rows<'_>,
+    ) -> Result<Converted<'_>, AllocError> {
+        let (rows, width) = (x.num_rows(), x.num_columns());
         let form = match arithmetic {
             Arithmetic::Int8 => Form::Bytes,
             _ if isa.has_bf16_dot() => Form::Bf16,
@@ -72,10 +74,11 @@ impl LinearScratch {
         let stride = width.div_ceil(form.elements_per_word()).div_ceil(LINE) * LINE;
         let stride = stride | LINE;
         if self.words.len() < rows * stride {
-            self.words = AlignedBuffer::zeroed(rows * stride);
+            self.words = AlignedBuffer::zeroed(rows * stride)?;
         }
-        self.quantized
-            .resize(rows.max(self.quantized.len()), Quantized::default());
+        if self.quantized.len() < rows {
+            self.quantized = AlignedBuffer::zeroed(rows)?;
+        }
         let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).clamp(1, rows.max(1));
         let threads = if rows * width < ELEMENTS_FOR_THREADS {
             1
@@ -84,7 +87,7 @@ impl LinearScratch {
         };
         let job = Job {
             x: x.as_ptr(),
-            x_stride: x.row_stride(),
+            x_stride: x.row_stride() as isize,
             width,
             form,
             words: self.words.as_mut_ptr(),
@@ -103,11 +106,11 @@ impl LinearScratch {
                 _ => dispatch(isa, part),
             }
         });
-        Converted {
+        Ok(Converted {
             words: self.words.as_ptr(),
             stride,
             quantized: &self.quantized,
-        }
+        })
     }
 }
 

@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use serde_json::value::RawValue;
 
-use crate::checkpoint::UniqueMap;
 use crate::error::{Error, Result};
+use saccade_checkpoint::UniqueMap;
 
 /// A value in a config.
 pub(super) struct Place<'a> {

@@ -11,19 +11,22 @@ mod plan;
 
 use std::path::Path;
 
+use saccade_checkpoint::OWN_CONFIG;
+
 use crate::error::{Error, Result};
 use crate::layout::FUTURE_TOKENS;
 use crate::rewrite::convert::Float;
 use crate::rewrite::{RewriteOptions, Source, Written};
-use crate::writer::OWN_CONFIG;
-
 use merge::resized;
-pub use merge::{MergedTokens, merge_future_tokens};
 use perturb::perturb;
-pub(crate) use plan::plan;
+use plan::plan;
+
+pub use merge::{MergedTokens, merge_future_tokens};
+pub use plan::resized_config;
 
 /// How a checkpoint is resized.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ResizeOptions {
     /// What is common to all rewriting.
     pub rewrite: RewriteOptions,
@@ -33,6 +36,19 @@ pub struct ResizeOptions {
     pub perturbation: f64,
     /// Of what is added.
     pub seed: u64,
+}
+
+impl ResizeOptions {
+    /// A copy with this number of future tokens and nothing added to them, to be changed field by field.
+    #[must_use]
+    pub fn new(rewrite: RewriteOptions, num_future_tokens: usize) -> Self {
+        Self {
+            rewrite,
+            num_future_tokens,
+            perturbation: 0.0,
+            seed: 0,
+        }
+    }
 }
 
 /// What [`resize`] wrote.
@@ -76,7 +92,7 @@ pub fn resize(
     let config = &source.config;
     let plan = plan(config, &source.given_config, options.num_future_tokens)?;
     let name = format!("{}{FUTURE_TOKENS}", source.prefix);
-    let tokens = source.checkpoint.read(&name)?.into_f32();
+    let tokens = source.checkpoint.read(&name)?.try_into_f32()?;
     if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
         return Err(Error::Checkpoint(format!(
             "source: {name} holds {bad}, expected finite numbers"
@@ -116,7 +132,7 @@ pub fn resize(
     let rewrite = &options.rewrite;
     let written = source.write(out, rewrite, &small, planned, &mut progress, |other, writer| {
         if other == name {
-            writer.tensor(&name, &bytes)
+            Ok(writer.tensor(&name, &bytes)?)
         } else {
             source.copy(other, writer)
         }

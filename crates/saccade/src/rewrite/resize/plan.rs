@@ -17,8 +17,18 @@ const COUNT_KEY: &str = "num_target_vision_tokens";
 const OWN_KEY: &str = "saccade";
 const BIAS_KEY: &str = "future_key_bias";
 
+/// The text of a config, which holds the head's, for `num_future_tokens` tokens without biases; all else is as it is written.
+///
+/// # Errors
+/// [`Error::Checkpoint`] for a config that is broken, says different numbers or is of a version without future tokens; [`Error::Input`] for a
+/// number out of range.
+pub fn resized_config(config_json: &str, num_future_tokens: usize) -> Result<String> {
+    let config = HeadConfig::from_json(config_json)?;
+    Ok(plan(&config, config_json, num_future_tokens)?.config(None).0)
+}
+
 /// What changes in a checkpoint's config: what can be said without its tensors.
-pub(crate) struct Plan {
+pub(super) struct Plan {
     given: String,
     count: usize,
     /// Where the number of future tokens stands.
@@ -40,7 +50,7 @@ struct Object {
 /// # Errors
 /// [`Error::Checkpoint`] for a version without future tokens, a head that has none, and numbers that contradict each other;
 /// [`Error::Input`] for a count out of range.
-pub(crate) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Plan> {
+pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Plan> {
     let bad = |problem: String| Err(Error::Checkpoint(problem));
     let before = config.num_future_tokens;
     if config.version != "n1.5" {
@@ -110,7 +120,7 @@ pub(crate) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
 
 impl Plan {
     /// The text of the new `config.json`, and that of a file of saccade's own beside it if the bias has no place in there.
-    pub(crate) fn config(&self, bias: Option<&[f32]>) -> (String, Option<String>) {
+    pub(super) fn config(&self, bias: Option<&[f32]>) -> (String, Option<String>) {
         let count = self.count.to_string();
         let mut edits: Vec<(Range<usize>, String)> = self
             .counts
