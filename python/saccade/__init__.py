@@ -67,41 +67,9 @@ _SUBMODULES = (
     "torch",
 )
 
-if TYPE_CHECKING:
-    from saccade import (
-        bench as bench,
-    )
-    from saccade import (
-        checkpoints as checkpoints,
-    )
-    from saccade import (
-        comparison as comparison,
-    )
-    from saccade import (
-        integrations as integrations,
-    )
-    from saccade import (
-        maps as maps,
-    )
-    from saccade import (
-        observation as observation,
-    )
-    from saccade import (
-        reference as reference,
-    )
-    from saccade import (
-        robots as robots,
-    )
-    from saccade import (
-        sim as sim,
-    )
-    from saccade import (
-        study as study,
-    )
-    from saccade import (
-        torch as torch,
-    )
-else:  # so that a type checker still reports names that do not exist
+if (
+    not TYPE_CHECKING
+):  # a type checker asks for `import saccade.reference`, and reports names that do not exist
 
     def __getattr__(name: str) -> Any:
         if name in _SUBMODULES:
