@@ -67,9 +67,8 @@ _SUBMODULES = (
     "torch",
 )
 
-if (
-    not TYPE_CHECKING
-):  # a type checker asks for `import saccade.reference`, and reports names that do not exist
+# Hidden from type checkers, so that they report names that do not exist. They need `import saccade.reference`.
+if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
         if name in _SUBMODULES:
