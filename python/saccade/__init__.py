@@ -67,7 +67,7 @@ _SUBMODULES = (
     "torch",
 )
 
-# Hidden from type checkers, so that they report names that do not exist. They need `import saccade.reference`.
+# Hidden from type checkers, so that they report names that do not exist; they need `import saccade.sim`.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
