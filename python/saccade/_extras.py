@@ -45,7 +45,7 @@ INCLUDES: dict[str, tuple[str, ...]] = {
     "ray": ("study", "sim", "cli", "torch"),
 }
 
-#: A message lists so many missing modules by name.
+#: Number of missing modules that a message names.
 SHOWN = 3
 
 
