@@ -11,14 +11,15 @@ use numpy::{
     Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
     PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyFileNotFoundError;
+use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyMemoryError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
 use saccade::{
-    Arithmetic, Array, Checkpoint, Chunking, ConvertOptions, ElementsRef, Error, Features, Group, Integrator,
-    Isa, Keep, LoadOptions, OwnedArray, Part, Patch, Profile, Recorded, ResizeOptions, RewriteOptions,
-    Sampling, TensorFacts, TensorView, TensorViews, Tokens, TraceOptions, Written, peak,
+    Arithmetic, Array, ArrayMut, Checkpoint, Chunking, ConvertOptions, ElementsRef, Error, Features, Group,
+    Integrator, Isa, Keep, KeyOptions, LoadOptions, NoisyActions, OwnedArray, Part, Patch, Profile, Recorded,
+    ResizeOptions, RewriteOptions, Sampling, TensorFacts, TensorView, TensorViews, Tokens, TraceOptions,
+    Written, peak,
 };
 
 /// The exception class of `saccade.errors` with this name.
@@ -38,6 +39,8 @@ fn raise(error: Error) -> PyErr {
     Python::attach(|py| {
         let class = match error {
             Error::NotFound { .. } => return PyFileNotFoundError::new_err(message),
+            Error::Memory { .. } => return PyMemoryError::new_err(message),
+            Error::Interrupted => return PyKeyboardInterrupt::new_err(()),
             Error::Shape(_) => exception(py, &SHAPE, "ShapeError"),
             Error::Checkpoint(_) | Error::Output(_) => exception(py, &CHECKPOINT, "CheckpointError"),
             _ => exception(py, &INPUT, "InputError"),
@@ -48,7 +51,12 @@ fn raise(error: Error) -> PyErr {
 
 /// A view of an array that the Python package made C-contiguous.
 fn view<'a, T: Element>(array: &'a PyReadonlyArrayDyn<'_, T>) -> PyResult<Array<'a, T>> {
-    Ok(Array::new(array.as_slice()?, array.shape()))
+    Array::new(array.as_slice()?, array.shape()).map_err(raise)
+}
+
+/// As [`view`], to be written; `shape` is the array's.
+fn view_mut<'a>(array: &'a mut PyReadwriteArrayDyn<'_, f32>, shape: &'a [usize]) -> PyResult<ArrayMut<'a>> {
+    ArrayMut::new(array.as_slice_mut()?, shape).map_err(raise)
 }
 
 fn optional_view<'a, T: Element>(
@@ -87,7 +95,7 @@ fn tokens((name, indices): PyTokens) -> PyResult<Tokens> {
 }
 
 fn owned(array: &PyReadonlyArrayDyn<'_, f32>) -> PyResult<OwnedArray> {
-    Ok(OwnedArray::new(array.as_slice()?.to_vec(), array.shape()))
+    OwnedArray::new(array.as_slice()?.to_vec(), array.shape()).map_err(raise)
 }
 
 fn intervention(given: PyIntervention<'_>) -> PyResult<saccade::Intervention> {
@@ -130,7 +138,8 @@ fn recorded<'py, Place: IntoPyObject<'py>>(
     let to_dict = |arrays: BTreeMap<Place, OwnedArray>| {
         let dict = PyDict::new(py);
         for (place, array) in arrays {
-            dict.set_item(place, to_numpy(py, array.data, &array.shape)?)?;
+            let (data, shape) = array.into_parts();
+            dict.set_item(place, to_numpy(py, data, &shape)?)?;
         }
         Ok::<_, PyErr>(dict)
     };
@@ -197,14 +206,16 @@ fn held_tensors<'py>(tensors: &Bound<'py, PyDict>) -> PyResult<Vec<(String, PyTe
 fn tensor_views<'a>(held: &'a [(String, PyTensor<'_>)]) -> PyResult<TensorViews<'a>> {
     let view = |tensor: &'a PyTensor<'_>| {
         Ok::<_, PyErr>(match tensor {
-            PyTensor::Float32(array) => TensorView::new(array.shape(), ElementsRef::F32(array.as_slice()?)),
+            PyTensor::Float32(array) => {
+                TensorView::new(array.shape(), ElementsRef::F32(array.as_slice()?)).map_err(raise)?
+            }
             PyTensor::Half((dtype, array)) => {
                 let bits = array.as_slice()?;
                 let elements = match dtype.as_str() {
                     "bfloat16" => ElementsRef::Bf16(bits),
                     _ => ElementsRef::F16(bits),
                 };
-                TensorView::new(array.shape(), elements)
+                TensorView::new(array.shape(), elements).map_err(raise)?
             }
         })
     };
@@ -266,12 +277,11 @@ impl ActionHead {
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = LoadOptions {
-            config,
-            embodiment_ids,
-            precision: precision.parse().map_err(raise)?,
-            num_threads,
-        };
+        let options = LoadOptions::default()
+            .with_config(config)
+            .with_embodiment_ids(embodiment_ids)
+            .with_precision(precision.parse().map_err(raise)?)
+            .with_num_threads(num_threads);
         py.detach(|| saccade::ActionHead::load(&source, &options))
             .map(Self)
             .map_err(raise)
@@ -286,12 +296,11 @@ impl ActionHead {
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = LoadOptions {
-            config: Some(config),
-            embodiment_ids,
-            precision: precision.parse().map_err(raise)?,
-            num_threads,
-        };
+        let options = LoadOptions::default()
+            .with_config(config)
+            .with_embodiment_ids(embodiment_ids)
+            .with_precision(precision.parse().map_err(raise)?)
+            .with_num_threads(num_threads);
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
         py.detach(|| saccade::ActionHead::from_tensors(&views, &options))
@@ -310,7 +319,7 @@ impl ActionHead {
 
     fn future_tokens<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let tokens = self.0.future_tokens();
-        to_numpy(py, tokens.data.to_vec(), tokens.shape)
+        to_numpy(py, tokens.data().to_vec(), tokens.shape())
     }
 
     #[getter]
@@ -356,13 +365,11 @@ impl ActionHead {
         attention: bool,
         hidden: bool,
     ) -> PyResult<(Context, PyRecorded<'py>)> {
-        let features = Features {
-            backbone_features: view(&backbone_features)?,
-            attention_mask: optional_view(&attention_mask)?,
-            image_mask: optional_view(&image_mask)?,
-            drop_vl: optional_view(&drop_vl)?,
-            record: Keep { attention, hidden },
-        };
+        let features = Features::new(view(&backbone_features)?)
+            .with_attention_mask(optional_view(&attention_mask)?)
+            .with_image_mask(optional_view(&image_mask)?)
+            .with_drop_vl(optional_view(&drop_vl)?)
+            .with_record(Keep { attention, hidden });
         let mut context = py.detach(|| self.0.encode(&features)).map_err(raise)?;
         let kept = recorded(py, context.take_recorded())?;
         Ok((Context(Arc::new(context)), kept))
@@ -386,23 +393,25 @@ impl ActionHead {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
-        let (context, out) = (&context.0, out.as_slice_mut()?);
-        let sampling = Sampling {
-            num_steps,
-            integrator: Integrator::from_name(integrator).map_err(raise)?,
-            num_samples,
-            future_refresh,
-            chunking: optional_view(&previous_chunk)?.zip(chunking).map(
-                |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
-                    previous_chunk,
-                    overlap,
-                    frozen,
-                    ramp_rate,
-                    horizon,
-                },
-            ),
-            interventions: &interventions(intervention)?,
-        };
+        let shape = out.shape().to_vec();
+        let (context, out) = (&context.0, view_mut(&mut out, &shape)?);
+        let chunking = optional_view(&previous_chunk)?.zip(chunking).map(
+            |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
+                previous_chunk,
+                overlap,
+                frozen,
+                ramp_rate,
+                horizon,
+            },
+        );
+        let interventions = interventions(intervention)?;
+        let sampling = Sampling::default()
+            .with_num_steps(num_steps)
+            .with_integrator(Integrator::from_name(integrator).map_err(raise)?)
+            .with_num_samples(num_samples)
+            .with_future_refresh(future_refresh)
+            .with_chunking(chunking)
+            .with_interventions(&interventions);
         py.detach(|| {
             self.0
                 .sample(context, state, embodiment_id, noise, &sampling, out)
@@ -428,17 +437,14 @@ impl ActionHead {
     ) -> PyResult<(PyRecorded<'py>, Bound<'py, PyDict>, Bound<'py, PyArrayDyn<f32>>)> {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
         let context = &context.0;
-        let sampling = Sampling {
-            num_steps,
-            interventions: &interventions(intervention)?,
-            ..Sampling::default()
-        };
-        let options = TraceOptions {
-            record: Keep { attention, hidden },
-            blocks,
-            steps,
-            max_bytes,
-        };
+        let interventions = interventions(intervention)?;
+        let sampling = Sampling::default()
+            .with_num_steps(num_steps)
+            .with_interventions(&interventions);
+        let options = TraceOptions::new(Keep { attention, hidden })
+            .with_blocks(blocks)
+            .with_steps(steps)
+            .with_max_bytes(max_bytes);
         let trace = py
             .detach(|| {
                 self.0
@@ -450,7 +456,8 @@ impl ActionHead {
             let range = trace.groups.range(group);
             rows.set_item(group.name(), (range.start, range.end))?;
         }
-        let actions = to_numpy(py, trace.actions.data, &trace.actions.shape)?;
+        let (actions, shape) = trace.actions.into_parts();
+        let actions = to_numpy(py, actions, &shape)?;
         Ok((recorded(py, trace.recorded)?, rows, actions))
     }
 
@@ -467,19 +474,16 @@ impl ActionHead {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let (state, embodiment_id) = (view(&state)?, view(&embodiment_id)?);
-        let (actions, timestep) = (view(&actions)?, view(&timestep)?);
-        let (context, out) = (&context.0, out.as_slice_mut()?);
+        let noisy = NoisyActions {
+            actions: view(&actions)?,
+            timestep: view(&timestep)?,
+        };
+        let shape = out.shape().to_vec();
+        let (context, out) = (&context.0, view_mut(&mut out, &shape)?);
         let interventions = interventions(intervention)?;
         py.detach(|| {
-            self.0.velocity(
-                context,
-                state,
-                embodiment_id,
-                actions,
-                timestep,
-                &interventions,
-                out,
-            )
+            self.0
+                .velocity(context, state, embodiment_id, noisy, &interventions, out)
         })
         .map_err(raise)
     }
@@ -567,13 +571,17 @@ impl CrossAttention {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let hidden_states = view(&hidden_states)?;
-        let (key_mask, key_bias) = (optional_view(&key_mask)?, optional_view(&key_bias)?);
-        let weights = weights
-            .as_mut()
-            .map(|weights| weights.as_slice_mut())
-            .transpose()?;
-        let (kv, out) = (&kv.0, out.as_slice_mut()?);
-        py.detach(|| self.0.attend(hidden_states, kv, key_mask, key_bias, weights, out))
+        let keys = KeyOptions::default()
+            .with_key_mask(optional_view(&key_mask)?)
+            .with_key_bias(optional_view(&key_bias)?);
+        let weights_shape = weights.as_ref().map(|weights| weights.shape().to_vec());
+        let weights = match (&mut weights, &weights_shape) {
+            (Some(weights), Some(shape)) => Some(view_mut(weights, shape)?),
+            _ => None,
+        };
+        let shape = out.shape().to_vec();
+        let (kv, out) = (&kv.0, view_mut(&mut out, &shape)?);
+        py.detach(|| self.0.attend(hidden_states, kv, keys, weights, out))
             .map_err(raise)
     }
 }

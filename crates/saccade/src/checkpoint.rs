@@ -21,7 +21,7 @@ use crate::companions::is_processor;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, show_shape};
 use crate::fit::{self, Problem};
-use crate::layout::{is_unused, tensor_specs};
+use crate::head::plan::{is_unused, tensor_specs};
 
 /// A longer header, index or config is hostile: the released head has 314 tensors in 40 kB.
 const MAX_HEADER_BYTES: u64 = 100_000_000;

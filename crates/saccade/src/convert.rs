@@ -8,8 +8,8 @@ use safetensors::Dtype;
 
 use crate::checkpoint::{KEPT_EMBODIMENTS, SCALE_SUFFIX};
 use crate::error::{Error, Result};
-use crate::head::chosen_embodiments;
-use crate::layout::tensor_specs;
+use crate::head::embodiments::chosen_embodiments;
+use crate::head::plan::tensor_specs;
 use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::CheckpointWriter;
 

@@ -23,6 +23,17 @@ pub enum Error {
     /// A file that cannot be written.
     #[error("{}", printable(.0))]
     Output(String),
+    /// Memory that the system refused.
+    #[error("{what}: cannot allocate {bytes} bytes of memory")]
+    Memory {
+        /// What it was for.
+        what: &'static str,
+        /// How much was asked for.
+        bytes: usize,
+    },
+    /// The call was stopped by [`interruptible`](crate::interruptible).
+    #[error("the call was interrupted")]
+    Interrupted,
     /// A path that is not there.
     #[error("{what}: no such file or directory: {}", printable(&path.to_string_lossy()))]
     NotFound {

@@ -8,8 +8,9 @@ use safetensors::Dtype;
 
 use crate::checkpoint::{Checkpoint, SCALE_SUFFIX};
 use crate::error::{Error, Result};
-use crate::layers::weight_view;
-use crate::layout::{TensorSpec, tensor_specs};
+use crate::head::plan::tensor_specs;
+use crate::layout::TensorSpec;
+use crate::nn::weights::weight_view;
 use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::{CheckpointWriter, Planned};
 

@@ -1,13 +1,12 @@
 //! Reading ahead: a thread reads the next tensor while the layers are made of the last one.
 
-use std::ops::Range;
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::Builder;
 
 use crate::checkpoint::{Checkpoint, Elements};
 use crate::error::Result;
-use crate::layers::TensorSource;
 use crate::layout::Wanted;
+use crate::nn::weights::{Request, Source, Tensor};
 
 /// A checkpoint in which the head stands under a prefix.
 pub(crate) struct HeadTensors<'a> {
@@ -66,13 +65,22 @@ impl HeadTensors<'_> {
     }
 }
 
-impl TensorSource for HeadTensors<'_> {
-    fn tensor(&self, name: &str) -> Result<Elements> {
-        self.take(Wanted::whole(name.to_owned()))
-    }
-
-    fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements> {
-        self.take(Wanted::slices(name, slices))
+impl Source for HeadTensors<'_> {
+    fn tensor(&self, request: &Request) -> Result<Tensor> {
+        let Request {
+            spec,
+            slices,
+            is_given_back,
+        } = request;
+        if spec.shape.contains(&0) {
+            return Ok(Tensor::Held(Elements::F32(Vec::new())));
+        }
+        let elements = self.take(Wanted {
+            name: spec.name.clone(),
+            slices: slices.clone(),
+            is_given_back: *is_given_back,
+        })?;
+        Ok(Tensor::Held(elements))
     }
 
     fn give_back(&self, used: Elements) {

@@ -14,7 +14,7 @@ use crate::checkpoint::UniqueMap;
 use crate::config::HeadConfig;
 use crate::convert::Float;
 use crate::error::{Error, Result};
-use crate::layout::FUTURE_TOKENS;
+use crate::head::plan::FUTURE_TOKENS;
 use crate::rewrite::{RewriteOptions, Source, Written};
 use crate::writer::OWN_CONFIG;
 

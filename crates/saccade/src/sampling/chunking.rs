@@ -1,4 +1,4 @@
-//! Real-time chunking (spec 5.2): a chunk begins as the last one ended, and moves away from it only as far as the robot still can.
+//! Real-time chunking (spec 5.2): a chunk begins with the end of the previous one.
 
 use crate::array::Array;
 use crate::config::HeadConfig;
@@ -56,7 +56,7 @@ impl<'a> Chunking<'a> {
             )));
         }
         let widths = [config.encoder_action_dim, config.action_dim];
-        match *self.previous_chunk.shape {
+        match *self.previous_chunk.shape() {
             [given, rows, width]
                 if given == batch
                     && (horizon..=config.action_horizon).contains(&rows)
@@ -69,7 +69,7 @@ impl<'a> Chunking<'a> {
                 return Err(Error::Shape(format!(
                     "previous_chunk: expected (batch, rows, width) with batch {batch}, {horizon} to {} rows and width {widths}, got {}",
                     config.action_horizon,
-                    show_shape(self.previous_chunk.shape)
+                    show_shape(self.previous_chunk.shape())
                 )));
             }
         }
@@ -86,9 +86,9 @@ impl<'a> Chunking<'a> {
 impl Seam<'_> {
     /// Writes what is taken over into chunks `x (batch, samples, horizon, width)`; what it is too narrow for becomes zero.
     pub(crate) fn begin(&self, samples: usize, horizon: usize, width: usize, x: &mut [f32]) {
-        let (rows, given) = (self.previous.shape[1], self.previous.shape[2]);
+        let (rows, given) = (self.previous.shape()[1], self.previous.shape()[2]);
         for (index, chunk) in x.chunks_exact_mut(horizon * width).enumerate() {
-            let previous = &self.previous.data[(index / samples * rows + self.first) * given..];
+            let previous = &self.previous.data()[(index / samples * rows + self.first) * given..];
             for (row, previous) in chunk
                 .chunks_exact_mut(width)
                 .zip(previous.chunks_exact(given))
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     fn strengths(frozen: usize, overlap: usize, ramp_rate: f64) -> Vec<f32> {
-        let previous = Array::new(&[], &[0, 0, 0]);
+        let previous = Array::new(&[], &[0, 0, 0]).unwrap();
         let seam = Seam {
             previous,
             first: 0,

@@ -1,18 +1,20 @@
-//! Cross-attention alone: the layer in which state, future and action rows look at the vision-language tokens.
+//! Cross-attention on its own: the layer in which state, future and action rows attend to the vision-language tokens.
 
 use std::sync::Mutex;
 
 use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
 
-use crate::array::Array;
-use crate::attention::{Attention, AttentionBuffers, Bias};
+use crate::alloc::{collected, filled, product};
+use crate::array::{Array, ArrayMut};
+use crate::engine::Engine;
 use crate::error::{Error, Result, show_shape};
 use crate::fit;
-use crate::head::engine;
-use crate::layers::Engine;
-use crate::layout::AttentionNames;
 use crate::memory::{self, MemorySource, TensorViews};
+use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys};
+use crate::nn::planner::Planner;
+use crate::nn::weights::{Builder, Source};
 use crate::precision::Precision;
+use crate::profile::Part;
 
 /// Projected keys and values of a batch: immutable, for any number of calls.
 pub struct KeyValues {
@@ -49,7 +51,38 @@ pub struct CrossAttention {
     engine: Engine,
     num_heads: usize,
     context_dim: usize,
+    nbytes: usize,
     buffers: Mutex<Vec<AttentionBuffers>>,
+}
+
+/// Which keys count, and how much.
+#[derive(Clone, Copy, Debug, Default)]
+#[non_exhaustive]
+pub struct KeyOptions<'a> {
+    /// `(batch, num_vl_tokens)`, true = attended.
+    pub key_mask: Option<Array<'a, bool>>,
+    /// `(batch, num_vl_tokens)`, added to the logits.
+    pub key_bias: Option<Array<'a>>,
+}
+
+impl<'a> KeyOptions<'a> {
+    /// With this mask.
+    #[must_use]
+    pub fn with_key_mask(self, key_mask: impl Into<Option<Array<'a, bool>>>) -> Self {
+        Self {
+            key_mask: key_mask.into(),
+            ..self
+        }
+    }
+
+    /// With this bias.
+    #[must_use]
+    pub fn with_key_bias(self, key_bias: impl Into<Option<Array<'a>>>) -> Self {
+        Self {
+            key_bias: key_bias.into(),
+            ..self
+        }
+    }
 }
 
 impl CrossAttention {
@@ -65,7 +98,7 @@ impl CrossAttention {
         precision: Precision,
         num_threads: Option<usize>,
     ) -> Result<Self> {
-        let engine = engine(precision, num_threads)?;
+        let engine = Engine::new(precision, num_threads)?;
         let axes = |name: &str| memory::shape_of(tensors, name);
         // The sizes come from two of the tensors; the others must agree with them.
         let width = axes("to_q.weight")
@@ -74,8 +107,9 @@ impl CrossAttention {
         let context_dim = axes("to_k.weight")
             .and_then(|shape| shape.get(1).copied())
             .unwrap_or(1);
-        let names = AttentionNames::new("", width, context_dim);
-        let problems = memory::problems(tensors, &names.tensors(), |_, _| false);
+        let planner = Planner::default();
+        attention(&planner, engine, width, context_dim, 1)?;
+        let problems = memory::problems(tensors, &planner.into_plan().specs, |_, _| false);
         if !problems.is_empty() {
             let listed = fit::list(&problems, "the widths of to_q and to_k");
             return Err(Error::Checkpoint(format!("tensors: {listed}")));
@@ -90,9 +124,11 @@ impl CrossAttention {
                 "num_heads: expected a divisor of the width {width}, got {num_heads}"
             )));
         }
-        let attention = Attention::load(&MemorySource::new(tensors), engine, &names, num_heads)?;
+        let source = MemorySource::new(tensors);
+        let (attention, nbytes) = attention(&source, engine, width, context_dim, num_heads)?;
         Ok(Self {
             attention,
+            nbytes,
             engine,
             num_heads,
             context_dim,
@@ -121,7 +157,7 @@ impl CrossAttention {
     /// Bytes of weights in memory.
     #[must_use]
     pub fn nbytes(&self) -> usize {
-        self.attention.nbytes()
+        self.nbytes
     }
 
     /// Attention heads.
@@ -139,11 +175,11 @@ impl CrossAttention {
             self.check_rows("encoder_hidden_states", encoder_hidden_states, self.context_dim)?;
         let packed = self.attention.project(
             self.engine,
-            encoder_hidden_states.data,
-            &vec![num_vl_tokens; batch],
+            encoder_hidden_states.data(),
+            &filled("keys and values", batch, num_vl_tokens)?,
             &mut Vec::new(),
             &mut LinearScratch::new(),
-        );
+        )?;
         Ok(KeyValues {
             batch,
             num_vl_tokens,
@@ -159,17 +195,61 @@ impl CrossAttention {
     /// gets zeros before the output projection. `out` is `(batch, queries, width)`; `weights`, if wanted, `(batch, heads, queries, keys)`.
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit; `out` is then untouched.
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for a result that is not finite, after which
+    /// `out` is zero; [`Error::Memory`].
     pub fn attend(
         &self,
         hidden_states: Array<'_>,
         kv: &KeyValues,
-        key_mask: Option<Array<'_, bool>>,
-        key_bias: Option<Array<'_>>,
-        weights: Option<&mut [f32]>,
-        out: &mut [f32],
+        keys: KeyOptions<'_>,
+        weights: Option<ArrayMut<'_>>,
+        out: ArrayMut<'_>,
     ) -> Result<()> {
-        let (batch, _) = self.check_rows("hidden_states", hidden_states, self.width())?;
+        let (batch, queries) = self.check_rows("hidden_states", hidden_states, self.width())?;
+        self.check_keys(kv, batch)?;
+        let shape = [batch, queries, self.width()];
+        let out = out.check_shape("out", "(batch, queries, width)", &shape)?;
+        let weights = match weights {
+            None => None,
+            Some(weights) => {
+                let shape = [batch, self.num_heads, queries, kv.num_vl_tokens];
+                Some(weights.check_shape("weights", "(batch, heads, queries, keys)", &shape)?)
+            }
+        };
+        let logit_bias = logit_bias([kv.batch, kv.num_vl_tokens], keys.key_mask, keys.key_bias)?;
+        let keys = CrossKeys {
+            packed: &kv.packed,
+            samples: 1,
+            subset: None,
+            bias: Bias {
+                keys: logit_bias.as_deref(),
+                shared: None,
+            },
+        };
+        let (y, engine) = (hidden_states.data(), self.engine);
+        self.with_buffers(|buffers| {
+            self.attention.mix_cross(engine, y, keys, weights, buffers)?;
+            self.attention.out(engine, Epilogue::Store, buffers, out)
+        })?;
+        let result = Array::new(out, &shape)?.check_result("hidden_states");
+        result.map(drop).inspect_err(|_| out.fill(0.0))
+    }
+
+    /// Lends buffers to `call`; their list is never waited for.
+    fn with_buffers(&self, call: impl FnOnce(&mut AttentionBuffers) -> Result<()>) -> Result<()> {
+        let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
+        let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);
+        let result = call(&mut buffers);
+        // Those that grew until memory ran out are not kept.
+        if !matches!(result, Err(Error::Memory { .. }))
+            && let Ok(mut kept) = self.buffers.try_lock()
+        {
+            kept.push(buffers);
+        }
+        result
+    }
+
+    fn check_keys(&self, kv: &KeyValues, batch: usize) -> Result<()> {
         if (kv.num_heads, kv.width) != (self.num_heads, self.width()) {
             return Err(Error::Input(format!(
                 "kv: expected keys and values of {} heads and width {}, got {} and {}",
@@ -185,44 +265,35 @@ impl CrossAttention {
                 kv.batch
             )));
         }
-        let logit_bias = logit_bias([kv.batch, kv.num_vl_tokens], key_mask, key_bias)?;
-        let bias = Bias {
-            keys: logit_bias.as_deref(),
-            shared: None,
-        };
-        let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
-        let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);
-        let (y, engine) = (hidden_states.data, self.engine);
-        self.attention.add_cross(
-            engine,
-            y,
-            &kv.packed,
-            1,
-            None,
-            bias,
-            weights,
-            Epilogue::Store,
-            &mut buffers,
-            out,
-        );
-        if let Ok(mut kept) = self.buffers.try_lock() {
-            kept.push(buffers);
-        }
         Ok(())
     }
 
     fn check_rows(&self, name: &str, array: Array<'_>, width: usize) -> Result<(usize, usize)> {
-        match *array.shape {
+        match *array.shape() {
             [batch, rows, last] if last == width && batch > 0 && rows > 0 => {
                 array.check_finite(name)?;
                 Ok((batch, rows))
             }
             _ => Err(Error::Shape(format!(
                 "{name}: expected (batch, rows, {width}) with at least one row, got {}",
-                show_shape(array.shape)
+                show_shape(array.shape())
             ))),
         }
     }
+}
+
+/// The layer from the tensors of `source`, and the bytes that it holds.
+fn attention(
+    source: &dyn Source,
+    engine: Engine,
+    width: usize,
+    context_dim: usize,
+    num_heads: usize,
+) -> Result<(Attention, usize)> {
+    let builder = Builder::new(source, engine);
+    let weights = builder.weights();
+    let layer = Attention::new(&weights, width, context_dim, num_heads, Part::ContextToKv)?;
+    Ok((layer, builder.nbytes()))
 }
 
 /// Mask and bias in one: minus infinity takes a key away.
@@ -234,11 +305,11 @@ fn logit_bias(
     let axes = "(batch, num_vl_tokens)";
     let mut values = match key_bias {
         None if key_mask.is_none() => return Ok(None),
-        None => vec![0.0; shape[0] * shape[1]],
+        None => filled("key_mask", product("key_mask", &shape)?, 0.0)?,
         Some(bias) => {
             bias.check_shape("key_bias", axes, &shape)?;
             if let Some(bad) = bias
-                .data
+                .data()
                 .iter()
                 .find(|value| value.is_nan() || **value == f32::INFINITY)
             {
@@ -246,12 +317,12 @@ fn logit_bias(
                     "key_bias: expected finite values or minus infinity, got {bad}"
                 )));
             }
-            bias.data.to_vec()
+            collected("key_bias", bias.data().len(), bias.data().iter().copied())?
         }
     };
     if let Some(mask) = key_mask {
         mask.check_shape("key_mask", axes, &shape)?;
-        for (value, &attended) in values.iter_mut().zip(mask.data) {
+        for (value, &attended) in values.iter_mut().zip(mask.data()) {
             if !attended {
                 *value = f32::NEG_INFINITY;
             }

@@ -7,7 +7,7 @@
 const LN_10000: f32 = 9.210_340_5;
 
 /// Width of the time embedding's table.
-pub(crate) const TIME_CHANNELS: usize = crate::layout::TIME_CHANNELS;
+pub(crate) const TIME_CHANNELS: usize = 256;
 
 /// The action encoder's table: `out[0..half] = sin(t freq)`, `out[half..] = cos(t freq)`, `freq_i = exp(-i ln(10000) / half)`.
 pub(crate) fn action_time(timestep: usize, out: &mut [f32]) {

@@ -2,9 +2,11 @@
 
 use std::collections::BTreeMap;
 
+use super::groups::{Groups, check_indices};
+use crate::alloc::reserve;
 use crate::array::OwnedArray;
 use crate::error::{Error, Result};
-use crate::intervention::{Groups, check_indices};
+use crate::ops::check_interrupted;
 
 /// What to keep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -17,6 +19,7 @@ pub struct Keep {
 
 /// What [`ActionHead::trace`](crate::ActionHead::trace) keeps, and how much of it at most.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct TraceOptions {
     /// What to keep.
     pub record: Keep,
@@ -31,16 +34,16 @@ pub struct TraceOptions {
 /// An Euler step and a block of the transformer.
 pub type StepBlock = (usize, usize);
 
-/// What was kept, by place: [`StepBlock`], or the block of the VL self-attention.
+/// What was kept, by [`StepBlock`], or by block of the VL self-attention.
 #[derive(Clone, Debug)]
-pub struct Recorded<Place> {
+pub struct Recorded<Key> {
     /// The probabilities used, `(batch, heads, queries, keys)`; exactly 0 for keys that were cut, dropped or are not seen.
-    pub attention: BTreeMap<Place, OwnedArray>,
+    pub attention: BTreeMap<Key, OwnedArray>,
     /// Rows after the block, `(batch, rows, width)`.
-    pub hidden: BTreeMap<Place, OwnedArray>,
+    pub hidden: BTreeMap<Key, OwnedArray>,
 }
 
-impl<Place> Default for Recorded<Place> {
+impl<Key> Default for Recorded<Key> {
     /// Keeps nothing.
     fn default() -> Self {
         Self {
@@ -50,74 +53,72 @@ impl<Place> Default for Recorded<Place> {
     }
 }
 
-/// What a place would keep: the shapes of its probabilities and rows.
+/// What is kept of a block: the shapes of its probabilities and rows.
 pub(crate) struct Shapes {
     pub attention: [usize; 4],
     pub hidden: [usize; 3],
 }
 
-impl<Place: Ord + Copy> Recorded<Place> {
-    /// Memory for `record` of these places. `argument` is what a caller would change to be allowed more.
+impl<Key: Ord + Copy> Recorded<Key> {
+    /// Memory for `record` of these keys, each a block or a step and a block. `argument` is what a caller would change to be allowed more.
     ///
     /// # Errors
-    /// [`Error::Input`] if that is more than `max_bytes`, before anything is allocated, or does not fit in memory.
+    /// [`Error::Input`] if that is more than `max_bytes`, before anything is allocated; [`Error::Memory`] if the system refuses it.
     pub(crate) fn claim(
         argument: &str,
         record: Keep,
-        places: &[(Place, Shapes)],
+        keys: &[(Key, Shapes)],
         max_bytes: u64,
     ) -> Result<Self> {
         let bytes = |shape: &[usize]| 4 * shape.iter().map(|&size| size as u128).product::<u128>();
-        let of_place = |shapes: &Shapes| {
+        let of_key = |shapes: &Shapes| {
             u128::from(record.attention) * bytes(&shapes.attention)
                 + u128::from(record.hidden) * bytes(&shapes.hidden)
         };
-        let needed: u128 = places.iter().map(|(_, shapes)| of_place(shapes)).sum();
+        let needed: u128 = keys.iter().map(|(_, shapes)| of_key(shapes)).sum();
         if needed > u128::from(max_bytes) {
             return Err(Error::Input(format!(
                 "{argument}: what is to be recorded takes {needed} bytes, expected at most {max_bytes}; record less at a time"
             )));
         }
-        let reserve = |shape: &[usize]| {
+        // All is reserved before any of it is touched: what does not fit is refused at once.
+        let claim = |shape: &[usize]| {
             let mut data: Vec<f32> = Vec::new();
             let elements = shape.iter().product(); // fits: it is below needed, which is at most max_bytes
-            match data.try_reserve_exact(elements) {
-                Ok(()) => Ok((data, shape.to_vec())),
-                Err(_) => Err(Error::Input(format!(
-                    "{argument}: what is to be recorded takes {needed} bytes, which do not fit in memory; record less at a time"
-                ))),
-            }
+            reserve("record", &mut data, elements).map_err(|_| Error::Memory {
+                what: "record",
+                bytes: usize::try_from(needed).unwrap_or(usize::MAX),
+            })?;
+            Ok((data, shape.to_vec()))
         };
-        // All is reserved before any of it is touched: what does not fit is refused at once.
         let (mut attention, mut hidden) = (Vec::new(), Vec::new());
-        for (place, shapes) in places {
+        for (key, shapes) in keys {
             if record.attention {
-                attention.push((*place, reserve(&shapes.attention)?));
+                attention.push((*key, claim(&shapes.attention)?));
             }
             if record.hidden {
-                hidden.push((*place, reserve(&shapes.hidden)?));
+                hidden.push((*key, claim(&shapes.hidden)?));
             }
         }
-        let filled = |(place, (mut data, shape)): (Place, (Vec<f32>, Vec<usize>))| {
+        let zeros = |(key, (mut data, shape)): (Key, (Vec<f32>, Vec<usize>))| {
+            check_interrupted()?;
             data.resize(shape.iter().product(), 0.0);
-            (place, OwnedArray { data, shape })
+            Ok((key, OwnedArray::new(data, &shape)?))
         };
         Ok(Self {
-            attention: attention.into_iter().map(filled).collect(),
-            hidden: hidden.into_iter().map(filled).collect(),
+            attention: attention.into_iter().map(zeros).collect::<Result<_>>()?,
+            hidden: hidden.into_iter().map(zeros).collect::<Result<_>>()?,
         })
     }
 
-    /// Where the probabilities at `place` go, if they are wanted.
-    pub(crate) fn attention(&mut self, place: Place) -> Option<&mut [f32]> {
-        self.attention
-            .get_mut(&place)
-            .map(|array| array.data.as_mut_slice())
+    /// Where the probabilities of `key` go, if they are wanted.
+    pub(crate) fn attention(&mut self, key: Key) -> Option<&mut [f32]> {
+        self.attention.get_mut(&key).map(OwnedArray::data_mut)
     }
 
-    /// Where the rows after `place` go, if they are wanted.
-    pub(crate) fn hidden(&mut self, place: Place) -> Option<&mut [f32]> {
-        self.hidden.get_mut(&place).map(|array| array.data.as_mut_slice())
+    /// Where the rows of `key` go, if they are wanted.
+    pub(crate) fn hidden(&mut self, key: Key) -> Option<&mut [f32]> {
+        self.hidden.get_mut(&key).map(OwnedArray::data_mut)
     }
 }
 
@@ -132,18 +133,56 @@ pub struct Trace {
     pub actions: OwnedArray,
 }
 
+/// What is kept by default at most.
+const MAX_BYTES: u64 = 1 << 31;
+
 impl TraceOptions {
-    /// The places that are kept, of `num_steps` steps and `num_layers` blocks.
+    /// Keeps `record` of all blocks and steps, 2 GiB of it at most.
+    #[must_use]
+    pub fn new(record: Keep) -> Self {
+        Self {
+            record,
+            blocks: None,
+            steps: None,
+            max_bytes: MAX_BYTES,
+        }
+    }
+
+    /// Of these blocks only; none stands for all.
+    #[must_use]
+    pub fn with_blocks(self, blocks: impl Into<Option<Vec<usize>>>) -> Self {
+        Self {
+            blocks: blocks.into(),
+            ..self
+        }
+    }
+
+    /// Of these Euler steps only; none stands for all.
+    #[must_use]
+    pub fn with_steps(self, steps: impl Into<Option<Vec<usize>>>) -> Self {
+        Self {
+            steps: steps.into(),
+            ..self
+        }
+    }
+
+    /// At most this many bytes.
+    #[must_use]
+    pub fn with_max_bytes(self, max_bytes: u64) -> Self {
+        Self { max_bytes, ..self }
+    }
+
+    /// The steps and blocks that are kept, of `num_steps` steps and `num_layers` blocks.
     ///
     /// # Errors
     /// [`Error::Input`] for a step or block that is not there.
-    pub(crate) fn places(&self, num_steps: usize, num_layers: usize) -> Result<Vec<StepBlock>> {
-        let chosen = |name, given: &Option<Vec<usize>>, count| match given {
+    pub(crate) fn chosen(&self, num_steps: usize, num_layers: usize) -> Result<Vec<StepBlock>> {
+        let of = |name, given: &Option<Vec<usize>>, count| match given {
             None => Ok((0..count).collect()),
             Some(indices) => check_indices(name, indices, count).map(|()| indices.clone()),
         };
-        let steps = chosen("steps", &self.steps, num_steps)?;
-        let blocks = chosen("blocks", &self.blocks, num_layers)?;
+        let steps = of("steps", &self.steps, num_steps)?;
+        let blocks = of("blocks", &self.blocks, num_layers)?;
         Ok(steps
             .iter()
             .flat_map(|&step| blocks.iter().map(move |&block| (step, block)))
@@ -162,18 +201,18 @@ mod tests {
 
     #[test]
     fn one_byte_too_much_is_refused() {
-        let places = || {
+        let keys = || {
             [0, 2].map(|block| {
                 let (attention, hidden) = ([2, 3, 4, 5], [2, 4, 7]);
                 (block, Shapes { attention, hidden })
             })
         };
         let bytes = 2 * 4 * (2 * 3 * 4 * 5 + 2 * 4 * 7);
-        let recorded = Recorded::claim("max_bytes", BOTH, &places(), bytes).unwrap();
-        assert_eq!(recorded.attention[&2].shape, [2, 3, 4, 5]);
-        assert_eq!(recorded.hidden[&0].data.len(), 2 * 4 * 7);
+        let recorded = Recorded::claim("max_bytes", BOTH, &keys(), bytes).unwrap();
+        assert_eq!(recorded.attention[&2].shape(), [2, 3, 4, 5]);
+        assert_eq!(recorded.hidden[&0].data().len(), 2 * 4 * 7);
         assert_eq!(
-            Recorded::claim("max_bytes", BOTH, &places(), bytes - 1)
+            Recorded::claim("max_bytes", BOTH, &keys(), bytes - 1)
                 .unwrap_err()
                 .to_string(),
             format!(
@@ -181,7 +220,7 @@ mod tests {
                 bytes - 1
             )
         );
-        let nothing = Recorded::claim("max_bytes", Keep::default(), &places(), 0).unwrap();
+        let nothing = Recorded::claim("max_bytes", Keep::default(), &keys(), 0).unwrap();
         assert!(nothing.attention.is_empty() && nothing.hidden.is_empty());
     }
 
