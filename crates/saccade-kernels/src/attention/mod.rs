@@ -4,17 +4,19 @@
 //! key-major. Both products are the same register tile. Softmax runs over fixed blocks of keys with a running maximum and sum
 //! for each query, so that a query's bits depend on its row, the keys and the instruction set only.
 
+mod arithmetic;
+mod keys_values;
 mod mask;
-mod packed;
+mod product;
+mod softmax;
 mod tile;
 
-use crate::linear::Element;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
-use crate::simd::{dispatch, dispatch_dots};
+use crate::weights::Element;
+pub use keys_values::PackedKeyValues;
 pub use mask::{LogitBias, Mask};
-pub use packed::PackedKeyValues;
-use tile::{Job, Tile, tile_rows};
+use tile::{Bf16Tile, FloatTile, Job, Tile};
 
 /// Multiply-adds from which a second thread pays: some 10 us of one core.
 const MACS_FOR_THREADS: usize = 1 << 19;
@@ -91,7 +93,7 @@ pub fn attention(
         out_stride: out.row_stride() as isize,
         out: out.as_mut_ptr(),
     };
-    let tiles = rows.div_ceil(tile_rows(kv.isa()));
+    let tiles = rows.div_ceil(kv.isa().vectors().tile_rows);
     let threads = if 2 * rows * kv.len() * width < MACS_FOR_THREADS {
         1
     } else {
@@ -109,8 +111,8 @@ pub fn attention(
             rows: end - first,
         };
         match kv.element() {
-            Element::Bf16 => dispatch_dots(kv.isa(), tile),
-            _ => dispatch(kv.isa(), tile),
+            Element::Bf16 => kv.isa().run(Bf16Tile(tile)),
+            _ => kv.isa().run(FloatTile(tile)),
         }
     });
 }

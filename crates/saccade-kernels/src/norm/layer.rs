@@ -1,21 +1,17 @@
 //! LayerNorm over rows, plain or with a scale and a shift applied in the same pass.
 
+use super::split;
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
-use crate::simd::{Kernel, Vector, dispatch, load, store};
-
-/// Elements from which a second thread pays: below, one core is done in less time than it takes to wake another.
-const ELEMENTS_FOR_THREADS: usize = 1 << 16;
-
-/// Elements of one task: long enough that dealing it costs nothing, short enough that threads finish together.
-const ELEMENTS_PER_TASK: usize = 1 << 13;
+use crate::simd::{Kernel, Simd, Vector, load, store};
 
 /// `out = norm(x) * scale + shift`, row by row, with `norm(x) = (x - mean) / sqrt(variance + eps)` over the columns.
 ///
 /// `x` and `out` are `(rows, width)`, row-major with any row stride; `scale` and `shift` have `width` elements and hold for all rows: the
 /// learned affine, or `1 + scale` and `shift` of an adaptive norm. The variance is the mean of squared distances from the mean, in a second
-/// pass over the row, which also finds what rounding has left of the mean: rows far from zero are as exact as others. A row of zero variance gives `shift`; one with NaN or infinity gives NaN.
+/// pass over the row, which also finds what rounding has left of the mean: rows far from zero are as exact as others. A row of zero variance
+/// gives `shift`; one with NaN or infinity gives NaN.
 ///
 /// # Panics
 /// If a shape does not fit, or this CPU lacks `isa`.
@@ -60,22 +56,14 @@ pub fn layer_norm(
         eps,
         scale_shift,
     };
-    let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).min(rows);
-    let threads = if rows * width < ELEMENTS_FOR_THREADS {
-        1
-    } else {
-        threads
-    };
+    let (threads, tasks) = split(threads, rows, width);
     parallel_for(threads, tasks, &|task| {
         let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        dispatch(
-            isa,
-            Part {
-                job: &job,
-                first,
-                end,
-            },
-        );
+        isa.run(Part {
+            job: &job,
+            first,
+            end,
+        });
     });
 }
 
@@ -102,13 +90,13 @@ impl Kernel for Part<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<V: Vector>(self) {
+    unsafe fn run<S: Simd>(self, _: S) {
         for row in self.first..self.end {
             // SAFETY: rows are within the views; the caller has the instruction set.
             unsafe {
                 let x = self.job.x.offset(row as isize * self.job.x_stride);
                 let out = self.job.out.offset(row as isize * self.job.out_stride);
-                norm_row::<V>(self.job, x, out);
+                norm_row::<S::Vector>(self.job, x, out);
             }
         }
     }

@@ -1,14 +1,13 @@
 //! Keys and values in the layout that the tiles read, and how they get there.
 
-use std::marker::PhantomData;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::aligned::{AlignedBuffer, AllocError};
 use crate::isa::Isa;
-use crate::linear::Element;
 use crate::pool::parallel_for;
 use crate::rows::Rows;
-use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots, lanes, load};
+use crate::simd::{Dot, Dots, Kernel, MAX_LANES, Simd, Vector, load};
+use crate::weights::Element;
 
 /// Elements from which packing on a second thread pays.
 const ELEMENTS_FOR_THREADS: usize = 1 << 16;
@@ -47,7 +46,7 @@ impl PackedKeyValues {
     #[must_use]
     pub fn new(isa: Isa, element: Element, num_kv_heads: usize, head_dim: usize) -> Self {
         assert!(head_dim > 0, "head_dim: expected at least 1");
-        assert!(isa.is_available(), "this CPU lacks {isa}");
+        isa.check();
         assert!(
             matches!(element, Element::F32 | Element::Bf16),
             "element: expected F32 or Bf16, got {element:?}"
@@ -146,8 +145,8 @@ impl PackedKeyValues {
                 }
             };
             let head_is_finite = match element {
-                Element::Bf16 => dispatch_dots(isa, head),
-                _ => dispatch(isa, head),
+                Element::Bf16 => isa.run(PairHead(head)),
+                _ => isa.run(WordHead(head)),
             };
             if !head_is_finite {
                 finite.store(false, Ordering::Relaxed);
@@ -261,7 +260,7 @@ impl PackedKeyValues {
 
     /// Words of one head's keys, where there is room for `capacity` of them.
     fn keys_of_head(&self, capacity: usize) -> usize {
-        capacity.next_multiple_of(lanes(self.isa)) * self.head_dim.div_ceil(self.step())
+        capacity.next_multiple_of(self.isa.vectors().lanes) * self.head_dim.div_ceil(self.step())
     }
 
     /// Words of one head's values, where there is room for `capacity` of them.
@@ -271,7 +270,7 @@ impl PackedKeyValues {
 
     /// Words from one step of keys to the next in the values.
     pub(super) fn value_width(&self) -> usize {
-        self.head_dim.next_multiple_of(lanes(self.isa))
+        self.head_dim.next_multiple_of(self.isa.vectors().lanes)
     }
 
     /// The keys of one head.
@@ -321,37 +320,37 @@ struct Head<'a> {
 }
 
 /// As float32.
-impl Kernel for Head<'_> {
-    type Output = bool;
-
-    #[inline(always)]
-    unsafe fn run<V: Vector>(self) -> bool {
-        // SAFETY: the caller has the instruction set.
-        unsafe { self.pack::<V, Words>() }
-    }
-}
+struct WordHead<'a>(Head<'a>);
 
 /// As pairs of bfloat16.
-impl DotKernel for Head<'_> {
+struct PairHead<'a>(Head<'a>);
+
+impl Kernel for WordHead<'_> {
     type Output = bool;
 
-    const DOT: Dot = Dot::Bf16;
-
     #[inline(always)]
-    unsafe fn run<V: Vector, D: Dots<V>>(self) -> bool {
-        // SAFETY: the caller has the instruction set and the dot product.
-        unsafe { self.pack::<V, Pairs<D>>() }
+    unsafe fn run<S: Simd>(self, _: S) -> bool {
+        // SAFETY: called within `Simd::run`.
+        unsafe { self.0.pack::<S, S::Vector, Words>() }
     }
 }
 
-/// Lanes of the widest vector.
-const MAX_LANES: usize = 16;
+impl Kernel for PairHead<'_> {
+    type Output = bool;
+    const DOTS: Option<Dot> = Some(Dot::Bf16);
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self, _: S) -> bool {
+        // SAFETY: called within `Simd::run`.
+        unsafe { self.0.pack::<S, S::Vector, Pairs>() }
+    }
+}
 
 /// How elements become words.
 ///
 /// # Safety
-/// Every method needs a CPU that has the instruction set of `V`, pointers to as many elements as they name, and room for a vector of words.
-trait Store<V: Vector> {
+/// Every method is called within [`Simd::run`] of `S`, with pointers to as many elements as it names, and room for a vector of words.
+trait Store<S: Simd> {
     /// Elements in a word.
     const STEP: usize;
 
@@ -369,7 +368,7 @@ trait Store<V: Vector> {
 /// float32.
 struct Words;
 
-impl<V: Vector> Store<V> for Words {
+impl<S: Simd<Vector = V>, V: Vector> Store<S> for Words {
     const STEP: usize = 1;
 
     #[inline(always)]
@@ -382,7 +381,7 @@ impl<V: Vector> Store<V> for Words {
     unsafe fn across(rows: [Option<*const f32>; 2], count: usize, _: u32, to: *mut u32) {
         if let Some(row) = rows[0] {
             // SAFETY: as above.
-            unsafe { <Self as Store<V>>::along(row, count, to) }
+            unsafe { <Self as Store<S>>::along(row, count, to) }
         }
     }
 
@@ -393,9 +392,9 @@ impl<V: Vector> Store<V> for Words {
 }
 
 /// Pairs of bfloat16.
-struct Pairs<D>(PhantomData<D>);
+struct Pairs;
 
-impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
+impl<S: Simd<Vector = V>, V: Vector> Store<S> for Pairs {
     const STEP: usize = 2;
 
     #[inline(always)]
@@ -404,7 +403,7 @@ impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
         unsafe {
             let first = load::<V>(row, V::LANES.min(count));
             let second = load::<V>(row.wrapping_add(V::LANES), count.saturating_sub(V::LANES));
-            D::store_bf16(first, second, to.cast());
+            S::Dots::store_bf16(first, second, to.cast());
         }
     }
 
@@ -417,7 +416,7 @@ impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
                 Some(row) => load::<V>(row, count),
                 None => V::splat(0.0),
             });
-            D::store_bf16(first, second, halves.as_mut_ptr());
+            S::Dots::store_bf16(first, second, halves.as_mut_ptr());
             std::slice::from_raw_parts_mut(to, V::LANES)
         };
         let (low, high) = halves[..2 * V::LANES].split_at(V::LANES);
@@ -441,23 +440,23 @@ impl Head<'_> {
     }
 
     /// # Safety
-    /// The CPU has the instruction set of `V`, and what `S` needs.
+    /// Called within [`Simd::run`] of `S`.
     #[inline(always)]
-    unsafe fn pack<V: Vector, S: Store<V>>(mut self) -> bool {
+    unsafe fn pack<S: Simd<Vector = V>, V: Vector, W: Store<S>>(mut self) -> bool {
         // SAFETY: the caller's promise.
         unsafe {
-            self.pack_keys::<V, S>();
-            self.pack_values::<V, S>()
+            self.pack_keys::<S, V, W>();
+            self.pack_values::<S, V, W>()
         }
     }
 
     /// # Safety
     /// As [`Self::pack`].
     #[inline(always)]
-    unsafe fn pack_keys<V: Vector, S: Store<V>>(&mut self) {
+    unsafe fn pack_keys<S: Simd<Vector = V>, V: Vector, W: Store<S>>(&mut self) {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
         let len = first + self.job.keys.num_rows();
-        let steps = head_dim.div_ceil(S::STEP);
+        let steps = head_dim.div_ceil(W::STEP);
         for panel in first / V::LANES..len.div_ceil(V::LANES) {
             let keys = panel * V::LANES..(panel + 1) * V::LANES;
             // Lanes before the first key given stay.
@@ -467,10 +466,10 @@ impl Head<'_> {
             for step in (0..steps).step_by(V::LANES) {
                 for (lane, to) in square.iter_mut().enumerate().take(end).skip(start) {
                     let row = self.row(self.job.keys, keys.start + lane - first);
-                    let (from, most) = (step * S::STEP, V::LANES * S::STEP);
+                    let (from, most) = (step * W::STEP, V::LANES * W::STEP);
                     let (row, count) = (row.wrapping_add(from), most.min(head_dim - from));
                     // SAFETY: the row has these elements; the caller has the instruction set.
-                    unsafe { S::along(row, count, to.as_mut_ptr()) };
+                    unsafe { W::along(row, count, to.as_mut_ptr()) };
                 }
                 let to = &mut self.keys_to[(panel * steps + step) * V::LANES..];
                 let count = V::LANES.min(steps - step);
@@ -486,28 +485,28 @@ impl Head<'_> {
     /// # Safety
     /// As [`Self::pack`].
     #[inline(always)]
-    unsafe fn pack_values<V: Vector, S: Store<V>>(&mut self) -> bool {
+    unsafe fn pack_values<S: Simd<Vector = V>, V: Vector, W: Store<S>>(&mut self) -> bool {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
         let len = first + self.job.values.num_rows();
         let width = head_dim.next_multiple_of(V::LANES);
         let mut finite = true;
-        for step in first / S::STEP..len.div_ceil(S::STEP) {
+        for step in first / W::STEP..len.div_ceil(W::STEP) {
             let row = |part: usize| {
-                let key = step * S::STEP + part;
-                (part < S::STEP && first <= key && key < len).then(|| self.row(self.job.values, key - first))
+                let key = step * W::STEP + part;
+                (part < W::STEP && first <= key && key < len).then(|| self.row(self.job.values, key - first))
             };
             let rows = [row(0), row(1)];
             // The key before the first one given may share its words: it stays.
-            let kept = if step * S::STEP < first { 0xffff } else { 0 };
+            let kept = if step * W::STEP < first { 0xffff } else { 0 };
             for column in (0..head_dim).step_by(V::LANES) {
                 let rows = rows.map(|row| row.map(|row| row.wrapping_add(column)));
                 let count = V::LANES.min(head_dim - column);
                 let to = &mut self.values_to[step * width + column..][..V::LANES];
                 // SAFETY: the rows have these elements, and a vector of words fits; the caller has the instruction set.
-                unsafe { S::across(rows, count, kept, to.as_mut_ptr()) };
+                unsafe { W::across(rows, count, kept, to.as_mut_ptr()) };
                 let infinite = to
                     .iter()
-                    .fold(0, |infinite, &word| infinite | u32::from(!S::is_finite(word)));
+                    .fold(0, |infinite, &word| infinite | u32::from(!W::is_finite(word)));
                 finite &= infinite == 0;
             }
         }
