@@ -6,7 +6,7 @@ use saccade_benches::measure::{Contender, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::{Arithmetic, Element, Isa, LogitBias, PackedKeyValues, attention};
+use saccade_kernels::{Arithmetic, Element, Isa, LogitBias, Mask, PackedKeyValues, Rows, RowsMut, attention};
 
 /// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, with one camera and with three, the same of the action
 /// rows alone; self-attention of a VL block; a head of width 128.
@@ -92,8 +92,8 @@ fn saccade<'a>(
     let width = shape.width();
     let scale = 1.0 / (shape.head_dim as f32).sqrt();
     let mut held = PackedKeyValues::new(isa, element, shape.num_heads, shape.head_dim);
-    let (k, v) = (rows(&shape.k, width), rows(&shape.v, width));
-    held.pack(threads, k, v);
+    let (k, v) = (Rows::new(&shape.k, width), Rows::new(&shape.v, width));
+    held.pack(threads, k, v).expect("there is enough memory");
     let arithmetic = match element {
         Element::Bf16 => Arithmetic::Bfloat16,
         _ => Arithmetic::Float32,
@@ -120,18 +120,18 @@ fn saccade<'a>(
     ];
     for (what, bias) in biases {
         let mut out = vec![0.0; shape.queries * width];
-        let held = held.clone();
+        let held = held.try_clone().expect("there is enough memory");
         add(
             what,
             Box::new(move || {
                 attention(
                     threads,
-                    rows(&shape.q, width),
+                    Rows::new(&shape.q, width),
                     &held,
                     scale,
-                    bias,
+                    Mask::from(bias),
                     None,
-                    rows_mut(&mut out, width),
+                    RowsMut::new(&mut out, width),
                 );
             }),
         );
@@ -140,15 +140,15 @@ fn saccade<'a>(
     add(
         ", packing too",
         Box::new(move || {
-            held.pack(threads, k, v);
+            held.pack(threads, k, v).expect("there is enough memory");
             attention(
                 threads,
-                rows(&shape.q, width),
+                Rows::new(&shape.q, width),
                 &held,
                 scale,
+                Mask::None,
                 None,
-                None,
-                rows_mut(&mut out, width),
+                RowsMut::new(&mut out, width),
             );
         }),
     );

@@ -3,10 +3,10 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use faer::{MatMut, MatRef};
 use saccade_benches::random::Random;
 use saccade_kernels::{
-    Arithmetic, Element, Isa, PackedKeyValues, PackedLinear, WeightRef, gelu_tanh, layer_norm, relu, silu,
+    Arithmetic, Element, Isa, Matrix, PackedKeyValues, PackedLinear, Rows, RowsMut, WeightRef, gelu_tanh,
+    layer_norm, relu, silu,
 };
 
 const ROWS: usize = 49;
@@ -24,8 +24,8 @@ fn norms(criterion: &mut Criterion) {
             let name = format!("{isa}{}", if affine { ", scale and shift" } else { "" });
             group.bench_function(name, |bencher| {
                 bencher.iter(|| {
-                    let x = MatRef::from_row_major_slice(&x, ROWS, WIDTH);
-                    let out = MatMut::from_row_major_slice_mut(&mut out, ROWS, WIDTH);
+                    let x = Rows::new(&x, WIDTH);
+                    let out = RowsMut::new(&mut out, WIDTH);
                     layer_norm(isa, 1, x, 1e-5, affine.then_some((&scale[..], &shift[..])), out);
                 });
             });
@@ -58,7 +58,7 @@ fn packing(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("packing");
     group.sample_size(20);
     let weight = Random::new(5).vec(WIDTH * WIDTH, 0.05);
-    let view = MatRef::from_row_major_slice(&weight, WIDTH, WIDTH);
+    let view = Matrix::new(&weight, WIDTH);
     let isa = Isa::best();
     group.throughput(Throughput::Bytes((4 * WIDTH * WIDTH) as u64));
     for (name, view) in [("out x in", view), ("in x out", view.transpose())] {
@@ -66,7 +66,7 @@ fn packing(criterion: &mut Criterion) {
             bencher.iter(|| PackedLinear::pack(isa, Arithmetic::Float32, 1, &[(WeightRef::F32(view), None)]));
         });
     }
-    let keys = MatRef::from_row_major_slice(&weight[..296 * WIDTH], 296, WIDTH);
+    let keys = Rows::new(&weight[..296 * WIDTH], WIDTH);
     let mut held = PackedKeyValues::new(isa, Element::F32, 32, WIDTH / 32);
     group.throughput(Throughput::Bytes((8 * 296 * WIDTH) as u64));
     group.bench_function("PackedKeyValues 296 x 1536", |bencher| {

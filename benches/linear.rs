@@ -14,7 +14,9 @@ use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
 use saccade_kernels::peak::read_bytes_per_second;
-use saccade_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, PackedLinear, WeightRef, quantize_rows};
+use saccade_kernels::{
+    Arithmetic, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef, quantize_rows,
+};
 
 /// `(rows, in_features, out_features)`: a DiT block's feed-forward and projections, and a VL self-attention block's projection.
 const SHAPES: [(usize, usize, usize); 4] = [
@@ -45,7 +47,7 @@ impl Shape {
         let weight = random.vec(inputs * outputs, 0.05);
         let bf16 = weight.iter().map(|&value| bf16::from_f32(value)).collect();
         let (mut int8, mut scales) = (vec![0; weight.len()], vec![0.0; outputs]);
-        let view = MatRef::from_row_major_slice(&weight, outputs, inputs);
+        let view = Matrix::new(&weight, inputs);
         quantize_rows(WeightRef::F32(view), &mut int8, &mut scales);
         Self {
             rows,
@@ -67,7 +69,7 @@ fn main() {
     let bandwidths: Vec<_> = options
         .threads
         .iter()
-        .map(|&threads| read_bytes_per_second(threads))
+        .map(|&threads| read_bytes_per_second(threads).expect("there is enough memory"))
         .collect();
     for (threads, bandwidth) in options.threads.iter().zip(&bandwidths) {
         println!("read, {threads} threads: {:.1} GB/s", 1e-9 * bandwidth);
@@ -106,16 +108,8 @@ fn copies<T>(bytes: usize, make: impl Fn() -> T) -> Vec<T> {
 }
 
 fn saccade<'a>(shape: &'a Shape, options: &Options, contenders: &mut Vec<Contender<'a>>) {
-    let wide = WeightRef::F32(MatRef::from_row_major_slice(
-        &shape.weight,
-        shape.outputs,
-        shape.inputs,
-    ));
-    let narrow = WeightRef::Bf16(MatRef::from_row_major_slice(
-        &shape.bf16,
-        shape.outputs,
-        shape.inputs,
-    ));
+    let wide = WeightRef::F32(Matrix::new(&shape.weight, shape.inputs));
+    let narrow = WeightRef::Bf16(Matrix::new(&shape.bf16, shape.inputs));
     for isa in Isa::available() {
         for (arithmetic, weight, stored) in [
             (Arithmetic::Float32, wide, ""),
@@ -143,9 +137,13 @@ fn saccade<'a>(shape: &'a Shape, options: &Options, contenders: &mut Vec<Contend
                     threads,
                     (isa, arithmetic),
                     move |turn| {
-                        let out = MatMut::from_row_major_slice_mut(&mut out, shape.rows, shape.outputs);
-                        let x = MatRef::from_row_major_slice(&shape.x, shape.rows, shape.inputs);
-                        layers[turn % layers.len()].apply(threads, x, Epilogue::Store, out, &mut scratch);
+                        let (x, out) = (
+                            Rows::new(&shape.x, shape.inputs),
+                            RowsMut::new(&mut out, shape.outputs),
+                        );
+                        let applied =
+                            layers[turn % layers.len()].apply(threads, x, Epilogue::Store, out, &mut scratch);
+                        applied.expect("there is enough memory");
                     },
                 );
             }

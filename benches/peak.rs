@@ -37,7 +37,7 @@ fn main() {
     for &threads in &options.threads {
         println!(
             "read, {threads} threads{:>34.1} GB/s",
-            1e-9 * read_bytes_per_second(threads)
+            1e-9 * read_bytes_per_second(threads).expect("there is enough memory")
         );
     }
     report.end(&options);

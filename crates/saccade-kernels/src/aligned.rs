@@ -1,6 +1,6 @@
-//! Memory that begins on a cache line, so that whole vectors never straddle two.
+//! Memory that begins on a cache line, so that no vector spans two of them; and the error of memory that the system refuses.
 
-use std::alloc::{Layout, alloc, alloc_zeroed, dealloc, handle_alloc_error};
+use std::alloc::{Layout, alloc, alloc_zeroed, dealloc};
 use std::ops::{Deref, DerefMut};
 use std::ptr::NonNull;
 
@@ -10,63 +10,90 @@ const ALIGNMENT: usize = 64;
 /// A huge page of x86-64 and most others.
 const HUGE_PAGE: usize = 2 << 20;
 
-mod sealed {
-    /// Types for which all bytes zero is a value.
-    pub trait Zeroable: Copy + Send + Sync {}
-    impl Zeroable for f32 {}
-    impl Zeroable for u32 {}
-    impl Zeroable for i32 {}
+/// The system has refused memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("out of memory: {bytes} bytes were asked for")]
+pub struct AllocError {
+    /// What was asked for; `usize::MAX` where it does not fit into the address space.
+    pub bytes: usize,
 }
 
-/// A fixed number of elements on a 64-byte boundary, zero at first.
-pub(crate) struct AlignedBuffer<T: sealed::Zeroable> {
+/// Types for which all bytes zero is a value.
+///
+/// # Safety
+/// That is so.
+pub(crate) unsafe trait Zeroable: Copy + Send + Sync {}
+// SAFETY: zero bytes are the number zero.
+unsafe impl Zeroable for f32 {}
+// SAFETY: as above.
+unsafe impl Zeroable for u32 {}
+// SAFETY: as above.
+unsafe impl Zeroable for i32 {}
+
+/// A fixed number of elements on a 64-byte boundary.
+pub(crate) struct AlignedBuffer<T: Zeroable> {
     pointer: NonNull<T>,
     len: usize,
 }
 
 // SAFETY: the buffer owns its memory alone, and its elements are plain numbers.
-unsafe impl<T: sealed::Zeroable> Send for AlignedBuffer<T> {}
+unsafe impl<T: Zeroable> Send for AlignedBuffer<T> {}
 // SAFETY: as above; shared references only read.
-unsafe impl<T: sealed::Zeroable> Sync for AlignedBuffer<T> {}
+unsafe impl<T: Zeroable> Sync for AlignedBuffer<T> {}
 
-impl<T: sealed::Zeroable> AlignedBuffer<T> {
-    pub(crate) fn zeroed(len: usize) -> Self {
-        let layout = Self::layout(len);
-        if layout.size() != 0 && layout.align() == ALIGNMENT {
-            // SAFETY: the layout is not of size zero.
-            let memory = unsafe { alloc_zeroed(layout) };
-            let pointer = NonNull::new(memory.cast()).unwrap_or_else(|| handle_alloc_error(layout));
-            return Self { pointer, len };
-        }
-        // SAFETY: the memory is written at once.
-        unsafe {
-            let buffer = Self::unwritten(len);
-            buffer.pointer.as_ptr().write_bytes(0, len);
-            buffer
+impl<T: Zeroable> AlignedBuffer<T> {
+    /// No elements, and no memory.
+    pub(crate) fn empty() -> Self {
+        Self {
+            pointer: NonNull::dangling(),
+            len: 0,
         }
     }
 
-    /// Memory that nothing was written to yet, so that whoever writes it first, maybe on several threads, also waits for its pages.
+    /// `len` zeros.
+    pub(crate) fn zeroed(len: usize) -> Result<Self, AllocError> {
+        let layout = Self::layout(len)?;
+        if layout.size() != 0 && layout.align() == ALIGNMENT {
+            // SAFETY: the layout is not of size zero.
+            let memory = unsafe { alloc_zeroed(layout) };
+            return Self::owned(memory, len, layout);
+        }
+        // SAFETY: the memory is written at once.
+        unsafe {
+            let buffer = Self::unwritten(len)?;
+            buffer.pointer.as_ptr().write_bytes(0, len);
+            Ok(buffer)
+        }
+    }
+
+    /// Memory that nothing has been written to: the threads that write it first also wait for its pages.
     ///
     /// # Safety
     /// Every element is written, through [`AlignedBuffer::pointer`], before the buffer is used as a slice.
-    pub(crate) unsafe fn unwritten(len: usize) -> Self {
-        let layout = Self::layout(len);
+    pub(crate) unsafe fn unwritten(len: usize) -> Result<Self, AllocError> {
+        let layout = Self::layout(len)?;
         if layout.size() == 0 {
-            return Self {
+            return Ok(Self {
                 pointer: NonNull::dangling(),
                 len,
-            };
+            });
         }
         // SAFETY: the layout is not of size zero.
         let memory = unsafe { alloc(layout) };
-        let pointer = NonNull::new(memory.cast()).unwrap_or_else(|| handle_alloc_error(layout));
+        let buffer = Self::owned(memory, len, layout)?;
         if layout.align() == HUGE_PAGE {
             // Before it is touched: pages are given at first touch.
             // SAFETY: the memory was just allocated.
             unsafe { advise_huge_pages(memory, layout.size()) };
         }
-        Self { pointer, len }
+        Ok(buffer)
+    }
+
+    fn owned(memory: *mut u8, len: usize, layout: Layout) -> Result<Self, AllocError> {
+        match NonNull::new(memory.cast()) {
+            Some(pointer) => Ok(Self { pointer, len }),
+            None => Err(AllocError { bytes: layout.size() }),
+        }
     }
 
     /// Where the first element is.
@@ -74,14 +101,24 @@ impl<T: sealed::Zeroable> AlignedBuffer<T> {
         self.pointer.as_ptr()
     }
 
-    fn layout(len: usize) -> Layout {
-        let alignment = if len * size_of::<T>() < HUGE_PAGE {
-            ALIGNMENT
-        } else {
-            HUGE_PAGE
+    /// A copy.
+    pub(crate) fn try_clone(&self) -> Result<Self, AllocError> {
+        let mut copy = Self::zeroed(self.len)?;
+        copy.copy_from_slice(self);
+        Ok(copy)
+    }
+
+    fn layout(len: usize) -> Result<Layout, AllocError> {
+        let of = |alignment| {
+            let layout = Layout::array::<T>(len).and_then(|layout| layout.align_to(alignment));
+            layout.map_err(|_| AllocError { bytes: usize::MAX })
         };
-        let layout = Layout::array::<T>(len).and_then(|layout| layout.align_to(alignment));
-        layout.expect("weights fit in the address space")
+        let layout = of(ALIGNMENT)?;
+        if layout.size() < HUGE_PAGE {
+            Ok(layout)
+        } else {
+            of(HUGE_PAGE)
+        }
     }
 }
 
@@ -99,25 +136,19 @@ unsafe fn advise_huge_pages(memory: *mut u8, size: usize) {
     let _ = (memory, size);
 }
 
-impl<T: sealed::Zeroable> Drop for AlignedBuffer<T> {
+impl<T: Zeroable> Drop for AlignedBuffer<T> {
     fn drop(&mut self) {
-        let layout = Self::layout(self.len);
-        if layout.size() != 0 {
+        // A buffer whose layout cannot be was never made.
+        if let Ok(layout) = Self::layout(self.len)
+            && layout.size() != 0
+        {
             // SAFETY: the memory was allocated with this layout.
             unsafe { dealloc(self.pointer.as_ptr().cast(), layout) };
         }
     }
 }
 
-impl<T: sealed::Zeroable> Clone for AlignedBuffer<T> {
-    fn clone(&self) -> Self {
-        let mut copy = Self::zeroed(self.len);
-        copy.copy_from_slice(self);
-        copy
-    }
-}
-
-impl<T: sealed::Zeroable> Deref for AlignedBuffer<T> {
+impl<T: Zeroable> Deref for AlignedBuffer<T> {
     type Target = [T];
 
     fn deref(&self) -> &[T] {
@@ -126,9 +157,36 @@ impl<T: sealed::Zeroable> Deref for AlignedBuffer<T> {
     }
 }
 
-impl<T: sealed::Zeroable> DerefMut for AlignedBuffer<T> {
+impl<T: Zeroable> DerefMut for AlignedBuffer<T> {
     fn deref_mut(&mut self) -> &mut [T] {
         // SAFETY: as above, and the reference is the only one.
         unsafe { std::slice::from_raw_parts_mut(self.pointer.as_ptr(), self.len) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_that_cannot_be_had_is_an_error() {
+        let huge = AlignedBuffer::<f32>::zeroed(usize::MAX / 2);
+        assert_eq!(huge.err(), Some(AllocError { bytes: usize::MAX }));
+        let large = isize::MAX as usize / 4 - HUGE_PAGE;
+        let error = AlignedBuffer::<f32>::zeroed(large).err().unwrap();
+        assert_eq!(error.bytes, 4 * large);
+        assert_eq!(
+            error.to_string(),
+            format!("out of memory: {} bytes were asked for", 4 * large)
+        );
+    }
+
+    #[test]
+    fn buffers_of_every_size_are_zero_at_first() {
+        for len in [0, 1, 17, 1 << 10, HUGE_PAGE / 4, HUGE_PAGE] {
+            let buffer = AlignedBuffer::<u32>::zeroed(len).unwrap();
+            assert!(buffer.iter().all(|&element| element == 0) && buffer.len() == len);
+            assert_eq!(buffer.as_ptr().addr() % if len > 0 { ALIGNMENT } else { 1 }, 0);
+        }
     }
 }

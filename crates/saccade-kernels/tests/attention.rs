@@ -6,7 +6,7 @@ use common::{ROUNDING, Strided, bits, numbers, rows, rows_mut};
 use std::fmt;
 
 use proptest::prelude::*;
-use saccade_kernels::{Element, Isa, LogitBias, PackedKeyValues, attention, bf16};
+use saccade_kernels::{Element, Isa, LogitBias, Mask, PackedKeyValues, attention, bf16};
 
 const REMOVED: f32 = f32::NEG_INFINITY;
 
@@ -69,7 +69,7 @@ impl Case {
 
     fn held(&self, kind: Kind) -> PackedKeyValues {
         let mut held = PackedKeyValues::new(kind.isa, kind.element, self.num_heads, self.head_dim);
-        held.pack(1, self.keys.view(), self.values.view());
+        held.pack(1, self.keys.view(), self.values.view()).unwrap();
         held
     }
 
@@ -87,7 +87,7 @@ impl Case {
             self.queries.view(),
             &self.held(kind),
             self.scale,
-            bias,
+            Mask::from(bias),
             weights,
             out.view_mut(),
         );
@@ -112,20 +112,20 @@ impl Case {
         let share_factor = (1.0 + share_rounding) / (1.0 - share_rounding);
         let (queries, keys, values) = (self.queries.view(), self.keys.view(), self.values.view());
         let (mut out, mut bounds) = (
-            vec![0.0; queries.nrows() * queries.ncols()],
-            vec![0.0; queries.nrows() * queries.ncols()],
+            vec![0.0; queries.num_rows() * queries.num_columns()],
+            vec![0.0; queries.num_rows() * queries.num_columns()],
         );
         let (mut weights, mut weight_bounds) = (Vec::new(), Vec::new());
         for head in 0..self.num_heads {
             let columns = head * self.head_dim..(head + 1) * self.head_dim;
-            for query in 0..queries.nrows() {
+            for query in 0..queries.num_rows() {
                 // The error of a logit is an error of its probability, as a factor.
                 let mut logit_error: f64 = 0.0;
-                let logits: Vec<f64> = (0..keys.nrows())
+                let logits: Vec<f64> = (0..keys.num_rows())
                     .map(|key| {
                         let products = columns
                             .clone()
-                            .map(|c| f64::from(queries[(query, c)]) * f64::from(keys[(key, c)]));
+                            .map(|c| f64::from(queries.row(query)[c]) * f64::from(keys.row(key)[c]));
                         let magnitude: f64 =
                             products.clone().map(f64::abs).sum::<f64>() * f64::from(self.scale);
                         let bias = f64::from(bias(head, query, key));
@@ -145,8 +145,9 @@ impl Case {
                     .collect();
                 let sum: f64 = shares.iter().sum();
                 // Twice the logits' error (own and in the sum), `exp`, sums over keys, and the division; small logits lose the digits of the largest.
-                let relative =
-                    (2.0 * logit_error + (keys.nrows() as f64 + 40.0) * ROUNDING).exp() * share_factor - 1.0;
+                let relative = (2.0 * logit_error + (keys.num_rows() as f64 + 40.0) * ROUNDING).exp()
+                    * share_factor
+                    - 1.0;
                 for (key, &share) in shares.iter().enumerate() {
                     let weight = if sum > 0.0 { share / sum } else { 0.0 };
                     weights.push(weight);
@@ -157,8 +158,8 @@ impl Case {
                     };
                     weight_bounds.push(weight * (relative + distance) + 1e-38);
                     for column in columns.clone() {
-                        let index = query * queries.ncols() + column;
-                        let value = f64::from(values[(key, column)]);
+                        let index = query * queries.num_columns() + column;
+                        let value = f64::from(values.row(key)[column]);
                         if weight > 0.0 {
                             out[index] += weight * value;
                             let error = weight * (relative + distance) + 1e-38;
@@ -320,8 +321,8 @@ fn a_removed_key_has_no_influence_whatever_it_holds() {
         for key in [0, 40, 95, 96, 129] {
             bias[key] = REMOVED;
             for column in 0..96 {
-                poisoned.keys.view_mut()[(key, column)] = poison;
-                poisoned.values.view_mut()[(key, column)] = poison;
+                poisoned.keys.view_mut().row_mut(key)[column] = poison;
+                poisoned.values.view_mut().row_mut(key)[column] = poison;
             }
         }
         let bias = LogitBias {
@@ -353,7 +354,7 @@ fn a_removed_key_has_no_influence_whatever_it_holds() {
 fn nan_stays_with_its_query_and_head() {
     let clean = Case::new(6, 20, 100, 3, 48, 0);
     let mut case = Case::new(6, 20, 100, 3, 48, 0);
-    case.queries.view_mut()[(7, 50)] = f32::NAN;
+    case.queries.view_mut().row_mut(7)[50] = f32::NAN;
     for kind in kinds() {
         let (out, expected) = (case.run(kind, 2, None, None), clean.run(kind, 1, None, None));
         for (index, (out, expected)) in out.iter().zip(&expected).enumerate() {
@@ -383,7 +384,7 @@ fn weights_are_the_probabilities_that_were_used() {
                 let expected: f64 = row
                     .iter()
                     .enumerate()
-                    .map(|(key, &weight)| f64::from(weight) * f64::from(case.values.view()[(key, column)]))
+                    .map(|(key, &weight)| f64::from(weight) * f64::from(case.values.view().row(key)[column]))
                     .sum();
                 assert!((f64::from(out[query * 120 + column]) - expected).abs() < 1e-5);
             }
@@ -413,7 +414,15 @@ fn bits_do_not_depend_on_threads_nor_on_other_queries() {
             for (first, count) in [(0, 1), (17, 1), (3, 2), (1, 8), (2, 9), (10, 17)] {
                 let mut out = vec![0.0; count * width];
                 let part = rows(&all[first * width..][..count * width], width);
-                attention(1, part, &held, case.scale, None, None, rows_mut(&mut out, width));
+                attention(
+                    1,
+                    part,
+                    &held,
+                    case.scale,
+                    Mask::None,
+                    None,
+                    rows_mut(&mut out, width),
+                );
                 assert_eq!(
                     bits(&out),
                     expected[first * width..][..count * width],
@@ -427,8 +436,7 @@ fn bits_do_not_depend_on_threads_nor_on_other_queries() {
 /// Rounded to bfloat16 where they lie.
 fn round(matrix: &mut Strided) {
     for row in 0..matrix.rows {
-        for column in 0..matrix.columns {
-            let element = &mut matrix.view_mut()[(row, column)];
+        for element in matrix.view_mut().row_mut(row) {
             *element = bf16::from_f32(*element).to_f32();
         }
     }
@@ -442,7 +450,7 @@ fn apply(held: &PackedKeyValues, case: &Case) -> Vec<f32> {
         case.queries.view(),
         held,
         case.scale,
-        None,
+        Mask::None,
         None,
         rows_mut(&mut out, width),
     );
@@ -475,20 +483,20 @@ fn packing_again_replaces_everything() {
     for kind in kinds() {
         let mut held = long.held(kind);
         let nbytes = held.nbytes();
-        held.pack(2, short.keys.view(), short.values.view());
+        held.pack(2, short.keys.view(), short.values.view()).unwrap();
         assert_eq!(
-            (held.len(), held.num_heads(), held.head_dim(), held.isa()),
+            (held.len(), held.num_kv_heads(), held.head_dim(), held.isa()),
             (34, 2, 30, kind.isa)
         );
         assert!(!held.is_empty() && held.nbytes() <= nbytes);
-        for held in [&held, &held.clone()] {
+        for held in [&held, &held.try_clone().unwrap()] {
             let mut out = vec![0.0; 5 * 60];
             attention(
                 1,
                 short.queries.view(),
                 held,
                 short.scale,
-                None,
+                Mask::None,
                 None,
                 rows_mut(&mut out, 60),
             );
@@ -526,7 +534,7 @@ fn packing_from_a_key_on_replaces_that_key_and_the_later_ones() {
                 queries,
                 &held,
                 new.scale,
-                None,
+                Mask::None,
                 None,
                 rows_mut(&mut out, width),
             );
@@ -545,7 +553,7 @@ fn an_infinite_value_that_stays_is_remembered() {
     values[0] = f32::INFINITY;
     for kind in kinds() {
         let mut held = PackedKeyValues::new(kind.isa, kind.element, 1, 2);
-        held.pack(1, rows(&keys, 2), rows(&values, 2));
+        held.pack(1, rows(&keys, 2), rows(&values, 2)).unwrap();
         held.pack_from(1, 2, rows(&keys[4..], 2), rows(&values[4..], 2));
         let bias = LogitBias {
             values: &[f32::NEG_INFINITY, 0.0, 0.0],
@@ -559,7 +567,7 @@ fn an_infinite_value_that_stays_is_remembered() {
             rows(&query, 2),
             &held,
             1.0,
-            Some(bias),
+            Mask::Bias(bias),
             None,
             rows_mut(&mut out, 2),
         );
@@ -571,7 +579,7 @@ fn an_infinite_value_that_stays_is_remembered() {
 #[should_panic(expected = "all that are held from number 2 on")]
 fn packing_from_a_key_on_keeps_their_number() {
     let mut held = PackedKeyValues::new(Isa::Portable, Element::F32, 1, 2);
-    held.pack(1, rows(&[0.0; 6], 2), rows(&[0.0; 6], 2));
+    held.pack(1, rows(&[0.0; 6], 2), rows(&[0.0; 6], 2)).unwrap();
     held.pack_from(1, 2, rows(&[0.0; 4], 2), rows(&[0.0; 4], 2));
 }
 
@@ -584,7 +592,7 @@ fn queries_of_another_width_panic() {
         rows(&[0.0; 12], 6),
         &case.held(best()),
         1.0,
-        None,
+        Mask::None,
         None,
         rows_mut(&mut [0.0; 12], 6),
     );

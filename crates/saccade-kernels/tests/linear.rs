@@ -3,11 +3,10 @@
 mod common;
 
 use common::{Strided, bits, gamma, numbers, rows, rows_mut};
-use faer::MatRef;
 use half::bf16;
 use proptest::prelude::*;
 use saccade_kernels::{
-    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, PackedLinear, WeightRef,
+    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, WeightRef,
 };
 
 const EPILOGUES: [Epilogue; 5] = [
@@ -60,11 +59,11 @@ fn weights(part: &Part, inputs: usize, seed: u64) -> Weights {
 }
 
 /// `data` as `(outputs, inputs)`: as it lies, or as the transpose of what lies there.
-fn view<'a, T>(data: &'a [T], part: &Part, inputs: usize) -> MatRef<'a, T> {
+fn view<'a, T: Copy>(data: &'a [T], part: &Part, inputs: usize) -> Matrix<'a, T> {
     if part.transposed {
-        MatRef::from_row_major_slice(data, inputs, part.outputs).transpose()
+        Matrix::from(Rows::strided(data, inputs, part.outputs, part.outputs)).transpose()
     } else {
-        MatRef::from_row_major_slice(data, part.outputs, inputs)
+        Matrix::from(Rows::strided(data, part.outputs, inputs, inputs))
     }
 }
 
@@ -99,7 +98,7 @@ fn exact(epilogue: Epilogue, value: f64, before: f32) -> (f64, f64) {
 fn check(parts: &[Part], weights: &[Weights], x: &Strided, before: &[f32], out: &[f32], epilogue: Epilogue) {
     let (inputs, outputs) = (x.columns, out.len() / x.rows.max(1));
     let x = x.view();
-    for row in 0..x.nrows() {
+    for row in 0..x.num_rows() {
         let mut column = 0;
         for (part, weights) in parts.iter().zip(weights) {
             let weight = view(&weights.f32, part, inputs);
@@ -111,7 +110,7 @@ fn check(parts: &[Part], weights: &[Weights], x: &Strided, before: &[f32], out: 
                 };
                 let (mut sum, mut magnitude) = (bias, bias.abs());
                 for k in 0..inputs {
-                    let product = f64::from(x[(row, k)]) * f64::from(weight[(output, k)]);
+                    let product = f64::from(x.row(row)[k]) * f64::from(weight.get(output, k));
                     sum += product;
                     magnitude += product.abs();
                 }
@@ -155,7 +154,7 @@ proptest! {
             let stored = if parts.iter().all(|part| part.bf16) { Element::Bf16 } else { Element::F32 };
             prop_assert_eq!((layer.in_features(), layer.out_features(), layer.element(), layer.isa()), (inputs, outputs, stored, isa));
             let mut out = Strided::new(&before, row_count, outputs, gaps.1);
-            layer.apply(threads, x.view(), epilogue, out.view_mut(), &mut LinearScratch::new());
+            layer.apply(threads, x.view(), epilogue, out.view_mut(), &mut LinearScratch::new()).unwrap();
             check(&parts, &weights, &x, &before, &out.values(), epilogue);
         }
     }
@@ -178,13 +177,15 @@ fn layers(isa: Isa, inputs: usize, outputs: usize) -> [PackedLinear; 2] {
 fn apply(layer: &PackedLinear, threads: usize, x: &[f32], epilogue: Epilogue) -> Vec<f32> {
     let mut out = vec![0.5; x.len() / layer.in_features() * layer.out_features()];
     let columns = layer.out_features();
-    layer.apply(
-        threads,
-        rows(x, layer.in_features()),
-        epilogue,
-        rows_mut(&mut out, columns),
-        &mut LinearScratch::new(),
-    );
+    layer
+        .apply(
+            threads,
+            rows(x, layer.in_features()),
+            epilogue,
+            rows_mut(&mut out, columns),
+            &mut LinearScratch::new(),
+        )
+        .unwrap();
     out
 }
 
@@ -343,7 +344,7 @@ fn huge_and_tiny_values_survive() {
             isa,
             Arithmetic::Float32,
             1,
-            &[(WeightRef::F32(MatRef::from_row_major_slice(&weight, 3, 1)), None)],
+            &[(WeightRef::F32(Matrix::new(&weight, 1)), None)],
         )
         .unwrap();
         assert_eq!(
@@ -356,7 +357,8 @@ fn huge_and_tiny_values_survive() {
 #[test]
 fn parts_that_do_not_fit_are_refused() {
     let weight = [0.0; 12];
-    let weight = |outputs, inputs| WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs));
+    let weight =
+        |outputs, inputs| WeightRef::F32(Matrix::from(Rows::strided(&weight, outputs, inputs, inputs)));
     let isa = Isa::best();
     assert!(matches!(
         PackedLinear::pack(isa, Arithmetic::Float32, 1, &[]),
@@ -389,24 +391,28 @@ fn parts_that_do_not_fit_are_refused() {
 #[should_panic(expected = "x: expected")]
 fn an_input_of_another_width_panics() {
     let layer = &layers(Isa::best(), 4, 4)[0];
-    layer.apply(
-        1,
-        rows(&[0.0; 6], 3),
-        Epilogue::Store,
-        rows_mut(&mut [0.0; 8], 4),
-        &mut LinearScratch::new(),
-    );
+    layer
+        .apply(
+            1,
+            rows(&[0.0; 6], 3),
+            Epilogue::Store,
+            rows_mut(&mut [0.0; 8], 4),
+            &mut LinearScratch::new(),
+        )
+        .unwrap();
 }
 
 #[test]
 #[should_panic(expected = "out: expected")]
 fn an_output_of_another_shape_panics() {
     let layer = &layers(Isa::best(), 4, 4)[0];
-    layer.apply(
-        1,
-        rows(&[0.0; 8], 4),
-        Epilogue::Store,
-        rows_mut(&mut [0.0; 12], 4),
-        &mut LinearScratch::new(),
-    );
+    layer
+        .apply(
+            1,
+            rows(&[0.0; 8], 4),
+            Epilogue::Store,
+            rows_mut(&mut [0.0; 12], 4),
+            &mut LinearScratch::new(),
+        )
+        .unwrap();
 }

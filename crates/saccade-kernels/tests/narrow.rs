@@ -3,18 +3,18 @@
 mod common;
 
 use common::{Strided, bits, gamma, numbers, rows, rows_mut};
-use faer::{MatMut, MatRef};
 use half::bf16;
 use proptest::prelude::*;
 use saccade_kernels::{
-    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, PackedLinear, WeightRef, quantize_rows,
+    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, RowsMut,
+    WeightRef, quantize_rows,
 };
 
 const NARROW: [Arithmetic; 2] = [Arithmetic::Bfloat16, Arithmetic::Int8];
 
 fn pack(isa: Isa, arithmetic: Arithmetic, weight: &[f32], bias: &[f32]) -> PackedLinear {
     let inputs = weight.len() / bias.len().max(1);
-    let weight = WeightRef::F32(MatRef::from_row_major_slice(weight, bias.len(), inputs));
+    let weight = WeightRef::F32(Matrix::new(weight, inputs));
     PackedLinear::pack(isa, arithmetic, 1, &[(weight, Some(bias))]).unwrap()
 }
 
@@ -22,13 +22,15 @@ fn apply(layer: &PackedLinear, threads: usize, x: &[f32], epilogue: Epilogue) ->
     let (inputs, outputs) = (layer.in_features(), layer.out_features());
     let mut out = vec![0.5; x.len() / inputs * outputs];
     let mut scratch = LinearScratch::new();
-    layer.apply(
-        threads,
-        rows(x, inputs),
-        epilogue,
-        rows_mut(&mut out, outputs),
-        &mut scratch,
-    );
+    layer
+        .apply(
+            threads,
+            rows(x, inputs),
+            epilogue,
+            rows_mut(&mut out, outputs),
+            &mut scratch,
+        )
+        .unwrap();
     out
 }
 
@@ -219,7 +221,7 @@ fn the_largest_sums_do_not_overflow() {
         }
     }
     let weight = vec![0.0; inputs + 1];
-    let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, 1, inputs + 1));
+    let weight = WeightRef::F32(Matrix::new(&weight, inputs + 1));
     let packed = PackedLinear::pack(Isa::best(), Arithmetic::Int8, 1, &[(weight, None)]);
     assert!(matches!(packed, Err(KernelError::TooManyInputs { given }) if given == inputs + 1));
 }
@@ -275,7 +277,7 @@ fn packing_on_more_threads_gives_the_same_bits() {
     let weight = numbers(23, outputs * inputs, 1.0);
     let x = numbers(24, 5 * inputs, 1.0);
     let parts = [(0, 100), (100, 101), (101, 311)].map(|(first, end): (usize, usize)| {
-        let rows = MatRef::from_row_major_slice(&weight[first * inputs..end * inputs], end - first, inputs);
+        let rows = Matrix::new(&weight[first * inputs..end * inputs], inputs);
         (WeightRef::F32(rows), None)
     });
     for isa in Isa::available() {
@@ -284,7 +286,7 @@ fn packing_on_more_threads_gives_the_same_bits() {
                 let layer = PackedLinear::pack(isa, arithmetic, threads, parts).unwrap();
                 bits(&apply(&layer, 1, &x, Epilogue::Store))
             };
-            let whole = WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs));
+            let whole = WeightRef::F32(Matrix::new(&weight, inputs));
             let expected = out(1, &[(whole, None)]);
             for threads in [1, 2, 5] {
                 assert_eq!(out(threads, &parts), expected, "{isa}, {arithmetic:?}");
@@ -309,19 +311,23 @@ fn a_used_scratch_changes_nothing() {
                 pack(isa, arithmetic, &weight, &bias),
             );
             let mut out = [0.0; 200];
-            bigger.apply(
-                1,
-                rows(&large, 100),
-                Epilogue::Store,
-                rows_mut(&mut out, 1),
-                &mut scratch,
-            );
+            bigger
+                .apply(
+                    1,
+                    rows(&large, 100),
+                    Epilogue::Store,
+                    rows_mut(&mut out, 1),
+                    &mut scratch,
+                )
+                .unwrap();
             assert!(out.iter().all(|value| value.is_nan()), "{isa}, {arithmetic:?}");
             assert!(scratch.nbytes() > 0);
             for epilogue in [Epilogue::Store, Epilogue::Relu, Epilogue::Silu, Epilogue::Add] {
                 let strided = Strided::new(&x, 20, inputs, 3);
                 let mut out = Strided::new(&[0.5; 20 * 53], 20, outputs, 2);
-                layer.apply(2, strided.view(), epilogue, out.view_mut(), &mut scratch);
+                layer
+                    .apply(2, strided.view(), epilogue, out.view_mut(), &mut scratch)
+                    .unwrap();
                 assert_eq!(
                     bits(&out.values()),
                     bits(&apply(&layer, 1, &x, epilogue)),
@@ -340,13 +346,13 @@ fn stored_weights_give_the_bits_of_weights_narrowed_at_pack() {
         let narrow: Vec<_> = weight.iter().map(|&value| bf16::from_f32(value)).collect();
         let (mut values, mut scales) = (vec![0; weight.len()], vec![0.0; outputs]);
         quantize_rows(
-            WeightRef::F32(MatRef::from_row_major_slice(&weight, outputs, inputs)),
+            WeightRef::F32(Matrix::new(&weight, inputs)),
             &mut values,
             &mut scales,
         );
-        let bf16 = WeightRef::Bf16(MatRef::from_row_major_slice(&narrow, outputs, inputs));
+        let bf16 = WeightRef::Bf16(Matrix::new(&narrow, inputs));
         let int8 = WeightRef::Int8 {
-            values: MatRef::from_row_major_slice(&values, outputs, inputs),
+            values: Matrix::new(&values, inputs),
             scales: &scales,
         };
         let dequantized: Vec<f32> = values
@@ -488,25 +494,32 @@ fn weights_that_are_not_finite_give_nan() {
 fn sizes_of_zero_are_fine() {
     for isa in Isa::available() {
         for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
-            let weight = |outputs, inputs| WeightRef::F32(MatRef::from_row_major_slice(&[], outputs, inputs));
+            let weight =
+                |outputs, inputs| WeightRef::F32(Matrix::from(Rows::strided(&[], outputs, inputs, inputs)));
             let no_inputs =
                 PackedLinear::pack(isa, arithmetic, 1, &[(weight(3, 0), Some(&[1.0, 2.0, 3.0]))]).unwrap();
             let mut out = [0.0; 6];
-            let x = MatRef::from_row_major_slice(&[], 2, 0);
+            let x = Rows::strided(&[], 2, 0, 0);
             let mut scratch = LinearScratch::new();
-            no_inputs.apply(1, x, Epilogue::Store, rows_mut(&mut out, 3), &mut scratch);
+            no_inputs
+                .apply(1, x, Epilogue::Store, rows_mut(&mut out, 3), &mut scratch)
+                .unwrap();
             assert_eq!(out, [1.0, 2.0, 3.0, 1.0, 2.0, 3.0], "{isa}, {arithmetic:?}");
             let no_outputs = PackedLinear::pack(isa, arithmetic, 1, &[(weight(0, 5), None)]).unwrap();
-            let nowhere = MatMut::from_row_major_slice_mut(&mut [], 1, 0);
-            no_outputs.apply(1, rows(&[1.0; 5], 5), Epilogue::Store, nowhere, &mut scratch);
+            let nowhere = RowsMut::strided(&mut [], 1, 0, 0);
+            no_outputs
+                .apply(1, rows(&[1.0; 5], 5), Epilogue::Store, nowhere, &mut scratch)
+                .unwrap();
             let layer = pack(isa, arithmetic, &[1.0; 6], &[0.0; 2]);
-            layer.apply(
-                1,
-                rows(&[], 3),
-                Epilogue::Store,
-                rows_mut(&mut [], 2),
-                &mut scratch,
-            );
+            layer
+                .apply(
+                    1,
+                    rows(&[], 3),
+                    Epilogue::Store,
+                    rows_mut(&mut [], 2),
+                    &mut scratch,
+                )
+                .unwrap();
         }
     }
 }
@@ -532,7 +545,7 @@ fn quantize_rows_keeps_to_half_a_step() {
     let (rows, inputs) = (30, 77);
     let weight = numbers(22, rows * inputs, 2.0);
     let (mut values, mut scales) = (vec![0; weight.len()], vec![0.0; rows]);
-    let view = MatRef::from_row_major_slice(&weight, rows, inputs);
+    let view = Matrix::new(&weight, inputs);
     quantize_rows(WeightRef::F32(view), &mut values, &mut scales);
     for (index, (&value, &w)) in values.iter().zip(&weight).enumerate() {
         let scale = f64::from(scales[index / inputs]);
@@ -546,7 +559,7 @@ fn quantize_rows_keeps_to_half_a_step() {
         .map(|i| weight[i % rows * inputs + i / rows])
         .collect();
     let (mut again, mut again_scales) = (vec![0; weight.len()], vec![0.0; rows]);
-    let view = MatRef::from_row_major_slice(&transposed, inputs, rows).transpose();
+    let view = Matrix::new(&transposed, rows).transpose();
     quantize_rows(WeightRef::F32(view), &mut again, &mut again_scales);
     assert_eq!((again, bits(&again_scales)), (values, bits(&scales)));
 }

@@ -7,10 +7,9 @@ use std::sync::Barrier;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::{numbers, rows, rows_mut};
-use faer::MatRef;
 use saccade_kernels::{
-    Arithmetic, Element, Epilogue, Isa, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, WeightRef,
-    attention, gelu_tanh, layer_norm, parallel_for, silu,
+    Arithmetic, Element, Epilogue, Isa, LinearScratch, LogitBias, Mask, Matrix, PackedKeyValues,
+    PackedLinear, WeightRef, attention, gelu_tanh, layer_norm, parallel_for, silu,
 };
 
 /// The system's allocator, counting what all threads ask of it.
@@ -49,7 +48,7 @@ fn the_second_call_of_a_shape_allocates_nothing() {
     let x = numbers(2, 296 * WIDTH, 1.0);
     let bias = numbers(3, 296, 1.0);
     for isa in Isa::available() {
-        let weight = WeightRef::F32(MatRef::from_row_major_slice(&weight, WIDTH, WIDTH));
+        let weight = WeightRef::F32(Matrix::new(&weight, WIDTH));
         let pack = |arithmetic| PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
         let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);
         let mut scratch = LinearScratch::new();
@@ -61,19 +60,37 @@ fn the_second_call_of_a_shape_allocates_nothing() {
             let out = &mut out[..count * WIDTH];
             for layer in &layers {
                 for epilogue in [Epilogue::GeluTanh, Epilogue::Add] {
-                    layer.apply(threads, x, epilogue, rows_mut(out, WIDTH), &mut scratch);
+                    layer
+                        .apply(threads, x, epilogue, rows_mut(out, WIDTH), &mut scratch)
+                        .unwrap();
                 }
             }
             layer_norm(isa, threads, x, 1e-5, None, rows_mut(out, WIDTH));
-            held.pack(threads, x, x);
+            held.pack(threads, x, x).unwrap();
             let bias = LogitBias {
                 values: &bias,
                 head_stride: 0,
                 query_stride: 0,
             };
-            attention(threads, x, &held, 0.1, Some(bias), None, rows_mut(out, WIDTH));
+            attention(
+                threads,
+                x,
+                &held,
+                0.1,
+                Mask::Bias(bias),
+                None,
+                rows_mut(out, WIDTH),
+            );
             let weights = &mut weights[..8 * count * count];
-            attention(threads, x, &held, 0.1, None, Some(weights), rows_mut(out, WIDTH));
+            attention(
+                threads,
+                x,
+                &held,
+                0.1,
+                Mask::None,
+                Some(weights),
+                rows_mut(out, WIDTH),
+            );
             gelu_tanh(isa, out);
             silu(isa, out);
             parallel_for(threads, 10, &|_| {});

@@ -621,10 +621,9 @@ fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Bound<'_, PyDic
     }
     let peaks = PyDict::new(py);
     peaks.set_item("macs_per_second", rates)?;
-    peaks.set_item(
-        "read_bytes_per_second",
-        py.detach(|| peak::read_bytes_per_second(num_threads)),
-    )?;
+    let read = py.detach(|| peak::read_bytes_per_second(num_threads));
+    let read = read.map_err(|error| pyo3::exceptions::PyMemoryError::new_err(error.to_string()))?;
+    peaks.set_item("read_bytes_per_second", read)?;
     peaks.set_item("clock_hz", py.detach(peak::clock_hz))?;
     Ok(peaks)
 }

@@ -2,7 +2,7 @@
 
 #![allow(dead_code, reason = "each test file uses a part")]
 
-use faer::{MatMut, MatRef};
+use saccade_kernels::{Rows, RowsMut};
 
 /// Half a unit in the last place of 1.
 pub const ROUNDING: f64 = 1.0 / (1u64 << 24) as f64;
@@ -51,14 +51,12 @@ impl Strided {
         }
     }
 
-    pub fn view(&self) -> MatRef<'_, f32> {
-        MatRef::from_row_major_slice_with_stride(&self.data, self.rows, self.columns, self.stride)
+    pub fn view(&self) -> Rows<'_> {
+        Rows::strided(&self.data, self.rows, self.columns, self.stride)
     }
 
-    pub fn view_mut(&mut self) -> MatMut<'_, f32> {
-        // Not `from_row_major_slice_with_stride_mut`, which swaps the strides in faer 0.24.4.
-        MatMut::from_column_major_slice_with_stride_mut(&mut self.data, self.columns, self.rows, self.stride)
-            .transpose_mut()
+    pub fn view_mut(&mut self) -> RowsMut<'_> {
+        RowsMut::strided(&mut self.data, self.rows, self.columns, self.stride)
     }
 
     /// The values without the gaps. Panics if a gap was written to.
@@ -80,13 +78,12 @@ pub fn bits(values: &[f32]) -> Vec<u32> {
     values.iter().map(|value| value.to_bits()).collect()
 }
 
-pub fn rows(values: &[f32], columns: usize) -> MatRef<'_, f32> {
-    MatRef::from_row_major_slice(values, values.len() / columns.max(1), columns)
+pub fn rows(values: &[f32], columns: usize) -> Rows<'_> {
+    Rows::new(values, columns)
 }
 
-pub fn rows_mut(values: &mut [f32], columns: usize) -> MatMut<'_, f32> {
-    let count = values.len() / columns.max(1);
-    MatMut::from_row_major_slice_mut(values, count, columns)
+pub fn rows_mut(values: &mut [f32], columns: usize) -> RowsMut<'_> {
+    RowsMut::new(values, columns)
 }
 
 pub fn gelu_tanh(x: f64) -> f64 {

@@ -1,52 +1,41 @@
 //! LayerNorm over rows, plain or with a scale and a shift applied in the same pass.
 
-use faer::{MatMut, MatRef};
-
+use super::split;
 use crate::isa::Isa;
 use crate::pool::parallel_for;
-use crate::simd::{Kernel, Vector, dispatch, load, store};
-
-/// Elements from which a second thread pays: below, one core is done in less time than it takes to wake another.
-const ELEMENTS_FOR_THREADS: usize = 1 << 16;
-
-/// Elements of one task: long enough that dealing it costs nothing, short enough that threads finish together.
-const ELEMENTS_PER_TASK: usize = 1 << 13;
+use crate::rows::{Rows, RowsMut};
+use crate::simd::{Kernel, Simd, Vector, load, store};
 
 /// `out = norm(x) * scale + shift`, row by row, with `norm(x) = (x - mean) / sqrt(variance + eps)` over the columns.
 ///
 /// `x` and `out` are `(rows, width)`, row-major with any row stride; `scale` and `shift` have `width` elements and hold for all rows: the
 /// learned affine, or `1 + scale` and `shift` of an adaptive norm. The variance is the mean of squared distances from the mean, in a second
-/// pass over the row, which also finds what rounding has left of the mean: rows far from zero are as exact as others. A row of zero variance gives `shift`; one with NaN or infinity gives NaN.
+/// pass over the row, which also finds what rounding has left of the mean: rows far from zero are as exact as others. A row of zero variance
+/// gives `shift`; one with NaN or infinity gives NaN.
 ///
 /// # Panics
-/// If a shape does not fit, columns are not contiguous, or this CPU lacks `isa`.
+/// If a shape does not fit, or this CPU lacks `isa`.
 ///
 /// ```
-/// use faer::{MatMut, MatRef};
+/// use saccade_kernels::{Isa, Rows, RowsMut, layer_norm};
 /// let mut out = [0.0; 2];
-/// let x = MatRef::from_row_major_slice(&[1.0, 3.0], 1, 2);
-/// let out_view = MatMut::from_row_major_slice_mut(&mut out, 1, 2);
-/// saccade_kernels::layer_norm(saccade_kernels::Isa::best(), 1, x, 0.0, Some((&[2.0, 2.0], &[0.5, 0.5])), out_view);
+/// let x = Rows::new(&[1.0, 3.0], 2);
+/// layer_norm(Isa::best(), 1, x, 0.0, Some((&[2.0, 2.0], &[0.5, 0.5])), RowsMut::new(&mut out, 2));
 /// assert_eq!(out, [-1.5, 2.5]);
 /// ```
 pub fn layer_norm(
     isa: Isa,
     threads: usize,
-    x: MatRef<'_, f32>,
+    x: Rows<'_>,
     eps: f32,
     scale_shift: Option<(&[f32], &[f32])>,
-    out: MatMut<'_, f32>,
+    mut out: RowsMut<'_>,
 ) {
-    let (rows, width) = (x.nrows(), x.ncols());
+    let (rows, width) = (x.num_rows(), x.num_columns());
     assert_eq!(
-        (out.nrows(), out.ncols()),
+        (out.num_rows(), out.num_columns()),
         (rows, width),
         "out: expected the shape of x"
-    );
-    assert!(x.col_stride() == 1 || width <= 1, "x: expected contiguous rows");
-    assert!(
-        out.col_stride() == 1 || width <= 1,
-        "out: expected contiguous rows"
     );
     if let Some((scale, shift)) = scale_shift {
         assert_eq!(
@@ -60,29 +49,21 @@ pub fn layer_norm(
     }
     let job = Job {
         x: x.as_ptr(),
-        x_stride: x.row_stride(),
-        out_stride: out.row_stride(),
-        out: out.as_ptr_mut(),
+        x_stride: x.row_stride() as isize,
+        out_stride: out.row_stride() as isize,
+        out: out.as_mut_ptr(),
         width,
         eps,
         scale_shift,
     };
-    let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).min(rows);
-    let threads = if rows * width < ELEMENTS_FOR_THREADS {
-        1
-    } else {
-        threads
-    };
+    let (threads, tasks) = split(threads, rows, width);
     parallel_for(threads, tasks, &|task| {
         let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        dispatch(
-            isa,
-            Rows {
-                job: &job,
-                first,
-                end,
-            },
-        );
+        isa.run(Part {
+            job: &job,
+            first,
+            end,
+        });
     });
 }
 
@@ -99,23 +80,23 @@ struct Job<'a> {
 // SAFETY: tasks read `x` and write different rows of `out`; both views are borrowed for the whole call.
 unsafe impl Sync for Job<'_> {}
 
-struct Rows<'a> {
+struct Part<'a> {
     job: &'a Job<'a>,
     first: usize,
     end: usize,
 }
 
-impl Kernel for Rows<'_> {
+impl Kernel for Part<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<V: Vector>(self) {
+    unsafe fn run<S: Simd>(self, _: S) {
         for row in self.first..self.end {
             // SAFETY: rows are within the views; the caller has the instruction set.
             unsafe {
                 let x = self.job.x.offset(row as isize * self.job.x_stride);
                 let out = self.job.out.offset(row as isize * self.job.out_stride);
-                norm_row::<V>(self.job, x, out);
+                norm_row::<S::Vector>(self.job, x, out);
             }
         }
     }

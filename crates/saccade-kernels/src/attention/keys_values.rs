@@ -1,15 +1,13 @@
 //! Keys and values in the layout that the tiles read, and how they get there.
 
-use std::marker::PhantomData;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use faer::MatRef;
-
-use crate::aligned::AlignedBuffer;
+use crate::aligned::{AlignedBuffer, AllocError};
 use crate::isa::Isa;
-use crate::linear::Element;
 use crate::pool::parallel_for;
-use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots, lanes, load};
+use crate::rows::Rows;
+use crate::simd::{Dot, Dots, Kernel, MAX_LANES, Simd, Vector, load};
+use crate::weights::Element;
 
 /// Elements from which packing on a second thread pays.
 const ELEMENTS_FOR_THREADS: usize = 1 << 16;
@@ -17,20 +15,20 @@ const ELEMENTS_FOR_THREADS: usize = 1 << 16;
 /// Keys and values of one sequence, all heads, in the layout that [`attention`](crate::attention()) reads.
 ///
 /// ```
-/// use faer::MatRef;
-/// use saccade_kernels::{Element, Isa, PackedKeyValues};
+/// use saccade_kernels::{Element, Isa, PackedKeyValues, Rows};
 /// let (keys, values) = ([1.0; 12], [2.0; 12]); // three keys of two heads of width 2
 /// let mut kv = PackedKeyValues::new(Isa::best(), Element::Bf16, 2, 2);
-/// kv.pack(1, MatRef::from_row_major_slice(&keys, 3, 4), MatRef::from_row_major_slice(&values, 3, 4));
+/// kv.pack(1, Rows::new(&keys, 4), Rows::new(&values, 4)).unwrap();
 /// assert_eq!(kv.len(), 3);
 /// ```
-#[derive(Clone)]
 pub struct PackedKeyValues {
     isa: Isa,
     element: Element,
-    num_heads: usize,
+    num_kv_heads: usize,
     head_dim: usize,
     len: usize,
+    /// Keys that each head has room for.
+    capacity: usize,
     /// `[head][vector of keys][step of head_dim][lane]`; lanes beyond the last key are zero. A word is an f32, or a pair of bf16, the
     /// even element in its low half: then a step is two elements, and an odd `head_dim` is padded with zero.
     keys: AlignedBuffer<u32>,
@@ -46,76 +44,78 @@ impl PackedKeyValues {
     /// # Panics
     /// If this CPU lacks `isa`, `head_dim` is 0, or `element` is neither [`Element::F32`] nor [`Element::Bf16`].
     #[must_use]
-    pub fn new(isa: Isa, element: Element, num_heads: usize, head_dim: usize) -> Self {
+    pub fn new(isa: Isa, element: Element, num_kv_heads: usize, head_dim: usize) -> Self {
         assert!(head_dim > 0, "head_dim: expected at least 1");
-        assert!(isa.is_available(), "this CPU lacks {isa}");
+        isa.check();
         assert!(
             matches!(element, Element::F32 | Element::Bf16),
             "element: expected F32 or Bf16, got {element:?}"
         );
-        let empty = || AlignedBuffer::zeroed(0);
+        let empty = AlignedBuffer::empty;
         Self {
             isa,
             element,
-            num_heads,
+            num_kv_heads,
             head_dim,
             len: 0,
+            capacity: 0,
             keys: empty(),
             values: empty(),
             finite: true,
         }
     }
 
-    /// Replaces what is held by `keys` and `values`, `(len, num_heads * head_dim)` each, row-major with any row stride.
+    /// Replaces what is held by `keys` and `values`, `(len, num_kv_heads * head_dim)` each, row-major with any row stride.
     /// Memory is claimed only if this needs more than ever before.
     ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; nothing is held then.
+    ///
     /// # Panics
-    /// If a shape does not fit, or columns are not contiguous.
-    pub fn pack(&mut self, threads: usize, keys: MatRef<'_, f32>, values: MatRef<'_, f32>) {
-        self.len = keys.nrows();
-        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
-        reserve(&mut self.keys, self.num_heads * keys_size);
-        reserve(&mut self.values, self.num_heads * values_size);
+    /// If a shape does not fit.
+    pub fn pack(&mut self, threads: usize, keys: Rows<'_>, values: Rows<'_>) -> Result<(), AllocError> {
+        (self.len, self.capacity) = (0, 0);
         self.finite = true;
+        let needed = (
+            self.num_kv_heads * self.keys_of_head(keys.num_rows()),
+            self.num_kv_heads * self.values_of_head(keys.num_rows()),
+        );
+        grow(&mut self.keys, needed.0)?;
+        grow(&mut self.values, needed.1)?;
+        (self.len, self.capacity) = (keys.num_rows(), keys.num_rows());
         self.pack_from(threads, 0, keys, values);
+        Ok(())
     }
 
     /// Replaces the keys and values from number `first` on, all of them to the end, as [`Self::pack`] does; those before it stay.
     ///
     /// # Panics
-    /// If a shape does not fit, or columns are not contiguous.
-    pub fn pack_from(
-        &mut self,
-        threads: usize,
-        first: usize,
-        keys: MatRef<'_, f32>,
-        values: MatRef<'_, f32>,
-    ) {
-        let width = self.num_heads * self.head_dim;
-        let rows = keys.nrows();
+    /// If a shape does not fit.
+    pub fn pack_from(&mut self, threads: usize, first: usize, keys: Rows<'_>, values: Rows<'_>) {
+        let width = self.num_kv_heads * self.head_dim;
+        let rows = keys.num_rows();
         assert_eq!(
             first + rows,
             self.len,
             "keys: expected all that are held from number {first} on"
         );
-        assert_eq!(keys.ncols(), width, "keys: expected num_heads * head_dim columns");
         assert_eq!(
-            (values.nrows(), values.ncols()),
+            keys.num_columns(),
+            width,
+            "keys: expected num_kv_heads * head_dim columns"
+        );
+        assert_eq!(
+            (values.num_rows(), values.num_columns()),
             (rows, width),
             "values: expected the shape of keys"
-        );
-        assert!(
-            keys.col_stride() == 1 || width <= 1,
-            "keys: expected contiguous rows"
-        );
-        assert!(
-            values.col_stride() == 1 || width <= 1,
-            "values: expected contiguous rows"
         );
         if rows == 0 || width == 0 {
             return;
         }
-        let (keys_size, values_size) = (self.keys_of_head(), self.values_of_head());
+        let (keys_size, values_size) = (
+            self.keys_of_head(self.capacity),
+            self.values_of_head(self.capacity),
+        );
         let finite = AtomicBool::new(true);
         let job = Pack {
             keys,
@@ -131,7 +131,7 @@ impl PackedKeyValues {
         } else {
             threads
         };
-        parallel_for(threads, self.num_heads, &|head| {
+        parallel_for(threads, self.num_kv_heads, &|head| {
             // SAFETY: heads write their own parts of the two buffers, which have room for all of them.
             let head = unsafe {
                 Head {
@@ -145,14 +145,67 @@ impl PackedKeyValues {
                 }
             };
             let head_is_finite = match element {
-                Element::Bf16 => dispatch_dots(isa, head),
-                _ => dispatch(isa, head),
+                Element::Bf16 => isa.run(PairHead(head)),
+                _ => isa.run(WordHead(head)),
             };
             if !head_is_finite {
                 finite.store(false, Ordering::Relaxed);
             }
         });
         self.finite &= finite.into_inner();
+    }
+
+    /// Adds `keys` and `values` after those that are held, as [`Self::pack`] would hold all of them together.
+    ///
+    /// Where there is no room left, room for twice as many is made; [`Self::reserve`] makes it ahead.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; what was held then stays.
+    ///
+    /// # Panics
+    /// If a shape does not fit.
+    pub fn append(&mut self, threads: usize, keys: Rows<'_>, values: Rows<'_>) -> Result<(), AllocError> {
+        let (first, len) = (self.len, self.len + keys.num_rows());
+        if len > self.capacity {
+            self.reserve(len.max(2 * self.capacity))?;
+        }
+        self.len = len;
+        self.pack_from(threads, first, keys, values);
+        Ok(())
+    }
+
+    /// Makes room for `capacity` keys, so that [`Self::append`] allocates nothing up to there. [`Self::pack`] gives it up.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; what was held then stays.
+    pub fn reserve(&mut self, capacity: usize) -> Result<(), AllocError> {
+        if capacity <= self.capacity {
+            return Ok(());
+        }
+        let keys = (self.keys_of_head(self.capacity), self.keys_of_head(capacity));
+        let values = (self.values_of_head(self.capacity), self.values_of_head(capacity));
+        let [keys, values] = [(&self.keys, keys), (&self.values, values)].map(|(from, (old, new))| {
+            let mut to = AlignedBuffer::zeroed(self.num_kv_heads * new)?;
+            for head in 0..self.num_kv_heads {
+                to[head * new..][..old].copy_from_slice(&from[head * old..][..old]);
+            }
+            Ok(to)
+        });
+        (self.keys, self.values) = (keys?, values?);
+        self.capacity = capacity;
+        Ok(())
+    }
+
+    /// A copy.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory.
+    pub fn try_clone(&self) -> Result<Self, AllocError> {
+        Ok(Self {
+            keys: self.keys.try_clone()?,
+            values: self.values.try_clone()?,
+            ..*self
+        })
     }
 
     /// Number of keys.
@@ -167,10 +220,10 @@ impl PackedKeyValues {
         self.len == 0
     }
 
-    /// Number of heads.
+    /// Number of heads of keys and values.
     #[must_use]
-    pub fn num_heads(&self) -> usize {
-        self.num_heads
+    pub fn num_kv_heads(&self) -> usize {
+        self.num_kv_heads
     }
 
     /// Width of a head's queries, keys and values.
@@ -205,30 +258,30 @@ impl PackedKeyValues {
         }
     }
 
-    /// Words of one head's keys.
-    fn keys_of_head(&self) -> usize {
-        self.len.next_multiple_of(lanes(self.isa)) * self.head_dim.div_ceil(self.step())
+    /// Words of one head's keys, where there is room for `capacity` of them.
+    fn keys_of_head(&self, capacity: usize) -> usize {
+        capacity.next_multiple_of(self.isa.vectors().lanes) * self.head_dim.div_ceil(self.step())
     }
 
-    /// Words of one head's values.
-    fn values_of_head(&self) -> usize {
-        self.len.div_ceil(self.step()) * self.value_width()
+    /// Words of one head's values, where there is room for `capacity` of them.
+    fn values_of_head(&self, capacity: usize) -> usize {
+        capacity.div_ceil(self.step()) * self.value_width()
     }
 
     /// Words from one step of keys to the next in the values.
     pub(super) fn value_width(&self) -> usize {
-        self.head_dim.next_multiple_of(lanes(self.isa))
+        self.head_dim.next_multiple_of(self.isa.vectors().lanes)
     }
 
     /// The keys of one head.
     pub(super) fn head_keys(&self, head: usize) -> &[u32] {
-        let size = self.keys_of_head();
+        let size = self.keys_of_head(self.capacity);
         &self.keys[head * size..(head + 1) * size]
     }
 
     /// The values of one head.
     pub(super) fn head_values(&self, head: usize) -> &[u32] {
-        let size = self.values_of_head();
+        let size = self.values_of_head(self.capacity);
         &self.values[head * size..(head + 1) * size]
     }
 
@@ -238,15 +291,16 @@ impl PackedKeyValues {
     }
 }
 
-fn reserve(buffer: &mut AlignedBuffer<u32>, elements: usize) {
+fn grow(buffer: &mut AlignedBuffer<u32>, elements: usize) -> Result<(), AllocError> {
     if buffer.len() < elements {
-        *buffer = AlignedBuffer::zeroed(elements);
+        *buffer = AlignedBuffer::zeroed(elements)?;
     }
+    Ok(())
 }
 
 struct Pack<'a> {
-    keys: MatRef<'a, f32>,
-    values: MatRef<'a, f32>,
+    keys: Rows<'a>,
+    values: Rows<'a>,
     /// Number of the first key given.
     first: usize,
     keys_to: *mut u32,
@@ -266,37 +320,37 @@ struct Head<'a> {
 }
 
 /// As float32.
-impl Kernel for Head<'_> {
-    type Output = bool;
-
-    #[inline(always)]
-    unsafe fn run<V: Vector>(self) -> bool {
-        // SAFETY: the caller has the instruction set.
-        unsafe { self.pack::<V, Words>() }
-    }
-}
+struct WordHead<'a>(Head<'a>);
 
 /// As pairs of bfloat16.
-impl DotKernel for Head<'_> {
+struct PairHead<'a>(Head<'a>);
+
+impl Kernel for WordHead<'_> {
     type Output = bool;
 
-    const DOT: Dot = Dot::Bf16;
-
     #[inline(always)]
-    unsafe fn run<V: Vector, D: Dots<V>>(self) -> bool {
-        // SAFETY: the caller has the instruction set and the dot product.
-        unsafe { self.pack::<V, Pairs<D>>() }
+    unsafe fn run<S: Simd>(self, _: S) -> bool {
+        // SAFETY: called within `Simd::run`.
+        unsafe { self.0.pack::<S, S::Vector, Words>() }
     }
 }
 
-/// Lanes of the widest vector.
-const MAX_LANES: usize = 16;
+impl Kernel for PairHead<'_> {
+    type Output = bool;
+    const DOTS: Option<Dot> = Some(Dot::Bf16);
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self, _: S) -> bool {
+        // SAFETY: called within `Simd::run`.
+        unsafe { self.0.pack::<S, S::Vector, Pairs>() }
+    }
+}
 
 /// How elements become words.
 ///
 /// # Safety
-/// Every method needs a CPU that has the instruction set of `V`, pointers to as many elements as they name, and room for a vector of words.
-trait Store<V: Vector> {
+/// Every method is called within [`Simd::run`] of `S`, with pointers to as many elements as it names, and room for a vector of words.
+trait Store<S: Simd> {
     /// Elements in a word.
     const STEP: usize;
 
@@ -314,7 +368,7 @@ trait Store<V: Vector> {
 /// float32.
 struct Words;
 
-impl<V: Vector> Store<V> for Words {
+impl<S: Simd<Vector = V>, V: Vector> Store<S> for Words {
     const STEP: usize = 1;
 
     #[inline(always)]
@@ -327,7 +381,7 @@ impl<V: Vector> Store<V> for Words {
     unsafe fn across(rows: [Option<*const f32>; 2], count: usize, _: u32, to: *mut u32) {
         if let Some(row) = rows[0] {
             // SAFETY: as above.
-            unsafe { <Self as Store<V>>::along(row, count, to) }
+            unsafe { <Self as Store<S>>::along(row, count, to) }
         }
     }
 
@@ -338,9 +392,9 @@ impl<V: Vector> Store<V> for Words {
 }
 
 /// Pairs of bfloat16.
-struct Pairs<D>(PhantomData<D>);
+struct Pairs;
 
-impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
+impl<S: Simd<Vector = V>, V: Vector> Store<S> for Pairs {
     const STEP: usize = 2;
 
     #[inline(always)]
@@ -349,7 +403,7 @@ impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
         unsafe {
             let first = load::<V>(row, V::LANES.min(count));
             let second = load::<V>(row.wrapping_add(V::LANES), count.saturating_sub(V::LANES));
-            D::store_bf16(first, second, to.cast());
+            S::Dots::store_bf16(first, second, to.cast());
         }
     }
 
@@ -362,7 +416,7 @@ impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
                 Some(row) => load::<V>(row, count),
                 None => V::splat(0.0),
             });
-            D::store_bf16(first, second, halves.as_mut_ptr());
+            S::Dots::store_bf16(first, second, halves.as_mut_ptr());
             std::slice::from_raw_parts_mut(to, V::LANES)
         };
         let (low, high) = halves[..2 * V::LANES].split_at(V::LANES);
@@ -379,30 +433,30 @@ impl<V: Vector, D: Dots<V>> Store<V> for Pairs<D> {
 
 impl Head<'_> {
     /// Columns of this head in a row of `of`.
-    fn row(&self, of: MatRef<'_, f32>, index: usize) -> *const f32 {
+    fn row(&self, of: Rows<'_>, index: usize) -> *const f32 {
         of.as_ptr()
-            .wrapping_offset(index as isize * of.row_stride())
+            .wrapping_add(index * of.row_stride())
             .wrapping_add(self.head * self.job.head_dim)
     }
 
     /// # Safety
-    /// The CPU has the instruction set of `V`, and what `S` needs.
+    /// Called within [`Simd::run`] of `S`.
     #[inline(always)]
-    unsafe fn pack<V: Vector, S: Store<V>>(mut self) -> bool {
+    unsafe fn pack<S: Simd<Vector = V>, V: Vector, W: Store<S>>(mut self) -> bool {
         // SAFETY: the caller's promise.
         unsafe {
-            self.pack_keys::<V, S>();
-            self.pack_values::<V, S>()
+            self.pack_keys::<S, V, W>();
+            self.pack_values::<S, V, W>()
         }
     }
 
     /// # Safety
     /// As [`Self::pack`].
     #[inline(always)]
-    unsafe fn pack_keys<V: Vector, S: Store<V>>(&mut self) {
+    unsafe fn pack_keys<S: Simd<Vector = V>, V: Vector, W: Store<S>>(&mut self) {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
-        let len = first + self.job.keys.nrows();
-        let steps = head_dim.div_ceil(S::STEP);
+        let len = first + self.job.keys.num_rows();
+        let steps = head_dim.div_ceil(W::STEP);
         for panel in first / V::LANES..len.div_ceil(V::LANES) {
             let keys = panel * V::LANES..(panel + 1) * V::LANES;
             // Lanes before the first key given stay.
@@ -412,10 +466,10 @@ impl Head<'_> {
             for step in (0..steps).step_by(V::LANES) {
                 for (lane, to) in square.iter_mut().enumerate().take(end).skip(start) {
                     let row = self.row(self.job.keys, keys.start + lane - first);
-                    let (from, most) = (step * S::STEP, V::LANES * S::STEP);
+                    let (from, most) = (step * W::STEP, V::LANES * W::STEP);
                     let (row, count) = (row.wrapping_add(from), most.min(head_dim - from));
                     // SAFETY: the row has these elements; the caller has the instruction set.
-                    unsafe { S::along(row, count, to.as_mut_ptr()) };
+                    unsafe { W::along(row, count, to.as_mut_ptr()) };
                 }
                 let to = &mut self.keys_to[(panel * steps + step) * V::LANES..];
                 let count = V::LANES.min(steps - step);
@@ -431,28 +485,28 @@ impl Head<'_> {
     /// # Safety
     /// As [`Self::pack`].
     #[inline(always)]
-    unsafe fn pack_values<V: Vector, S: Store<V>>(&mut self) -> bool {
+    unsafe fn pack_values<S: Simd<Vector = V>, V: Vector, W: Store<S>>(&mut self) -> bool {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
-        let len = first + self.job.values.nrows();
+        let len = first + self.job.values.num_rows();
         let width = head_dim.next_multiple_of(V::LANES);
         let mut finite = true;
-        for step in first / S::STEP..len.div_ceil(S::STEP) {
+        for step in first / W::STEP..len.div_ceil(W::STEP) {
             let row = |part: usize| {
-                let key = step * S::STEP + part;
-                (part < S::STEP && first <= key && key < len).then(|| self.row(self.job.values, key - first))
+                let key = step * W::STEP + part;
+                (part < W::STEP && first <= key && key < len).then(|| self.row(self.job.values, key - first))
             };
             let rows = [row(0), row(1)];
             // The key before the first one given may share its words: it stays.
-            let kept = if step * S::STEP < first { 0xffff } else { 0 };
+            let kept = if step * W::STEP < first { 0xffff } else { 0 };
             for column in (0..head_dim).step_by(V::LANES) {
                 let rows = rows.map(|row| row.map(|row| row.wrapping_add(column)));
                 let count = V::LANES.min(head_dim - column);
                 let to = &mut self.values_to[step * width + column..][..V::LANES];
                 // SAFETY: the rows have these elements, and a vector of words fits; the caller has the instruction set.
-                unsafe { S::across(rows, count, kept, to.as_mut_ptr()) };
+                unsafe { W::across(rows, count, kept, to.as_mut_ptr()) };
                 let infinite = to
                     .iter()
-                    .fold(0, |infinite, &word| infinite | u32::from(!S::is_finite(word)));
+                    .fold(0, |infinite, &word| infinite | u32::from(!W::is_finite(word)));
                 finite &= infinite == 0;
             }
         }

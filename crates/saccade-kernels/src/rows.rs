@@ -1,0 +1,533 @@
+//! Views of matrices: rows of contiguous elements, and weights of any two strides.
+
+use std::ops::Range;
+
+/// A matrix `(num_rows, num_columns)` whose rows are contiguous, with any number of elements from one row to the next.
+///
+/// ```
+/// use saccade_kernels::Rows;
+/// let data = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+/// let x = Rows::new(&data, 3);
+/// assert_eq!((x.num_rows(), x.row(1)), (2, &[4.0, 5.0, 6.0][..]));
+/// assert_eq!(x.columns(1..3).row(0), [2.0, 3.0]);
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Rows<'a, T = f32> {
+    /// From the first element on; ends at the last one or later.
+    data: &'a [T],
+    shape: Shape,
+}
+
+/// [`Rows`] that can be written to.
+///
+/// ```
+/// use saccade_kernels::RowsMut;
+/// let mut data = [0.0; 6];
+/// let mut out = RowsMut::new(&mut data, 3);
+/// out.row_mut(1).fill(2.0);
+/// assert_eq!(data, [0.0, 0.0, 0.0, 2.0, 2.0, 2.0]);
+/// ```
+#[derive(Debug)]
+pub struct RowsMut<'a, T = f32> {
+    /// As in [`Rows`].
+    data: &'a mut [T],
+    shape: Shape,
+}
+
+/// A matrix `(num_rows, num_columns)` with any strides, as weights may be stored: row-major, or the transpose of that.
+///
+/// ```
+/// use saccade_kernels::{Matrix, Rows};
+/// let in_major = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]; // (in_features 3, out_features 2)
+/// let weight = Matrix::from(Rows::new(&in_major, 2)).transpose();
+/// assert_eq!((weight.num_rows(), weight.num_columns(), weight.get(1, 2)), (2, 3, 6.0));
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Matrix<'a, T = f32> {
+    data: &'a [T],
+    num_rows: usize,
+    num_columns: usize,
+    row_stride: usize,
+    column_stride: usize,
+}
+
+/// How many rows and columns, and elements from one row to the next.
+#[derive(Clone, Copy, Debug)]
+struct Shape {
+    num_rows: usize,
+    num_columns: usize,
+    row_stride: usize,
+}
+
+impl Shape {
+    /// Of `len` elements as rows of `num_columns`.
+    #[track_caller]
+    fn contiguous(len: usize, num_columns: usize) -> Self {
+        let num_rows = len.checked_div(num_columns).unwrap_or(0);
+        assert_eq!(
+            num_rows * num_columns,
+            len,
+            "data: expected whole rows of {num_columns} elements"
+        );
+        Self {
+            num_rows,
+            num_columns,
+            row_stride: num_columns,
+        }
+    }
+
+    /// Checks that `len` elements hold all rows.
+    #[track_caller]
+    fn check(&self, len: usize) {
+        let end = match self.num_rows.checked_sub(1) {
+            Some(last) if self.num_columns > 0 => last
+                .checked_mul(self.row_stride)
+                .and_then(|last| last.checked_add(self.num_columns)),
+            _ => Some(0),
+        };
+        assert!(
+            end.is_some_and(|end| end <= len),
+            "data: expected room for {} rows of {} elements, {} apart, got {len} elements",
+            self.num_rows,
+            self.num_columns,
+            self.row_stride
+        );
+    }
+
+    /// The elements of row `row`.
+    #[track_caller]
+    fn row(&self, row: usize) -> Range<usize> {
+        assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
+        // Rows without elements may lie beyond the data.
+        let first = if self.num_columns == 0 {
+            0
+        } else {
+            row * self.row_stride
+        };
+        first..first + self.num_columns
+    }
+
+    /// The shape of some of the rows, and where they begin.
+    #[track_caller]
+    fn rows(&self, rows: &Range<usize>) -> (Self, usize) {
+        assert!(
+            rows.start <= rows.end && rows.end <= self.num_rows,
+            "rows {rows:?} of {}",
+            self.num_rows
+        );
+        let part = Self {
+            num_rows: rows.len(),
+            ..*self
+        };
+        (
+            part,
+            if part.is_empty() {
+                0
+            } else {
+                rows.start * self.row_stride
+            },
+        )
+    }
+
+    /// The shape of some of the columns, and where they begin.
+    #[track_caller]
+    fn columns(&self, columns: &Range<usize>) -> (Self, usize) {
+        assert!(
+            columns.start <= columns.end && columns.end <= self.num_columns,
+            "columns {columns:?} of {}",
+            self.num_columns
+        );
+        let part = Self {
+            num_columns: columns.len(),
+            ..*self
+        };
+        (part, if part.is_empty() { 0 } else { columns.start })
+    }
+
+    fn is_empty(&self) -> bool {
+        self.num_rows == 0 || self.num_columns == 0
+    }
+}
+
+impl<'a, T> Rows<'a, T> {
+    /// All of `data` as rows of `num_columns` elements, one after the other.
+    ///
+    /// # Panics
+    /// If `data` does not hold whole rows.
+    #[must_use]
+    #[track_caller]
+    pub fn new(data: &'a [T], num_columns: usize) -> Self {
+        let shape = Shape::contiguous(data.len(), num_columns);
+        Self { data, shape }
+    }
+
+    /// `num_rows` rows of `num_columns` elements, the first at the beginning of `data`, each `row_stride` elements after the one before.
+    ///
+    /// # Panics
+    /// If `data` is too short.
+    #[must_use]
+    #[track_caller]
+    pub fn strided(data: &'a [T], num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
+        let shape = Shape {
+            num_rows,
+            num_columns,
+            row_stride,
+        };
+        shape.check(data.len());
+        Self { data, shape }
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub fn num_rows(&self) -> usize {
+        self.shape.num_rows
+    }
+
+    /// Elements of a row.
+    #[must_use]
+    pub fn num_columns(&self) -> usize {
+        self.shape.num_columns
+    }
+
+    /// Elements from one row to the next.
+    #[must_use]
+    pub fn row_stride(&self) -> usize {
+        self.shape.row_stride
+    }
+
+    /// Row number `row`.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    #[must_use]
+    #[track_caller]
+    pub fn row(&self, row: usize) -> &'a [T] {
+        &self.data[self.shape.row(row)]
+    }
+
+    /// The rows in `rows`.
+    ///
+    /// # Panics
+    /// If not all of them are there.
+    #[must_use]
+    #[track_caller]
+    pub fn rows(&self, rows: Range<usize>) -> Self {
+        let (shape, first) = self.shape.rows(&rows);
+        let data = &self.data[first..];
+        Self { data, shape }
+    }
+
+    /// The columns in `columns` of all rows.
+    ///
+    /// # Panics
+    /// If not all of them are there.
+    #[must_use]
+    #[track_caller]
+    pub fn columns(&self, columns: Range<usize>) -> Self {
+        let (shape, first) = self.shape.columns(&columns);
+        let data = &self.data[first..];
+        Self { data, shape }
+    }
+
+    /// The first element of the first row.
+    pub(crate) fn as_ptr(&self) -> *const T {
+        self.data.as_ptr()
+    }
+}
+
+impl<'a, T> RowsMut<'a, T> {
+    /// As [`Rows::new`].
+    ///
+    /// # Panics
+    /// If `data` does not hold whole rows.
+    #[must_use]
+    #[track_caller]
+    pub fn new(data: &'a mut [T], num_columns: usize) -> Self {
+        let shape = Shape::contiguous(data.len(), num_columns);
+        Self { data, shape }
+    }
+
+    /// As [`Rows::strided`].
+    ///
+    /// # Panics
+    /// If `data` is too short, or rows overlap.
+    #[must_use]
+    #[track_caller]
+    pub fn strided(data: &'a mut [T], num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
+        let shape = Shape {
+            num_rows,
+            num_columns,
+            row_stride,
+        };
+        shape.check(data.len());
+        assert!(
+            num_rows <= 1 || num_columns <= row_stride,
+            "row_stride: expected at least the {num_columns} elements of a row, got {row_stride}"
+        );
+        Self { data, shape }
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub fn num_rows(&self) -> usize {
+        self.shape.num_rows
+    }
+
+    /// Elements of a row.
+    #[must_use]
+    pub fn num_columns(&self) -> usize {
+        self.shape.num_columns
+    }
+
+    /// Elements from one row to the next.
+    #[must_use]
+    pub fn row_stride(&self) -> usize {
+        self.shape.row_stride
+    }
+
+    /// Row number `row`.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    #[must_use]
+    #[track_caller]
+    pub fn row_mut(&mut self, row: usize) -> &mut [T] {
+        &mut self.data[self.shape.row(row)]
+    }
+
+    /// The same rows, to be read.
+    #[must_use]
+    pub fn as_rows(&self) -> Rows<'_, T> {
+        Rows {
+            data: self.data,
+            shape: self.shape,
+        }
+    }
+
+    /// The same rows for a shorter time.
+    #[must_use]
+    pub fn reborrow(&mut self) -> RowsMut<'_, T> {
+        RowsMut {
+            data: self.data,
+            shape: self.shape,
+        }
+    }
+
+    /// The rows in `rows`.
+    ///
+    /// # Panics
+    /// If not all of them are there.
+    #[must_use]
+    #[track_caller]
+    pub fn rows(self, rows: Range<usize>) -> Self {
+        let (shape, first) = self.shape.rows(&rows);
+        let data = &mut self.data[first..];
+        Self { data, shape }
+    }
+
+    /// The columns in `columns` of all rows.
+    ///
+    /// # Panics
+    /// If not all of them are there.
+    #[must_use]
+    #[track_caller]
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        let (shape, first) = self.shape.columns(&columns);
+        let data = &mut self.data[first..];
+        Self { data, shape }
+    }
+
+    /// The first element of the first row.
+    pub(crate) fn as_mut_ptr(&mut self) -> *mut T {
+        self.data.as_mut_ptr()
+    }
+}
+
+impl<'a, T> From<Rows<'a, T>> for Matrix<'a, T> {
+    fn from(rows: Rows<'a, T>) -> Self {
+        Self {
+            data: rows.data,
+            num_rows: rows.shape.num_rows,
+            num_columns: rows.shape.num_columns,
+            row_stride: rows.shape.row_stride,
+            column_stride: 1,
+        }
+    }
+}
+
+impl<'a, T: Copy> Matrix<'a, T> {
+    /// All of `data` as rows of `num_columns` elements, one after the other.
+    ///
+    /// # Panics
+    /// If `data` does not hold whole rows.
+    #[must_use]
+    #[track_caller]
+    pub fn new(data: &'a [T], num_columns: usize) -> Self {
+        Rows::new(data, num_columns).into()
+    }
+
+    /// Number of rows: `out_features` of a weight.
+    #[must_use]
+    pub fn num_rows(&self) -> usize {
+        self.num_rows
+    }
+
+    /// Number of columns: `in_features` of a weight.
+    #[must_use]
+    pub fn num_columns(&self) -> usize {
+        self.num_columns
+    }
+
+    /// Rows as columns.
+    #[must_use]
+    pub fn transpose(self) -> Self {
+        Self {
+            data: self.data,
+            num_rows: self.num_columns,
+            num_columns: self.num_rows,
+            row_stride: self.column_stride,
+            column_stride: self.row_stride,
+        }
+    }
+
+    /// The rows in `rows`.
+    ///
+    /// # Panics
+    /// If not all of them are there.
+    #[must_use]
+    #[track_caller]
+    pub fn rows(self, rows: Range<usize>) -> Self {
+        assert!(
+            rows.start <= rows.end && rows.end <= self.num_rows,
+            "rows {rows:?} of {}",
+            self.num_rows
+        );
+        let empty = rows.is_empty() || self.num_columns == 0;
+        let first = if empty { 0 } else { rows.start * self.row_stride };
+        Self {
+            data: &self.data[first..],
+            num_rows: rows.len(),
+            ..self
+        }
+    }
+
+    /// The columns in `columns`.
+    ///
+    /// # Panics
+    /// If not all of them are there.
+    #[must_use]
+    #[track_caller]
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        self.transpose().rows(columns).transpose()
+    }
+
+    /// Element `(row, column)`.
+    ///
+    /// # Panics
+    /// If there is no such element.
+    #[must_use]
+    #[track_caller]
+    #[inline]
+    pub fn get(&self, row: usize, column: usize) -> T {
+        assert!(
+            row < self.num_rows && column < self.num_columns,
+            "element ({row}, {column}) of ({}, {})",
+            self.num_rows,
+            self.num_columns
+        );
+        self.data[row * self.row_stride + column * self.column_stride]
+    }
+
+    /// Row number `row` where its elements are contiguous.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    #[must_use]
+    #[track_caller]
+    pub fn contiguous_row(&self, row: usize) -> Option<&'a [T]> {
+        assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
+        if self.num_columns == 0 {
+            return Some(&[]);
+        }
+        (self.column_stride == 1 || self.num_columns == 1)
+            .then(|| &self.data[row * self.row_stride..][..self.num_columns])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn counted(len: usize) -> Vec<u32> {
+        (0..).take(len).collect()
+    }
+
+    #[test]
+    fn parts_of_rows_are_where_they_should_be() {
+        let mut data = counted(23);
+        let x = Rows::strided(&data, 4, 5, 6);
+        assert_eq!((x.num_rows(), x.num_columns(), x.row_stride()), (4, 5, 6));
+        assert_eq!(x.rows(1..3).columns(2..4).row(1), [14, 15]);
+        assert_eq!(x.columns(4..5).rows(3..4).row(0), [22]);
+        assert_eq!(x.rows(4..4).num_rows(), 0);
+        assert_eq!(x.columns(5..5).row(3), [0_u32; 0]);
+        let mut out = RowsMut::strided(&mut data, 4, 5, 6);
+        out.reborrow().rows(1..2).columns(1..3).row_mut(0).fill(100);
+        assert_eq!(out.as_rows().row(1), [6, 100, 100, 9, 10]);
+    }
+
+    #[test]
+    fn views_without_elements() {
+        let none: [f32; 0] = [];
+        assert_eq!(Rows::new(&none, 7).num_rows(), 0);
+        assert_eq!(Rows::new(&none, 0).num_rows(), 0);
+        let x = Rows::strided(&none, 3, 0, 0);
+        assert_eq!((x.num_rows(), x.row(2)), (3, &none[..]));
+        assert_eq!(Matrix::from(x).transpose().num_columns(), 3);
+        assert_eq!(Matrix::from(x).rows(2..3).contiguous_row(0), Some(&none[..]));
+    }
+
+    #[test]
+    fn a_transposed_matrix_has_the_same_elements() {
+        let data = counted(12);
+        let matrix = Matrix::new(&data, 4);
+        let turned = matrix.transpose();
+        assert_eq!((turned.num_rows(), turned.num_columns()), (4, 3));
+        for (row, column) in (0..3).flat_map(|row| (0..4).map(move |column| (row, column))) {
+            assert_eq!(matrix.get(row, column), turned.get(column, row));
+        }
+        assert_eq!(turned.rows(1..3).columns(2..3).get(1, 0), matrix.get(2, 2));
+        assert_eq!(matrix.contiguous_row(1), Some(&data[4..8]));
+        assert_eq!(turned.contiguous_row(1), None);
+    }
+
+    #[test]
+    #[should_panic(expected = "data: expected whole rows of 4 elements")]
+    fn a_part_of_a_row_is_refused() {
+        let _ = Rows::new(&[0.0; 7], 4);
+    }
+
+    #[test]
+    #[should_panic(expected = "data: expected room for 3 rows of 2 elements, 4 apart, got 9 elements")]
+    fn data_that_is_too_short_is_refused() {
+        let _ = Rows::strided(&[0.0; 9], 3, 2, 4);
+    }
+
+    #[test]
+    #[should_panic(expected = "data: expected room")]
+    fn a_size_that_overflows_is_refused() {
+        let _ = Rows::strided(&[0.0; 9], usize::MAX, 2, usize::MAX / 2);
+    }
+
+    #[test]
+    #[should_panic(expected = "row_stride: expected at least the 3 elements of a row, got 2")]
+    fn rows_to_write_that_overlap_are_refused() {
+        let _ = RowsMut::strided(&mut [0.0; 9], 3, 3, 2);
+    }
+
+    #[test]
+    #[should_panic(expected = "rows 1..4 of 3")]
+    fn rows_that_are_not_there_are_refused() {
+        let _ = Rows::new(&[0.0; 6], 2).rows(1..4);
+    }
+}
