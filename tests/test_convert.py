@@ -286,7 +286,7 @@ def test_nothing_is_replaced_unasked(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     convert(source, out)
     before = others_of(out)
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="exists already"):
         convert(source, out)
     convert(source, out, force=True, dtype="bfloat16")
     assert others_of(out) == before

@@ -337,7 +337,7 @@ def test_a_name_in_two_files_outside_the_head_is_ignored(tmp_path: Path) -> None
 def test_a_tensor_in_two_files(tmp_path: Path) -> None:
     for name in ("a.safetensors", "b.safetensors"):
         save_file({"action_head.vlln.bias": np.zeros(24, np.float32)}, tmp_path / name)
-    with pytest.raises(saccade.CheckpointError, match=r"vlln.bias is also in .*a.safetensors"):
+    with pytest.raises(saccade.CheckpointError, match=r"vlln.bias is in two files, .*a.safetensors"):
         saccade.ActionHead.load(tmp_path, config=TINY.config)
 
 

@@ -168,7 +168,7 @@ def test_progress_and_stopping(source: Path, tmp_path: Path) -> None:
 
 def test_nothing_is_replaced_unasked(source: Path, quantized: Path) -> None:
     before = (quantized / "model.safetensors").read_bytes()
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="exists already"):
         quantize(source, quantized)
     assert (quantized / "model.safetensors").read_bytes() == before
     (quantized / "model.safetensors").write_bytes(b"")
@@ -188,7 +188,7 @@ def test_the_source_is_never_replaced(source: Path) -> None:
     for given in (source, source / "model.safetensors"):
         with pytest.raises(InputError, match="holds the source"):
             quantize(given, source, force=True)
-    with pytest.raises(InputError, match="is no directory"):
+    with pytest.raises(InputError, match="is not a directory"):
         quantize(source, source / "model.safetensors", force=True)
 
 
@@ -250,7 +250,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
     "scale of a wrong type": (lambda t: t.update({SCALE: t[SCALE].half()}), "_scale is F16, expected F32"),
     "scale without int8": (
         lambda t: t.update({WEIGHT: t[WEIGHT].float()}),
-        "stands beside .* of F32, expected I8",
+        "is there, but .* is F32, expected I8",
     ),
     "scale without weight": (lambda t: t.pop(WEIGHT), "to_q.weight is missing"),
     "scale of a bias": (
@@ -305,6 +305,6 @@ def test_the_command(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert report["num_quantized"] == sum(t.dtype == torch.int8 for t in tensors_of(out).values())
     assert report["head_bytes_after"] < report["head_bytes_before"]
     assert cli.main(["quantize", str(source), "--out", str(out)]) == cli.EXIT_BAD_INPUT
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert cli.main(["quantize", str(source), "--out", str(out), "--force", "--head-only"]) == 0
     assert "2 left out" in capsys.readouterr().out

@@ -1,51 +1,12 @@
-//! What the fuzz targets share: the files of `crates/saccade` that read checkpoints, and folders in memory.
-//!
-//! The files are compiled by path. So the targets reach what is private, and `saccade-kernels`, which takes minutes to build and reads no
-//! file, stays out.
-
-#![allow(dead_code)]
-
-#[path = "../../crates/saccade/src/checkpoint.rs"]
-pub mod checkpoint;
-#[path = "../../crates/saccade/src/companions.rs"]
-pub mod companions;
-#[path = "../../crates/saccade/src/config.rs"]
-pub mod config;
-#[path = "../../crates/saccade/src/convert.rs"]
-pub mod convert;
-#[path = "../../crates/saccade/src/error.rs"]
-pub mod error;
-#[path = "../../crates/saccade/src/fit.rs"]
-pub mod fit;
-#[path = "../../crates/saccade/src/layout.rs"]
-pub mod layout;
-#[path = "../../crates/saccade/src/recognise.rs"]
-pub mod recognise;
-#[path = "../../crates/saccade/src/resize.rs"]
-pub mod resize;
-#[path = "../../crates/saccade/src/rewrite.rs"]
-pub mod rewrite;
-#[path = "../../crates/saccade/src/writer.rs"]
-pub mod writer;
-
-/// What the files above want of `head.rs`, which needs the kernels.
-mod head {
-    use crate::error::Result;
-
-    pub(crate) fn chosen_embodiments(_: Option<&[i64]>, _: Option<&[i64]>, _: usize) -> Result<Vec<usize>> {
-        unreachable!("no target converts")
-    }
-}
+//! What the fuzz targets share: using what an input holds as the engine does, and folders in memory.
 
 use std::fs::{self, File};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use checkpoint::Checkpoint;
-use config::HeadConfig;
-use layout::tensor_specs;
-use recognise::Published;
-use resize::ResizeOptions;
+use saccade::{HeadConfig, Published, ResizeOptions, RewriteOptions, resize, resized_config, tensor_shapes};
+use saccade_checkpoint::spec::TensorSpec;
+use saccade_checkpoint::{Checkpoint, Companions};
 
 /// More than any tensor of an input: reading may not take more memory than the file has bytes, twice for widened halves.
 const MAX_BYTES_READ: usize = 1 << 26;
@@ -87,24 +48,21 @@ pub fn use_checkpoint(path: &Path) {
         let mut nbytes = 0;
         let read = checkpoint.read_bytes(name, |bytes| {
             nbytes += bytes.len() as u64;
-            Ok(())
+            Ok::<(), saccade_checkpoint::Error>(())
         });
         match read {
             Ok(()) => assert_eq!(nbytes, checkpoint.nbytes(name).expect("it was read")),
             Err(error) => check_message(&error),
         }
     }
-    if let Err(error) = checkpoint.kept_embodiments() {
-        check_message(&error);
-    }
-    match checkpoint.head_prefix() {
-        Ok(prefix) => {
-            let config = HeadConfig::from_json(include_str!("../config.json")).expect("config.json is valid");
-            if let Err(error) = checkpoint.check(prefix, &config) {
-                check_message(&error);
-            }
+    let expected = [TensorSpec::plain("weight", &[2, 3]), TensorSpec::plain("a", &[])];
+    for prefix in ["", "action_head."] {
+        for problem in checkpoint.problems(prefix, &expected, |_, shape| shape.is_empty()) {
+            assert!(!problem.text().is_empty());
         }
-        Err(error) => check_message(&error),
+    }
+    if let Err(error) = Companions::of(path, checkpoint.files()) {
+        check_message(&error);
     }
 }
 
@@ -118,16 +76,12 @@ pub fn use_config(text: &str) {
 
 fn use_head_config(config: &HeadConfig) {
     assert!(config.num_rows() > config.action_horizon);
-    let names = HeadNames::new(config);
-    for tensor in names.tensors() {
-        let size = tensor
-            .shape
+    for (name, shape) in tensor_shapes(config) {
+        let size = shape
             .iter()
             .try_fold(4usize, |product, &size| product.checked_mul(size));
-        assert!(size.is_some(), "{} overflows", tensor.name);
+        assert!(size.is_some(), "{name} overflows");
     }
-    let ids: Vec<usize> = (0..config.num_embodiments.min(3)).collect();
-    assert!(!names.reading_order(config, &ids).is_empty());
 }
 
 /// Says what the checkpoint of this `config.json` and this header is, as every command does. The file has all the bytes that the header
@@ -145,26 +99,26 @@ pub fn use_published(folder: &Path, config: &str, header: &[u8]) {
     if let Err(error) = published.check() {
         check_message(&error);
     }
+    if let Err(error) = published.kept_embodiments() {
+        check_message(&error);
+    }
 }
 
 /// Resizes the checkpoint of this `config.json`, this header and these bytes, repeated; it may be refused.
 pub fn use_resize(folder: &Path, count: usize, config: &str, header: &[u8], bytes: &[u8]) {
-    if let Ok(parsed) = HeadConfig::from_json(config) {
-        match resize::plan(&parsed, config, count) {
-            Ok(plan) => check_plan(&plan, &parsed, count),
+    if let Ok(before) = HeadConfig::from_json(config) {
+        match resized_config(config, count) {
+            Ok(text) => check_resized_config(&text, &before, count),
             Err(error) => check_message(&error),
         }
     }
     let (source, out) = (folder.join("source"), folder.join("out"));
     let _ = fs::create_dir(&source);
     write_checkpoint(&source, config, header, bytes, 1 << 20);
-    let options = ResizeOptions {
-        num_future_tokens: count,
-        // Some inputs with what is added to copies, some without.
-        perturbation: f64::from(u8::from(count % 2 == 1)),
-        ..ResizeOptions::default()
-    };
-    match resize::resize(&source, &out, &options, |_, _| true) {
+    let mut options = ResizeOptions::new(RewriteOptions::new(), count);
+    // Some inputs with what is added to copies, some without.
+    options.perturbation = f64::from(u8::from(count % 2 == 1));
+    match resize(&source, &out, &options, |_, _| true) {
         Ok(report) => {
             assert_eq!((report.num_after, report.sources.len()), (count, count));
             let published = Published::open(&out, None).expect("what was written can be read");
@@ -185,19 +139,12 @@ pub fn use_resize(folder: &Path, count: usize, config: &str, header: &[u8], byte
     );
 }
 
-/// The planned config says the new number, and is the old one else.
-fn check_plan(plan: &resize::Plan, before: &HeadConfig, count: usize) {
-    let (text, own) = plan.config(None);
-    if own.is_none()
-        && let Ok(after) = HeadConfig::from_json(&text)
-    {
-        let expected = HeadConfig {
-            num_future_tokens: count,
-            future_key_bias: None,
-            ..before.clone()
-        };
-        assert_eq!(after, expected);
-    }
+/// The new config says the new number and no biases, and otherwise what the old one said.
+fn check_resized_config(text: &str, before: &HeadConfig, count: usize) {
+    let mut expected = before.clone();
+    (expected.num_future_tokens, expected.future_key_bias) = (count, None);
+    let after = HeadConfig::from_json(text).expect("a config stays a config");
+    assert_eq!(after, expected);
 }
 
 /// `config.json` and a file of this header, `bytes` behind it, repeated up to the length that the header promises, but not longer than `most`.
@@ -243,7 +190,7 @@ pub fn split(mut bytes: &[u8], count: usize) -> Vec<&[u8]> {
 }
 
 /// A message is not empty, short enough to read and does nothing to a terminal.
-pub fn check_message(error: &error::Error) {
+pub fn check_message(error: &dyn std::error::Error) {
     let message = error.to_string();
     assert!(!message.is_empty());
     assert!(

@@ -9,10 +9,9 @@ use half::{bf16, f16};
 use safetensors::Dtype;
 
 use crate::alloc::reserve;
-use crate::checkpoint::Elements;
 use crate::error::{Error, Result, show_shape};
-use crate::fit::{self, Problem};
-use crate::layout::TensorSpec;
+use saccade_checkpoint::spec::{self, Problem};
+use saccade_checkpoint::{Elements, TensorSpec};
 use crate::nn::weights::{Request, Source, Tensor};
 use crate::ops::check_interrupted;
 
@@ -135,7 +134,7 @@ pub(crate) fn problems(
         Some((tensor.elements.dtype(), tensor.shape.as_slice()))
     };
     let names = tensors.keys().map(String::as_str);
-    fit::problems(names, describe, "", expected, is_unused)
+    spec::problems(names, describe, "", expected, is_unused)
 }
 
 /// Tensors in memory as layers take them: each is copied when it is asked for, and the memory of the last copy is used again.

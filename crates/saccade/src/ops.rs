@@ -1,29 +1,64 @@
-//! The kernels' calls, each counted for the profile of the thread that makes it.
+//! The kernels' calls: each counted for the profile of the thread that makes it, its refusals and interruptions made errors.
 
-use faer::{MatMut, MatRef};
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear};
+use saccade_kernels::{
+    AllocError, Epilogue, KernelError, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, Rows, RowsMut,
+};
 
 use crate::engine::Engine;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::profile::{Part, counted};
 
+/// Runs `work`, and asks `poll` every 20 ms or so whether to stop it.
+///
+/// `poll` is called on this thread, between the tasks of every kernel that `work` calls, between blocks and between tensors. Once it returns
+/// true, `work` ends soon, however large it is. A head, a layer or a checkpoint that was in use stays usable.
+///
+/// # Errors
+/// [`Error::Interrupted`] if `poll` returned true, otherwise those of `work`.
+///
+/// ```
+/// use saccade::{Error, interruptible};
+/// assert_eq!(interruptible(&|| false, || Ok(7)).unwrap(), 7);
+/// let stopped = interruptible(&|| true, || Err::<(), _>(Error::Interrupted));
+/// assert!(matches!(stopped, Err(Error::Interrupted)));
+/// ```
+pub fn interruptible<R>(poll: &dyn Fn() -> bool, work: impl FnOnce() -> Result<R>) -> Result<R> {
+    saccade_kernels::interruptible(poll, work).unwrap_or(Err(Error::Interrupted))
+}
+
+/// Whether an [`interruptible`] call that this code runs in is to stop: what kernels gave since then is not to be used.
+///
+/// # Errors
+/// [`Error::Interrupted`] if so.
+pub(crate) fn check_interrupted() -> Result<()> {
+    if saccade_kernels::interrupted() {
+        return Err(Error::Interrupted);
+    }
+    Ok(())
+}
+
 /// `data` as rows of `width`.
-pub(crate) fn rows(data: &[f32], width: usize) -> MatRef<'_, f32> {
-    MatRef::from_row_major_slice(data, data.len() / width, width)
+pub(crate) fn rows(data: &[f32], width: usize) -> Rows<'_> {
+    Rows::new(data, width)
 }
 
 /// `data` as rows of `width`, to be written.
-pub(crate) fn rows_mut(data: &mut [f32], width: usize) -> MatMut<'_, f32> {
-    let count = data.len() / width;
-    MatMut::from_row_major_slice_mut(data, count, width)
+pub(crate) fn rows_mut(data: &mut [f32], width: usize) -> RowsMut<'_> {
+    RowsMut::new(data, width)
 }
 
-/// Whether the caller has asked this thread's call to stop: what kernels gave since then is not to be used.
-///
-/// # Errors
-/// [`Error::Interrupted`](crate::Error::Interrupted) if so.
-pub(crate) fn check_interrupted() -> Result<()> {
-    Ok(())
+/// The error for memory that a kernel was refused.
+fn refused(what: &'static str) -> impl Fn(AllocError) -> Error {
+    move |AllocError { bytes }| Error::Memory { what, bytes }
+}
+
+/// The error for a layer that was not packed.
+pub(crate) fn packing_error(error: KernelError) -> Error {
+    match error {
+        KernelError::Alloc(error) => refused("weights")(error),
+        KernelError::Interrupted(_) => Error::Interrupted,
+        other => Error::Checkpoint(format!("source: {other}")),
+    }
 }
 
 /// [`PackedLinear::apply`] on rows that follow each other in memory.
@@ -37,26 +72,27 @@ pub(crate) fn linear(
     scratch: &mut LinearScratch,
 ) -> Result<()> {
     let (x, out) = (rows(x, layer.in_features()), rows_mut(out, layer.out_features()));
-    let multiply_adds = x.nrows() * layer.in_features() * layer.out_features();
-    counted(part, (multiply_adds, layer.nbytes()), || {
-        layer.apply(threads, x, epilogue, out, scratch);
+    let multiply_adds = x.num_rows() * layer.in_features() * layer.out_features();
+    let applied = counted(part, (multiply_adds, layer.nbytes()), || {
+        layer.apply(threads, x, epilogue, out, scratch)
     });
+    applied.map_err(refused("activations"))?;
     check_interrupted()
 }
 
 /// [`saccade_kernels::attention`].
 pub(crate) fn attention(
     threads: usize,
-    queries: MatRef<'_, f32>,
+    queries: Rows<'_>,
     kv: &PackedKeyValues,
     scale: f32,
     bias: Option<LogitBias<'_>>,
     weights: Option<&mut [f32]>,
-    out: MatMut<'_, f32>,
+    out: RowsMut<'_>,
 ) -> Result<()> {
-    let multiply_adds = 2 * queries.nrows() * kv.len() * queries.ncols();
+    let multiply_adds = 2 * queries.num_rows() * kv.len() * queries.num_columns();
     counted(Some(Part::Attention), (multiply_adds, kv.nbytes()), || {
-        saccade_kernels::attention(threads, queries, kv, scale, bias, weights, out);
+        saccade_kernels::attention(threads, queries, kv, scale, bias.into(), weights, out);
     });
     check_interrupted()
 }
@@ -82,13 +118,17 @@ pub(crate) fn pack(
     threads: usize,
     packed: &mut PackedKeyValues,
     first: usize,
-    keys: MatRef<'_, f32>,
-    values: MatRef<'_, f32>,
+    keys: Rows<'_>,
+    values: Rows<'_>,
 ) -> Result<()> {
-    counted(Some(Part::Pack), (0, 0), || match first {
+    let result = counted(Some(Part::Pack), (0, 0), || match first {
         0 => packed.pack(threads, keys, values),
-        _ => packed.pack_from(threads, first, keys, values),
+        _ => {
+            packed.pack_from(threads, first, keys, values);
+            Ok(())
+        }
     });
+    result.map_err(refused("keys and values"))?;
     check_interrupted()
 }
 

@@ -9,7 +9,9 @@ use std::path::Path;
 
 use serde_json::{Map, Value, json};
 
-use crate::checkpoint::{Checkpoint, read_text};
+use saccade_checkpoint::{Checkpoint, OWN_CONFIG, read_text};
+
+use crate::checkpoint::{check, head_prefix, kept_embodiments};
 use crate::config::Version::{self, N1, N15, N16, N17};
 use crate::config::{HeadConfig, misplaced_own_key};
 use crate::error::{Error, Result, show_shape};
@@ -78,7 +80,7 @@ impl Published {
             Some(text) => text.to_owned(),
             None => read_text("config", &directory.join("config.json"))?,
         };
-        let prefix = checkpoint.head_prefix()?;
+        let prefix = head_prefix(&checkpoint)?;
         let tensors = HeadShapes {
             checkpoint: &checkpoint,
             prefix,
@@ -138,7 +140,15 @@ impl Published {
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
     pub fn check(&self) -> Result<()> {
-        self.checkpoint.check(self.prefix, &self.config)
+        check(&self.checkpoint, self.prefix, &self.config)
+    }
+
+    /// The embodiments whose layers were kept when others were removed; none if all are there.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if the files' metadata list anything but numbers.
+    pub fn kept_embodiments(&self) -> Result<Option<Vec<i64>>> {
+        kept_embodiments(&self.checkpoint)
     }
 
     /// The files that tensors are read from.
@@ -709,7 +719,7 @@ fn chunk_of_processors(directory: &Path) -> Option<u64> {
 
 /// What saccade keeps in a file of its own, since lerobot refuses a `config.json` with keys that it does not know.
 fn beside_lerobots_config(directory: &Path) -> Result<Option<Value>> {
-    let path = directory.join("saccade.json");
+    let path = directory.join(OWN_CONFIG);
     if !path.exists() {
         return Ok(None);
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
-use saccade_kernels::{Epilogue, LinearScratch, WeightRef, silu};
+use saccade_kernels::{Epilogue, LinearScratch, Matrix, WeightRef, silu};
 
 use super::cache::Cache;
 use super::category::CategoryLinear;
@@ -14,8 +14,8 @@ use crate::config::HeadConfig;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::linear::Linear;
-use crate::nn::weights::{Matrix, Outline, Stored, Weights};
-use crate::ops::{check_interrupted, rows};
+use crate::nn::weights::{Outline, Stored, Weight, Weights};
+use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::sampling::tables::action_time;
 
@@ -145,27 +145,30 @@ fn apart(
     let (w1, w2) = (weights.at("W1"), weights.at("W2"));
     let count = embodiments.count;
     let first = w1.slice("W", &[count, actions, width], id)?;
-    let first_bias = w1.slice("b", &[count, width], id)?.into_f32();
+    let first_bias = w1.slice("b", &[count, width], id)?.into_f32()?;
     let second = w2.slice("W", &[count, 2 * width, width], id)?;
-    let second_bias = w2.slice("b", &[count, width], id)?.into_f32();
+    let second_bias = w2.slice("b", &[count, width], id)?.into_f32()?;
 
     // Products in float64: the fused layer is then closer to the exact one than two float32 layers are.
     let action_half = second.transposed(width, 2 * width).inputs(0, width);
     let (fused, constant);
-    let (action, bias) = match (first.matrix(actions, width), action_half) {
-        (Matrix::Held(first), Matrix::Held(action_half)) => {
+    let (action, bias) = match (first.weight(actions, width), action_half) {
+        (Weight::Held(first), Weight::Held(action_half)) => {
             let action_half = widened(action_half); // (out, hidden)
             let product_of_weights = product(action_half.as_ref(), widened(first).transpose()); // (out, action)
-            let first_bias = widened(WeightRef::F32(rows(&first_bias, width)));
+            let first_bias = widened(WeightRef::F32(Matrix::new(&first_bias, width)));
             let bias = product(action_half.as_ref(), first_bias.transpose()); // (out, 1)
             constant = second_bias
                 .iter()
                 .enumerate()
                 .map(|(row, &b)| (f64::from(b) + bias[(row, 0)]) as f32)
                 .collect::<Vec<_>>();
-            fused = Mat::from_fn(width, actions, |i, j| product_of_weights[(i, j)] as f32);
+            fused = (0..width)
+                .flat_map(|i| (0..actions).map(move |j| (i, j)))
+                .map(|(i, j)| product_of_weights[(i, j)] as f32)
+                .collect::<Vec<_>>();
             (
-                Matrix::Held(WeightRef::F32(fused.as_ref())),
+                Weight::Held(WeightRef::F32(Matrix::new(&fused, actions))),
                 Some(constant.as_slice()),
             )
         }
@@ -175,7 +178,7 @@ fn apart(
                 out_features: width,
                 in_features: actions,
             };
-            (Matrix::Outline(outline), None)
+            (Weight::Outline(outline), None)
         }
     };
     check_interrupted()?;
@@ -188,13 +191,12 @@ fn apart(
 }
 
 fn widened(weight: WeightRef<'_>) -> Mat<f64> {
-    match weight {
-        WeightRef::F32(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| f64::from(view[(i, j)])),
-        WeightRef::Bf16(view) => Mat::from_fn(view.nrows(), view.ncols(), |i, j| view[(i, j)].to_f64()),
-        WeightRef::Int8 { values, scales } => Mat::from_fn(values.nrows(), values.ncols(), |i, j| {
-            f64::from(values[(i, j)]) * f64::from(scales[i])
-        }),
-    }
+    let (rows, columns) = weight.shape();
+    Mat::from_fn(rows, columns, |i, j| match weight {
+        WeightRef::F32(view) => f64::from(view.get(i, j)),
+        WeightRef::Bf16(view) => view.get(i, j).to_f64(),
+        WeightRef::Int8 { values, scales } => f64::from(values.get(i, j)) * f64::from(scales[i]),
+    })
 }
 
 fn product(lhs: MatRef<'_, f64>, rhs: MatRef<'_, f64>) -> Mat<f64> {

@@ -31,7 +31,7 @@ impl CategoryLinear {
             let weight = weights.slice("W", &[embodiments.count, in_features, out_features], id)?;
             let bias = weights
                 .slice("b", &[embodiments.count, out_features], id)?
-                .into_f32();
+                .into_f32()?;
             let parts = [(
                 weight.transposed(out_features, in_features),
                 Some(bias.as_slice()),

@@ -8,7 +8,7 @@ use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
 use crate::engine::Engine;
 use crate::error::{Error, Result, show_shape};
-use crate::fit;
+use saccade_checkpoint::spec;
 use crate::memory::{self, MemorySource, TensorViews};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys};
 use crate::nn::planner::Planner;
@@ -111,7 +111,7 @@ impl CrossAttention {
         attention(&planner, engine, width, context_dim, 1)?;
         let problems = memory::problems(tensors, &planner.into_plan().specs, |_, _| false);
         if !problems.is_empty() {
-            let listed = fit::list(&problems, "the widths of to_q and to_k");
+            let listed = spec::list(&problems, "the widths of to_q and to_k");
             return Err(Error::Checkpoint(format!("tensors: {listed}")));
         }
         if width == 0 || context_dim == 0 {

@@ -2,19 +2,20 @@
 
 use std::path::Path;
 
+use saccade_checkpoint::granted;
+use saccade_checkpoint::spec::{self, Problem};
+
 use super::action_head::ActionHead;
 use super::embodiments::{Embodiments, chosen_embodiments};
 use super::layers::HeadLayers;
 use super::plan::{is_unused, reading_order, tensor_specs};
-use crate::checkpoint::grant;
 use crate::config::HeadConfig;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
-use crate::fit::{self, Problem};
 use crate::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::{Builder, Source};
 use crate::precision::Precision;
-use crate::reading::HeadTensors;
+use crate::nn::file::FileSource;
 use crate::recognise::Published;
 
 /// How a head is loaded.
@@ -83,11 +84,11 @@ impl ActionHead {
         let published = Published::open(source, options.config.as_deref())?;
         let embodiment_ids = chosen_embodiments(
             options.embodiment_ids.as_deref(),
-            published.checkpoint.kept_embodiments()?.as_deref(),
+            published.kept_embodiments()?.as_deref(),
             published.config.num_embodiments,
         )?;
         published.check()?;
-        grant(published.nbytes(options.precision, embodiment_ids.len())?)?;
+        granted("source", published.nbytes(options.precision, embodiment_ids.len())?)?;
         let Published {
             checkpoint,
             prefix,
@@ -95,7 +96,7 @@ impl ActionHead {
             ..
         } = published;
         let wanted = reading_order(&config, &embodiment_ids);
-        HeadTensors::read_ahead(&checkpoint, prefix, wanted, |tensors| {
+        FileSource::read_ahead(&checkpoint, prefix, wanted, |tensors| {
             Self::build(tensors, engine, config, embodiment_ids)
         })
     }
@@ -120,7 +121,7 @@ impl ActionHead {
             is_unused(&config, name, shape)
         });
         if !problems.is_empty() {
-            let message = format!("tensors: {}", fit::list(&problems, "the config"));
+            let message = format!("tensors: {}", spec::list(&problems, "the config"));
             let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
             return Err(if problems.iter().all(is_shape) {
                 Error::Shape(message)

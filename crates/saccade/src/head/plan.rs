@@ -1,12 +1,12 @@
 //! The tensors of a head without the head: what its checkpoint must hold, and in which order it is read.
 
+use saccade_checkpoint::{TensorSpec, Wanted};
 use saccade_kernels::Isa;
 
 use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
 use crate::config::HeadConfig;
 use crate::engine::Engine;
-use crate::layout::{TensorSpec, Wanted};
 use crate::nn::planner::{Plan, Planner};
 use crate::nn::weights::Builder;
 use crate::precision::Precision;

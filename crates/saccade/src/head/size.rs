@@ -17,7 +17,7 @@ impl Published {
     /// [`Error::Checkpoint`](crate::Error::Checkpoint) for a tensor that is not there or has too many inputs for int8.
     pub fn nbytes(&self, precision: Precision, num_embodiments: usize) -> Result<usize> {
         let engine = Engine::new(precision, Some(1))?;
-        let dtype = |name: &str| self.checkpoint.dtype(&format!("{}{name}", self.prefix));
+        let dtype = |name: &str| Ok(self.checkpoint.dtype(&format!("{}{name}", self.prefix))?);
         let sizer = Sizer::new(engine, dtype)?;
         let builder = Builder::new(&sizer, engine);
         let ids: Vec<usize> = (0..num_embodiments).collect();

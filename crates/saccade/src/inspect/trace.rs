@@ -89,7 +89,7 @@ impl<Key: Ord + Copy> Recorded<Key> {
                 what: "record",
                 bytes: usize::try_from(needed).unwrap_or(usize::MAX),
             })?;
-            Ok((data, shape.to_vec()))
+            Ok::<_, Error>((data, shape.to_vec()))
         };
         let (mut attention, mut hidden) = (Vec::new(), Vec::new());
         for (key, shapes) in keys {

@@ -1,7 +1,6 @@
 //! Multi-head attention with its projections: what VL blocks, DiT blocks and the cross-attention on its own share.
 
-use faer::MatRef;
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues};
+use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, Rows};
 
 use super::linear::Linear;
 use super::weights::Weights;
@@ -202,7 +201,8 @@ impl Attention {
         let mut all = collected("keys and values", counts.len(), [])?;
         for &count in counts {
             let mut packed = no_keys_values(engine, self.num_heads, self.head_dim());
-            let (keys, values) = (keys.subrows(first, count), values.subrows(first, count));
+            let new = first..first + count;
+            let (keys, values) = (keys.rows(new.clone()), values.rows(new));
             ops::pack(engine.threads, &mut packed, 0, keys, values)?;
             first += count;
             all.push(packed);
@@ -216,12 +216,13 @@ impl Attention {
         source: &[f32],
         buffer: &'a mut Vec<f32>,
         scratch: &mut LinearScratch,
-    ) -> Result<(MatRef<'a, f32>, MatRef<'a, f32>)> {
+    ) -> Result<(Rows<'a>, Rows<'a>)> {
         let both = self.to_kv.out_features();
         let buffer = sized(buffer, source.len() / self.to_kv.in_features() * both)?; // (rows, keys | values)
         self.to_kv
             .apply(engine, source, Epilogue::Store, buffer, scratch)?;
-        Ok(rows(buffer, both).split_at_col(both / 2))
+        let both_rows = rows(buffer, both);
+        Ok((both_rows.columns(0..both / 2), both_rows.columns(both / 2..both)))
     }
 
     /// `softmax(to_q(y) keys^T) values`, to be projected by [`Self::out`]. `weights`, where asked for, is
@@ -296,7 +297,7 @@ impl Attention {
         let count = buffers.q.len() / width / sequences; // query rows of a sequence
         let mix = sized(&mut buffers.mix, buffers.q.len())?;
         let (keys, values) = self.keys_values(engine, source, &mut buffers.kv, &mut buffers.linear)?;
-        let new = keys.nrows() / sequences; // rows of a sequence whose keys and values these are
+        let new = keys.num_rows() / sequences; // rows of a sequence whose keys and values these are
         // Those that are not held use the same memory one after the other.
         let (packed, distinct, first) = match held {
             None => (&mut buffers.packed, 1, 0),
@@ -309,10 +310,8 @@ impl Attention {
         let logits = [self.num_heads, count, first + new];
         for sequence in 0..sequences {
             let packed = &mut packed[sequence % distinct];
-            let (keys, values) = (
-                keys.subrows(sequence * new, new),
-                values.subrows(sequence * new, new),
-            );
+            let new = sequence * new..(sequence + 1) * new;
+            let (keys, values) = (keys.rows(new.clone()), values.rows(new));
             ops::pack(engine.threads, packed, first, keys, values)?;
             let range = sequence * count * width..(sequence + 1) * count * width;
             ops::attention(

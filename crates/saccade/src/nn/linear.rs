@@ -43,12 +43,12 @@ impl Linear {
                 .transpose()?;
             tensors.push((weight, *out_features, bias));
         }
-        let matrices: Vec<_> = tensors
+        let views: Vec<_> = tensors
             .iter()
-            .map(|(weight, out_features, bias)| (weight.matrix(*out_features, in_features), bias.as_deref()))
+            .map(|(weight, out_features, bias)| (weight.weight(*out_features, in_features), bias.as_deref()))
             .collect();
-        let packed = builder.pack(role, &matrices)?;
-        drop(matrices);
+        let packed = builder.pack(role, &views)?;
+        drop(views);
         if role == Role::Block {
             for (weight, ..) in tensors {
                 builder.give_back(weight);

@@ -1,6 +1,7 @@
 //! Layers: built from named weights, run by the kernels.
 
 pub(crate) mod attention;
+pub(crate) mod file;
 pub(crate) mod linear;
 pub(crate) mod mlp;
 pub(crate) mod norm;

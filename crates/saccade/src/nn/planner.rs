@@ -3,9 +3,10 @@
 use std::cell::RefCell;
 use std::collections::BTreeSet;
 
+use saccade_checkpoint::{TensorSpec, Wanted};
+
 use super::weights::{Request, Source, Stored, Tensor};
 use crate::error::Result;
-use crate::layout::{TensorSpec, Wanted};
 
 /// Notes every request.
 #[derive(Default)]

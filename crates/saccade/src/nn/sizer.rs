@@ -3,14 +3,15 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-use faer::Mat;
 use half::bf16;
-use saccade_kernels::{Arithmetic, Isa, PackedLinear, WeightRef};
+use saccade_kernels::{Arithmetic, Isa, Matrix, PackedLinear, WeightRef};
 use safetensors::Dtype;
 
 use super::weights::{Outline, Request, Source, Stored, Tensor};
+use crate::alloc::filled;
 use crate::engine::Engine;
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::ops::packing_error;
 use crate::precision::Role;
 
 /// Measures layers made of tensors of the types that `dtype` gives by name.
@@ -98,16 +99,16 @@ fn packed_nbytes(
     let (wide, narrow);
     let weight = match stored {
         Stored::F32 => {
-            wide = Mat::from_fn(out_features, in_features, |_, _| 0.0);
-            WeightRef::F32(wide.as_ref())
+            wide = filled("weights", out_features * in_features, 0.0)?;
+            WeightRef::F32(Matrix::new(&wide, in_features))
         }
         Stored::Bf16 => {
-            narrow = Mat::from_fn(out_features, in_features, |_, _| bf16::ZERO);
-            WeightRef::Bf16(narrow.as_ref())
+            narrow = filled("weights", out_features * in_features, bf16::ZERO)?;
+            WeightRef::Bf16(Matrix::new(&narrow, in_features))
         }
     };
     let layer = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]);
     layer
         .map(|layer| layer.nbytes())
-        .map_err(|error| Error::Checkpoint(format!("source: {error}")))
+        .map_err(packing_error)
 }

@@ -5,15 +5,14 @@ use std::cell::Cell;
 use std::ops::Range;
 
 use half::bf16;
-use saccade_kernels::{PackedLinear, WeightRef};
+use saccade_checkpoint::{Elements, TensorSpec};
+use saccade_kernels::{Matrix, PackedLinear, WeightRef};
 
 use crate::alloc::collected;
 use crate::array::{first_not_finite, unravel};
-use crate::checkpoint::Elements;
 use crate::engine::Engine;
 use crate::error::{Error, Result, show_shape};
-use crate::layout::TensorSpec;
-use crate::ops::{check_interrupted, rows};
+use crate::ops::{check_interrupted, packing_error};
 use crate::precision::Role;
 
 /// A tensor that a layer asks for.
@@ -68,25 +67,25 @@ pub(crate) struct Outline {
 
 /// A weight to pack, `(out_features, in_features)`.
 #[derive(Clone, Copy)]
-pub(crate) enum Matrix<'a> {
+pub(crate) enum Weight<'a> {
     Held(WeightRef<'a>),
     Outline(Outline),
 }
 
 impl Tensor {
     /// The elements as float32; none of an outline.
-    pub(crate) fn into_f32(self) -> Vec<f32> {
-        match self {
-            Self::Held(elements) => elements.into_f32(),
+    pub(crate) fn into_f32(self) -> Result<Vec<f32>> {
+        Ok(match self {
+            Self::Held(elements) => elements.try_into_f32()?,
             Self::Outline(_) => Vec::new(),
-        }
+        })
     }
 
     /// As `(out_features, in_features)`, which is how it is stored.
-    pub(crate) fn matrix(&self, out_features: usize, in_features: usize) -> Matrix<'_> {
+    pub(crate) fn weight(&self, out_features: usize, in_features: usize) -> Weight<'_> {
         match self {
-            Self::Held(elements) => Matrix::Held(weight_view(elements, out_features, in_features)),
-            Self::Outline(stored) => Matrix::Outline(Outline {
+            Self::Held(elements) => Weight::Held(weight_view(elements, out_features, in_features)),
+            Self::Outline(stored) => Weight::Outline(Outline {
                 stored: *stored,
                 out_features,
                 in_features,
@@ -95,11 +94,11 @@ impl Tensor {
     }
 
     /// As `(out_features, in_features)` of a tensor stored as `(in_features, out_features)`, as the category-specific layers are.
-    pub(crate) fn transposed(&self, out_features: usize, in_features: usize) -> Matrix<'_> {
+    pub(crate) fn transposed(&self, out_features: usize, in_features: usize) -> Weight<'_> {
         let Self::Held(elements) = self else {
-            return self.matrix(out_features, in_features);
+            return self.weight(out_features, in_features);
         };
-        Matrix::Held(match weight_view(elements, in_features, out_features) {
+        Weight::Held(match weight_view(elements, in_features, out_features) {
             WeightRef::F32(view) => WeightRef::F32(view.transpose()),
             WeightRef::Bf16(view) => WeightRef::Bf16(view.transpose()),
             WeightRef::Int8 { .. } => {
@@ -122,14 +121,14 @@ impl Tensor {
     }
 }
 
-impl Matrix<'_> {
+impl Weight<'_> {
     /// The inputs `first .. first + count`.
     pub(crate) fn inputs(self, first: usize, count: usize) -> Self {
         match self {
-            Self::Held(WeightRef::F32(view)) => Self::Held(WeightRef::F32(view.subcols(first, count))),
-            Self::Held(WeightRef::Bf16(view)) => Self::Held(WeightRef::Bf16(view.subcols(first, count))),
+            Self::Held(WeightRef::F32(view)) => Self::Held(WeightRef::F32(view.columns(first..first + count))),
+            Self::Held(WeightRef::Bf16(view)) => Self::Held(WeightRef::Bf16(view.columns(first..first + count))),
             Self::Held(WeightRef::Int8 { values, scales }) => Self::Held(WeightRef::Int8 {
-                values: values.subcols(first, count),
+                values: values.columns(first..first + count),
                 scales,
             }),
             Self::Outline(outline) => Self::Outline(Outline {
@@ -141,9 +140,9 @@ impl Matrix<'_> {
 
     fn in_features(&self) -> usize {
         match self {
-            Self::Held(WeightRef::F32(view)) => view.ncols(),
-            Self::Held(WeightRef::Bf16(view)) => view.ncols(),
-            Self::Held(WeightRef::Int8 { values, .. }) => values.ncols(),
+            Self::Held(WeightRef::F32(view)) => view.num_columns(),
+            Self::Held(WeightRef::Bf16(view)) => view.num_columns(),
+            Self::Held(WeightRef::Int8 { values, .. }) => values.num_columns(),
             Self::Outline(outline) => outline.in_features,
         }
     }
@@ -151,17 +150,16 @@ impl Matrix<'_> {
 
 /// `(out_features, in_features)` as they are stored.
 pub(crate) fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> WeightRef<'_> {
-    use faer::MatRef;
-    match elements {
-        Elements::F32(data) => WeightRef::F32(rows(data, in_features)),
-        Elements::Bf16(data) => {
-            WeightRef::Bf16(MatRef::from_row_major_slice(data, out_features, in_features))
-        }
+    let weight = match elements {
+        Elements::F32(data) => WeightRef::F32(Matrix::new(data, in_features)),
+        Elements::Bf16(data) => WeightRef::Bf16(Matrix::new(data, in_features)),
         Elements::Int8 { values, scales } => WeightRef::Int8 {
-            values: MatRef::from_row_major_slice(values, out_features, in_features),
+            values: Matrix::new(values, in_features),
             scales,
         },
-    }
+    };
+    debug_assert_eq!(weight.shape(), (out_features, in_features));
+    weight
 }
 
 /// What all layers of one model are built with.
@@ -243,7 +241,7 @@ impl Weights<'_> {
             slices: None,
             is_given_back: false,
         })?;
-        Ok(bias.into_f32())
+        bias.into_f32()
     }
 
     /// The vector `name`, kept as float32. Empty where there is but its outline.
@@ -260,7 +258,7 @@ impl Weights<'_> {
             slices: (count != shape[0]).then_some(0..count),
             is_given_back: false,
         })?;
-        Ok(table.into_f32())
+        table.into_f32()
     }
 
     /// Slice `id` of tensor `name`, whose first axis is of embodiments.
@@ -276,16 +274,16 @@ impl Weights<'_> {
     }
 
     /// Packs weights with their biases as one layer: their outputs are concatenated. Biases of outlines are not looked at.
-    pub(crate) fn pack(&self, role: Role, parts: &[(Matrix<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
+    pub(crate) fn pack(&self, role: Role, parts: &[(Weight<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
         let engine = self.engine();
         let arithmetic = engine.precision.arithmetic(role);
         let in_features = parts[0].0.in_features();
         let mut held = Vec::with_capacity(parts.len());
         let mut outline: Option<Outline> = None;
-        for (matrix, bias) in parts {
-            match *matrix {
-                Matrix::Held(weight) => held.push((weight, *bias)),
-                Matrix::Outline(part) => {
+        for (weight, bias) in parts {
+            match *weight {
+                Weight::Held(weight) => held.push((weight, *bias)),
+                Weight::Outline(part) => {
                     outline = Some(outline.map_or(part, |all| Outline {
                         stored: all.stored.min(part.stored),
                         out_features: all.out_features + part.out_features,
@@ -298,13 +296,12 @@ impl Weights<'_> {
             self.count(self.builder.source.packed_nbytes(role, outline)?);
             // Stands in for the layer: the same inputs and no output.
             held = vec![(
-                WeightRef::F32(faer::MatRef::from_row_major_slice(&[], 0, in_features)),
+                WeightRef::F32(Matrix::new(&[], in_features)),
                 None,
             )];
         }
         let packed = PackedLinear::pack(engine.isa, arithmetic, engine.threads, &held)
-            .map_err(|error| Error::Checkpoint(format!("source: {error}")))?;
-        check_interrupted()?;
+            .map_err(packing_error)?;
         if outline.is_none() {
             self.count(packed.nbytes());
         }

@@ -1,14 +1,16 @@
-//! The files beside a checkpoint's weights that belong to it: statistics, processors, tokenizers, licences. Whatever program read the
-//! source looks for them, so a copy has them too, byte for byte.
+//! The files next to a checkpoint's weights that belong to it: statistics, processors, tokenizers, licences. The programs that read the
+//! source need them, so a copy has them too, byte for byte.
 
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use crate::checkpoint::open_regular;
 use crate::error::{Error, Result};
-use crate::writer::{OWN_CONFIG, failed};
+use crate::source::open_regular;
+
+/// The part of a config that is saccade's own, for layouts whose `config.json` takes no other keys.
+pub const OWN_CONFIG: &str = "saccade.json";
 
 /// What ends the name of a file that belongs to a checkpoint.
 const ENDINGS: [&str; 10] = [
@@ -35,8 +37,8 @@ pub(crate) fn is_processor(name: &str) -> bool {
     PROCESSORS.iter().any(|start| name.starts_with(start))
 }
 
-/// The files beside a checkpoint's weights.
-pub(crate) struct Companions {
+/// The files next to a checkpoint's weights.
+pub struct Companions {
     root: PathBuf,
     /// What is copied, by the path from `root`.
     carried: BTreeSet<PathBuf>,
@@ -45,9 +47,12 @@ pub(crate) struct Companions {
 }
 
 impl Companions {
-    /// Those of `source`, a checkpoint with the files `weights`. Of what lies beside a source that is a single file only saccade's own part of
-    /// the config counts: the rest may belong to anything.
-    pub(crate) fn of<'a>(source: &Path, weights: impl Iterator<Item = &'a Path>) -> Result<Self> {
+    /// Those of `source`, a checkpoint with the files `weights`. Next to a source that is a single file, only saccade's own part of the config
+    /// counts: the other files may belong to anything.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] and [`Error::Unreadable`] for a directory that cannot be listed.
+    pub fn of<'a>(source: &Path, weights: impl Iterator<Item = &'a Path>) -> Result<Self> {
         let is_directory = source.is_dir();
         let root = match is_directory {
             true => source,
@@ -69,7 +74,7 @@ impl Companions {
 
     fn add_folder(&mut self, folder: &Path, weights: &BTreeSet<&Path>) -> Result<()> {
         let from = self.root.join(folder);
-        let unreadable = |error: std::io::Error| Error::from_io("source", &from, &error);
+        let unreadable = |error: std::io::Error| Error::reading("source", &from, error);
         let entries = std::fs::read_dir(&from).map_err(unreadable)?;
         let mut names = entries
             .map(|entry| Ok(entry?.file_name()))
@@ -117,26 +122,29 @@ impl Companions {
                 .is_ok_and(|entries| !entries.flatten().any(is_weights))
     }
 
-    /// All of them but `file`, which is written anew.
-    pub(crate) fn without(mut self, file: &str) -> Self {
+    /// All of them but `file`, which is written separately.
+    #[must_use]
+    pub fn without(mut self, file: &str) -> Self {
         self.carried.remove(Path::new(file));
         self
     }
 
     /// What is copied, by the path from the checkpoint's directory.
-    pub(crate) fn all_paths(&self) -> BTreeSet<PathBuf> {
+    #[must_use]
+    pub fn all_paths(&self) -> BTreeSet<PathBuf> {
         self.carried.clone()
     }
 
-    /// What is there and is not copied: other weights, states of an optimizer, other checkpoints.
-    pub(crate) fn left(&self) -> &[PathBuf] {
+    /// What is not copied: other weights, states of an optimizer, other checkpoints.
+    #[must_use]
+    pub fn left(&self) -> &[PathBuf] {
         &self.left
     }
 
     pub(crate) fn copy_to(&self, directory: &Path) -> Result<()> {
         for path in &self.carried {
             let (from, to) = (self.root.join(path), directory.join(path));
-            let source = open_regular(&from).map_err(|error| Error::from_io("source", &from, &error))?;
+            let source = open_regular(&from).map_err(|error| Error::reading("source", &from, error))?;
             let folder = to.parent().expect("a path in a directory has a parent");
             let copy = || {
                 std::fs::create_dir_all(folder)?;
@@ -145,7 +153,7 @@ impl Companions {
                 std::io::copy(&mut source.take(MAX_BYTES), &mut copy)?;
                 copy.sync_all()
             };
-            copy().map_err(|error| failed(&to, &error))?;
+            copy().map_err(|error| Error::writing(&to, error))?;
         }
         Ok(())
     }

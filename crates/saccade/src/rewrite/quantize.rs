@@ -3,16 +3,14 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use saccade_checkpoint::spec::SCALE_SUFFIX;
+use saccade_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec};
 use saccade_kernels::quantize_rows;
-use safetensors::Dtype;
 
-use crate::checkpoint::{Checkpoint, SCALE_SUFFIX};
 use crate::error::{Error, Result};
 use crate::head::plan::tensor_specs;
-use crate::layout::TensorSpec;
 use crate::nn::weights::weight_view;
 use crate::rewrite::{RewriteOptions, Source, Written};
-use crate::writer::{CheckpointWriter, Planned};
 
 /// What [`quantize`] wrote.
 #[derive(Clone, Debug)]
@@ -74,7 +72,7 @@ pub fn quantize(
         if int8.contains_key(name) {
             report.num_quantized += 1;
             tensors[0].dtype = Dtype::I8;
-            tensors.push(Planned {
+            tensors.push(PlannedTensor {
                 name: format!("{name}{SCALE_SUFFIX}"),
                 dtype: Dtype::F32,
                 shape: vec![source.shape(name)[0]],
@@ -84,7 +82,7 @@ pub fn quantize(
         }
         if source.is_head(name) {
             report.head_bytes_before += source.checkpoint.nbytes(name)?;
-            report.head_bytes_after += tensors.iter().map(Planned::nbytes).sum::<usize>() as u64;
+            report.head_bytes_after += tensors.iter().map(PlannedTensor::nbytes).sum::<usize>() as u64;
         }
         planned.extend(tensors);
     }
@@ -126,5 +124,5 @@ fn write_quantized(
     }
     writer.tensor(name, bytemuck::cast_slice(&values))?;
     let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
-    writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)
+    Ok(writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)?)
 }

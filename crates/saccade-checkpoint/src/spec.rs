@@ -1,15 +1,43 @@
-//! Whether tensors fit what a head needs, by their names, shapes and types alone.
+//! Which tensors a model needs, and whether those of a checkpoint fit, by their names, shapes and types alone.
 
 use std::collections::BTreeSet;
 
 use safetensors::Dtype;
 
-use crate::checkpoint::SCALE_SUFFIX;
 use crate::error::show_shape;
-use crate::layout::TensorSpec;
+
+/// What the name of a tensor's scales adds to its own: `X.weight` of int8 has `X.weight_scale`.
+pub const SCALE_SUFFIX: &str = "_scale";
+
+/// A tensor that a checkpoint must hold.
+#[derive(Clone, Debug)]
+pub struct TensorSpec {
+    /// Its name, without the prefix of the model in the checkpoint.
+    pub name: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Whether it may be stored as int8 with a scale for each row.
+    pub may_be_int8: bool,
+    /// Whether its first axis is of embodiments.
+    pub per_embodiment: bool,
+}
+
+impl TensorSpec {
+    /// A floating-point tensor that all embodiments share.
+    #[must_use]
+    pub fn plain(name: &str, shape: &[usize]) -> Self {
+        Self {
+            name: name.to_owned(),
+            shape: shape.to_vec(),
+            may_be_int8: false,
+            per_embodiment: false,
+        }
+    }
+}
 
 /// One thing that is wrong.
-pub(crate) enum Problem {
+#[derive(Clone, Debug)]
+pub enum Problem {
     /// A tensor of another shape.
     Shape(String),
     /// A tensor that is missing, unknown or of another type.
@@ -17,16 +45,18 @@ pub(crate) enum Problem {
 }
 
 impl Problem {
-    pub(crate) fn text(&self) -> &str {
+    /// The tensor, what it is and what was expected.
+    #[must_use]
+    pub fn text(&self) -> &str {
         match self {
             Self::Shape(text) | Self::Other(text) => text,
         }
     }
 }
 
-/// All that is wrong with the tensors `names`, of which `describe` tells type and shape: exactly the `expected` ones must stand under
-/// `prefix`, and those that `is_unused`, given a name without the prefix and a shape, knows may.
-pub(crate) fn problems<'a>(
+/// All that is wrong with the tensors `names`, whose type and shape `describe` gives. Under `prefix` there must be the `expected` ones, and
+/// there may be those for which `is_unused(name without the prefix, shape)` is true.
+pub fn problems<'a>(
     names: impl Iterator<Item = &'a str>,
     describe: impl Fn(&str) -> Option<(Dtype, &'a [usize])>,
     prefix: &str,
@@ -51,7 +81,12 @@ pub(crate) fn problems<'a>(
                 show_shape(&spec.shape)
             ))),
             Some((Dtype::I8, _)) if spec.may_be_int8 => {
-                problems.extend(scale_problem(&describe, &name, &scale, spec.shape[0]));
+                problems.extend(scale_problem(
+                    &describe,
+                    &name,
+                    &scale,
+                    spec.shape.first().copied().unwrap_or(1),
+                ));
                 known.insert(scale);
             }
             Some((dtype, _)) if !is_readable(dtype) => {
@@ -66,7 +101,7 @@ pub(crate) fn problems<'a>(
             }
             Some((dtype, _)) if spec.may_be_int8 && describe(&scale).is_some() => {
                 problems.push(Problem::Other(format!(
-                    "{scale} stands beside {name} of {dtype:?}, expected I8"
+                    "{scale} is there, but {name} is {dtype:?}, expected I8"
                 )));
                 known.insert(scale);
             }
@@ -105,13 +140,14 @@ pub(crate) fn scale_problem<'a>(
     }
 }
 
-/// Whether a tensor of this type holds numbers as they are.
-pub(crate) fn is_readable(dtype: Dtype) -> bool {
+/// Whether a tensor of this type holds floating-point numbers that can be read.
+fn is_readable(dtype: Dtype) -> bool {
     matches!(dtype, Dtype::F32 | Dtype::BF16 | Dtype::F16)
 }
 
 /// The problems, one on a line, of tensors that should fit `what`.
-pub(crate) fn list(problems: &[Problem], what: &str) -> String {
+#[must_use]
+pub fn list(problems: &[Problem], what: &str) -> String {
     let lines: Vec<&str> = problems.iter().map(Problem::text).collect();
     let noun = if problems.len() == 1 {
         "tensor does"

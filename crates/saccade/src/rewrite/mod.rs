@@ -1,20 +1,24 @@
 //! What all commands that write a checkpoint from another have in common: opening it, what they keep of it, writing it.
 
+pub(crate) mod convert;
+pub(crate) mod quantize;
+pub(crate) mod resize;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use crate::checkpoint::Checkpoint;
-use crate::companions::Companions;
+use saccade_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTensor};
+
 use crate::config::HeadConfig;
 use crate::error::{Error, Result};
 use crate::recognise::Published;
-use crate::writer::{CheckpointWriter, Planned};
 
 /// Published checkpoints are cut into files of this size.
 const MAX_SHARD_BYTES: u64 = 5_000_000_000;
 
 /// How a checkpoint is written from another.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct RewriteOptions {
     /// The source's config as JSON; default the `config.json` beside the weights.
     pub config: Option<String>,
@@ -26,6 +30,14 @@ pub struct RewriteOptions {
     pub metadata: BTreeMap<String, String>,
     /// A file is closed before it grows larger than this; default one file of one, and 5 GB of several, as they are published.
     pub max_shard_bytes: Option<u64>,
+}
+
+impl RewriteOptions {
+    /// The defaults, to be changed field by field.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 /// What was written.
@@ -81,8 +93,8 @@ impl Source {
     }
 
     /// Tensor `name` as it is.
-    pub(crate) fn as_it_is(&self, name: &str) -> Result<Planned> {
-        Ok(Planned {
+    pub(crate) fn as_it_is(&self, name: &str) -> Result<PlannedTensor> {
+        Ok(PlannedTensor {
             name: name.to_owned(),
             dtype: self.checkpoint.dtype(name)?,
             shape: self.shape(name).to_vec(),
@@ -95,8 +107,9 @@ impl Source {
     }
 
     pub(crate) fn copy(&self, name: &str, writer: &mut CheckpointWriter) -> Result<()> {
-        self.checkpoint
-            .read_bytes(name, |bytes| writer.tensor(name, bytes))
+        Ok(self
+            .checkpoint
+            .read_bytes(name, |bytes| writer.tensor(name, bytes))?)
     }
 
     /// Writes a checkpoint to the directory `out`: the `small` files by name and contents (`config.json` is one), what else lies beside the
@@ -110,7 +123,7 @@ impl Source {
         out: &Path,
         options: &RewriteOptions,
         small: &[(&str, Option<&str>)],
-        planned: Vec<Planned>,
+        planned: Vec<PlannedTensor>,
         progress: Progress<'_>,
         mut write: impl FnMut(&str, &mut CheckpointWriter) -> Result<()>,
     ) -> Result<Written> {
@@ -123,7 +136,7 @@ impl Source {
             1 => u64::MAX,
             _ => MAX_SHARD_BYTES,
         };
-        let mut metadata = self.checkpoint.notes().clone();
+        let mut metadata = self.checkpoint.metadata().clone();
         metadata.extend(options.metadata.clone());
         let mut writer = CheckpointWriter::create(
             out,

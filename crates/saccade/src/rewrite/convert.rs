@@ -4,14 +4,14 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use half::{bf16, f16};
-use safetensors::Dtype;
+use saccade_checkpoint::spec::SCALE_SUFFIX;
+use saccade_checkpoint::{CheckpointWriter, Dtype};
 
-use crate::checkpoint::{KEPT_EMBODIMENTS, SCALE_SUFFIX};
+use crate::checkpoint::{KEPT_EMBODIMENTS, kept_embodiments};
 use crate::error::{Error, Result};
 use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
 use crate::rewrite::{RewriteOptions, Source, Written};
-use crate::writer::CheckpointWriter;
 
 /// A type that weights are stored in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -107,6 +107,7 @@ impl Float {
 
 /// How a checkpoint is converted.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct ConvertOptions {
     /// What is common to all rewriting.
     pub rewrite: RewriteOptions,
@@ -115,6 +116,17 @@ pub struct ConvertOptions {
     pub embodiment_ids: Option<Vec<i64>>,
     /// What floating point tensors become; default what they are. int8 and its scales stay.
     pub dtype: Option<Float>,
+}
+
+impl ConvertOptions {
+    /// A copy by these rules that changes nothing else, to be changed field by field.
+    #[must_use]
+    pub fn new(rewrite: RewriteOptions) -> Self {
+        Self {
+            rewrite,
+            ..Self::default()
+        }
+    }
 }
 
 /// What [`convert`] wrote.
@@ -162,7 +174,7 @@ pub fn convert(
     let mut rewrite = options.rewrite.clone();
     let mut kept = None;
     if let Some(ids) = &options.embodiment_ids {
-        let there = source.checkpoint.kept_embodiments()?;
+        let there = kept_embodiments(&source.checkpoint)?;
         let ids = chosen_embodiments(Some(ids), there.as_deref(), source.config.num_embodiments)?;
         let note: Vec<String> = ids.iter().map(usize::to_string).collect();
         rewrite
@@ -210,7 +222,7 @@ pub fn convert(
                 source
                     .checkpoint
                     .read_byte_range(name, start..start + nbytes, |bytes| match change {
-                        None => writer.tensor(name, bytes),
+                        None => Ok(writer.tensor(name, bytes)?),
                         Some((from, to)) => rounding.write(name, bytes, from, to, writer),
                     })?;
             } else {
@@ -286,6 +298,6 @@ impl Rounding {
             }
         }
         to.write(&self.values, &mut self.bytes);
-        writer.tensor(name, &self.bytes)
+        Ok(writer.tensor(name, &self.bytes)?)
     }
 }

@@ -1,0 +1,260 @@
+//! What can go wrong with files, and how messages show shapes, sizes and text from strangers.
+
+use std::borrow::Cow;
+use std::fmt::Write;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// The result of everything in this crate that can fail.
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// An error that a user can act on.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// An argument is out of range, or names a directory that must not be replaced.
+    #[error("{}", printable(.0))]
+    Input(String),
+    /// A checkpoint is broken, incomplete or of another kind.
+    #[error("{}", printable(.0))]
+    Checkpoint(String),
+    /// A file cannot be read.
+    #[error("{what}: {} cannot be read: {source}", printable(&path.to_string_lossy()))]
+    Unreadable {
+        /// The argument or role of the path.
+        what: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A tensor cannot be read from its file.
+    #[error("source: {} cannot be read from {}: {source}", printable(name), printable(&path.to_string_lossy()))]
+    UnreadableTensor {
+        /// The tensor.
+        name: String,
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A file holds text that is not the JSON that is expected there.
+    #[error("{what}: {}: {}", printable(&path.to_string_lossy()), printable(&source.to_string()))]
+    Json {
+        /// The argument or role of the path.
+        what: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Where and why.
+        source: serde_json::Error,
+    },
+    /// A file cannot be written.
+    #[error("out: {} cannot be written: {source}", printable(&path.to_string_lossy()))]
+    Output {
+        /// The file or directory.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A checkpoint was written, and could not be given its name; nothing was deleted.
+    #[error(
+        "out: {} cannot be given to the new checkpoint: {source}; the old one is in {} and the new one in {}",
+        printable(&path.to_string_lossy()),
+        printable(&old.to_string_lossy()),
+        printable(&new.to_string_lossy())
+    )]
+    Stranded {
+        /// The wanted name.
+        path: PathBuf,
+        /// Where the checkpoint is that had this name.
+        old: PathBuf,
+        /// Where the new one is.
+        new: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// Memory that the system refused.
+    #[error("{what}: cannot allocate {}", show_bytes(*bytes))]
+    Memory {
+        /// What it was for.
+        what: &'static str,
+        /// How much was asked for.
+        bytes: usize,
+    },
+    /// A path that is not there.
+    #[error("{what}: no such file or directory: {}", printable(&path.to_string_lossy()))]
+    NotFound {
+        /// The argument or role of the path.
+        what: &'static str,
+        /// The path as given.
+        path: PathBuf,
+    },
+}
+
+impl Error {
+    /// The error for `path`, which could not be opened or read.
+    pub(crate) fn reading(what: &'static str, path: &Path, source: io::Error) -> Self {
+        let path = path.to_owned();
+        match source.kind() {
+            io::ErrorKind::NotFound => Self::NotFound { what, path },
+            _ => Self::Unreadable { what, path, source },
+        }
+    }
+
+    /// The error for `path`, which could not be written.
+    pub(crate) fn writing(path: &Path, source: io::Error) -> Self {
+        Self::Output {
+            path: path.to_owned(),
+            source,
+        }
+    }
+}
+
+/// Gives `values` room for `len` elements in all.
+///
+/// # Errors
+/// [`Error::Memory`] if the system refuses it: a file with holes is as long as it likes, and an allocation that fails ends the process.
+pub(crate) fn reserve<T>(what: &'static str, values: &mut Vec<T>, len: usize) -> Result<()> {
+    let more = len.saturating_sub(values.len());
+    values.try_reserve_exact(more).map_err(|_| Error::Memory {
+        what,
+        bytes: len.saturating_mul(size_of::<T>()),
+    })
+}
+
+/// Checks that the system grants this many bytes, which it says before they are used.
+///
+/// # Errors
+/// [`Error::Memory`] if it does not.
+pub fn granted(what: &'static str, bytes: usize) -> Result<()> {
+    reserve(what, &mut Vec::<u8>::new(), bytes)
+}
+
+/// Lines of a message that are shown, and characters of the beginning and of the end of a line.
+const MAX_LINES: usize = 1000;
+const MAX_LINE: usize = 1000;
+
+/// A message as it may reach a terminal: names and values in it come from files, which may hold anything. Control characters, and those
+/// that change the direction of writing, are escaped; what is too long is cut.
+#[must_use]
+pub fn printable(message: &str) -> Cow<'_, str> {
+    let is_plain = |line: &str| line.len() <= MAX_LINE && !line.contains(is_active);
+    if message.lines().count() <= MAX_LINES && message.lines().all(is_plain) {
+        return Cow::Borrowed(message);
+    }
+    let mut shown = String::new();
+    for (number, line) in message.split('\n').enumerate() {
+        if number == MAX_LINES {
+            shown.push_str("\n  ...");
+            break;
+        }
+        if number > 0 {
+            shown.push('\n');
+        }
+        let length = line.chars().count();
+        for (column, character) in line.chars().enumerate() {
+            if column == MAX_LINE && length > 2 * MAX_LINE {
+                shown.push_str("...");
+            }
+            if column >= MAX_LINE && column < length.saturating_sub(MAX_LINE) {
+                continue;
+            }
+            if is_active(character) {
+                write!(shown, "{}", character.escape_unicode()).expect("strings take everything");
+            } else {
+                shown.push(character);
+            }
+        }
+    }
+    Cow::Owned(shown)
+}
+
+/// Whether a character makes a terminal do anything but show it.
+fn is_active(character: char) -> bool {
+    character.is_control()
+        || matches!(character, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
+/// Writes a shape as users write it: `(2, 40, 64)`, `(5,)`, `()`.
+#[must_use]
+pub fn show_shape(shape: &[usize]) -> String {
+    match shape {
+        [one] => format!("({one},)"),
+        _ => format!(
+            "({})",
+            shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
+        ),
+    }
+}
+
+/// Writes a number of bytes, from 1000 on also in a larger unit: `512 bytes of memory`, `1500000 bytes of memory (1.5 MB)`.
+#[must_use]
+pub fn show_bytes(bytes: usize) -> String {
+    let units = [
+        (1e18, "EB"),
+        (1e15, "PB"),
+        (1e12, "TB"),
+        (1e9, "GB"),
+        (1e6, "MB"),
+        (1e3, "kB"),
+    ];
+    let unit = units.iter().find(|(size, _)| bytes as f64 >= *size);
+    let larger = unit.map(|(size, name)| format!(" ({:.1} {name})", bytes as f64 / size));
+    format!("{bytes} bytes of memory{}", larger.unwrap_or_default())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::error::Error as _;
+
+    use super::*;
+
+    #[test]
+    fn messages_do_nothing_to_a_terminal() {
+        let error = Error::Checkpoint(
+            "source: 2 tensors:\n  a\u{1b}[2Jb is unknown\n  c\r\u{202e}d\u{9b}".to_owned(),
+        );
+        let expected = "source: 2 tensors:\n  a\\u{1b}[2Jb is unknown\n  c\\u{d}\\u{202e}d\\u{9b}";
+        assert_eq!(error.to_string(), expected);
+        let error = Error::NotFound {
+            what: "source",
+            path: "a\u{7}".into(),
+        };
+        assert_eq!(error.to_string(), "source: no such file or directory: a\\u{7}");
+    }
+
+    #[test]
+    fn long_messages_end() {
+        let (begin, end) = ("a".repeat(MAX_LINE), "e".repeat(MAX_LINE));
+        let shown = Error::Input(format!("{begin}{}{end}", "m".repeat(10 * MAX_LINE))).to_string();
+        assert_eq!(shown, format!("{begin}...{end}"));
+        assert_eq!(
+            Error::Input(format!("{begin}{end}")).to_string(),
+            format!("{begin}{end}")
+        );
+        let many = "a line\n".repeat(10 * MAX_LINES);
+        let shown = Error::Input(many.clone()).to_string();
+        assert_eq!(shown.lines().count(), MAX_LINES + 1);
+        assert!(many.starts_with(shown.strip_suffix("  ...").unwrap()));
+        let all = "a line with \"quotes\", tabs not, \u{e4}\u{3b1}\u{4e2d}\n".repeat(MAX_LINES);
+        assert_eq!(Error::Input(all.clone()).to_string(), all);
+    }
+
+    #[test]
+    fn sizes_have_suitable_units() {
+        assert_eq!(show_bytes(999), "999 bytes of memory");
+        assert_eq!(show_bytes(12_345_678), "12345678 bytes of memory (12.3 MB)");
+        let error = granted("source", usize::MAX).unwrap_err().to_string();
+        assert_eq!(
+            error,
+            "source: cannot allocate 18446744073709551615 bytes of memory (18.4 EB)"
+        );
+    }
+
+    #[test]
+    fn causes_are_kept() {
+        let error = Error::writing(Path::new("a"), io::Error::other("the reason"));
+        assert_eq!(error.source().unwrap().to_string(), "the reason");
+        assert_eq!(error.to_string(), "out: a cannot be written: the reason");
+    }
+}

@@ -1,0 +1,505 @@
+//! A checkpoint that is open: its tensors by name, each read when asked for.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use bytemuck::Pod;
+use half::{bf16, f16};
+use safetensors::Dtype;
+use safetensors::tensor::TensorInfo;
+
+use crate::elements::Elements;
+use crate::error::{Error, Result, granted, reserve, show_shape};
+use crate::header::Header;
+use crate::index::WeightFiles;
+use crate::source::SourceFile;
+use crate::spec::{self, Problem, SCALE_SUFFIX, TensorSpec};
+
+/// Bytes that are copied together.
+const PIECE: usize = 1 << 24;
+
+struct Entry {
+    file: usize,
+    info: TensorInfo,
+    /// Where the tensor's first byte lies in the file.
+    start: u64,
+}
+
+/// The tensors of one checkpoint, by name.
+pub struct Checkpoint {
+    files: Vec<SourceFile>,
+    entries: BTreeMap<String, Entry>,
+    /// Names that are in more than one file, with what to say of them: an error only where the tensor is wanted.
+    duplicates: BTreeMap<String, String>,
+    /// What the files say of themselves.
+    metadata: BTreeMap<String, String>,
+}
+
+impl Checkpoint {
+    /// Opens `path`: one `.safetensors` file, or a directory with one or more of them.
+    ///
+    /// A directory with an index (`*.safetensors.index.json`) is read as the index says; otherwise every `.safetensors` file in it counts.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] for a path that is not there; [`Error::Checkpoint`] for a file that is not safetensors, is truncated,
+    /// or names a tensor twice. A name in two files is an error only where that tensor is wanted.
+    pub fn open(path: &Path) -> Result<Self> {
+        let metadata = std::fs::metadata(path).map_err(|error| Error::reading("source", path, error))?;
+        let mut checkpoint = Self {
+            files: Vec::new(),
+            entries: BTreeMap::new(),
+            duplicates: BTreeMap::new(),
+            metadata: BTreeMap::new(),
+        };
+        if metadata.is_dir() {
+            let weights = WeightFiles::of(path)?;
+            for file in &weights.files {
+                checkpoint.add_file(file)?;
+            }
+            checkpoint.check_index(&weights)?;
+        } else {
+            checkpoint.add_file(path)?;
+        }
+        Ok(checkpoint)
+    }
+
+    /// What the files say of themselves; where they differ, what the first one says.
+    #[must_use]
+    pub fn metadata(&self) -> &BTreeMap<String, String> {
+        &self.metadata
+    }
+
+    /// The files that tensors are read from.
+    pub fn files(&self) -> impl Iterator<Item = &Path> {
+        self.files.iter().map(|source| source.path.as_path())
+    }
+
+    /// The names of all tensors, sorted.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.entries.keys().map(String::as_str)
+    }
+
+    /// The shape of tensor `name`.
+    #[must_use]
+    pub fn shape(&self, name: &str) -> Option<&[usize]> {
+        self.entries.get(name).map(|entry| entry.info.shape.as_slice())
+    }
+
+    /// All that is wrong with the tensors under `prefix`, which should be the `expected` ones; those for which `is_unused(name without the
+    /// prefix, shape)` is true may be there too.
+    pub fn problems(
+        &self,
+        prefix: &str,
+        expected: &[TensorSpec],
+        is_unused: impl Fn(&str, &[usize]) -> bool,
+    ) -> Vec<Problem> {
+        let describe = |name: &str| self.describe(name);
+        let mut problems = spec::problems(self.names(), describe, prefix, expected, is_unused);
+        let twice = self
+            .duplicates
+            .iter()
+            .filter(|(name, _)| name.starts_with(prefix));
+        problems.extend(twice.map(|(_, problem)| Problem::Other(problem.clone())));
+        problems
+    }
+
+    fn describe(&self, name: &str) -> Option<(Dtype, &[usize])> {
+        let entry = self.entries.get(name)?;
+        Some((entry.info.dtype, &entry.info.shape))
+    }
+
+    /// Reads tensor `name` whole; int8 with its scales.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if there is no such tensor or its type is not F32, BF16, F16 or I8 with scales; [`Error::UnreadableTensor`] if the
+    /// file cannot be read or has changed since it was opened; [`Error::Memory`] if there is no memory for the tensor.
+    pub fn read(&self, name: &str) -> Result<Elements> {
+        self.read_into(name, None, None)
+    }
+
+    /// Reads tensor `name` whole as float32, as [`Elements::into_f32`] has it.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::read`].
+    pub fn read_f32(&self, name: &str) -> Result<Vec<f32>> {
+        let elements: usize = self.entry(name)?.info.shape.iter().product();
+        granted("source", elements.saturating_mul(size_of::<f32>()))?;
+        self.read(name)?.try_into_f32()
+    }
+
+    /// Reads the slices `wanted` of the first axis of tensor `name`.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::read`], and if there are no such slices. int8 is read whole only.
+    pub fn read_slices(&self, name: &str, wanted: Range<usize>) -> Result<Elements> {
+        self.read_into(name, Some(wanted), None)
+    }
+
+    /// Reads tensor `name`, or the slices `wanted` of its first axis, into the memory of `spare` if that has its type: fresh memory is
+    /// given page by page, which takes longer than the reading.
+    pub(crate) fn read_into(
+        &self,
+        name: &str,
+        wanted: Option<Range<usize>>,
+        spare: Option<Elements>,
+    ) -> Result<Elements> {
+        let entry = self.entry(name)?;
+        let Some(wanted) = wanted else {
+            if entry.info.dtype == Dtype::I8 {
+                return self.read_int8(name, entry);
+            }
+            let elements = entry.info.shape.iter().product();
+            return self.read_elements(name, entry, 0, elements, spare);
+        };
+        match entry.info.shape.split_first() {
+            Some((&size, rest)) if wanted.start <= wanted.end && wanted.end <= size => {
+                let elements: usize = rest.iter().product();
+                let (first, count) = (wanted.start * elements, wanted.len() * elements);
+                self.read_elements(name, entry, first, count, spare)
+            }
+            _ => Err(Error::Checkpoint(format!(
+                "source: {name} has shape {} and no slices {wanted:?}",
+                show_shape(&entry.info.shape)
+            ))),
+        }
+    }
+
+    /// The type of tensor `name`.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if there is no such tensor, or it is in two files.
+    pub fn dtype(&self, name: &str) -> Result<Dtype> {
+        Ok(self.entry(name)?.info.dtype)
+    }
+
+    /// Bytes of tensor `name` in its file.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::dtype`].
+    pub fn nbytes(&self, name: &str) -> Result<u64> {
+        let (start, end) = self.entry(name)?.info.data_offsets;
+        Ok((end - start) as u64)
+    }
+
+    /// Gives the bytes of tensor `name`, of whatever type, to `take`, piece by piece.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::read_byte_range`].
+    pub fn read_bytes<E: From<Error>>(
+        &self,
+        name: &str,
+        take: impl FnMut(&[u8]) -> std::result::Result<(), E>,
+    ) -> std::result::Result<(), E> {
+        self.read_byte_range(name, 0..self.nbytes(name)?, take)
+    }
+
+    /// Gives some of the bytes of tensor `name`, of whatever type, to `take`, piece by piece; a piece holds whole elements if `bytes` does.
+    ///
+    /// # Errors
+    /// What `take` returns; as [`Checkpoint::dtype`]; [`Error::UnreadableTensor`] if the file cannot be read or has changed.
+    ///
+    /// # Panics
+    /// If the tensor has no such bytes.
+    pub fn read_byte_range<E: From<Error>>(
+        &self,
+        name: &str,
+        bytes: Range<u64>,
+        mut take: impl FnMut(&[u8]) -> std::result::Result<(), E>,
+    ) -> std::result::Result<(), E> {
+        let entry = self.entry(name)?;
+        let (start, end) = (bytes.start as usize, bytes.end as usize);
+        let (first, last) = entry.info.data_offsets;
+        assert!(
+            start <= end && end <= last - first,
+            "{name} has no bytes {bytes:?}"
+        );
+        let mut piece: Vec<u8> = Vec::new();
+        for first in (start..end).step_by(PIECE) {
+            piece = self.read_plain(name, entry, first, PIECE.min(end - first), piece)?;
+            take(&piece)?;
+        }
+        Ok(())
+    }
+
+    fn entry(&self, name: &str) -> Result<&Entry> {
+        match self.duplicates.get(name) {
+            Some(problem) => Err(Error::Checkpoint(format!("source: {problem}"))),
+            None => self
+                .entries
+                .get(name)
+                .ok_or_else(|| Error::Checkpoint(format!("source: {name} is missing"))),
+        }
+    }
+
+    fn read_elements(
+        &self,
+        name: &str,
+        entry: &Entry,
+        first: usize,
+        count: usize,
+        spare: Option<Elements>,
+    ) -> Result<Elements> {
+        match entry.info.dtype {
+            Dtype::F32 => {
+                let spare = match spare {
+                    Some(Elements::F32(values)) => values,
+                    _ => Vec::new(),
+                };
+                let mut values: Vec<f32> = self.read_plain(name, entry, first, count, spare)?;
+                from_little_endian(&mut values, |value| f32::from_bits(u32::from_le(value.to_bits())));
+                Ok(Elements::F32(values))
+            }
+            Dtype::BF16 => {
+                let spare = match spare {
+                    Some(Elements::Bf16(values)) => values,
+                    _ => Vec::new(),
+                };
+                let mut values: Vec<bf16> = self.read_plain(name, entry, first, count, spare)?;
+                from_little_endian(&mut values, |value| {
+                    bf16::from_bits(u16::from_le(value.to_bits()))
+                });
+                Ok(Elements::Bf16(values))
+            }
+            Dtype::F16 => {
+                let halves: Vec<u16> = self.read_plain(name, entry, first, count, Vec::new())?;
+                let mut widened = Vec::new();
+                reserve("source", &mut widened, halves.len())?;
+                let values = halves.into_iter().map(u16::from_le);
+                widened.extend(values.map(|bits| f16::from_bits(bits).to_f32()));
+                Ok(Elements::F32(widened))
+            }
+            other => Err(Error::Checkpoint(format!(
+                "source: {name} is {other:?}, expected F32, BF16 or F16"
+            ))),
+        }
+    }
+
+    fn read_int8(&self, name: &str, entry: &Entry) -> Result<Elements> {
+        let scale = format!("{name}{SCALE_SUFFIX}");
+        let rows = entry.info.shape.first().copied().unwrap_or(1);
+        if let Some(problem) = spec::scale_problem(|name| self.describe(name), name, &scale, rows) {
+            return Err(Error::Checkpoint(format!("source: {}", problem.text())));
+        }
+        let values: Vec<i8> =
+            self.read_plain(name, entry, 0, entry.info.shape.iter().product(), Vec::new())?;
+        let scales = self
+            .read_elements(&scale, self.entry(&scale)?, 0, rows, None)?
+            .into_f32();
+        let bad = |problem: String| Err(Error::Checkpoint(format!("source: {problem}")));
+        if let Some(row) = scales
+            .iter()
+            .position(|scale| !((127.0 * scale).is_finite() && *scale >= 0.0))
+        {
+            return bad(format!(
+                "{scale} is {} at index {row}, expected finite scales that are not negative, and 127 times them finite",
+                scales[row]
+            ));
+        }
+        if values.contains(&i8::MIN) {
+            return bad(format!("{name} holds -128, expected -127 to 127"));
+        }
+        let width = values.len() / rows.max(1);
+        let unscaled = |row: usize| {
+            values[row * width..(row + 1) * width]
+                .iter()
+                .any(|&value| value != 0)
+        };
+        if let Some(row) = (0..rows).find(|&row| scales[row] == 0.0 && unscaled(row)) {
+            return bad(format!(
+                "{scale} is 0 at index {row}, whose row of {name} is not zero"
+            ));
+        }
+        Ok(Elements::Int8 { values, scales })
+    }
+
+    /// `count` elements from number `first` on, as their bytes are in the file, in the memory of `values`.
+    fn read_plain<T: Pod>(
+        &self,
+        name: &str,
+        entry: &Entry,
+        first: usize,
+        count: usize,
+        mut values: Vec<T>,
+    ) -> Result<Vec<T>> {
+        let file = &self.files[entry.file];
+        reserve("source", &mut values, count)?;
+        values.resize(count, T::zeroed());
+        let start = entry.start + (first * size_of::<T>()) as u64;
+        file.read_at(bytemuck::cast_slice_mut(&mut values), start)
+            .map_err(|source| Error::UnreadableTensor {
+                name: name.to_owned(),
+                path: file.path.clone(),
+                source,
+            })?;
+        Ok(values)
+    }
+
+    fn add_file(&mut self, path: &Path) -> Result<()> {
+        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
+        let file = SourceFile::open(path).map_err(|error| Error::reading("source", path, error))?;
+        let header = Header::read(&file).map_err(bad)?;
+        for (key, value) in header.metadata {
+            self.metadata.entry(key).or_insert(value);
+        }
+        let index = self.files.len();
+        for (name, info) in header.tensors {
+            let start = header.data_start + info.data_offsets.0 as u64;
+            if let Some(other) = self.entries.get(&name) {
+                let other = self.files[other.file].path.display();
+                let problem = format!("{name} is in two files, {other} and {}", path.display());
+                self.duplicates.insert(name, problem);
+                continue;
+            }
+            self.entries.insert(
+                name,
+                Entry {
+                    file: index,
+                    info,
+                    start,
+                },
+            );
+        }
+        self.files.push(file);
+        Ok(())
+    }
+
+    fn check_index(&self, weights: &WeightFiles) -> Result<()> {
+        let mut problems = Vec::new();
+        for (name, shard) in &weights.weight_map {
+            match self.entries.get(name) {
+                Some(entry) if weights.files[entry.file] == *shard => {}
+                _ => problems.push(format!("{name} is not in {}", shard.display())),
+            }
+        }
+        if problems.is_empty() {
+            Ok(())
+        } else {
+            Err(Error::Checkpoint(format!(
+                "source: the index and its shards disagree:\n  {}",
+                problems.join("\n  ")
+            )))
+        }
+    }
+}
+
+/// Puts the bytes of each value in this machine's order; on most machines there is nothing to do, and no code.
+fn from_little_endian<T: Copy>(values: &mut [T], convert: impl Fn(T) -> T) {
+    if cfg!(target_endian = "big") {
+        values.iter_mut().for_each(|value| *value = convert(*value));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+    use std::io::Write;
+    use std::path::PathBuf;
+
+    use super::*;
+
+    /// Two float32, `a`, in the file `name` of the temporary folder.
+    fn two_numbers(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("saccade-{}-{name}", std::process::id()));
+        let header = r#"{"a":{"dtype":"F32","shape":[2],"data_offsets":[0,8]}}"#;
+        let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+        bytes.extend(header.as_bytes());
+        bytes.extend([1.0f32, 2.0].iter().flat_map(|value| value.to_le_bytes()));
+        std::fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    #[test]
+    fn a_file_that_changes_after_it_was_opened_is_an_error() {
+        type Change = fn(&Path) -> std::io::Result<()>;
+        let changes: [(&str, &str, Change); 4] = [
+            ("shrinks", "fill whole buffer", |path| {
+                File::options().write(true).open(path)?.set_len(10)
+            }),
+            ("grows", "changed while it was read", |path| {
+                File::options().append(true).open(path)?.write_all(b"more")
+            }),
+            ("rewritten", "changed while it was read", |path| {
+                // The clock of a file moves in steps of some milliseconds.
+                std::thread::sleep(std::time::Duration::from_millis(30));
+                let length = std::fs::metadata(path)?.len();
+                std::fs::write(path, vec![0; length as usize])
+            }),
+            ("emptied", "fill whole buffer", |path| {
+                File::create(path).map(|_| ())
+            }),
+        ];
+        for (name, expected, change) in changes {
+            let path = two_numbers(name);
+            let checkpoint = Checkpoint::open(&path).unwrap();
+            assert!(checkpoint.read("a").is_ok());
+            change(&path).unwrap();
+            let error = checkpoint.read("a").unwrap_err().to_string();
+            assert!(error.contains(expected), "{name}: {error}");
+            std::fs::remove_file(&path).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_removed_or_replaced_stays_what_it_was() {
+        let path = two_numbers("removed");
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        let other = two_numbers("other");
+        std::fs::write(&other, b"something else").unwrap();
+        std::fs::rename(&other, &path).unwrap();
+        assert_eq!(checkpoint.read("a").unwrap(), Elements::F32(vec![1.0, 2.0]));
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(checkpoint.read("a").unwrap(), Elements::F32(vec![1.0, 2.0]));
+    }
+
+    #[test]
+    fn slices_are_those_that_are_there() {
+        let path = two_numbers("slices");
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        assert_eq!(
+            checkpoint.read_slices("a", 1..2).unwrap(),
+            Elements::F32(vec![2.0])
+        );
+        #[allow(clippy::reversed_empty_ranges)]
+        for wanted in [0..3, 3..3, 2..1, 0..usize::MAX] {
+            assert!(checkpoint.read_slices("a", wanted).is_err());
+        }
+        std::fs::remove_file(&path).unwrap();
+    }
+
+    #[test]
+    fn threads_read_different_tensors_at_once() {
+        const NUM_TENSORS: usize = 8;
+        const LENGTH: usize = 5000;
+        let path = std::env::temp_dir().join(format!("saccade-{}-threads", std::process::id()));
+        let mut header = serde_json::Map::new();
+        for index in 0..NUM_TENSORS {
+            let (start, end) = (4 * LENGTH * index, 4 * LENGTH * (index + 1));
+            let info = serde_json::json!({"dtype": "F32", "shape": [LENGTH], "data_offsets": [start, end]});
+            header.insert(format!("t{index}"), info);
+        }
+        let header = serde_json::Value::Object(header).to_string();
+        let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+        bytes.extend(header.as_bytes());
+        for index in 0..NUM_TENSORS {
+            bytes.extend((index as f32).to_le_bytes().repeat(LENGTH));
+        }
+        std::fs::write(&path, bytes).unwrap();
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        std::thread::scope(|scope| {
+            for index in 0..NUM_TENSORS {
+                let checkpoint = &checkpoint;
+                scope.spawn(move || {
+                    let expected = Elements::F32(vec![index as f32; LENGTH]);
+                    for _ in 0..200 {
+                        assert!(
+                            checkpoint.read(&format!("t{index}")).unwrap() == expected,
+                            "t{index}"
+                        );
+                    }
+                });
+            }
+        });
+        std::fs::remove_file(&path).unwrap();
+    }
+}

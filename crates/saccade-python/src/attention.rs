@@ -1,0 +1,104 @@
+//! `saccade._saccade.CrossAttention` and its keys and values.
+
+use numpy::{PyReadonlyArrayDyn, PyReadwriteArrayDyn};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays::{held_tensors, optional_view, tensor_views, view};
+use crate::detached::call;
+use crate::error::raise;
+
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct KeyValues(saccade::KeyValues);
+
+#[pymethods]
+impl KeyValues {
+    #[getter]
+    fn batch(&self) -> usize {
+        self.0.batch()
+    }
+
+    #[getter]
+    fn num_vl_tokens(&self) -> usize {
+        self.0.num_vl_tokens()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+}
+
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct CrossAttention(saccade::CrossAttention);
+
+#[pymethods]
+impl CrossAttention {
+    #[new]
+    fn new(py: Python<'_>, tensors: &Bound<'_, PyDict>, num_heads: usize, precision: &str) -> PyResult<Self> {
+        let precision = precision.parse().map_err(raise)?;
+        let held = held_tensors(tensors)?;
+        let views = tensor_views(&held)?;
+        call(py, || {
+            saccade::CrossAttention::new(&views, num_heads, precision, None)
+        })
+        .map(Self)
+    }
+
+    #[getter]
+    fn width(&self) -> usize {
+        self.0.width()
+    }
+
+    #[getter]
+    fn context_dim(&self) -> usize {
+        self.0.context_dim()
+    }
+
+    #[getter]
+    fn num_heads(&self) -> usize {
+        self.0.num_heads()
+    }
+
+    #[getter]
+    fn precision(&self) -> String {
+        self.0.precision().to_string()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+
+    fn project(
+        &self,
+        py: Python<'_>,
+        encoder_hidden_states: PyReadonlyArrayDyn<'_, f32>,
+    ) -> PyResult<KeyValues> {
+        let states = view(&encoder_hidden_states)?;
+        call(py, || self.0.project(states)).map(KeyValues)
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn attend(
+        &self,
+        py: Python<'_>,
+        hidden_states: PyReadonlyArrayDyn<'_, f32>,
+        kv: &KeyValues,
+        key_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        key_bias: Option<PyReadonlyArrayDyn<'_, f32>>,
+        mut weights: Option<PyReadwriteArrayDyn<'_, f32>>,
+        mut out: PyReadwriteArrayDyn<'_, f32>,
+    ) -> PyResult<()> {
+        let hidden_states = view(&hidden_states)?;
+        let (key_mask, key_bias) = (optional_view(&key_mask)?, optional_view(&key_bias)?);
+        let weights = weights
+            .as_mut()
+            .map(|weights| weights.as_slice_mut())
+            .transpose()?;
+        let (kv, out) = (&kv.0, out.as_slice_mut()?);
+        call(py, || {
+            self.0.attend(hidden_states, kv, key_mask, key_bias, weights, out)
+        })
+    }
+}

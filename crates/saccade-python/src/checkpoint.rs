@@ -1,0 +1,114 @@
+//! `saccade._saccade.Published`: an open checkpoint and what it is.
+
+use std::path::PathBuf;
+
+use numpy::PyArrayDyn;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use saccade::{Checkpoint, TensorFacts};
+
+use crate::arrays::to_numpy;
+use crate::config::config_dict;
+use crate::detached::call;
+use crate::error::raise;
+
+/// Every tensor whose name begins with `prefix`, as float32, by the rest of its name.
+#[pyfunction]
+pub(crate) fn read_tensors<'py>(
+    py: Python<'py>,
+    source: PathBuf,
+    prefix: &str,
+) -> PyResult<Bound<'py, PyDict>> {
+    let checkpoint = call(py, || Ok(Checkpoint::open(&source)?))?;
+    let dict = PyDict::new(py);
+    for name in checkpoint.names().filter(|name| name.starts_with(prefix)) {
+        let data = call(py, || Ok(checkpoint.read_f32(name)?))?;
+        let shape = checkpoint
+            .shape(name)
+            .expect("the name is one of the checkpoint's");
+        dict.set_item(&name[prefix.len()..], to_numpy(py, data, shape)?)?;
+    }
+    Ok(dict)
+}
+
+/// Name, type, shape and bytes in the file of a tensor.
+type PyTensorFacts = (String, String, Vec<usize>, u64);
+
+/// An open checkpoint and what it is.
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct Published(saccade::Published);
+
+#[pymethods]
+impl Published {
+    #[staticmethod]
+    fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
+        call(py, || saccade::Published::open(&source, config.as_deref())).map(Self)
+    }
+
+    fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        config_dict(py, &self.0.config)
+    }
+
+    #[getter]
+    fn config_json(&self) -> String {
+        self.0.config_json.clone()
+    }
+
+    #[getter]
+    fn layout(&self) -> String {
+        self.0.layout.to_string()
+    }
+
+    #[getter]
+    fn prefix(&self) -> &'static str {
+        self.0.prefix
+    }
+
+    #[getter]
+    fn evidence(&self) -> Vec<String> {
+        self.0.evidence.clone()
+    }
+
+    #[getter]
+    fn files(&self) -> Vec<PathBuf> {
+        self.0.files().map(PathBuf::from).collect()
+    }
+
+    /// The embodiments that are left, if others were taken out.
+    fn kept_embodiments(&self, py: Python<'_>) -> PyResult<Option<Vec<i64>>> {
+        call(py, || self.0.kept_embodiments())
+    }
+
+    fn tensors(&self) -> Vec<PyTensorFacts> {
+        let fields = |tensor: TensorFacts| (tensor.name, tensor.dtype, tensor.shape, tensor.nbytes);
+        self.0.tensors().map(fields).collect()
+    }
+
+    fn check(&self, py: Python<'_>) -> PyResult<()> {
+        call(py, || self.0.check())
+    }
+
+    /// A tensor as float32, or one slice of its first axis.
+    fn read<'py>(
+        &self,
+        py: Python<'py>,
+        name: &str,
+        index: Option<usize>,
+    ) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let checkpoint = &self.0.checkpoint;
+        let data = call(py, || {
+            let elements = match index {
+                None => checkpoint.read(name),
+                Some(index) => checkpoint.read_slices(name, index..index.saturating_add(1)),
+            };
+            Ok(elements?.try_into_f32()?)
+        })?;
+        let shape = checkpoint.shape(name).expect("a tensor that was read is there");
+        to_numpy(py, data, &shape[usize::from(index.is_some())..])
+    }
+
+    fn nbytes(&self, py: Python<'_>, precision: &str, num_embodiments: usize) -> PyResult<usize> {
+        let precision = precision.parse().map_err(raise)?;
+        call(py, || self.0.nbytes(precision, num_embodiments))
+    }
+}

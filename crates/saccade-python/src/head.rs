@@ -1,0 +1,237 @@
+//! `saccade._saccade.ActionHead`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use saccade::{Chunking, Features, Group, Integrator, Keep, LoadOptions, Sampling, TraceOptions};
+
+use crate::arrays::{held_tensors, optional_view, tensor_views, to_numpy, view};
+use crate::config::config_dict;
+use crate::context::Context;
+use crate::detached::call;
+use crate::error::raise;
+use crate::intervention::{PyIntervention, PyRecorded, interventions, recorded};
+
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct ActionHead(saccade::ActionHead);
+
+#[pymethods]
+impl ActionHead {
+    #[staticmethod]
+    fn load(
+        py: Python<'_>,
+        source: PathBuf,
+        config: Option<String>,
+        embodiment_ids: Option<Vec<i64>>,
+        precision: &str,
+        num_threads: Option<usize>,
+    ) -> PyResult<Self> {
+        let options = LoadOptions {
+            config,
+            embodiment_ids,
+            precision: precision.parse().map_err(raise)?,
+            num_threads,
+        };
+        call(py, || saccade::ActionHead::load(&source, &options)).map(Self)
+    }
+
+    #[staticmethod]
+    fn from_tensors(
+        py: Python<'_>,
+        tensors: &Bound<'_, PyDict>,
+        config: String,
+        embodiment_ids: Option<Vec<i64>>,
+        precision: &str,
+        num_threads: Option<usize>,
+    ) -> PyResult<Self> {
+        let options = LoadOptions {
+            config: Some(config),
+            embodiment_ids,
+            precision: precision.parse().map_err(raise)?,
+            num_threads,
+        };
+        let held = held_tensors(tensors)?;
+        let views = tensor_views(&held)?;
+        call(py, || saccade::ActionHead::from_tensors(&views, &options)).map(Self)
+    }
+
+    fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        config_dict(py, self.0.config())
+    }
+
+    #[getter]
+    fn embodiment_ids(&self) -> Vec<usize> {
+        self.0.embodiment_ids().to_vec()
+    }
+
+    #[getter]
+    fn num_threads(&self) -> usize {
+        self.0.num_threads()
+    }
+
+    #[getter]
+    fn precision(&self) -> String {
+        self.0.precision().to_string()
+    }
+
+    #[getter]
+    fn isa(&self) -> String {
+        self.0.isa().to_string()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+
+    fn warmup(
+        &self,
+        py: Python<'_>,
+        num_vl_tokens: usize,
+        batch: usize,
+        num_samples: Option<usize>,
+        future_refresh: Option<usize>,
+    ) -> PyResult<()> {
+        call(py, || {
+            self.0.warmup(num_vl_tokens, batch, num_samples, future_refresh)
+        })
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn encode<'py>(
+        &self,
+        py: Python<'py>,
+        backbone_features: PyReadonlyArrayDyn<'_, f32>,
+        attention_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        image_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        drop_vl: Option<PyReadonlyArrayDyn<'_, bool>>,
+        attention: bool,
+        hidden: bool,
+    ) -> PyResult<(Context, PyRecorded<'py>)> {
+        let features = Features {
+            backbone_features: view(&backbone_features)?,
+            attention_mask: optional_view(&attention_mask)?,
+            image_mask: optional_view(&image_mask)?,
+            drop_vl: optional_view(&drop_vl)?,
+            record: Keep { attention, hidden },
+        };
+        let mut context = call(py, || self.0.encode(&features))?;
+        let kept = recorded(py, context.take_recorded())?;
+        Ok((Context(Arc::new(context)), kept))
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn sample(
+        &self,
+        py: Python<'_>,
+        context: &Context,
+        state: PyReadonlyArrayDyn<'_, f32>,
+        embodiment_id: PyReadonlyArrayDyn<'_, i64>,
+        noise: PyReadonlyArrayDyn<'_, f32>,
+        num_steps: Option<usize>,
+        integrator: &str,
+        num_samples: Option<usize>,
+        future_refresh: Option<usize>,
+        previous_chunk: Option<PyReadonlyArrayDyn<'_, f32>>,
+        chunking: Option<(usize, usize, f64, Option<usize>)>,
+        intervention: Vec<PyIntervention<'_>>,
+        mut out: PyReadwriteArrayDyn<'_, f32>,
+    ) -> PyResult<()> {
+        let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
+        let (context, out) = (&context.0, out.as_slice_mut()?);
+        let sampling = Sampling {
+            num_steps,
+            integrator: Integrator::from_name(integrator).map_err(raise)?,
+            num_samples,
+            future_refresh,
+            chunking: optional_view(&previous_chunk)?.zip(chunking).map(
+                |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
+                    previous_chunk,
+                    overlap,
+                    frozen,
+                    ramp_rate,
+                    horizon,
+                },
+            ),
+            interventions: &interventions(intervention)?,
+        };
+        call(py, || {
+            self.0
+                .sample(context, state, embodiment_id, noise, &sampling, out)
+        })
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn trace<'py>(
+        &self,
+        py: Python<'py>,
+        context: &Context,
+        state: PyReadonlyArrayDyn<'_, f32>,
+        embodiment_id: PyReadonlyArrayDyn<'_, i64>,
+        noise: PyReadonlyArrayDyn<'_, f32>,
+        num_steps: Option<usize>,
+        intervention: Vec<PyIntervention<'_>>,
+        attention: bool,
+        hidden: bool,
+        blocks: Option<Vec<usize>>,
+        steps: Option<Vec<usize>>,
+        max_bytes: u64,
+    ) -> PyResult<(PyRecorded<'py>, Bound<'py, PyDict>, Bound<'py, PyArrayDyn<f32>>)> {
+        let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
+        let context = &context.0;
+        let sampling = Sampling {
+            num_steps,
+            interventions: &interventions(intervention)?,
+            ..Sampling::default()
+        };
+        let options = TraceOptions {
+            record: Keep { attention, hidden },
+            blocks,
+            steps,
+            max_bytes,
+        };
+        let trace = call(py, || {
+            self.0
+                .trace(context, state, embodiment_id, noise, &sampling, &options)
+        })?;
+        let rows = PyDict::new(py);
+        for group in [Group::State, Group::Future, Group::Action] {
+            let range = trace.groups.range(group);
+            rows.set_item(group.name(), (range.start, range.end))?;
+        }
+        let actions = to_numpy(py, trace.actions.data, &trace.actions.shape)?;
+        Ok((recorded(py, trace.recorded)?, rows, actions))
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn velocity(
+        &self,
+        py: Python<'_>,
+        context: &Context,
+        state: PyReadonlyArrayDyn<'_, f32>,
+        embodiment_id: PyReadonlyArrayDyn<'_, i64>,
+        actions: PyReadonlyArrayDyn<'_, f32>,
+        timestep: PyReadonlyArrayDyn<'_, i64>,
+        intervention: Vec<PyIntervention<'_>>,
+        mut out: PyReadwriteArrayDyn<'_, f32>,
+    ) -> PyResult<()> {
+        let (state, embodiment_id) = (view(&state)?, view(&embodiment_id)?);
+        let (actions, timestep) = (view(&actions)?, view(&timestep)?);
+        let (context, out) = (&context.0, out.as_slice_mut()?);
+        let interventions = interventions(intervention)?;
+        call(py, || {
+            self.0.velocity(
+                context,
+                state,
+                embodiment_id,
+                actions,
+                timestep,
+                &interventions,
+                out,
+            )
+        })
+    }
+}

@@ -1,0 +1,79 @@
+//! Interventions as the Python package gives them, and what a run recorded.
+
+use std::collections::BTreeMap;
+
+use numpy::PyReadonlyArrayDyn;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use saccade::{Group, OwnedArray, Patch, Recorded, Tokens};
+
+use crate::arrays::{owned, to_numpy};
+use crate::error::raise;
+
+/// A group's name and indices.
+pub(crate) type PyTokens = (String, Option<Vec<usize>>);
+
+/// The fields of a `saccade.Intervention` by name, as its constructor normalised them; mappings are lists of their items.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub(crate) struct PyIntervention<'py> {
+    cut: Vec<(PyTokens, PyTokens)>,
+    key_bias: Vec<(PyTokens, PyReadonlyArrayDyn<'py, f32>)>,
+    patch: Vec<((usize, usize), PyTokens, PyReadonlyArrayDyn<'py, f32>)>,
+    future_tokens: Option<PyReadonlyArrayDyn<'py, f32>>,
+    blocks: Option<Vec<usize>>,
+    steps: Option<Vec<usize>>,
+    heads: Option<Vec<usize>>,
+}
+
+pub(crate) fn tokens((name, indices): PyTokens) -> PyResult<Tokens> {
+    let group = Group::from_name(&name).map_err(raise)?;
+    Ok(Tokens { group, indices })
+}
+
+pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade::Intervention> {
+    let cut = |(reader, source)| Ok((tokens(reader)?, tokens(source)?));
+    let key_bias = |(keys, bias)| Ok((tokens(keys)?, owned(&bias)?));
+    let patch = |((step, block), patched, rows)| {
+        Ok(Patch {
+            step,
+            block,
+            tokens: tokens(patched)?,
+            rows: owned(&rows)?,
+        })
+    };
+    Ok(saccade::Intervention {
+        cut: given.cut.into_iter().map(cut).collect::<PyResult<_>>()?,
+        key_bias: given
+            .key_bias
+            .into_iter()
+            .map(key_bias)
+            .collect::<PyResult<_>>()?,
+        patch: given.patch.into_iter().map(patch).collect::<PyResult<_>>()?,
+        future_tokens: given.future_tokens.as_ref().map(owned).transpose()?,
+        blocks: given.blocks,
+        steps: given.steps,
+        heads: given.heads,
+    })
+}
+
+pub(crate) fn interventions(given: Vec<PyIntervention<'_>>) -> PyResult<Vec<saccade::Intervention>> {
+    given.into_iter().map(intervention).collect()
+}
+
+/// Attention and hidden rows, each by place.
+pub(crate) type PyRecorded<'py> = (Bound<'py, PyDict>, Bound<'py, PyDict>);
+
+pub(crate) fn recorded<'py, Place: IntoPyObject<'py>>(
+    py: Python<'py>,
+    recorded: Recorded<Place>,
+) -> PyResult<PyRecorded<'py>> {
+    let to_dict = |arrays: BTreeMap<Place, OwnedArray>| {
+        let dict = PyDict::new(py);
+        for (place, array) in arrays {
+            dict.set_item(place, to_numpy(py, array.data, &array.shape)?)?;
+        }
+        Ok::<_, PyErr>(dict)
+    };
+    Ok((to_dict(recorded.attention)?, to_dict(recorded.hidden)?))
+}

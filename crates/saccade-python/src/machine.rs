@@ -1,0 +1,92 @@
+//! What this machine has, what it can do at most, and where the time of calls goes.
+
+use pyo3::exceptions::PyMemoryError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use saccade::{Arithmetic, Error, Isa, Part, Profile, peak};
+
+use crate::detached::call;
+use crate::error::raise;
+
+/// What this machine can do at most on `num_threads` threads; takes some tenths of a second for each instruction set.
+#[pyfunction]
+pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Bound<'_, PyDict>> {
+    if num_threads == 0 {
+        return Err(raise(Error::Input(
+            "num_threads: expected at least 1, got 0".to_owned(),
+        )));
+    }
+    let rates = PyDict::new(py);
+    for isa in Isa::available() {
+        let of_isa = PyDict::new(py);
+        for (name, arithmetic) in [
+            ("float32", Arithmetic::Float32),
+            ("bfloat16", Arithmetic::Bfloat16),
+            ("int8", Arithmetic::Int8),
+        ] {
+            let rate = call(py, || Ok(peak::macs_per_second(isa, arithmetic, num_threads)))?;
+            of_isa.set_item(name, rate)?;
+        }
+        rates.set_item(isa.to_string(), of_isa)?;
+    }
+    let peaks = PyDict::new(py);
+    peaks.set_item("macs_per_second", rates)?;
+    let read = call(py, || Ok(peak::read_bytes_per_second(num_threads)))?;
+    let read = read.map_err(|error| PyMemoryError::new_err(error.to_string()))?;
+    peaks.set_item("read_bytes_per_second", read)?;
+    peaks.set_item("clock_hz", call(py, || Ok(peak::clock_hz()))?)?;
+    Ok(peaks)
+}
+
+/// Begins to count where the time of this thread's calls goes.
+#[pyfunction]
+pub(crate) fn start_profile() {
+    Profile::start();
+}
+
+/// Ends it: `(calls, seconds, multiply_adds, bytes)` by part.
+#[pyfunction]
+pub(crate) fn take_profile(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+    let profile = Profile::take().unwrap_or_default();
+    let dict = PyDict::new(py);
+    for part in Part::ALL {
+        let counter = profile.part(part);
+        dict.set_item(
+            part.name(),
+            (
+                counter.calls,
+                counter.time.as_secs_f64(),
+                counter.multiply_adds,
+                counter.bytes,
+            ),
+        )?;
+    }
+    Ok(dict)
+}
+
+#[pyfunction]
+pub(crate) fn available_isas() -> Vec<String> {
+    Isa::available().iter().map(Isa::to_string).collect()
+}
+
+#[pyfunction]
+pub(crate) fn selected_isa() -> PyResult<String> {
+    Isa::from_env()
+        .map(|isa| isa.to_string())
+        .map_err(|error| raise(Error::Input(error.to_string())))
+}
+
+#[pyfunction]
+pub(crate) fn dot_products() -> PyResult<Vec<&'static str>> {
+    Isa::from_env()
+        .map(Isa::dot_products)
+        .map_err(|error| raise(Error::Input(error.to_string())))
+}
+
+#[pyfunction]
+pub(crate) fn default_num_threads() -> PyResult<usize> {
+    let threads = saccade::default_num_threads();
+    threads
+        .map(usize::from)
+        .map_err(|error| raise(Error::Input(error.to_string())))
+}

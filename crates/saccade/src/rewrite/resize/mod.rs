@@ -1,0 +1,150 @@
+//! Checkpoints with another number of future tokens.
+//!
+//! Copies of a token, each with the logarithm of their number taken off its key's logit in every self-attention block, are together what the
+//! token was (spec I2), and so is one token in place of equal ones with the logarithm of their number added. No published layout has a place
+//! for such a bias, so it stands in a key of saccade's own: exact in saccade, while other programs see plain copies.
+
+mod json_edit;
+mod merge;
+mod perturb;
+mod plan;
+
+use std::path::Path;
+
+use saccade_checkpoint::OWN_CONFIG;
+
+use crate::error::{Error, Result};
+use crate::head::plan::FUTURE_TOKENS;
+use crate::rewrite::convert::Float;
+use crate::rewrite::{RewriteOptions, Source, Written};
+use merge::resized;
+use perturb::perturb;
+use plan::plan;
+
+pub use merge::{MergedTokens, merge_future_tokens};
+pub use plan::resized_config;
+
+/// How a checkpoint is resized.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct ResizeOptions {
+    /// What is common to all rewriting.
+    pub rewrite: RewriteOptions,
+    /// Future tokens that the copy is to have.
+    pub num_future_tokens: usize,
+    /// Root mean square of what is added to the copies of tokens, as a part of that of all tokens; 0 adds nothing.
+    pub perturbation: f64,
+    /// Of what is added.
+    pub seed: u64,
+}
+
+impl ResizeOptions {
+    /// A copy with this number of future tokens and nothing added to them, to be changed field by field.
+    #[must_use]
+    pub fn new(rewrite: RewriteOptions, num_future_tokens: usize) -> Self {
+        Self {
+            rewrite,
+            num_future_tokens,
+            perturbation: 0.0,
+            seed: 0,
+        }
+    }
+}
+
+/// What [`resize`] wrote.
+#[derive(Clone, Debug)]
+pub struct ResizeReport {
+    /// The files.
+    pub written: Written,
+    /// Future tokens of the source.
+    pub num_before: usize,
+    /// Future tokens of the copy.
+    pub num_after: usize,
+    /// For each token of the copy, which ones of the source it stands for: one if it is a copy, several if they were merged.
+    pub sources: Vec<Vec<usize>>,
+    /// What saccade adds to the logits of the tokens' keys; none if nothing.
+    pub future_key_bias: Option<Vec<f32>>,
+    /// Whether chunks of actions in saccade stay what they were, but for rounding.
+    pub is_exact: bool,
+    /// Whether the tokens are float32 now because the type that they had cannot hold the new ones.
+    pub is_widened: bool,
+    /// Root mean square of what was added to copies.
+    pub perturbation_rms: f64,
+}
+
+/// Writes the checkpoint `source` to the directory `out` with another number of future tokens. Going up, tokens are copied in turn; going
+/// down, the most similar are merged. All other tensors are copied bit for bit, and the number is changed wherever the config says it.
+///
+/// `progress(done, total)`, in bytes read, is called after each tensor; where it returns false, nothing is written.
+///
+/// # Errors
+/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a version without future tokens, a source that has none, one
+/// whose config says different numbers, and tokens that are not finite; [`Error::Input`] for a number or a perturbation out of range, and if
+/// `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source; [`Error::Output`] if it cannot be
+/// written.
+pub fn resize(
+    source: &Path,
+    out: &Path,
+    options: &ResizeOptions,
+    mut progress: impl FnMut(u64, u64) -> bool,
+) -> Result<ResizeReport> {
+    let source = Source::open(source, options.rewrite.config.as_deref())?;
+    let config = &source.config;
+    let plan = plan(config, &source.given_config, options.num_future_tokens)?;
+    let name = format!("{}{FUTURE_TOKENS}", source.prefix);
+    let tokens = source.checkpoint.read(&name)?.try_into_f32()?;
+    if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
+        return Err(Error::Checkpoint(format!(
+            "source: {name} holds {bad}, expected finite numbers"
+        )));
+    }
+    let no_bias = || vec![0.0; config.num_future_tokens];
+    let bias = config.future_key_bias.clone().unwrap_or_else(no_bias);
+    let mut resized = resized(&tokens, config.width, &bias, options.num_future_tokens);
+    let perturbation_rms = perturb(
+        &mut resized.tokens,
+        &tokens,
+        config.num_future_tokens,
+        options.perturbation,
+        options.seed,
+    )?;
+
+    let mut stored = source.as_it_is(&name)?;
+    let dtype = Float::of(stored.dtype).expect("the tokens are checked to be floating point");
+    let is_widened = resized.tokens.iter().any(|&value| dtype.round(value) != value);
+    let dtype = if is_widened { Float::F32 } else { dtype };
+    (stored.dtype, stored.shape) = (dtype.dtype(), vec![options.num_future_tokens, config.width]);
+    let mut bytes = Vec::new();
+    dtype.write(&resized.tokens, &mut bytes);
+
+    let mut planned = Vec::new();
+    for other in source.names(&options.rewrite) {
+        if other != name {
+            planned.push(source.as_it_is(other)?);
+        }
+    }
+    planned.push(stored);
+    let (config_text, own) = plan.config(resized.key_bias.as_deref());
+    let small = [
+        ("config.json", Some(config_text.as_str())),
+        (OWN_CONFIG, own.as_deref()),
+    ];
+    let rewrite = &options.rewrite;
+    let written = source.write(out, rewrite, &small, planned, &mut progress, |other, writer| {
+        if other == name {
+            Ok(writer.tensor(&name, &bytes)?)
+        } else {
+            source.copy(other, writer)
+        }
+    })?;
+    Ok(ResizeReport {
+        written,
+        num_before: config.num_future_tokens,
+        num_after: options.num_future_tokens,
+        is_exact: resized.is_exact && perturbation_rms == 0.0,
+        sources: resized.sources,
+        future_key_bias: resized.key_bias,
+        is_widened,
+        perturbation_rms,
+    })
+}

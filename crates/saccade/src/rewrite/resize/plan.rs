@@ -1,0 +1,263 @@
+//! What changes in a checkpoint's config when it gets another number of future tokens.
+
+use std::ops::Range;
+
+use serde_json::Value;
+use serde_json::value::RawValue;
+
+use super::json_edit::{Place, entry, find, span};
+use crate::config::HeadConfig;
+use crate::error::{Error, Result};
+
+/// Merging compares every token with every other, and a chunk takes time in proportion to their number.
+const MAX_TOKENS: usize = 4096;
+
+/// The key of the number of future tokens in published configs, and that of saccade's own.
+const COUNT_KEY: &str = "num_target_vision_tokens";
+const OWN_KEY: &str = "saccade";
+const BIAS_KEY: &str = "future_key_bias";
+
+/// The text of a config, which holds the head's, for `num_future_tokens` tokens without biases; all else is as it is written.
+///
+/// # Errors
+/// [`Error::Checkpoint`] for a config that is broken, says different numbers or is of a version without future tokens; [`Error::Input`] for a
+/// number out of range.
+pub fn resized_config(config_json: &str, num_future_tokens: usize) -> Result<String> {
+    let config = HeadConfig::from_json(config_json)?;
+    Ok(plan(&config, config_json, num_future_tokens)?.config(None).0)
+}
+
+/// What changes in a checkpoint's config: what can be said without its tensors.
+pub(super) struct Plan {
+    given: String,
+    count: usize,
+    /// Where the number of future tokens stands.
+    counts: Vec<Range<usize>>,
+    /// The head's own object; none if the config has none, as lerobot's.
+    head: Option<Object>,
+}
+
+/// An object in a config's text.
+struct Object {
+    range: Range<usize>,
+    has_count: bool,
+    /// Where saccade's own key has its value, and the object that it is.
+    own: Option<(Range<usize>, serde_json::Map<String, Value>)>,
+}
+
+/// How the config `given`, which is `config`, becomes one of `count` future tokens.
+///
+/// # Errors
+/// [`Error::Checkpoint`] for a version without future tokens, a head that has none, and numbers that contradict each other;
+/// [`Error::Input`] for a count out of range.
+pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Plan> {
+    let bad = |problem: String| Err(Error::Checkpoint(problem));
+    let before = config.num_future_tokens;
+    if config.version != "n1.5" {
+        return bad(format!(
+            "source: GR00T {} has no future tokens, so there is no number of them to change",
+            config.version.to_uppercase()
+        ));
+    }
+    if before == 0 {
+        return bad(
+            "source: it has no future tokens: there is nothing to copy, and new ones would have to be trained".to_owned(),
+        );
+    }
+    if count > MAX_TOKENS {
+        return Err(Error::Input(format!(
+            "num_future_tokens: expected at most {MAX_TOKENS}, got {count}"
+        )));
+    }
+    if before > MAX_TOKENS {
+        return bad(format!(
+            "source: it has {before} future tokens, expected at most {MAX_TOKENS}"
+        ));
+    }
+    let mut places = Vec::new();
+    let whole: &RawValue = serde_json::from_str(given)
+        .map_err(|error| Error::Checkpoint(format!("config: not valid JSON: {error}")))?;
+    find("", whole, &mut places)?;
+    let counts: Vec<&Place<'_>> = places.iter().filter(|place| place.key == COUNT_KEY).collect();
+    let others: Vec<String> = counts
+        .iter()
+        .filter(|place| serde_json::from_str::<usize>(place.value.get()).ok() != Some(before))
+        .map(|place| format!("{} is {}", place.path, place.value.get()))
+        .collect();
+    if !others.is_empty() {
+        return bad(format!(
+            "config: {}, but the head has {before} future tokens",
+            others.join("; ")
+        ));
+    }
+    let head = places
+        .iter()
+        .find(|place| place.path == "action_head_cfg")
+        .map(|place| place.value)
+        .or_else(|| (!places.iter().any(|place| place.path == "type")).then_some(whole));
+    let in_head = |key: &str, head: &RawValue| {
+        let path = if std::ptr::eq(head, whole) {
+            key.to_owned()
+        } else {
+            format!("action_head_cfg.{key}")
+        };
+        places.iter().find(|place| place.path == path)
+    };
+    Ok(Plan {
+        given: given.to_owned(),
+        count,
+        counts: counts.iter().map(|place| span(given, place.value)).collect(),
+        head: head.map(|head| Object {
+            range: span(given, head),
+            has_count: in_head(COUNT_KEY, head).is_some(),
+            own: in_head(OWN_KEY, head).map(|place| {
+                let object = serde_json::from_str(place.value.get()).unwrap_or_default();
+                (span(given, place.value), object)
+            }),
+        }),
+    })
+}
+
+impl Plan {
+    /// The text of the new `config.json`, and that of a file of saccade's own beside it if the bias has no place in there.
+    pub(super) fn config(&self, bias: Option<&[f32]>) -> (String, Option<String>) {
+        let count = self.count.to_string();
+        let mut edits: Vec<(Range<usize>, String)> = self
+            .counts
+            .iter()
+            .map(|range| (range.clone(), count.clone()))
+            .collect();
+        let own = bias.map(|bias| serde_json::json!({ BIAS_KEY: bias }));
+        let mut beside = None;
+        match &self.head {
+            None => beside = own.map(|own| format!("{own:#}\n")),
+            Some(head) => {
+                // New keys come first, spaced as the first one is.
+                let start = head.range.start + 1;
+                let rest = &self.given[start..head.range.end];
+                let space = &rest[..rest.len() - rest.trim_start().len()];
+                let mut first = String::new();
+                if !head.has_count {
+                    first += &format!("{space}\"{COUNT_KEY}\": {count},");
+                }
+                match (&head.own, own) {
+                    (Some((range, object)), own) => {
+                        let mut object = object.clone();
+                        object.remove(BIAS_KEY);
+                        object.extend(own.and_then(|own| own.as_object().cloned()).into_iter().flatten());
+                        edits.push(match entry(&self.given, range, OWN_KEY) {
+                            Some(entry) if object.is_empty() => (entry, String::new()),
+                            _ => (range.clone(), Value::Object(object).to_string()),
+                        });
+                    }
+                    (None, Some(own)) => first += &format!("{space}\"{OWN_KEY}\": {own},"),
+                    (None, None) => {}
+                }
+                edits.push((start..start, first));
+            }
+        }
+        edits.sort_by_key(|(range, _)| range.start);
+        let mut text = self.given.clone();
+        for (range, new) in edits.into_iter().rev() {
+            text.replace_range(range, &new);
+        }
+        (text, beside)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CONFIG: &str = r#"{
+  "action_head_cfg": {
+    "action_dim": 3, "action_horizon": 5, "add_pos_embed": true, "backbone_embedding_dim": 8, "hidden_size": 7,
+    "input_embedding_dim": 12, "max_state_dim": 6, "noise_s": 0.99900000000000000001, "num_inference_timesteps": 4,
+    "num_target_vision_tokens": 4, "num_timestep_buckets": 1000, "use_vlln": false,
+    "diffusion_model_cfg": {"num_layers": 2, "num_attention_heads": 3, "attention_head_dim": 4, "positional_embeddings": null, "cross_attention_dim": 8, "interleave_self_attention": true}
+  },
+  "model_type": "gr00t_n1_5", "extra": [{"num_target_vision_tokens": 4}]
+}"#;
+
+    fn planned(given: &str, count: usize) -> Result<Plan> {
+        plan(&HeadConfig::from_json(given)?, given, count)
+    }
+
+    #[test]
+    fn all_of_a_config_but_the_number_stays_as_it_is_written() {
+        let (text, beside) = planned(CONFIG, 9).unwrap().config(None);
+        assert_eq!(
+            text,
+            CONFIG.replace("num_target_vision_tokens\": 4", "num_target_vision_tokens\": 9")
+        );
+        assert_eq!(beside, None);
+    }
+
+    #[test]
+    fn a_bias_comes_and_goes() {
+        let (with, _) = planned(CONFIG, 2).unwrap().config(Some(&[0.5, -1.0]));
+        let config = HeadConfig::from_json(&with).unwrap();
+        assert_eq!(
+            (config.num_future_tokens, config.future_key_bias),
+            (2, Some(vec![0.5, -1.0]))
+        );
+        let (other, _) = planned(&with, 1).unwrap().config(Some(&[0.25]));
+        assert_eq!(
+            HeadConfig::from_json(&other).unwrap().future_key_bias,
+            Some(vec![0.25])
+        );
+        let (back, _) = planned(&other, 4).unwrap().config(None);
+        assert_eq!(back, CONFIG);
+        // Wherever the key stands.
+        for written in [
+            CONFIG.replace(
+                "\"use_vlln\": false,",
+                "\"saccade\" :\t{\"future_key_bias\": null} , \"use_vlln\": false,",
+            ),
+            CONFIG.replace(
+                "\"interleave_self_attention\": true}",
+                "\"interleave_self_attention\": true}\n, \"saccade\": {}",
+            ),
+        ] {
+            let (back, _) = planned(&written, 4).unwrap().config(None);
+            let value: Value = serde_json::from_str(&back).unwrap();
+            assert_eq!(value, serde_json::from_str::<Value>(CONFIG).unwrap(), "{back}");
+        }
+    }
+
+    #[test]
+    fn a_number_that_the_config_leaves_out_is_written() {
+        let given = CONFIG.replace("\"num_target_vision_tokens\": 4, ", "");
+        let config = HeadConfig::from_json(&given).unwrap();
+        assert_eq!(config.num_future_tokens, 32);
+        let given = given.replace("{\"num_target_vision_tokens\": 4}", "");
+        let (text, _) = plan(&config, &given, 40).unwrap().config(None);
+        assert_eq!(HeadConfig::from_json(&text).unwrap().num_future_tokens, 40);
+    }
+
+    #[test]
+    fn numbers_that_disagree_are_all_listed() {
+        let given = CONFIG.replace(
+            "[{\"num_target_vision_tokens\": 4}]",
+            "[{\"num_target_vision_tokens\": 32}]",
+        );
+        let error = planned(&given, 9).err().unwrap().to_string();
+        assert!(
+            error.contains("extra[0].num_target_vision_tokens is 32"),
+            "{error}"
+        );
+        assert!(error.contains("4 future tokens"), "{error}");
+    }
+
+    #[test]
+    fn a_config_without_a_head_is_left_alone() {
+        let config = HeadConfig::from_json(CONFIG).unwrap();
+        let given = "{\"type\": \"groot\", \"chunk_size\": 50}";
+        let plan = plan(&config, given, 8).unwrap();
+        assert_eq!(plan.config(None), (given.to_owned(), None));
+        let (text, beside) = plan.config(Some(&[0.5]));
+        assert_eq!(text, given);
+        let beside: Value = serde_json::from_str(&beside.unwrap()).unwrap();
+        assert_eq!(beside, serde_json::json!({"future_key_bias": [0.5]}));
+    }
+}
