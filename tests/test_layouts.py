@@ -206,7 +206,7 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Json], object], Callable[[Json], 
         "nvidia",
         lambda config: config.update(model_type="gr00t_n2"),
         lambda tensors: None,
-        ['the model is "gr00t_n2", expected one of gr00t_n1, gr00t_n1_5, Gr00tN1d6, Gr00tN1d7'],
+        ['model_type is "gr00t_n2", expected one of gr00t_n1, gr00t_n1_5, Gr00tN1d6, Gr00tN1d7'],
     ),
     "another model": (
         "nvidia",
@@ -224,7 +224,7 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Json], object], Callable[[Json], 
         "nvidia",
         lambda config: config.update(saccade={"future_key_bias": [0.0] * 32}),
         lambda tensors: None,
-        ["saccade stands beside action_head_cfg, expected inside"],
+        ["saccade is next to action_head_cfg, expected inside it"],
     ),
     "another policy of lerobot's": (
         "lerobot",
@@ -262,7 +262,7 @@ def test_contradictions_of_a_config_alone() -> None:
         saccade.HeadConfig.from_dict(
             config | {"action_head_cfg": layouts.n15_head() | {"model_type": "Gr00tN1d7"}}
         )
-    with pytest.raises(CheckpointError, match="saccade stands beside action_head_cfg"):
+    with pytest.raises(CheckpointError, match="saccade is next to action_head_cfg"):
         saccade.HeadConfig.from_dict(config | {"saccade": {"future_key_bias": [0.0] * 32}})
 
 

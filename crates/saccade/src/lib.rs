@@ -11,7 +11,6 @@
 mod array;
 mod attention;
 mod cache;
-mod checkpoint;
 mod chunking;
 mod config;
 mod context;
@@ -44,8 +43,9 @@ pub use layout::tensor_shapes;
 pub use memory::{ElementsRef, TensorView, TensorViews};
 pub use precision::Precision;
 pub use profile::{Counter, Part, Profile};
-pub use recognise::{Layout, Published, TensorFacts};
-pub use rewrite::convert::{ConvertOptions, ConvertReport, Float, convert};
+pub use recognise::{Published, TensorFacts};
+pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
+pub use rewrite::float::Float;
 pub use rewrite::quantize::{QuantizeReport, quantize};
 pub use rewrite::resize::{
     MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config,
