@@ -255,6 +255,15 @@ def test_contradictions_are_one_error_with_all_that_was_found(tmp_path: Path, ca
         assert re.search(message, str(caught.value)), caught.value
 
 
+def test_an_encoder_without_inputs(tmp_path: Path) -> None:
+    """Its width is a multiple of every state's, none of which it holds."""
+    folder = layouts.write(tmp_path / "checkpoint", "lerobot-n17")
+    name = f"{EXPECTED['lerobot'][2]}state_encoder.layer1.W"
+    change_tensors(folder, lambda tensors: tensors.update({name: torch.zeros(1, 0, 4)}))
+    with pytest.raises(CheckpointError, match="max_state_dim is"):
+        saccade.ActionHead.load(folder)
+
+
 def test_contradictions_of_a_config_alone() -> None:
     config = {"model_type": "gr00t_n1_5", "action_head_cfg": layouts.n15_head()}
     saccade.HeadConfig.from_dict(config)
