@@ -154,7 +154,9 @@ impl Checkpoint {
         };
         match entry.info.shape.split_first() {
             Some((&size, rest)) if wanted.start <= wanted.end && wanted.end <= size => {
-                let elements: usize = rest.iter().product();
+                let elements = rest
+                    .iter()
+                    .fold(1, |product, &size| usize::saturating_mul(product, size));
                 let (first, count) = (wanted.start * elements, wanted.len() * elements);
                 self.read_elements(name, entry, first, count, spare)
             }

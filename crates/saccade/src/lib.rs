@@ -10,7 +10,6 @@
 
 mod alloc;
 mod array;
-mod checkpoint;
 mod config;
 mod engine;
 mod error;
@@ -43,8 +42,9 @@ pub use memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
 pub use profile::{Counter, Part, Profile};
-pub use recognise::{Layout, Published, TensorFacts};
-pub use rewrite::convert::{ConvertOptions, ConvertReport, Float, convert};
+pub use recognise::{Published, TensorFacts};
+pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
+pub use rewrite::float::Float;
 pub use rewrite::quantize::{QuantizeReport, quantize};
 pub use rewrite::resize::{
     MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config,

@@ -10,10 +10,10 @@ use safetensors::Dtype;
 
 use crate::alloc::reserve;
 use crate::error::{Error, Result, show_shape};
-use saccade_checkpoint::spec::{self, Problem};
-use saccade_checkpoint::{Elements, TensorSpec};
 use crate::nn::weights::{Request, Source, Tensor};
 use crate::ops::check_interrupted;
+use saccade_checkpoint::spec::{self, Problem};
+use saccade_checkpoint::{Elements, TensorSpec};
 
 /// The elements of a tensor that someone else holds, row-major.
 #[derive(Clone, Copy, Debug)]

@@ -36,7 +36,9 @@ impl PlannedTensor {
     /// Bytes in the file.
     #[must_use]
     pub fn nbytes(&self) -> usize {
-        self.shape.iter().product::<usize>() * self.dtype.bitsize() / 8
+        let elements: u128 = self.shape.iter().map(|&size| size as u128).product();
+        let bits = elements.saturating_mul(self.dtype.bitsize() as u128);
+        usize::try_from(bits / 8).unwrap_or(usize::MAX)
     }
 }
 
@@ -85,11 +87,11 @@ impl CheckpointWriter {
         let mut held = 0;
         for tensor in planned {
             let nbytes = tensor.nbytes() as u64;
-            if held > 0 && held + nbytes > max_shard_bytes {
+            if held > 0 && u64::saturating_add(held, nbytes) > max_shard_bytes {
                 sharded.push(Vec::new());
                 held = 0;
             }
-            held += nbytes;
+            held = u64::saturating_add(held, nbytes);
             sharded.last_mut().expect("there is at least one").push(tensor);
         }
         let mut writer = Self {
@@ -129,7 +131,7 @@ impl CheckpointWriter {
         }
         let (mut offset, mut offsets) = (0, Vec::new());
         for tensor in tensors {
-            let end = offset + tensor.nbytes();
+            let end = usize::saturating_add(offset, tensor.nbytes());
             let info = TensorInfo {
                 dtype: tensor.dtype,
                 shape: tensor.shape,
@@ -146,7 +148,7 @@ impl CheckpointWriter {
         for (name, start, nbytes) in offsets {
             let extent = Extent {
                 shard,
-                start: data + start,
+                start: data.saturating_add(start),
                 nbytes,
                 written: 0,
             };
@@ -157,7 +159,7 @@ impl CheckpointWriter {
             let mut file = File::create_new(&path)?;
             file.write_all(&(header.len() as u64).to_le_bytes())?;
             file.write_all(header.as_bytes())?;
-            file.set_len(data + offset as u64)?;
+            file.set_len(data.saturating_add(offset as u64))?;
             Ok(file)
         };
         let file = write().map_err(|error| Error::writing(&path, error))?;

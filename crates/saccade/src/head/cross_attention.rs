@@ -8,13 +8,13 @@ use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
 use crate::engine::Engine;
 use crate::error::{Error, Result, show_shape};
-use saccade_checkpoint::spec;
 use crate::memory::{self, MemorySource, TensorViews};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys};
 use crate::nn::planner::Planner;
 use crate::nn::weights::{Builder, Source};
 use crate::precision::Precision;
 use crate::profile::Part;
+use saccade_checkpoint::spec;
 
 /// Projected keys and values of a batch: immutable, for any number of calls.
 pub struct KeyValues {

@@ -13,9 +13,9 @@ use crate::config::HeadConfig;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
 use crate::memory::{self, MemorySource, TensorViews};
+use crate::nn::file::FileSource;
 use crate::nn::weights::{Builder, Source};
 use crate::precision::Precision;
-use crate::nn::file::FileSource;
 use crate::recognise::Published;
 
 /// How a head is loaded.
@@ -88,7 +88,10 @@ impl ActionHead {
             published.config.num_embodiments,
         )?;
         published.check()?;
-        granted("source", published.nbytes(options.precision, embodiment_ids.len())?)?;
+        granted(
+            "source",
+            published.nbytes(options.precision, embodiment_ids.len())?,
+        )?;
         let Published {
             checkpoint,
             prefix,

@@ -108,7 +108,5 @@ fn packed_nbytes(
         }
     };
     let layer = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]);
-    layer
-        .map(|layer| layer.nbytes())
-        .map_err(packing_error)
+    layer.map(|layer| layer.nbytes()).map_err(packing_error)
 }

@@ -125,8 +125,12 @@ impl Weight<'_> {
     /// The inputs `first .. first + count`.
     pub(crate) fn inputs(self, first: usize, count: usize) -> Self {
         match self {
-            Self::Held(WeightRef::F32(view)) => Self::Held(WeightRef::F32(view.columns(first..first + count))),
-            Self::Held(WeightRef::Bf16(view)) => Self::Held(WeightRef::Bf16(view.columns(first..first + count))),
+            Self::Held(WeightRef::F32(view)) => {
+                Self::Held(WeightRef::F32(view.columns(first..first + count)))
+            }
+            Self::Held(WeightRef::Bf16(view)) => {
+                Self::Held(WeightRef::Bf16(view.columns(first..first + count)))
+            }
             Self::Held(WeightRef::Int8 { values, scales }) => Self::Held(WeightRef::Int8 {
                 values: values.columns(first..first + count),
                 scales,
@@ -295,13 +299,10 @@ impl Weights<'_> {
         if let Some(outline) = outline {
             self.count(self.builder.source.packed_nbytes(role, outline)?);
             // Stands in for the layer: the same inputs and no output.
-            held = vec![(
-                WeightRef::F32(Matrix::new(&[], in_features)),
-                None,
-            )];
+            held = vec![(WeightRef::F32(Matrix::new(&[], in_features)), None)];
         }
-        let packed = PackedLinear::pack(engine.isa, arithmetic, engine.threads, &held)
-            .map_err(packing_error)?;
+        let packed =
+            PackedLinear::pack(engine.isa, arithmetic, engine.threads, &held).map_err(packing_error)?;
         if outline.is_none() {
             self.count(packed.nbytes());
         }

@@ -2,6 +2,8 @@
 //!
 //! All weights are logarithms, and sums of them are taken relative to the largest (log-sum-exp), so that no finite bias over- or underflows.
 
+use saccade_checkpoint::{granted, reserve};
+
 use crate::error::{Error, Result};
 
 /// A smaller bias is rounding error of the logarithms and is written as no bias.
@@ -65,21 +67,27 @@ pub fn merge_future_tokens(
             "num_future_tokens: expected at most the {count} tokens that are given, got {num_future_tokens}"
         )));
     }
-    Ok(resized(tokens, width, key_bias, num_future_tokens))
+    resized(tokens, width, key_bias, num_future_tokens)
 }
 
 /// `count` tokens in place of `tokens`, rows of `width`, with `bias` on their keys: copied in turn, or merged.
-pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> MergedTokens {
+///
+/// # Errors
+/// [`Error::File`] if there is no memory for them.
+pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Result<MergedTokens> {
     let before = bias.len();
+    let mut rows = Vec::new();
+    reserve("future tokens", &mut rows, count * width)?;
     let sources: Vec<Vec<usize>> = if count >= before {
         (0..count).map(|index| vec![index % before]).collect()
     } else {
+        // As float64, while they are compared.
+        granted("future tokens", tokens.len().saturating_mul(size_of::<f64>()))?;
         merged(tokens, width, bias, count)
     };
     let row = |index: usize| &tokens[index * width..(index + 1) * width];
     let is_equal = |group: &Vec<usize>| group.iter().all(|&one| row(one) == row(group[0]));
     let is_exact = count > 0 && sources.iter().all(is_equal);
-    let mut rows = Vec::with_capacity(count * width);
     let mut biases = Vec::with_capacity(count);
     for group in &sources {
         let copies = match count >= before {
@@ -106,12 +114,12 @@ pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) 
         }));
     }
     let has_bias = biases.iter().any(|bias| bias.abs() > NO_BIAS);
-    MergedTokens {
+    Ok(MergedTokens {
         tokens: rows,
         key_bias: has_bias.then(|| biases.into_iter().map(|bias| bias as f32).collect()),
         sources,
         is_exact,
-    }
+    })
 }
 
 /// What is subtracted from biases before they are exponentiated: 0, or the largest of them where one is too large for that.
@@ -256,7 +264,7 @@ mod tests {
             let mut number = || uniform(&mut state) as f32 - 0.5;
             let tokens: Vec<f32> = (0..before * width).map(|_| number()).collect();
             let bias: Vec<f32> = (0..before).map(|_| number()).collect();
-            let grown = resized(&tokens, width, &bias, before + more);
+            let grown = resized(&tokens, width, &bias, before + more).unwrap();
             proptest::prop_assert!(grown.is_exact);
             proptest::prop_assert_eq!(&grown.tokens[..before * width], &tokens[..]);
             let was = mass(&tokens, width, Some(&bias));
@@ -266,7 +274,7 @@ mod tests {
                 proptest::prop_assert!((was - is).abs() < 1e-6 * was, "{} {}", was, is);
             }
             let all_zero = vec![0.0; before + more];
-            let shrunk = resized(&grown.tokens, width, grown.key_bias.as_deref().unwrap_or(&all_zero), before);
+            let shrunk = resized(&grown.tokens, width, grown.key_bias.as_deref().unwrap_or(&all_zero), before).unwrap();
             // Rows of one element have one of two directions: merging those of different lengths is as good.
             if width > 1 {
                 proptest::prop_assert!(shrunk.is_exact);
@@ -289,7 +297,7 @@ mod tests {
             let mut state = seed;
             let tokens: Vec<f32> = (0..before * 3).map(|_| uniform(&mut state) as f32 - 0.5).collect();
             let bias = if is_small { &small[..before] } else { &bias[..before] };
-            let resized = resized(&tokens, 3, bias, count);
+            let resized = resized(&tokens, 3, bias, count).unwrap();
             proptest::prop_assert!(resized.tokens.iter().all(|value| value.is_finite() && value.abs() <= 0.5));
             proptest::prop_assert!(resized.key_bias.iter().flatten().all(|value| value.is_finite()));
             let mut all: Vec<usize> = resized.sources.concat();
@@ -310,7 +318,7 @@ mod tests {
             let tokens: Vec<f32> = (0..before * 3).map(|_| uniform(&mut state) as f32 - 0.5).collect();
             let bias: Vec<f32> = (0..before).map(|_| (uniform(&mut state) * 8192.0) as f32 / 8192.0).collect();
             let moved: Vec<f32> = bias.iter().map(|bias| bias + f32::from(shift)).collect();
-            let (one, other) = (resized(&tokens, 3, &bias, 1), resized(&tokens, 3, &moved, 1));
+            let (one, other) = (resized(&tokens, 3, &bias, 1).unwrap(), resized(&tokens, 3, &moved, 1).unwrap());
             for (one, other) in one.tokens.iter().zip(&other.tokens) {
                 proptest::prop_assert!((one - other).abs() < 1e-4, "{} {}", one, other);
             }

@@ -1,4 +1,4 @@
-//! A head in a checkpoint: where its tensors are, which embodiments it has, whether its tensors fit a config.
+//! A head in a checkpoint: which embodiments it has, and whether its tensors fit a config.
 
 use saccade_checkpoint::{Checkpoint, spec};
 
@@ -8,26 +8,6 @@ use crate::head::plan::{is_unused, tensor_specs};
 
 /// The metadata key of the embodiments that were kept when others were removed.
 pub(crate) const KEPT_EMBODIMENTS: &str = "saccade_embodiment_ids";
-
-/// The prefixes of a head's tensors in published checkpoints, longest first.
-const HEAD_PREFIXES: [&str; 2] = ["_groot_model.action_head.", "action_head."];
-
-/// The prefix of the head's tensors, empty if none of the known ones is used.
-///
-/// # Errors
-/// [`Error::Checkpoint`] if there are two heads in one checkpoint.
-pub(crate) fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
-    let mut used = HEAD_PREFIXES
-        .iter()
-        .filter(|prefix| checkpoint.names().any(|name| name.starts_with(**prefix)));
-    match (used.next(), used.next()) {
-        (None, _) => Ok(""),
-        (Some(prefix), None) => Ok(prefix),
-        (Some(first), Some(second)) => Err(Error::Checkpoint(format!(
-            "source: two heads in one checkpoint, under `{first}` and `{second}`"
-        ))),
-    }
-}
 
 /// The embodiments whose layers were kept when others were removed; none if all are there.
 ///

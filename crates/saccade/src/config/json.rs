@@ -1,222 +1,19 @@
-//! The head's configuration, read from a checkpoint's `config.json`.
-//!
-//! The names in JSON are the released ones (`input_embedding_dim`, `num_target_vision_tokens`); the fields here are the house's.
+//! Reading a head's config from JSON: every key is checked, and one error lists all problems.
 
 use std::ops::RangeInclusive;
 
 use serde_json::{Map, Value};
 
+use super::HeadConfig;
+use super::versions::{FEATURE_KEYS, Feature, Version};
+use super::whole::{OWN_KEY, Object, WholeConfig};
 use crate::error::{Error, Result};
-
-/// The sizes and switches of an action head.
-#[derive(Clone, Debug, PartialEq)]
-#[non_exhaustive]
-pub struct HeadConfig {
-    /// Release of the architecture: `"n1"`, `"n1.5"`, `"n1.6"` or `"n1.7"`. What the head computes is said by the other fields.
-    pub version: String,
-    /// Width of the diffusion transformer (`input_embedding_dim`).
-    pub width: usize,
-    /// Blocks of the diffusion transformer.
-    pub num_layers: usize,
-    /// Attention heads of the diffusion transformer.
-    pub num_heads: usize,
-    /// Width of one of these heads; `num_heads * head_dim == width`.
-    pub head_dim: usize,
-    /// Width of the vision-language tokens (`backbone_embedding_dim`; N1: `cross_attention_dim`).
-    pub context_dim: usize,
-    /// Whether every second block is self-attention; otherwise all are cross-attention.
-    pub interleave_self_attention: bool,
-    /// If not 0, cross-attention blocks see attended positions only: of text in every so many of them, from the first one on, and of images in
-    /// the others (spec 5.3). 0: all of them see all positions, masks or not (spec 1.9).
-    pub attend_text_every_n_blocks: usize,
-    /// Whether the vision-language tokens pass the norm `vlln`.
-    pub use_vlln: bool,
-    /// Blocks of the VL self-attention, 0 without one.
-    pub vl_num_layers: usize,
-    /// Attention heads of the VL self-attention.
-    pub vl_num_heads: usize,
-    /// Width of one of these heads; `vl_num_heads * vl_head_dim == context_dim`.
-    pub vl_head_dim: usize,
-    /// Learned query rows between state and actions (`num_target_vision_tokens`).
-    pub num_future_tokens: usize,
-    /// What is added to the logits of each future key in every self-attention block: the logarithms of how many tokens each stands for
-    /// (spec I2). Saccade's own: no published program reads it.
-    pub future_key_bias: Option<Vec<f32>>,
-    /// Actions in a chunk.
-    pub action_horizon: usize,
-    /// Width of an action as it is returned.
-    pub action_dim: usize,
-    /// Width of an action as it is denoised (`pretrained_action_dim`); what it has beyond `action_dim` is held at zero.
-    pub encoder_action_dim: usize,
-    /// The decoders: module and width, in the order in which their outputs stand side by side; together `action_dim` wide.
-    pub decoders: Vec<(String, usize)>,
-    /// Width of the state vector (`max_state_dim`).
-    pub state_dim: usize,
-    /// State vectors that make the state row (`state_history_length`).
-    pub state_history: usize,
-    /// Hidden width of the encoders and the decoders (`hidden_size`).
-    pub hidden_dim: usize,
-    /// Slices of the category-specific layers (`max_num_embodiments`).
-    pub num_embodiments: usize,
-    /// Buckets that time 0..1 is cut into.
-    pub num_timestep_buckets: usize,
-    /// Euler steps unless a call says otherwise (`num_inference_timesteps`).
-    pub num_steps: usize,
-    /// Rows of the position table (`max_seq_len`).
-    pub max_positions: usize,
-    /// Whether action rows get a position.
-    pub add_pos_embed: bool,
-}
-
-/// Which of the vision-language tokens a cross-attention block sees.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Reads {
-    /// All, masks or not.
-    All,
-    /// Those of text that are attended.
-    Text,
-    /// Those of images that are attended.
-    Images,
-}
-
-impl HeadConfig {
-    /// Reads a whole checkpoint config (with `action_head_cfg`, or flat as those of N1.6 and N1.7 are) or the head's own.
-    ///
-    /// `model_type` says the version; without it the keys do.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`] with everything that is missing, of the wrong type or contradictory.
-    pub fn from_json(text: &str) -> Result<Self> {
-        let value: Value = serde_json::from_str(text)
-            .map_err(|error| Error::Checkpoint(format!("config: not valid JSON: {error}")))?;
-        let Value::Object(top) = &value else {
-            return Err(Error::Checkpoint("config: expected a JSON object".to_owned()));
-        };
-        let head = match top.get("action_head_cfg") {
-            None => top,
-            Some(Value::Object(head)) => head,
-            Some(_) => {
-                return Err(Error::Checkpoint(
-                    "config: action_head_cfg: expected an object".to_owned(),
-                ));
-            }
-        };
-        let mut reader = Reader { problems: Vec::new() };
-        reader.problems.extend(misplaced_own_key(top));
-        let version = reader.version(top, head);
-        let config = reader.head(version, head);
-        if reader.problems.is_empty() {
-            Ok(config)
-        } else {
-            Err(Error::Checkpoint(format!(
-                "config: {}",
-                reader.problems.join("; ")
-            )))
-        }
-    }
-
-    /// Rows of the query sequence: state, future, action.
-    #[must_use]
-    pub fn num_rows(&self) -> usize {
-        1 + self.num_future_tokens + self.action_horizon
-    }
-
-    /// Whether block `index` attends to the vision-language tokens.
-    #[must_use]
-    pub fn is_cross(&self, index: usize) -> bool {
-        !self.interleave_self_attention || index.is_multiple_of(2)
-    }
-
-    /// How cross-attention blocks take masks: `"none"` ignores them, `"alternate"` is the rule of `attend_text_every_n_blocks`.
-    #[must_use]
-    pub fn mask_mode(&self) -> &'static str {
-        match self.attend_text_every_n_blocks {
-            0 => "none",
-            _ => "alternate",
-        }
-    }
-
-    /// What block `index` sees of the vision-language tokens, if it is cross-attention.
-    pub(crate) fn reads(&self, index: usize) -> Option<Reads> {
-        let every = self.attend_text_every_n_blocks;
-        self.is_cross(index).then_some(match every {
-            0 => Reads::All,
-            _ if index.is_multiple_of(2 * every) => Reads::Text,
-            _ => Reads::Images,
-        })
-    }
-}
-
-/// What is wrong with saccade's own key in a whole checkpoint config, whose head would not have it.
-pub(crate) fn misplaced_own_key(top: &Map<String, Value>) -> Option<String> {
-    let both = top.contains_key("action_head_cfg") && top.contains_key("saccade");
-    both.then(|| "saccade stands beside action_head_cfg, expected inside".to_owned())
-}
 
 /// No size in a config is larger: products of three of them stay far below `u64::MAX`.
 const MAX_SIZE: u64 = 1 << 20;
 
 /// No head has more blocks; the names of their tensors are written out.
 const MAX_LAYERS: u64 = 1024;
-
-/// A release of the architecture, for what its class does with the keys that its config names or leaves out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Version {
-    N1,
-    N15,
-    N16,
-    N17,
-}
-
-impl Version {
-    pub(crate) const ALL: [Self; 4] = [Self::N1, Self::N15, Self::N16, Self::N17];
-
-    pub(crate) fn name(self) -> &'static str {
-        match self {
-            Self::N1 => "n1",
-            Self::N15 => "n1.5",
-            Self::N16 => "n1.6",
-            Self::N17 => "n1.7",
-        }
-    }
-
-    pub(crate) fn model_type(self) -> &'static str {
-        match self {
-            Self::N1 => "gr00t_n1",
-            Self::N15 => "gr00t_n1_5",
-            Self::N16 => "Gr00tN1d6",
-            Self::N17 => "Gr00tN1d7",
-        }
-    }
-
-    /// Whether it is one of those that name `max_action_dim` and choose their transformer by `use_alternate_vl_dit`.
-    fn is_flat(self) -> bool {
-        matches!(self, Self::N16 | Self::N17)
-    }
-
-    /// What the version's class takes for a size that its config leaves out; none if the config must name it.
-    fn default_size(self, key: &str) -> Option<usize> {
-        let by_version = match (key, self) {
-            ("max_state_dim" | "max_action_dim", Self::N16) => 29,
-            ("max_state_dim" | "max_action_dim", Self::N17) => 132,
-            ("action_horizon", Self::N16) => 16,
-            ("action_horizon", Self::N17) => 40,
-            ("num_inference_timesteps", Self::N16 | Self::N17) => 4,
-            ("backbone_embedding_dim", Self::N16 | Self::N17) => 2048,
-            ("backbone_embedding_dim", Self::N15) => 1536,
-            ("num_target_vision_tokens", Self::N15) => 32,
-            ("hidden_size" | "max_seq_len", _) => 1024,
-            ("num_timestep_buckets", _) => 1000,
-            ("max_num_embodiments", _) => 32,
-            ("attend_text_every_n_blocks" | "action_claw_dim", _) => 2,
-            ("action_arm_dim", _) => 14,
-            ("action_left_arm_dim" | "action_right_arm_dim", _) => 7,
-            ("state_history_length", _) => 1,
-            _ => return None,
-        };
-        Some(by_version)
-    }
-}
 
 /// Whether a transformer is asked for: N1.7's class builds none of null, nor of a config without layers.
 fn has_layers(cfg: &Value) -> bool {
@@ -226,36 +23,57 @@ fn has_layers(cfg: &Value) -> bool {
     }
 }
 
-/// Reads keys and remembers all that is wrong, so that one error lists everything.
+/// The head's config in a whole one.
+///
+/// # Errors
+/// [`Error::Checkpoint`] with everything that is missing, of the wrong type or contradictory.
+pub(super) fn read(config: &WholeConfig) -> Result<HeadConfig> {
+    let mut reader = Reader { problems: Vec::new() };
+    let version = reader.version(config);
+    let head = reader.head(version, config.head());
+    if reader.problems.is_empty() {
+        return Ok(head);
+    }
+    Err(Error::Checkpoint(format!(
+        "config: {}",
+        reader.problems.join("; ")
+    )))
+}
+
+/// Whether a key that only some versions have asks for something.
+fn is_asked_for(key: &str, given: &Value) -> bool {
+    match (key, given) {
+        (_, Value::Bool(flag)) if key.starts_with("use_") => *flag,
+        _ if key.starts_with("use_") => false,
+        ("vl_self_attention_cfg", cfg) => has_layers(cfg),
+        ("state_history_length", length) => *length != 0 && *length != 1 && !length.is_null(),
+        (_, size) => *size != 0 && !size.is_null(),
+    }
+}
+
+/// Reads keys and collects all problems, so that one error lists everything.
 struct Reader {
     problems: Vec<String>,
 }
 
-type Object = Map<String, Value>;
-
 impl Reader {
-    /// What `model_type` says, or else what the keys of the head tell.
-    fn version(&mut self, top: &Object, head: &Object) -> Version {
-        // A head's own config that a program wrote whole has an empty one.
-        let given = [top, head].into_iter().filter_map(|map| map.get("model_type"));
-        let mut given = given.filter(|given| !given.is_null() && **given != "");
-        if let Some(first) = given.next() {
-            if let Some(other) = given.find(|other| *other != first) {
-                self.problems.push(format!(
-                    "model_type is {first}, but action_head_cfg.model_type is {other}"
-                ));
+    /// The version that `model_type` names, or else the one that the keys of the head belong to.
+    fn version(&mut self, config: &WholeConfig) -> Version {
+        let declared = config.declared();
+        if let Some(first) = declared.first() {
+            if let Some(other) = declared.iter().find(|other| other.version != first.version) {
+                self.problems.push(format!("{}, but {}", first.text, other.text));
             }
-            let given = first;
-            let known = Version::ALL
-                .into_iter()
-                .find(|version| *given == version.model_type());
-            if let Some(version) = known {
-                return version;
+            match first.version {
+                Some(version) => return version,
+                None => self.problems.push(format!(
+                    "{}, expected one of {}",
+                    first.text,
+                    Version::model_types()
+                )),
             }
-            let names = Version::ALL.map(Version::model_type).join(", ");
-            self.problems
-                .push(format!("model_type is {given}, expected one of {names}"));
         }
+        let head = config.head();
         let names = |keys: &[&str]| keys.iter().any(|key| head.contains_key(*key));
         if names(&["num_target_vision_tokens", "use_multi_action_heads"]) {
             Version::N15
@@ -291,7 +109,7 @@ impl Reader {
         let num_heads = self.size(dit, path, "num_attention_heads", 1);
         let head_dim = self.size(dit, path, "attention_head_dim", 1);
         let interleave_self_attention = self.flag(dit, path, "interleave_self_attention", None);
-        // The width is said twice; upstream's default for one of them fits a single size of the other.
+        // The width appears twice; upstream's default for one of them fits a single size of the other.
         let width = match head.contains_key("input_embedding_dim") {
             true => self.size(head, "", "input_embedding_dim", 1),
             false => num_heads * head_dim,
@@ -300,21 +118,14 @@ impl Reader {
             Version::N1 => self.cross_dim(dit).unwrap_or(width),
             _ => self.size_of(version, head, "backbone_embedding_dim", 1),
         };
-        let use_vlln = version != Version::N1 && self.flag(head, "", "use_vlln", Some(true));
-        let (vl_num_layers, vl_num_heads, vl_head_dim) = match self.vl_self_attention(version, head, use_vlln)
+        let use_vlln = version.has(Feature::VlNorm) && self.flag(head, "", "use_vlln", Some(true));
+        let [vl_num_layers, vl_num_heads, vl_head_dim] = match self.vl_self_attention(version, head, use_vlln)
         {
-            None => (0, 1, context_dim),
-            Some(vl) => {
-                let path = "vl_self_attention_cfg.";
-                self.expect_plain_blocks(vl, path);
-                (
-                    self.layers(vl, path, 0),
-                    self.size(vl, path, "num_attention_heads", 1),
-                    self.size(vl, path, "attention_head_dim", 1),
-                )
-            }
+            Some(vl) => self.vl_sizes(vl),
+            None => [0, 1, context_dim],
         };
-        let alternates = version.is_flat() && self.flag(head, "", "use_alternate_vl_dit", Some(true));
+        let alternates = version.has(Feature::AlternatingBlocks)
+            && self.flag(head, "", "use_alternate_vl_dit", Some(true));
         let (encoder_action_dim, decoders) = self.actions(version, head);
         let config = HeadConfig {
             version: version.name().to_owned(),
@@ -332,9 +143,9 @@ impl Reader {
             vl_num_layers,
             vl_num_heads,
             vl_head_dim,
-            num_future_tokens: match version {
-                Version::N15 => self.size_of(version, head, "num_target_vision_tokens", 0),
-                _ => 0,
+            num_future_tokens: match version.has(Feature::FutureTokens) {
+                true => self.size_of(version, head, "num_target_vision_tokens", 0),
+                false => 0,
             },
             future_key_bias: self.future_key_bias(head),
             action_horizon: self.size_of(version, head, "action_horizon", 1),
@@ -342,9 +153,9 @@ impl Reader {
             encoder_action_dim,
             decoders,
             state_dim: self.size_of(version, head, "max_state_dim", 1),
-            state_history: match version {
-                Version::N17 => self.size_of(version, head, "state_history_length", 1),
-                _ => 1,
+            state_history: match version.has(Feature::StateHistory) {
+                true => self.size_of(version, head, "state_history_length", 1),
+                false => 1,
             },
             hidden_dim: self.size_of(version, head, "hidden_size", 1),
             num_embodiments: self.size_of(version, head, "max_num_embodiments", 1),
@@ -359,51 +170,16 @@ impl Reader {
         config
     }
 
-    /// A version's class does not have the layers that these keys ask for: a head without them would be silently wrong.
+    /// Lists keys that ask for what the version's class does not have: a head without it would be silently wrong.
     fn refuse_keys_of_other_versions(&mut self, version: Version, head: &Object) {
-        let (on, none) = (Value::from(true), Value::from(0));
-        let is_on = |key: &str| head.get(key) == Some(&on);
-        let is_some = |key: &str| {
-            head.get(key)
-                .is_some_and(|value| *value != none && !value.is_null())
-        };
-        for (key, is_asked_for, versions) in [
-            (
-                "use_alternate_vl_dit",
-                is_on("use_alternate_vl_dit"),
-                &[Version::N16, Version::N17][..],
-            ),
-            (
-                "use_multi_action_heads",
-                is_on("use_multi_action_heads"),
-                &[Version::N15],
-            ),
-            (
-                "num_target_vision_tokens",
-                is_some("num_target_vision_tokens"),
-                &[Version::N15],
-            ),
-            (
-                "use_vlln",
-                is_on("use_vlln"),
-                &[Version::N15, Version::N16, Version::N17],
-            ),
-            (
-                "vl_self_attention_cfg",
-                head.get("vl_self_attention_cfg").is_some_and(has_layers),
-                &[Version::N15, Version::N17],
-            ),
-            (
-                "state_history_length",
-                is_some("state_history_length") && head["state_history_length"] != 1,
-                &[Version::N17],
-            ),
-        ] {
-            if is_asked_for && !versions.contains(&version) {
-                let names: Vec<_> = versions.iter().map(|version| version.name()).collect();
+        for (key, feature) in FEATURE_KEYS {
+            let Some(given) = head.get(key).filter(|given| is_asked_for(key, given)) else {
+                continue;
+            };
+            if !version.has(feature) {
+                let names: Vec<_> = Version::with(feature).into_iter().map(Version::name).collect();
                 self.problems.push(format!(
-                    "{key} is {}, which only {} has, but this is a config of {}",
-                    head[key],
+                    "{key} is {given}, which only {} has, but this is a config of {}",
                     names.join(", "),
                     version.name(),
                 ));
@@ -419,11 +195,25 @@ impl Reader {
         use_vlln: bool,
     ) -> Option<&'a Object> {
         let key = "vl_self_attention_cfg";
-        match version {
-            Version::N15 if use_vlln => self.object(head, key),
-            Version::N17 if head.get(key).is_some_and(has_layers) => self.object(head, key),
-            _ => None,
+        let is_built = match version.is_flat() {
+            false => use_vlln,
+            true => head.get(key).is_some_and(has_layers),
+        };
+        if is_built && version.has(Feature::VlSelfAttention) {
+            return self.object(head, key);
         }
+        None
+    }
+
+    /// Blocks, attention heads and width of one of these of the VL self-attention.
+    fn vl_sizes(&mut self, vl: &Object) -> [usize; 3] {
+        let path = "vl_self_attention_cfg.";
+        self.expect_plain_blocks(vl, path);
+        [
+            self.layers(vl, path, 0),
+            self.size(vl, path, "num_attention_heads", 1),
+            self.size(vl, path, "attention_head_dim", 1),
+        ]
     }
 
     /// The width of an action as it is denoised, and the decoders (spec 1.11).
@@ -471,7 +261,7 @@ impl Reader {
 
     /// `saccade.future_key_bias`: one finite number for each future token.
     fn future_key_bias(&mut self, head: &Object) -> Option<Vec<f32>> {
-        let own = match head.get("saccade") {
+        let own = match head.get(OWN_KEY) {
             None => return None,
             Some(Value::Object(own)) => own,
             Some(_) => {
