@@ -72,7 +72,7 @@ mod tests {
     fn a_refusal_says_how_much_was_asked_for() {
         let error = filled("features", usize::MAX / 8, 0.0_f32).unwrap_err();
         let expected = format!("features: cannot allocate {} bytes of memory", usize::MAX / 8 * 4);
-        assert_eq!(error.to_string(), expected);
+        assert!(error.to_string().starts_with(&expected), "{error}");
         let mut buffer = vec![1.0; 3];
         assert!(matches!(
             sized(&mut buffer, usize::MAX / 2),
