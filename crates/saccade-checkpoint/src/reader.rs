@@ -22,7 +22,7 @@ const PIECE: usize = 1 << 24;
 struct Entry {
     file: usize,
     info: TensorInfo,
-    /// Where the tensor's first byte lies in the file.
+    /// The position of the tensor's first byte in the file.
     start: u64,
 }
 

@@ -43,7 +43,7 @@ impl PlannedTensor {
 }
 
 /// Where a tensor's bytes are in the files.
-struct Extent {
+struct Region {
     shard: usize,
     start: u64,
     nbytes: u64,
@@ -59,7 +59,7 @@ pub struct CheckpointWriter {
     companions: BTreeSet<PathBuf>,
     temporary: TemporaryDirectory,
     shards: Vec<(String, File)>,
-    extents: BTreeMap<String, Extent>,
+    regions: BTreeMap<String, Region>,
 }
 
 impl CheckpointWriter {
@@ -80,8 +80,8 @@ impl CheckpointWriter {
         let out = &out.canonicalize().unwrap_or_else(|_| out.to_owned());
         let carried = companions.all_paths();
         let replaces = check_replaceable(out, &carried, force)?;
-        let temporary = TemporaryDirectory::beside(out)?;
-        // Wide elements first, as the format's own writer does: each tensor then lies at a multiple of its element.
+        let temporary = TemporaryDirectory::next_to(out)?;
+        // Wide elements first, as the format's own writer does: each tensor then starts at a multiple of its element size.
         planned.sort_by(|a, b| (b.dtype.bitsize(), &a.name).cmp(&(a.dtype.bitsize(), &b.name)));
         let mut sharded: Vec<Vec<PlannedTensor>> = vec![Vec::new()];
         let mut held = 0;
@@ -101,7 +101,7 @@ impl CheckpointWriter {
             companions: carried,
             temporary,
             shards: Vec::new(),
-            extents: BTreeMap::new(),
+            regions: BTreeMap::new(),
         };
         let count = sharded.len();
         for (index, tensors) in sharded.into_iter().enumerate() {
@@ -146,13 +146,13 @@ impl CheckpointWriter {
         header.push_str(&" ".repeat(header.len().next_multiple_of(8) - header.len()));
         let data = 8 + header.len() as u64;
         for (name, start, nbytes) in offsets {
-            let extent = Extent {
+            let region = Region {
                 shard,
                 start: data.saturating_add(start),
                 nbytes,
                 written: 0,
             };
-            self.extents.insert(name, extent);
+            self.regions.insert(name, region);
         }
         let path = self.temporary.path().join(&name);
         let write = || {
@@ -168,11 +168,11 @@ impl CheckpointWriter {
     }
 
     fn write_index(&self) -> Result<()> {
-        let total: u64 = self.extents.values().map(|extent| extent.nbytes).sum();
+        let total: u64 = self.regions.values().map(|region| region.nbytes).sum();
         let map: BTreeMap<&str, &str> = self
-            .extents
+            .regions
             .iter()
-            .map(|(name, extent)| (name.as_str(), self.shards[extent.shard].0.as_str()))
+            .map(|(name, region)| (name.as_str(), self.shards[region.shard].0.as_str()))
             .collect();
         let index = serde_json::json!({ "metadata": { "total_size": total }, "weight_map": map });
         self.file("model.safetensors.index.json", &format!("{index:#}\n"))
@@ -200,15 +200,15 @@ impl CheckpointWriter {
     /// # Panics
     /// If there is no such tensor, or it is shorter.
     pub fn tensor(&mut self, name: &str, bytes: &[u8]) -> Result<()> {
-        let extent = self.extents.get_mut(name).expect("the tensor was planned");
-        let (shard, file) = &mut self.shards[extent.shard];
-        let first = extent.written;
-        extent.written += bytes.len() as u64;
+        let region = self.regions.get_mut(name).expect("the tensor was planned");
+        let (shard, file) = &mut self.shards[region.shard];
+        let first = region.written;
+        region.written += bytes.len() as u64;
         assert!(
-            extent.written <= extent.nbytes,
+            region.written <= region.nbytes,
             "{name}: more bytes than were planned"
         );
-        file.seek(SeekFrom::Start(extent.start + first))
+        file.seek(SeekFrom::Start(region.start + first))
             .and_then(|_| file.write_all(bytes))
             .map_err(|error| Error::writing(&self.temporary.path().join(shard), error))
     }
@@ -218,10 +218,10 @@ impl CheckpointWriter {
     /// # Panics
     /// As [`CheckpointWriter::tensor`].
     pub fn zeros(&mut self, name: &str, nbytes: u64) {
-        let extent = self.extents.get_mut(name).expect("the tensor was planned");
-        extent.written += nbytes;
+        let region = self.regions.get_mut(name).expect("the tensor was planned");
+        region.written += nbytes;
         assert!(
-            extent.written <= extent.nbytes,
+            region.written <= region.nbytes,
             "{name}: more bytes than were planned"
         );
     }
@@ -236,9 +236,9 @@ impl CheckpointWriter {
     /// could get the name; both are then kept.
     pub fn finish(self) -> Result<Vec<String>> {
         assert!(
-            self.extents
+            self.regions
                 .values()
-                .all(|extent| extent.written == extent.nbytes),
+                .all(|region| region.written == region.nbytes),
             "all planned tensors are written"
         );
         for (name, file) in &self.shards {

@@ -42,7 +42,7 @@ pub struct Published {
 }
 
 impl Published {
-    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` beside the weights.
+    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights.
     ///
     /// The names and shapes of single tensors are checked where they are read.
     ///
@@ -94,7 +94,7 @@ impl Published {
         })
     }
 
-    /// All tensors of the checkpoint, sorted by name; without those that stand in two files, which [`Published::check`] refuses in a head.
+    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which [`Published::check`] refuses in a head.
     pub fn tensors(&self) -> impl Iterator<Item = TensorFacts> {
         let checkpoint = &self.checkpoint;
         checkpoint.names().filter_map(|name| {
@@ -107,7 +107,7 @@ impl Published {
         })
     }
 
-    /// That exactly the head's tensors stand under the prefix, each of the right shape and a readable type.
+    /// Checks that exactly the head's tensors are under the prefix, each of the right shape and a readable type.
     ///
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.

@@ -60,7 +60,7 @@ pub struct ResizeReport {
     pub num_before: usize,
     /// Future tokens of the copy.
     pub num_after: usize,
-    /// For each token of the copy, the indices of the source's tokens that it stands for: one for a copy, several for merged ones.
+    /// For each token of the copy, the indices of the source's tokens that it represents: one for a copy, several for merged ones.
     pub sources: Vec<Vec<usize>>,
     /// What saccade adds to the logits of the tokens' keys; none if it is zero everywhere.
     pub future_key_bias: Option<Vec<f32>>,
