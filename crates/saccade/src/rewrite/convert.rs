@@ -136,9 +136,7 @@ pub fn convert(
                         Some((from, to)) => rounding.write(name, bytes, from, to, writer),
                     })?;
             } else {
-                let nbytes = change.map_or(nbytes, |(from, to)| {
-                    nbytes / from.dtype().bitsize() as u64 * to.dtype().bitsize() as u64
-                });
+                let nbytes = change.map_or(nbytes, |(from, to)| nbytes / from.size() * to.size());
                 writer.zeros(name, nbytes);
                 zeroed_bytes += nbytes;
             }
