@@ -190,7 +190,7 @@ impl ActionHead {
     /// Loads a head from `source`: one `.safetensors` file, or a directory with `config.json` beside one or more of them.
     ///
     /// # Errors
-    /// [`Error::NotFound`] for a path that is not there, [`Error::Checkpoint`] for a config or weights that are broken or do not fit each
+    /// [`Error::File`] for a path that is not there, [`Error::Checkpoint`] for a config or weights that are broken or do not fit each
     /// other (all that is wrong is listed), [`Error::Input`] for options out of range.
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = engine(options.precision, options.num_threads)?;

@@ -256,3 +256,57 @@ impl CheckpointWriter {
         Ok(files)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Checkpoint, Elements};
+
+    fn planned(name: &str, shape: &[usize]) -> PlannedTensor {
+        PlannedTensor {
+            name: name.to_owned(),
+            dtype: Dtype::F32,
+            shape: shape.to_vec(),
+        }
+    }
+
+    /// A checkpoint of two tensors, half written, at `out`.
+    fn half_written(out: &Path, max_shard_bytes: u64) -> CheckpointWriter {
+        let metadata = BTreeMap::from([("key".to_owned(), "value".to_owned())]);
+        let companions = Companions::of(Path::new("none.safetensors"), std::iter::empty()).unwrap();
+        let tensors = vec![planned("a", &[2]), planned("b", &[3])];
+        let mut writer =
+            CheckpointWriter::create(out, tensors, &metadata, &companions, max_shard_bytes, false).unwrap();
+        writer.file("config.json", "{}").unwrap();
+        for value in [1.0f32, 2.0] {
+            writer.tensor("a", &value.to_le_bytes()).unwrap();
+        }
+        writer
+    }
+
+    #[test]
+    fn what_is_written_can_be_read() {
+        for (max_shard_bytes, num_files) in [(u64::MAX, 1), (10, 2)] {
+            let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
+            let out = parent.join("out");
+            let mut writer = half_written(&out, max_shard_bytes);
+            writer.zeros("b", 12);
+            assert_eq!(writer.finish().unwrap().len(), num_files);
+            let checkpoint = Checkpoint::open(&out).unwrap();
+            assert_eq!(checkpoint.files().count(), num_files);
+            assert_eq!(checkpoint.metadata()["key"], "value");
+            assert_eq!(checkpoint.read("a").unwrap(), Elements::F32(vec![1.0, 2.0]));
+            assert_eq!(checkpoint.read("b").unwrap(), Elements::F32(vec![0.0; 3]));
+            assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 1);
+            std::fs::remove_dir_all(parent).unwrap();
+        }
+    }
+
+    #[test]
+    fn what_is_not_finished_leaves_nothing() {
+        let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
+        drop(half_written(&parent.join("out"), u64::MAX));
+        assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 0);
+        std::fs::remove_dir_all(parent).unwrap();
+    }
+}

@@ -47,8 +47,8 @@ impl Published {
     /// The names and shapes of single tensors are checked where they are read.
     ///
     /// # Errors
-    /// [`Error::NotFound`] for a path or a config that is not there; [`Error::Checkpoint`] for files that are broken, a config that is
-    /// none, and for whatever config and tensors disagree on: all of it is listed.
+    /// [`Error::File`] for a path or a config that is not there and for broken files; [`Error::Checkpoint`] for a config that is not one, and
+    /// for everything that config and tensors disagree on, in one list.
     pub fn open(source: &Path, config: Option<&str>) -> Result<Self> {
         let checkpoint = Checkpoint::open(source)?;
         let directory = match source.is_dir() {
