@@ -1,11 +1,12 @@
-# Two commands: `make rollout` (the shipped policy drives the simulated robot) and `make test` (every test).
-# They share one virtual environment. Each step of setting it up leaves a stamp in it and is redone when what it was made from changes.
+# Two commands: `make rollout` (the bundled policy drives a simulated robot) and `make test` (every test).
+# Both use one virtual environment. Each setup step leaves a stamp file and is repeated only when its inputs change.
 
 PYTHON ?= python3
 VENV ?= .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 
+PYTEST_ARGS ?=
 PEERS_VENV ?= .venv-peers
 PEERS_ARGS ?=
 COMPAT_ARGS ?=
@@ -15,7 +16,7 @@ WHEEL_ARGS ?=
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
-# The build tool is in the environment, so a build neither downloads anything nor uses another version of it.
+# The build tool is installed in the environment, so a build downloads nothing and uses that version.
 INSTALL := MATURIN_PEP517_ARGS=--locked $(PIP) --no-build-isolation --editable
 RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name Cargo.toml)
 
@@ -25,17 +26,17 @@ MAKEFLAGS += --no-print-directory
 .PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat fuzz setup-rollout setup-test clean
 
 help:
-	@echo "make rollout   the shipped policy drives a simulated robot; table and videos in $(ROLLOUT_OUT)"
-	@echo "make test      every test, Rust and Python"
-	@echo "make bench-peers   saccade beside every engine that runs the same head; report in out/peers"
-	@echo "make lint      what .ci/run checks besides the tests"
-	@echo "make sanitize  kernel tests under AddressSanitizer (nightly Rust) and valgrind"
-	@echo "make fuzz      hostile headers, indexes, configs and resizes, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
-	@echo "make test-compat  lerobot's own policies, accelerated, in an environment of each release; writes docs/compatibility.md"
-	@echo "make wheel     a manylinux wheel in dist, from the last commit"
-	@echo "make test-wheel   the wheel under every CPython, old and new NumPy, emulated old CPUs; writes docs/wheels.md"
-	@echo "make format    formats all Rust and Python files"
-	@echo "make clean     removes the virtual environment and what was built"
+	@echo "make rollout      run the bundled policy in simulation; table and videos in $(ROLLOUT_OUT)"
+	@echo "make test         run all tests, Rust and Python"
+	@echo "make lint         run the other checks of .ci/run: formatting, clippy, ruff, mypy, stubs, rustdoc"
+	@echo "make format       format all Rust and Python files"
+	@echo "make bench-peers  compare with other engines that run the same head; report in out/peers"
+	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
+	@echo "make fuzz         fuzz headers, indexes, configs and resizing, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
+	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
+	@echo "make wheel        build a manylinux wheel of the last commit in dist"
+	@echo "make test-wheel   test the wheel on CPythons, NumPys and emulated old CPUs; writes docs/wheels.md"
+	@echo "make clean        remove the virtual environments and build outputs"
 
 rollout: setup-rollout
 	$(BIN)/saccade rollout $(ROLLOUT_ARGS) --out $(ROLLOUT_OUT)
@@ -45,12 +46,14 @@ test: setup-test
 	$(MAKE) test-rust
 	$(MAKE) test-python
 
-# The default members: benches hold no tests, and their peers take long to build.
+# The default members and their examples. Benches have no tests, and their dependencies are slow to build.
 test-rust:
 	cargo test --locked --quiet
 
+# One worker per core. Each starts with a contiguous part of the tests, so few module fixtures are built twice. The
+# workers fill the cores; more OpenMP threads in torch and NumPy would only compete for them.
 test-python:
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal $(PYTEST_ARGS)
 
 lint: setup-test
 	cargo fmt --all --check
@@ -61,7 +64,7 @@ lint: setup-test
 	$(BIN)/mypy
 	$(BIN)/stubtest saccade._saccade
 
-# Other engines, in an environment of their own. PEERS_ARGS=--help lists what can be asked for.
+# Other engines, in a separate environment. PEERS_ARGS=--help lists the options.
 bench-peers: setup-peers
 	SACCADE_PEERS_GGML=$(PEERS_VENV)/ggml/build/bin $(PEERS_VENV)/bin/python -m benches.peers $(PEERS_ARGS)
 
@@ -70,22 +73,23 @@ format: setup-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Memory errors of the only crate with unsafe code. AddressSanitizer runs its tests on every instruction set of this CPU; a toolchain's own
-# target directory, since everything is built with it. Slowed down so, a test runs for longer than a minute; the test runner then says so, and that
-# allocates: the test that counts allocations is left out. Valgrind shows programs a CPU without AVX-512, so that it runs the portable and the AVX2
-# paths; it is slow, and leaves out the tests that try many sizes.
+# Memory errors in the only crate with unsafe code. AddressSanitizer runs its tests on every instruction set of this CPU.
+# It needs a target directory of its own, because dependencies are instrumented too. Under it a test may run for more
+# than a minute; the test runner then prints a warning, which allocates, so the test that counts allocations is skipped.
+# Valgrind emulates a CPU without AVX-512, so it covers the portable and AVX2 paths. It is slow, so the tests that try
+# many sizes are skipped.
 ASAN_TARGET := x86_64-unknown-linux-gnu
 VALGRIND_TESTS := attention layer_norm linear
 
 sanitize:
-	@cargo +nightly --version >/dev/null 2>&1 || { echo "make sanitize: AddressSanitizer needs a nightly Rust: rustup toolchain install nightly"; exit 1; }
-	@command -v valgrind >/dev/null || { echo "make sanitize: valgrind is missing: install the package of that name"; exit 1; }
+	@cargo +nightly --version >/dev/null 2>&1 || { echo "make sanitize needs a nightly Rust: rustup toolchain install nightly"; exit 1; }
+	@command -v valgrind >/dev/null || { echo "make sanitize: valgrind is not installed; install the package valgrind"; exit 1; }
 	RUSTFLAGS=-Zsanitizer=address cargo +nightly test --locked --quiet -p saccade-kernels --lib --tests \
 		--target $(ASAN_TARGET) --target-dir target/sanitize -- --skip allocates_nothing
 	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER="valgrind --quiet --error-exitcode=1" \
 		cargo test --locked --quiet -p saccade-kernels $(VALGRIND_TESTS:%=--test %) -- --test-threads 1 --skip float64
 
-# One after the other, in this order, also under `make -j`.
+# These steps run in this order, even with `make -j`.
 setup-rollout:
 	@$(PYTHON) .ci/needs.py python rust opengl
 	@$(MAKE) -s $(VENV)/.rollout
@@ -102,26 +106,26 @@ setup-peers:
 	@$(MAKE) -s $(PEERS_VENV)/.extension
 	@$(MAKE) -s $(PEERS_VENV)/.ggml
 
-# A copied or moved checkout has an environment that points elsewhere: it is made anew.
+# The environment of a copied or moved checkout points to the old place, so it is recreated.
 $(VENV)/.tools: constraints.txt
 	@test "$$($(BIN)/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(VENV))" || $(PYTHON) -m venv --clear $(VENV)
-	@echo "setting up: build tool"
+	@echo "setup: build tool"
 	@$(PIP) maturin
 	@touch $@
 
 $(VENV)/.rollout: pyproject.toml constraints.txt $(VENV)/.tools
-	@echo "setting up: saccade and the simulation (builds the Rust head; minutes on the first run)"
+	@echo "setup: saccade and the simulation (builds the Rust head; takes minutes the first time)"
 	@$(INSTALL) ".[sim]"
 	@touch $@ $(VENV)/.extension
 
 $(VENV)/.test: pyproject.toml constraints.txt $(VENV)/.tools
-	@echo "setting up: saccade and all that the tests need (torch is large; minutes on the first run)"
+	@echo "setup: saccade and everything the tests need (torch is large; takes minutes the first time)"
 	@$(INSTALL) ".[all]"
 	@$(PIP) --no-deps lerobot
 	@touch $@ $(VENV)/.rollout $(VENV)/.extension
 
 $(VENV)/.extension: pyproject.toml $(RUST_SOURCES)
-	@echo "setting up: the Rust head has changed, building it"
+	@echo "setup: the Rust sources have changed, rebuilding the head"
 	@$(INSTALL) . --no-deps
 	@touch $@
 
@@ -130,31 +134,31 @@ ENGINES := torch diffusers transformers onnx onnxscript onnxruntime openvino mat
 
 $(PEERS_VENV)/.engines: benches/peers/constraints.txt
 	@test "$$($(PEERS_VENV)/bin/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(PEERS_VENV))" || $(PYTHON) -m venv --clear $(PEERS_VENV)
-	@echo "setting up: torch, ONNX Runtime, OpenVINO (large; minutes on the first run)"
+	@echo "setup: torch, ONNX Runtime, OpenVINO (large; takes minutes the first time)"
 	@$(PEERS_PIP) $(ENGINES)
 	@$(PEERS_PIP) --no-deps lerobot
 	@touch $@
 
 $(PEERS_VENV)/.extension: pyproject.toml $(RUST_SOURCES) $(PEERS_VENV)/.engines
-	@echo "setting up: the Rust head, in release"
+	@echo "setup: building the Rust head"
 	@MATURIN_PEP517_ARGS=--locked $(PEERS_PIP) --no-build-isolation --no-deps --editable .
 	@touch $@
 
-# ggml as llama-cpp-python ships it, built for this CPU. Without it the report lacks ggml and says so; nothing else needs it.
+# ggml as llama-cpp-python ships it, built for this CPU. It is optional: without it, the report has no ggml rows and says so.
 $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
-	@echo "setting up: ggml (builds it; minutes)"
-	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report goes without it"
+	@echo "setup: building ggml (takes minutes)"
+	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report will not include it"
 	@touch $@
 
-# fuzz/README.md says what is done with which input, and why without AddressSanitizer.
+# fuzz/README.md describes the targets and why they run without AddressSanitizer.
 fuzz: setup-test
-	@cargo +nightly fuzz --version >/dev/null 2>&1 || { echo "make fuzz: needs a nightly Rust (rustup toolchain install nightly) and cargo-fuzz (cargo install cargo-fuzz)"; exit 1; }
+	@cargo +nightly fuzz --version >/dev/null 2>&1 || { echo "make fuzz needs a nightly Rust (rustup toolchain install nightly) and cargo-fuzz (cargo install cargo-fuzz)"; exit 1; }
 	$(BIN)/python fuzz/seeds.py
 	@for target in header index config resize; do \
 		cargo +nightly fuzz run --sanitizer none $$target -- -dict=fuzz/words.dict -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=2048 || exit 1; \
 	done
 
-# lerobot 0.5 and later need Python 3.12: COMPAT_ARGS="--python312 PATH" where python3.12 is not on PATH.
+# lerobot 0.5 and later need Python 3.12. If python3.12 is not on PATH: COMPAT_ARGS="--python312 PATH".
 test-compat: setup-test
 	$(BIN)/python tests/compat/run.py $(COMPAT_ARGS)
 
@@ -169,7 +173,7 @@ test-wheel: wheel
 
 $(WHEEL_VENV)/.tools: .ci/wheels/requirements.txt
 	@test "$$($(WHEEL_VENV)/bin/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(WHEEL_VENV))" || $(PYTHON) -m venv --clear $(WHEEL_VENV)
-	@echo "setting up: maturin and zig"
+	@echo "setup: maturin and zig"
 	@$(WHEEL_VENV)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --requirement $<
 	@touch $@
 

@@ -1,7 +1,7 @@
-"""Writes constraints.txt anew: one exact version of every Python package that saccade's environment holds.
+"""Writes constraints.txt: one exact version of every Python package in the development environment.
 
-Each interpreter given resolves `.[all]` to the newest versions that fit it. Where they differ, lines carry a
-marker: the last interpreter's versions also hold for every newer Python.
+Each given interpreter resolves `.[all]` to the newest compatible versions. Where the versions differ, lines
+carry a marker. The last interpreter's versions also apply to every newer Python.
 
     python .ci/lock.py python3.10 python3.11
 """
@@ -16,12 +16,12 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-RELEASED_HEAD = "lerobot==0.4.4"  # installed without its own requirements, so it is no extra of saccade
-# What the numbers in the docs were made with; raising one is a decision, not a refresh.
+RELEASED_HEAD = "lerobot==0.4.4"  # installed without its requirements, so it is not in an extra of saccade
+# The numbers in the docs were measured with these versions. Change them deliberately, not in a refresh.
 HELD = ("torch==2.13.0", "gymnasium==1.4.0")
 HEADER = f"""\
-# Every Python package of the development environment, one version each; the Makefile's pip reads it.
-# Written by `python .ci/lock.py python3.10 python3.11`, not by hand. Then run `make test` and read the diff.
+# One exact version of every Python package in the development environment; every pip call of the Makefile
+# uses it. Do not edit: `python .ci/lock.py python3.10 python3.11` writes it. Then run `make test`.
 {RELEASED_HEAD}
 """
 

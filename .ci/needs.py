@@ -1,8 +1,8 @@
-"""Says what the machine lacks, and which packages bring it, before anything long is started.
+"""Reports missing system requirements and the packages that provide them, before a long build starts.
 
     python3 .ci/needs.py python rust opengl
 
-Written for Python 3.6 and later, so that an old one is told what is wrong.
+Runs on Python 3.6 and later, so that users of an old Python get a clear message.
 """
 
 import ctypes
@@ -22,14 +22,14 @@ def lacks_python():
         oldest = ".".join(map(str, OLDEST_PYTHON))
         return (
             f"Python {oldest} or newer is needed; {sys.executable} is {sys.version.split()[0]}."
-            "\n    Another one is chosen by: make PYTHON=/path/to/python3 ..."
+            "\n    To use another one: make PYTHON=/path/to/python3 ..."
         )
     try:
         import ensurepip  # noqa: F401
         import venv  # noqa: F401
     except ImportError:
         return (
-            f"{sys.executable} cannot make virtual environments."
+            f"{sys.executable} cannot create virtual environments."
             "\n    Debian, Ubuntu: apt-get install python3-venv"
         )
     return None
@@ -55,9 +55,9 @@ def lacks_rust():
 
 
 def lacks_opengl():
-    """What is missing for drawing without a screen, or None."""
+    """What is missing for rendering without a display, or None."""
     if not sys.platform.startswith("linux"):
-        return None  # macOS and Windows bring their own
+        return None  # macOS and Windows include it
     for name in ("libEGL.so.1", "libOSMesa.so.8", "libOSMesa.so.6"):
         try:
             ctypes.CDLL(name)
@@ -65,7 +65,7 @@ def lacks_opengl():
         except OSError:
             pass
     return (
-        "The simulation draws with OpenGL; neither libEGL nor libOSMesa was found."
+        "The simulation renders with OpenGL; neither libEGL nor libOSMesa was found."
         "\n    Debian, Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
         "\n    Fedora: dnf install mesa-libEGL mesa-dri-drivers"
         "\n    Arch: pacman -S mesa"
@@ -73,21 +73,21 @@ def lacks_opengl():
 
 
 def lacks_browser():
-    """What is missing for clicking through a page without a screen, or None."""
+    """What is missing for testing a web page without a display, or None."""
     if shutil.which("chromium") and shutil.which("chromedriver"):
         return None
     return (
-        "The tests of the attention page need Chromium and its driver; they are skipped without."
+        "Chromium and its driver were not found; the tests of the attention page are skipped without them."
         "\n    Debian: apt-get install chromium chromium-driver"
     )
 
 
 def lacks_qemu():
-    """What is missing for running a wheel on an old CPU, or None."""
+    """What is missing for emulating an old CPU, or None."""
     if shutil.which("qemu-x86_64"):
         return None
     return (
-        "Old CPUs are emulated by qemu-user; no qemu-x86_64 was found on PATH."
+        "Emulating old CPUs needs qemu-user; no qemu-x86_64 was found on PATH."
         "\n    Debian, Ubuntu: apt-get install qemu-user"
     )
 
@@ -102,7 +102,7 @@ CHECKS = {
 
 
 def main():
-    """Prints one paragraph for each thing that is missing; the exit status is 1 if there is any."""
+    """Prints a paragraph for each missing requirement. The exit status is 1 if there is one."""
     problems = [problem for problem in (CHECKS[name]() for name in sys.argv[1:]) if problem]
     for problem in problems:
         print(f"missing: {problem}", file=sys.stderr)

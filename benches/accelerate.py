@@ -1,12 +1,12 @@
-"""What `saccade.integrations.accelerate` does to the time of a lerobot policy's head.
+"""Speed-up of a lerobot policy's head by `saccade.integrations.accelerate`.
 
     python -m benches.accelerate                    N1.5's size, 2 threads; three minutes
-    python -m benches.accelerate --size small       a second, to see that it runs
+    python -m benches.accelerate --size small       one second, to check that it runs
 
-A chunk is one call of `get_action`, of the released head and of the same head accelerated, by turns; medians.
-lerobot's head has float32 weights and runs plainly, and under autocast to bfloat16, its policy's default. The
-weights are random, of two embodiments, whose number takes no part in the time. What is printed as `check` is
-what an accelerated call spends on seeing whether weights have changed.
+A chunk is one call of `get_action`. Calls of the released head and of the same head accelerated alternate;
+medians are printed. lerobot's head has float32 weights and runs in float32, and under autocast to bfloat16,
+its policy's default. The weights are random, for two embodiments; their number does not affect the time.
+`check` is the time that an accelerated call spends on checking whether weights have changed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def released_head(size: str) -> nn.Module:
 
 
 def chunk(head: Any, num_vl_tokens: int, autocast: bool) -> Callable[[], Any]:
-    """One call of `get_action`, with inputs of its own, since the head writes into them."""
+    """One call of `get_action`, with new inputs each time, because the head writes into them."""
     feature = lerobot_head.import_head().BatchFeature
     features = torch.randn(1, num_vl_tokens, head.config.backbone_embedding_dim)
     state = torch.randn(1, 1, head.config.max_state_dim)
@@ -65,14 +65,14 @@ def seconds(work: Callable[[], Any]) -> float:
 
 
 def interleaved(head: Any, handle: Accelerated, work: Callable[[], Any], rounds: int) -> tuple[float, float]:
-    """Medians in seconds of the original's calls and of the accelerated ones, by turns."""
+    """Medians in seconds of the original's and the accelerated calls, which alternate."""
     theirs, ours = [], []
     for turn in range(rounds + 1):
         del head.get_action
         original = seconds(work)
         head.get_action = handle
         accelerated = seconds(work)
-        if turn:  # the first one of each warms up
+        if turn:  # the first call of each warms up
             theirs.append(original)
             ours.append(accelerated)
     return statistics.median(theirs), statistics.median(ours)
@@ -85,17 +85,17 @@ def main() -> None:
     )
     parser.add_argument("--size", choices=("n1.5", "small"), default="n1.5")
     parser.add_argument("--num-vl-tokens", type=int, default=296)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--num-threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--precisions", nargs="+", choices=PRECISIONS, default=PRECISIONS)
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(options.num_threads)
     head = released_head(options.size)
     print("| saccade | lerobot | lerobot, ms | accelerated, ms | ratio | check, ms | accelerate(), s |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for precision in options.precisions:
         start = time.perf_counter()
-        handle = accelerate(head, precision=precision, num_threads=options.threads, embodiment_ids=[0])
+        handle = accelerate(head, precision=precision, num_threads=options.num_threads, embodiment_ids=[0])
         loading = time.perf_counter() - start
         check = statistics.median(seconds(partial(getattr, handle, "head")) for _ in range(50))
         for autocast in (False, True):

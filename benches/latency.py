@@ -1,18 +1,18 @@
-"""Latency as a user feels it: chunks on a busy machine, many callers, small heads, the least a call costs.
+"""Latency in practice: chunks on a busy machine, many callers, small heads, the minimum cost of a call.
 
     python -m benches.latency                       all sections; half an hour, most of it the first one
-    python -m benches.latency loaded --chunks 40    one of them: loaded, callers, small or overhead
-    python -m benches.latency report                prints what is in out/latency/results.json
+    python -m benches.latency loaded --chunks 40    one section: loaded, callers, small or overhead
+    python -m benches.latency report                prints the results in out/latency/results.json
 
-- `loaded`: chunks (encode and sample) at N1.5's size while as many other processes as cores keep busy,
-  beside lerobot's head. The fair share of the machine is then half of it: twice the quiet time.
-- `callers`: 8 Python threads that sample at the same time beside one that does all the work.
-- `small`: a head of the shipped policy's sizes beside torch.
-- `overhead`: a head so small that its arithmetic is nothing: what is left is dispatch and binding.
+- `loaded`: chunks (encode and sample) at N1.5's size while other processes, one per core, are busy; compared
+  with lerobot's head. The fair share of the machine is then half of it, which means twice the idle time.
+- `callers`: 8 Python threads that sample at the same time, compared with one thread that does all the work.
+- `small`: a head of the bundled policy's sizes, compared with torch.
+- `overhead`: a head so small that its arithmetic takes no time; what remains is dispatch and binding.
 
-Contenders live in processes of their own, as in `benches.peers`, and take turns. Run it on a machine that has
-nothing else to do. Results are kept as JSON: a section that runs again replaces its own, but `loaded` adds
-its chunks to those that are there, so that they can be measured in several sittings.
+Each contender runs in a process of its own, as in `benches.peers`, and they take turns. Run it on an idle
+machine. Results are kept as JSON. A section that runs again replaces its results, except that `loaded` adds
+its chunks, so it can be measured in several sessions.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ SECTIONS = ("loaded", "callers", "small", "overhead")
 LOADED = ("saccade-float32", "saccade-bfloat16", "saccade-int8", "lerobot-bfloat16")
 SMALL = ("saccade-float32", "lerobot-float32", "lerobot-bfloat16", "torch-float32", "compile-float32")
 NUM_CALLERS = 8
-SETTLE = 0.3  # seconds until the scheduler has spread a new load
+SETTLE = 0.3  # seconds for the scheduler to distribute a new load
 
 Report = dict[str, Any]
 
 
 def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path) -> None:
-    """A contender's process: builds its head, then answers `(work, times)` with so many times in seconds."""
+    """A contender's process: builds its head, then answers `(work, count)` with `count` times in seconds."""
     try:
         arrays = inputs.inputs_of(case, saccade.HeadConfig.from_file(source / "config.json"))
         arrays["expected"] = arrays["noise"]  # of the result's shape
@@ -102,7 +102,7 @@ class Contenders:
         return answer
 
     def ask(self, name: str, work: str, times: int) -> list[float]:
-        """Seconds of so many calls in a row."""
+        """Seconds of each of `times` consecutive calls."""
         self._pipes[name].send((work, times))
         return list(self._answer(name))
 
@@ -132,7 +132,7 @@ def environment(added: dict[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def busy_processes(count: int) -> Iterator[Callable[[bool], None]]:
-    """Processes that compute without end while `work(True)`, and stand still otherwise."""
+    """Processes that are busy after `work(True)` and stopped after `work(False)`."""
     processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
 
     def work(on: bool) -> None:
@@ -151,13 +151,13 @@ def busy_processes(count: int) -> Iterator[Callable[[bool], None]]:
 
 
 def rotated(names: list[str], turn: int) -> list[str]:
-    """Everybody once, another one first each time."""
+    """Every name once, with a different first name each turn."""
     turn %= len(names)
     return names[turn:] + names[:turn]
 
 
 def loaded(args: argparse.Namespace, before: Report) -> Report:
-    """Chunks while other processes keep every core busy, and while they do not."""
+    """Times of chunks while other processes keep every core busy, and on the idle machine."""
     case = Case("head", args.threads, size=args.size)
     source = checkpoint(inputs.config_of(case), args.work / f"n15-{args.size}")
     names = list(args.contenders or LOADED)
@@ -182,12 +182,12 @@ def loaded(args: argparse.Namespace, before: Report) -> Report:
 
 
 def loaded_table(report: Report) -> list[str]:
-    """How many times as long a chunk takes under load."""
+    """How much longer a chunk takes under load."""
     lines = [
         f"N1.5, encode and sample, {report['case']['threads']} threads; "
-        f"{report['busy']} busy processes beside them.",
+        f"with {report['busy']} busy processes running at the same time.",
         "",
-        "| contender | quiet p50, ms | loaded p50, ms | p50 to quiet | p90 to p50 | p99 to p50 | chunks |",
+        "| contender | idle p50, ms | loaded p50, ms | loaded / idle | p90 / p50 | p99 / p50 | chunks |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, seconds in report["seconds"].items():
@@ -200,12 +200,12 @@ def loaded_table(report: Report) -> list[str]:
 
 
 def callers(args: argparse.Namespace, before: Report) -> Report:
-    """Chunks a second of one caller and of several, in turns; and whether all have the same bits."""
+    """Chunks per second of one caller and of several, alternating; and whether all have the same bits."""
     del before
     whole = Case("head", args.threads, size=args.size)
     heads = {
-        "the shipped policy's size": (policy_config(), "policy", 56, 40),
-        f"N1.5's size ({args.size})": (inputs.config_of(whole), f"n15-{args.size}", 296, 1),
+        "the bundled policy's size": (policy_config(), "policy", 56, 40),
+        f"N1.5's structure ({args.size})": (inputs.config_of(whole), f"n15-{args.size}", 296, 1),
     }
     cases = {}
     for label, (config, name, num_vl_tokens, each) in heads.items():
@@ -243,7 +243,7 @@ def callers(args: argparse.Namespace, before: Report) -> Report:
             for thread in threads:
                 thread.join()
             several = time.perf_counter() - start
-            if turn > 0:  # the first one makes the workspaces
+            if turn > 0:  # the first round allocates the workspaces
                 rates["one"].append(NUM_CALLERS * each / one)
                 rates["several"].append(NUM_CALLERS * each / several)
         cases[label] = {"rates": rates, "wrong": len(wrong)}
@@ -253,9 +253,9 @@ def callers(args: argparse.Namespace, before: Report) -> Report:
 def callers_table(report: Report) -> list[str]:
     """Throughput of several callers over that of one."""
     lines = [
-        f"`sample` on one held context, a head of {report['threads']} threads.",
+        f"`sample` on one context, with a head of {report['threads']} threads.",
         "",
-        f"| head | chunks a second, 1 caller | {NUM_CALLERS} callers | ratio (least, most) | other bits |",
+        f"| head | chunks per second, 1 caller | {NUM_CALLERS} callers | ratio (min, max) | different bits |",
         "|---|---|---|---|---|",
     ]
     for label, case in report["cases"].items():
@@ -269,7 +269,7 @@ def callers_table(report: Report) -> list[str]:
 
 
 def small(args: argparse.Namespace, before: Report) -> Report:
-    """A head of the shipped policy's sizes beside torch."""
+    """Times of a head of the bundled policy's sizes, and of torch."""
     del before
     runs = []
     source = checkpoint(policy_config(), args.work / "policy")
@@ -281,7 +281,7 @@ def small(args: argparse.Namespace, before: Report) -> Report:
             for turn in range(args.rounds):
                 for name in rotated(names, turn):
                     for work in ("sample", "both"):
-                        # The first ones wake threads and caches.
+                        # The first calls warm up threads and caches.
                         taken = contenders.ask(name, work, 25)[5:]
                         seconds[name][work].append(statistics.median(taken))
         runs.append({"threads": threads, "seconds": seconds})
@@ -289,9 +289,9 @@ def small(args: argparse.Namespace, before: Report) -> Report:
 
 
 def small_table(report: Report) -> list[str]:
-    """Times a chunk, and the first contender's share of each."""
-    lines = ["The shipped policy's sizes: width 128, 4 blocks, T_vl 57, 4 Euler steps.", ""]
-    lines += ["| contender | threads | sample, ms | encode and sample, ms | sample, in saccade's |"]
+    """Times of a chunk, and their ratio to the first contender's."""
+    lines = ["The bundled policy's sizes: width 128, 4 blocks, T_vl 57, 4 Euler steps.", ""]
+    lines += ["| contender | threads | sample, ms | encode and sample, ms | sample / saccade's |"]
     lines += ["|---|---|---|---|---|"]
     for run in report["runs"]:
         first = next(iter(run["seconds"].values()))
@@ -349,9 +349,9 @@ def overhead(args: argparse.Namespace, before: Report) -> Report:
 
 
 def overhead_table(report: Report) -> list[str]:
-    """Microseconds a call."""
+    """Microseconds per call."""
     lines = ["A head of one block, width 8, one token each of observation, future and action.", ""]
-    lines += ["| call | median, us | 90 %, us |", "|---|---|---|"]
+    lines += ["| call | median, us | p90, us |", "|---|---|---|"]
     for name, seconds in report["seconds"].items():
         median, high = 1e6 * np.quantile(seconds, (0.5, 0.9))
         lines.append(f"| {name} | {median:.1f} | {high:.1f} |")
@@ -359,14 +359,14 @@ def overhead_table(report: Report) -> list[str]:
 
 
 def policy_config() -> dict[str, Any]:
-    """The shipped policy's head, with as many embodiments as the engines of `benches.peers` expect."""
+    """Config of the bundled policy's head, with the number of embodiments that `benches.peers` expects."""
     file = importlib.resources.files("saccade") / "sim" / "demo" / "config.json"
     config: dict[str, Any] = json.loads(file.read_text())["action_head_cfg"]
     return config | {"max_num_embodiments": inputs.NUM_EMBODIMENTS}
 
 
 def checkpoint(config: dict[str, Any], folder: Path) -> Path:
-    """Random weights; written in a process of its own, so that this one stays small."""
+    """Random weights, written in a separate process so that this one stays small."""
     if not folder.exists():
         process = multiprocessing.get_context("spawn").Process(target=write, args=(config, folder))
         process.start()
@@ -377,7 +377,7 @@ def checkpoint(config: dict[str, Any], folder: Path) -> Path:
 
 
 def write(config: dict[str, Any], folder: Path) -> None:
-    """The checkpoint itself, under another name until it is whole."""
+    """Writes the checkpoint under a temporary name, then renames it."""
     import torch
 
     from saccade.reference import random_weights
@@ -390,7 +390,7 @@ def write(config: dict[str, Any], folder: Path) -> None:
 
 
 def note(message: str) -> None:
-    """Progress, beside the result."""
+    """Prints progress on stderr."""
     print(f"latency: {message}", file=sys.stderr, flush=True)
 
 
@@ -402,15 +402,17 @@ def parse() -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "sections", nargs="*", metavar="SECTION", help="of: " + ", ".join(SECTIONS) + "; or report"
+        "sections", nargs="*", metavar="SECTION", help="one or more of " + ", ".join(SECTIONS) + "; or report"
     )
     parser.add_argument("--threads", type=int, default=2, help="threads of every head (default 2)")
     parser.add_argument("--busy", type=int, help="busy processes (default: the cores)")
     parser.add_argument("--chunks", type=int, default=200, help="loaded: chunks under load (default 200)")
-    parser.add_argument("--chunks-a-turn", type=int, default=10, help="loaded: in a row (default 10)")
-    parser.add_argument("--rounds", type=int, default=9, help="of the other sections (default 9)")
+    parser.add_argument(
+        "--chunks-a-turn", type=int, default=10, help="loaded: consecutive chunks per turn (default 10)"
+    )
+    parser.add_argument("--rounds", type=int, default=9, help="rounds of the other sections (default 9)")
     parser.add_argument("--contenders", nargs="+", choices=CONTENDERS, metavar="NAME", help="instead of all")
-    parser.add_argument("--size", choices=("full", "small"), default="full", help="small: to see it work")
+    parser.add_argument("--size", choices=("full", "small"), default="full", help="small: for a quick trial")
     parser.add_argument(
         "--work", type=Path, default=Path("out/latency"), help="weights and results (default out/latency)"
     )
@@ -443,7 +445,7 @@ def main() -> None:
         part.write_text(json.dumps(report))
         part.rename(results)
     if not report:
-        raise SystemExit(f"latency: there is no {results} yet")
+        raise SystemExit(f"latency: {results} does not exist yet; run a section first")
     described = report["machine"]
     print(
         f"{described['cpu']} ({described['family']}), {described['cores']} cores, "

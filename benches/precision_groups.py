@@ -1,7 +1,7 @@
-"""What rounding each group of layers costs: the action chunk of the torch reference with that group alone in
-int8 or bfloat16, and everything else in float32.
+"""Error from rounding one group of layers: the action chunk of the torch reference with that group in int8 or
+bfloat16 and everything else in float32.
 
-Run with the package and torch installed; prints a Markdown table, that of docs/precision.md:
+Needs the package and torch. Prints the Markdown table of docs/precision.md:
 
     python benches/precision_groups.py CHECKPOINT [--embodiment-id 0]
     python benches/precision_groups.py --full               N1.5's size, seeded random weights; 4 GB of memory
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from saccade.reference import ActionHead, random_weights
-from saccade.reference.model import CategoryLinear
+from saccade.reference.layers import CategoryLinear
 
 VL, DIT = r"vl_self_attention\.transformer_blocks\.\d+\.", r"model\.transformer_blocks\.\d+\."
 EVEN, ODD = r"model\.transformer_blocks\.\d*[02468]\.", r"model\.transformer_blocks\.\d*[13579]\."
@@ -50,7 +50,7 @@ def int8_weight(weight: Tensor) -> Tensor:
 
 
 def int8_rows(x: Tensor) -> Tensor:
-    """Rows rounded to 256 steps between their extremes, zero among them."""
+    """Rows rounded to 256 steps between their minimum and maximum, where zero is one of the steps."""
     low, high = x.amin(dim=-1, keepdim=True).clamp_max(0), x.amax(dim=-1, keepdim=True).clamp_min(0)
     scale = ((high - low) / 255).clamp_min(1e-30)
     zero = (-low / scale).round()
@@ -58,14 +58,14 @@ def int8_rows(x: Tensor) -> Tensor:
 
 
 def bfloat16(x: Tensor) -> Tensor:
-    """Rounded to 8 bits."""
+    """`x` rounded to bfloat16."""
     return x.bfloat16().to(x.dtype)
 
 
 def round_group(
     head: ActionHead, pattern: str, weights: Callable[[Tensor], Tensor], rows: Callable[[Tensor], Tensor]
 ) -> dict[Tensor, Tensor]:
-    """Rounds the weights of the layers that match, and what comes into them; returns the weights before."""
+    """Rounds the weights and inputs of the matching layers; returns the original weights."""
     before: dict[Tensor, Tensor] = {}
     for name, module in head.named_modules():
         if not isinstance(module, nn.Linear | CategoryLinear) or not re.fullmatch(pattern, name):
@@ -82,7 +82,7 @@ def round_group(
 
 
 def add_outliers(head: ActionHead) -> None:
-    """Makes one input column and one output in 64 of every linear layer of the blocks larger."""
+    """Scales one input column and one output row in 64 of every linear layer of the blocks."""
     for name, module in head.named_modules():
         if isinstance(module, nn.Linear) and re.fullmatch(rf"({VL}|{DIT})(attn1|ff)\..*", name):
             with torch.no_grad():
@@ -95,11 +95,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("checkpoint", nargs="?", type=Path)
     parser.add_argument("--full", action="store_true", help="random weights of N1.5's size")
-    parser.add_argument(
-        "--outliers", action="store_true", help="a few input channels and outputs much larger"
-    )
+    parser.add_argument("--outliers", action="store_true", help="scale a few input channels and outputs")
     parser.add_argument("--embodiment-id", type=int, default=0)
-    parser.add_argument("--vl-tokens", type=int, default=296)
+    parser.add_argument("--num-vl-tokens", type=int, default=296)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     if args.checkpoint is not None:
@@ -109,7 +107,9 @@ def main() -> None:
         head = random_weights.random_head(config, args.seed)
     if args.outliers:
         add_outliers(head)
-    inputs = random_weights.random_inputs(head.config, args.seed + 1, batch=1, num_vl_tokens=args.vl_tokens)
+    inputs = random_weights.random_inputs(
+        head.config, args.seed + 1, batch=1, num_vl_tokens=args.num_vl_tokens
+    )
     inputs["embodiment_id"] = torch.tensor([args.embodiment_id])
 
     def chunk() -> Tensor:

@@ -1,21 +1,20 @@
-"""Acting while thinking: what inference delay does in closed loop, with and without real-time chunking.
+"""Asynchronous inference: the effect of delay in closed loop, with and without real-time chunking.
 
     python examples/asynchronous.py                     2 episodes of each task in each arm, a minute
-    python examples/asynchronous.py --episodes 30       what docs/asynchronous.md shows; goes on where it was
-    python examples/asynchronous.py report              prints the tables and draws the picture again
+    python examples/asynchronous.py --episodes 30       the run of docs/asynchronous.md; resumes after a stop
+    python examples/asynchronous.py report              print the tables and draw the figure again
 
-The shipped policy drives the simulated robot, but a chunk of actions is not there when the robot looks: it
-comes `delay` control ticks later, and until then the robot goes on along the last chunk. So the first `delay`
-actions of the new chunk are over when it comes, and the robot jumps from one chunk into the middle of the
-next. Two arms, on the same layouts, words and noise:
+The bundled policy drives the simulated robot. A chunk of actions arrives `delay` control ticks after its
+observation; until then the robot keeps executing the last chunk. The first `delay` actions of the new chunk
+are therefore in the past when it arrives, and the robot jumps from one chunk into the middle of the next.
+There are two arms, with the same layouts, instructions and noise:
 
-plain     the next chunk knows nothing of what the robot did meanwhile
-chunked   the head is given the last chunk, `previous_chunk=`: its next `delay` actions are certain to be
-          carried out, so they are frozen; those after them pull on the new chunk less and less
-          (`saccade.Chunking`)
+plain     the new chunk is sampled independently of the last one
+chunked   the head gets the last chunk as `previous_chunk=`. Its next `delay` actions will be executed, so they
+          are frozen; the influence of the actions after them decreases along the overlap (`saccade.Chunking`)
 
-The delay is counted in ticks, not in seconds: every run of a seed is the same, on any machine.
-Needs `pip install 'saccade[study]'`.
+The delay is counted in ticks, not in seconds, so a seed gives the same run on any machine.
+Needs the extra `study`.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ from matplotlib.figure import Figure as Picture
 from numpy.typing import NDArray
 
 import saccade
+from saccade._files import writable_directory, write_json
+from saccade.environment import cpu_name
 from saccade.errors import InputError
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.files import writable_directory, write_json
 from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Policy
-from saccade.sim.report import cpu_name
 from saccade.sim.rollout import Episode, environment_for
 from saccade.sim.tasks import DEMO_TASKS, TASKS, check_evaluation_seeds
 from saccade.sim.video import VideoWriter
@@ -48,15 +47,15 @@ from saccade.study.statistics import Estimate, bootstrap, paired_difference, sca
 
 Float32Array = NDArray[np.float32]
 ARMS = ("plain", "chunked")
-#: No training, choice or other page used seeds from here on.
+#: No training, model selection or other experiment used seeds from here on.
 FIRST_SEED = 10_000
-#: In the picture: the first episode of this task, and so much of it.
+#: The figure shows the first episode of this task, up to this tick.
 SHOWN_TASK = "push"
 SHOWN_TICKS = 72
 
 
 class Thinker:
-    """The shipped policy: from what the robot sees to a chunk, with or without the chunk before it."""
+    """The bundled policy: from an observation to a chunk, with or without the previous chunk."""
 
     def __init__(self) -> None:
         self.policy = Policy.load(num_threads=1)
@@ -69,7 +68,7 @@ class Thinker:
         previous: Float32Array | None,
         chunking: saccade.Chunking | None,
     ) -> Float32Array:
-        """`(1, horizon, action_dim)`, normalised as the head gives it; so is `previous`."""
+        """The chunk `(1, horizon, action_dim)`, normalised as the head returns it; `previous` likewise."""
         observation = environment.observe()
         return np.asarray(
             self._head(
@@ -83,7 +82,7 @@ class Thinker:
         )
 
     def commands(self, chunk: Float32Array) -> Float32Array:
-        """What the robot is told, `(horizon, 4)` in [-1, 1]."""
+        """The commands of a chunk, `(horizon, 4)` in [-1, 1]."""
         return np.clip(self.policy.config.action.restore(chunk[0]), -1.0, 1.0)
 
 
@@ -92,11 +91,11 @@ class Drive:
     """One episode.
 
     Attributes:
-        delay: Control ticks from a look to its chunk.
-        arm: Of `ARMS`.
+        delay: Control ticks from an observation to its chunk.
+        arm: One of `ARMS`.
         task, seed, success, steps: As in `saccade.sim.rollout.Episode`.
-        commands: What the robot was told, `(steps, 4)`.
-        seams: The steps at which a new chunk took over.
+        commands: The executed commands, `(steps, 4)`.
+        seams: Steps at which a new chunk took over.
     """
 
     delay: int
@@ -109,15 +108,15 @@ class Drive:
     seams: tuple[int, ...]
 
     def row(self) -> dict[str, Any]:
-        """For the result file: how smooth it was, and no longer every command."""
+        """The entry for the result file: smoothness instead of single commands."""
         values = {name: value for name, value in asdict(self).items() if name not in ("commands", "seams")}
         return {**values, "num_seams": len(self.seams), **self.smoothness()}
 
     def smoothness(self) -> dict[str, float | None]:
-        """Euclidean norms over the command's four numbers, in the mean; None where there is nothing to mean.
+        """Mean Euclidean norms over the command's four numbers; None without values.
 
-        `seam`: of the change at the steps at which a new chunk took over. `within`: of the change at the
-        others. `bend`: of the second difference, all along the episode.
+        `seam`: the change at steps at which a new chunk took over. `within`: the change at all other steps.
+        `bend`: the second difference over the whole episode.
         """
         changes = np.linalg.norm(np.diff(self.commands, axis=0), axis=1)
         bends = np.linalg.norm(np.diff(self.commands, n=2, axis=0), axis=1)
@@ -135,35 +134,36 @@ def drive(
     max_steps: int | None = None,
     on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
 ) -> Drive:
-    """Runs an episode. The first chunk is there when the robot starts; all others are late."""
+    """Runs an episode. The first chunk is available at the start; all others arrive late."""
     task = environment.task
     every, horizon = thinker.policy.config.execute_steps, thinker.policy.horizon
-    # What the last chunk still holds when the robot looks again; its first `delay` actions will be executed.
+    # The overlap is what remains of the last chunk at the next observation; its first `delay` actions will be
+    # executed.
     chunking = saccade.Chunking(overlap=horizon - every, frozen=delay) if arm == "chunked" else None
     environment.restart(seed)
     rng = np.random.default_rng((list(TASKS).index(task.name), seed))
     episode = Episode(task.name, seed, environment.instruction)
-    told, seams = [], []
-    current, looked = thinker.chunk(environment, rng, None, None), 0
-    thinking, asked = current, 0
+    executed, seams = [], []
+    current, observed = thinker.chunk(environment, rng, None, None), 0
+    pending, requested = current, 0
     on_step(environment, episode)
     for step in range(min(task.max_steps, max_steps or task.max_steps)):
-        if thinking is not current and step - asked >= delay:
-            current, looked = thinking, asked
+        if pending is not current and step - requested >= delay:
+            current, observed = pending, requested
             seams.append(step)
         if step and step % every == 0:
             given = (current, chunking) if chunking else (None, None)
-            thinking, asked = thinker.chunk(environment, rng, *given), step
+            pending, requested = thinker.chunk(environment, rng, *given), step
             if delay == 0:
-                current, looked = thinking, asked
+                current, observed = pending, requested
                 seams.append(step)
-        told.append(thinker.commands(current)[step - looked])
-        episode.success = environment.advance(told[-1]).success
+        executed.append(thinker.commands(current)[step - observed])
+        episode.success = environment.advance(executed[-1]).success
         episode.steps += 1
         on_step(environment, episode)
         if episode.success:
             break
-    commands = np.array(told, np.float32).reshape(-1, 4)
+    commands = np.array(executed, np.float32).reshape(-1, 4)
     return Drive(delay, arm, task.name, seed, episode.success, episode.steps, commands, tuple(seams))
 
 
@@ -178,7 +178,7 @@ def percent(value: Estimate) -> str:
 
 
 class Results:
-    """Episodes by delay and arm, and what they say. `rows` are those of the result file."""
+    """Statistics of the episodes by delay and arm. `rows` are those of the result file."""
 
     def __init__(self, rows: Sequence[dict[str, Any]]) -> None:
         self._arms: dict[tuple[int, str], dict[tuple[str, int], dict[str, Any]]] = {}
@@ -187,7 +187,7 @@ class Results:
         self.delays = sorted({delay for delay, _ in self._arms})
 
     def arm(self, delay: int, arm: str) -> list[dict[str, Any]]:
-        """Its episodes."""
+        """The episodes of an arm."""
         return list(self._arms.get((delay, arm), {}).values())
 
     def success(self, delay: int, arm: str) -> Estimate:
@@ -205,12 +205,12 @@ class Results:
     def pairs(
         self, first: tuple[int, str], second: tuple[int, str]
     ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-        """The episodes that both arms have."""
+        """The pairs of episodes that exist in both arms."""
         one, two = self._arms.get(first, {}), self._arms.get(second, {})
         return [(one[key], two[key]) for key in one if key in two]
 
     def table(self) -> list[str]:
-        """Each arm alone."""
+        """The table of the arms."""
         lines = [
             "| delay, ticks | arm | success | % (Wilson 95 %) | change at a seam | change elsewhere "
             "| second difference |",
@@ -226,19 +226,19 @@ class Results:
         return lines
 
     def comparisons(self) -> list[str]:
-        """Arms side by side, on the same episodes."""
+        """The table of differences between arms on the same episodes."""
         lines = [
             "| compared | pairs | success, points (Tango 95 %) | change at a seam | second difference |",
             "|---|---|---|---|---|",
         ]
-        asked = [((delay, "chunked"), (delay, "plain")) for delay in self.delays]
-        asked += [((delay, arm), (0, "plain")) for delay, arm in product(self.delays, ARMS) if delay]
-        for first, second in asked:
+        compared = [((delay, "chunked"), (delay, "plain")) for delay in self.delays]
+        compared += [((delay, arm), (0, "plain")) for delay, arm in product(self.delays, ARMS) if delay]
+        for first, second in compared:
             pairs = self.pairs(first, second)
             if pairs:
                 won = paired_difference(*([pair[i]["success"] for pair in pairs] for i in (0, 1)))
                 cells = [
-                    f"delay {first[0]} {first[1]}, less delay {second[0]} {second[1]}",
+                    f"delay {first[0]} {first[1]}, minus delay {second[0]} {second[1]}",
                     str(len(pairs)),
                     percent(won.difference),
                     *(self.change(pairs, what) for what in ("seam", "bend")),
@@ -247,7 +247,7 @@ class Results:
         return lines
 
     def change(self, pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]], what: str) -> str:
-        """The mean difference within pairs."""
+        """The mean difference within pairs, with its interval."""
         both = [
             (one[what], two[what]) for one, two in pairs if one[what] is not None and two[what] is not None
         ]
@@ -256,7 +256,7 @@ class Results:
         return interval(bootstrap([one - two for one, two in both], range(len(both))))
 
     def by_task(self) -> list[str]:
-        """Successes of each task."""
+        """The table of successes by task."""
         tasks = list(dict.fromkeys(row["task"] for key in self._arms for row in self._arms[key].values()))
         lines = [f"| delay, ticks | arm | {' | '.join(tasks)} |", f"|---|---|{'---|' * len(tasks)}"]
         for delay, arm in product(self.delays, ARMS):
@@ -269,7 +269,7 @@ class Results:
 
 
 def draw(results: Results, examples: Sequence[Drive], path: Path) -> None:
-    """Success and changes at seams over the delay, and the commands of one episode in each arm."""
+    """Draws success and changes at seams against the delay, and the commands of one episode in each arm."""
     picture = Picture(figsize=(WIDTH, 5.2), layout="constrained")
     axes = picture.subplot_mosaic([["success", "seam"], ["trace", "trace"]])
     for plot in axes.values():
@@ -311,11 +311,11 @@ def draw(results: Results, examples: Sequence[Drive], path: Path) -> None:
 
 
 def run(args: argparse.Namespace, seeds: range) -> None:
-    """Runs what the result file does not have yet."""
+    """Runs the episodes that are not in the result file yet."""
     thinker = Thinker()
     most = thinker.policy.horizon - thinker.policy.config.execute_steps
     if not all(0 <= delay <= most for delay in args.delays):
-        raise InputError(f"--delays: given {args.delays}, expected 0 to {most}: there the old chunk ends")
+        raise InputError(f"--delays: expected 0 to {most}, the length of the overlap; got {args.delays}")
     file = writable_directory(args.out) / "results.json"
     record = {
         "checkpoint_sha256": thinker.policy.checkpoint_sha256(),
@@ -328,7 +328,7 @@ def run(args: argparse.Namespace, seeds: range) -> None:
         found = json.loads(file.read_text(encoding="utf-8"))
         same = ("checkpoint_sha256", "engine", "max_steps")
         if any(found.get(key) != record[key] for key in same):
-            raise InputError(f"{file}: holds another policy, engine or --max-steps; give another --out")
+            raise InputError(f"{file} is from another policy, engine or --max-steps; use another --out")
         record["episodes"] = found["episodes"]
     done = {(row["delay"], row["arm"], row["task"], row["seed"]) for row in record["episodes"]}
     if args.video:
@@ -356,13 +356,13 @@ def run(args: argparse.Namespace, seeds: range) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    """Prints the tables and writes the picture."""
+    """Prints the tables and writes the figure."""
     record = json.loads((args.out / "results.json").read_text(encoding="utf-8"))
     results = Results(record["episodes"])
     print(f"{record['machine']['cpu']}; {record['engine']}; checkpoint {record['checkpoint_sha256'][:12]}\n")
     for table in (results.table(), results.comparisons(), results.by_task()):
         print("\n".join(table) + "\n")
-    # An episode to look at: commands are not kept, and the same seed gives them again.
+    # Commands are not stored; the same seed reproduces them.
     thinker, delay = Thinker(), results.delays[len(results.delays) // 2]
     rows = results.arm(delay, ARMS[0])
     first = next((row for row in rows if row["task"] == SHOWN_TASK), rows[0])
@@ -371,27 +371,29 @@ def report(args: argparse.Namespace) -> None:
             drive(thinker, environment, first["seed"], delay, arm, record["max_steps"]) for arm in ARMS
         ]
     draw(results, examples, args.out / "asynchronous.png")
-    print(f"picture: {args.out / 'asynchronous.png'}")
+    print(f"figure: {args.out / 'asynchronous.png'}")
 
 
 def main() -> None:
-    """Runs, then reports."""
+    """Runs the episodes, then reports."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     names = [task.name for task in DEMO_TASKS]
     parser.add_argument("do", nargs="?", choices=("run", "report"), default="run", help="default: run")
     parser.add_argument(
-        "--tasks", nargs="+", choices=names, default=names, metavar="TASK", help="default all"
+        "--tasks", nargs="+", choices=names, default=names, metavar="TASK", help="default: all"
     )
-    parser.add_argument("--episodes", type=int, default=2, help="of each task and arm (default 2)")
-    parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"the first (default {FIRST_SEED})")
+    parser.add_argument("--episodes", type=int, default=2, help="episodes of each task and arm (default: 2)")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"first seed (default: {FIRST_SEED})")
     parser.add_argument(
-        "--delays", type=int, nargs="+", default=[0, 2, 4, 6, 8], help="ticks; default 0 2 4 6 8"
+        "--delays", type=int, nargs="+", default=[0, 2, 4, 6, 8], help="control ticks (default: 0 2 4 6 8)"
     )
-    parser.add_argument("--max-steps", type=int, help="end episodes earlier than their tasks do")
-    parser.add_argument("--video", action="store_true", help="an MP4 of the first seed in each arm")
-    parser.add_argument("--out", type=Path, default=Path("out/asynchronous"), help="default out/asynchronous")
+    parser.add_argument("--max-steps", type=int, help="end episodes after at most this many steps")
+    parser.add_argument("--video", action="store_true", help="write an MP4 of the first seed in each arm")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/asynchronous"), help="default: out/asynchronous"
+    )
     args = parser.parse_args()
     if args.max_steps is not None and args.max_steps < 1:
         parser.error(f"--max-steps: expected at least 1, got {args.max_steps}")

@@ -1,5 +1,5 @@
-"""Writes what the fuzzers start from to fuzz/corpus: cuts of the files in tests/data and checkpoints in every
-published layout, small enough to be changed everywhere.
+"""Writes the seeds of the fuzzers to fuzz/corpus: pieces of the files in tests/data and small checkpoints in
+every published layout.
 
 Usage: python fuzz/seeds.py, in the environment of the tests.
 """
@@ -155,7 +155,7 @@ def checkpoint(folder: Path) -> tuple[bytes, bytes]:
 
 
 def main() -> None:
-    """Writes all seeds, each under a name of its own, and says how many there are."""
+    """Writes all seeds under distinct names and prints their number."""
     files = headers()
     targets = {"header": files, "index": indexes(files), "config": configs(), "resize": resizes()}
     for target, seeds in targets.items():

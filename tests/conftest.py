@@ -10,8 +10,8 @@ from released import NAMES, Released, load_released
 
 from saccade import _saccade
 
-# No deadline: the machine may be shared. On CI the same examples each time, so that a failure is the
-# change's and not the draw's.
+# No deadline: the machine may be shared. On CI every run draws the same examples, so a failure is caused by the
+# change and not by the draw.
 hypothesis.settings.register_profile(
     "saccade",
     deadline=None,
@@ -25,12 +25,12 @@ hypothesis.settings.load_profile("saccade")
 
 @pytest.fixture(params=NAMES)
 def released(request: pytest.FixtureRequest) -> Released:
-    """Each file of tests/data in turn."""
+    """Each file of tests/data."""
     return load_released(request.param)
 
 
 @pytest.fixture(params=_saccade.available_isas())
 def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each instruction set that this machine has, in turn; heads built in the test use it."""
+    """Each instruction set that this machine has. Heads built in the test use it."""
     monkeypatch.setenv("SACCADE_ISA", request.param)
     return str(request.param)

@@ -262,9 +262,18 @@ def test_json_has_times_profile_and_model(
     monkeypatch.setattr(bench, "VARIED", {"num_steps": (1, 2), "num_vl_tokens": (3,)})
     report = printed(
         capsys,
-        *(str(folder), "--precision", "float32", "--threads", "1", "--num-vl-tokens", "5"),
+        *(
+            "--checkpoint",
+            str(folder),
+            "--precisions",
+            "float32",
+            "--num-threads",
+            "1",
+            "--num-vl-tokens",
+            "5",
+        ),
         *("--num-steps", "2", "--num-samples", "2", "--future-refresh", "2", "--rounds", "2"),
-        *("--profile", "--model"),
+        *("--profile", "--cost-model"),
     )
     assert report["saccade"] == saccade.__version__
     assert report["call"] == {
@@ -308,9 +317,9 @@ def test_json_has_times_profile_and_model(
 
 def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -> None:
     """Its T_vl is what its backbone gives: three cameras of sixteen patches, eight words, a register."""
-    assert main(["bench", "--precision", "float32", "--rounds", "1", "--profile"]) == 0
+    assert main(["bench", "--precisions", "float32", "--rounds", "1", "--profile"]) == 0
     text = capsys.readouterr().out
-    assert "the shipped policy" in text
+    assert "the bundled policy" in text
     assert "T_vl 57, N 32, 4 steps, 1 samples, future_refresh 1" in text
     assert "float32 sample, by part" in text
     assert "feed_forward_out" in text
@@ -319,13 +328,16 @@ def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--precision", "float16"], "--precision is 'float16', expected some of float32, bfloat16, int8"),
-        (["--precision", ""], "--precision is ''"),
-        (["--threads", "0"], "--threads is 0, expected at least 1"),
-        (["--rounds", "-1"], "--rounds is -1, expected at least 1"),
-        (["--future-refresh", "0"], "--future-refresh is 0, expected at least 1"),
-        (["no/such/place"], "no/such/place: no such checkpoint"),
-        ([".", "--size", "n1.5"], "--size is about random weights: leave out the checkpoint"),
+        (
+            ["--precisions", "float16"],
+            "--precisions: unknown name 'float16', expected one of float32, bfloat16, int8",
+        ),
+        (["--precisions", ""], "--precisions: expected at least one name"),
+        (["--num-threads", "0"], "--num-threads: given 0, expected at least 1"),
+        (["--rounds", "-1"], "--rounds: given -1, expected at least 1"),
+        (["--future-refresh", "0"], "--future-refresh: given 0, expected at least 1"),
+        (["--checkpoint", "no/such/place"], "no/such/place: no such checkpoint"),
+        (["--checkpoint", ".", "--version", "n1.5"], "leave out --checkpoint"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -15,7 +15,7 @@ from reference_cases import relative_error, variant_config
 import saccade
 from saccade import Chunking, InputError, ShapeError
 from saccade.reference import ActionHead as Reference
-from saccade.reference.model import velocity_strength
+from saccade.reference.chunking import velocity_strength
 from saccade.reference.random_weights import random_inputs
 
 HORIZON = 8

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import json
 import os
 import subprocess
 import sys
@@ -13,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 import saccade
-from saccade import cli
+from saccade import _extras, cli
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = tuple(cli.COMMANDS)
@@ -49,7 +51,8 @@ def fails(error: BaseException) -> Callable[[argparse.Namespace], int]:
 def test_help_lists_the_commands_and_imports_none_of_them() -> None:
     code = (
         "import sys; from saccade.cli import main\n"
-        "heavy = ('saccade.cli.', 'torch', 'rich', 'mujoco')\n"
+        "from saccade.cli import COMMANDS\n"
+        "heavy = (*(f'saccade.cli.{name}' for name in COMMANDS), 'torch', 'rich', 'mujoco')\n"
         "try: main(['--help'])\n"
         "finally: print('IMPORTED', *[name for name in sys.modules if name.startswith(heavy)])"
     )
@@ -80,7 +83,7 @@ def test_installed_script_is_the_same_program() -> None:
 
 def test_every_file_is_a_command_and_every_command_a_file() -> None:
     files = (path.stem for path in Path(cli.__file__).parent.glob("*.py"))
-    assert {name for name in files if not name.startswith("_")} == set(COMMANDS)
+    assert {name for name in files if not name.startswith("_")} == {*COMMANDS, "arguments"}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -134,12 +137,15 @@ def test_arguments_that_do_not_parse_are_one_line(
         (MemoryError(), "too large for this machine's memory"),
         (
             ModuleNotFoundError("No module named 'mujoco'", name="mujoco"),
-            "mujoco is not installed: pip install 'saccade[sim]'",
+            f"mujoco is not installed. Install with: {_extras.install_command(['sim'], ['mujoco'])}",
         ),
         (
             ModuleNotFoundError("No module named 'rich.progress'", name="rich.progress"),
-            "rich is not installed: pip install 'saccade[cli]'",
+            f"rich is not installed. Install with: {_extras.install_command(['cli'], ['rich'])}",
         ),
+        (OSError(errno.EROFS, "Read-only file system", "/ro/out"), "/ro/out: Read-only file system"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "aa"), "aa: File name too long"),
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
@@ -183,10 +189,59 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_missing_extra_is_named_before_anything_else() -> None:
-    code = (
-        "import sys; sys.modules['rich'] = None; from saccade.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
-    done = saccade_command("rollout", "--episodes", "1", code=code)
+#: Runs the command where no optional package is installed.
+BARE = f"""
+import sys
+for module in {sorted(module for modules in _extras.EXTRAS.values() for module in modules)}:
+    sys.modules[module] = None
+from saccade.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("name", cli.NEEDS)
+def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path) -> None:
+    arguments = {"demos": ["--out", "out"], "train": ["--demos", str(tmp_path), "--out", "out"]}
+    (tmp_path / "reach").mkdir()
+    (tmp_path / "reach" / "recording.json").write_text("{}")
+    done = saccade_command(name, *arguments.get(name, ["report", "."] if name == "study" else []), code=BARE)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "saccade: rich is not installed: pip install 'saccade[cli]'\n"
+    assert done.stderr.count("\n") == 1
+    extras = {extra for extra, modules in _extras.EXTRAS.items() if set(modules) & set(cli.NEEDS[name])}
+    wanted = extras - {included for extra in extras for included in _extras.INCLUDES.get(extra, ())}
+    if "[" in done.stderr:  # in a checkout
+        assert f"[{','.join(sorted(wanted))}]" in done.stderr
+    assert "is not installed" in done.stderr or "are not installed" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["attention", "--task", "fly"], "unknown name 'fly'"),
+        (["attention", "--grid", "3x3"], "--grid: only with --features"),
+        (["rollout", "--tasks", "reach,fly"], "unknown name 'fly'"),
+        (["demos", "--tasks", "fly", "--out", "out"], "unknown name 'fly'"),
+        (["train", "--demos", "nowhere", "--out", "out"], "nowhere: no demonstrations there"),
+        (["parity", "--checkpoint", "nowhere"], "nowhere"),
+    ],
+)
+def test_arguments_are_checked_before_packages(arguments: list[str], message: str) -> None:
+    done = saccade_command(*arguments, code=BARE)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "not installed" not in done.stderr
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_commands_on_checkpoints_need_no_package(options: list[str], tmp_path: Path) -> None:
+    demo = str(Path(saccade.__file__).parent / "sim" / "demo")
+    for command in (
+        ["inspect", demo, "--no-time"],
+        ["convert", demo, "--dtype", "float32", "--out", str(tmp_path / "a")],
+        ["quantize", demo, "--out", str(tmp_path / "b")],
+        ["resize", demo, "--num-future-tokens", "33", "--out", str(tmp_path / "c")],
+    ):
+        done = saccade_command(*command, *options, code=BARE)
+        assert (done.returncode, done.stderr) == (0, ""), command
+        if options:
+            json.loads(done.stdout)

@@ -24,7 +24,8 @@ from torch import Tensor
 
 import saccade
 from saccade import cli
-from saccade.checkpoints import action_changes, convert, quantize, resize
+from saccade.checkpoints import convert, quantize, resize
+from saccade.comparison import action_changes
 from saccade.errors import CheckpointError, InputError
 from saccade.reference.random_weights import random_inputs
 
@@ -441,10 +442,15 @@ def test_sources_that_do_not_fit(source: Path, tmp_path: Path) -> None:
 def test_the_command(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(tmp_path / "out")
     (source / "optimizer.pt").write_text("")
-    options = ["--dtype", "bfloat16", "--embodiment-ids", "3", "31", "--max-shard-size", "2MB"]
+    options = ["--dtype", "bfloat16", "--embodiment-ids", "3,31", "--max-shard-size", "2MB"]
     assert cli.main(["convert", str(source), "--out", out, *options]) == 0
     printed = capsys.readouterr().out
-    for part in ("embodiments 3, 31 kept", "numbers, by at most", "not copied: optimizer.pt", "carried over"):
+    for part in (
+        "kept embodiments 3, 31",
+        "numbers: largest error",
+        "not copied: optimizer.pt",
+        "other file",
+    ):
         assert part in printed
     assert cli.main(["convert", str(source), "--out", out, "--force", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

@@ -1,4 +1,4 @@
-"""What the docs say is what runs: examples in docstrings and README, commands, links."""
+"""The documentation is tested: examples in docstrings and pages, commands, links, pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import imageio.v2 as imageio
+import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 import saccade
 from saccade import cli
@@ -25,7 +28,7 @@ PAGES = [
     ROOT / "studies" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-#: Need checkpoints to run on: tests/test_docs_checkpoints.py has them.
+#: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
 NEED_CHECKPOINTS = ("lerobot.md", "nvidia.md", "fork.md", "resize.md")
 MODULES = sorted(
     info.name
@@ -40,7 +43,7 @@ def code_blocks(page: Path, language: str) -> list[str]:
 
 
 def command_lines(text: str, program: str) -> list[list[str]]:
-    """The arguments of each line of `text` that calls `program`; comments after two blanks are left out."""
+    """The arguments of each line of `text` that calls `program`, without comments after two blanks."""
     lines = (
         re.split(r"\s{2,}|\s#", line.strip())[0] for line in re.sub(r"\s*\\\n\s*", " ", text).splitlines()
     )
@@ -98,7 +101,7 @@ def test_examples_of_commands_parse(name: str) -> None:
 
 
 def assert_parses(arguments: list[str]) -> None:
-    """That the command line takes these arguments."""
+    """Fails if the command line does not accept these arguments."""
     parser = cli.build_parser(arguments[0])
     if "--help" not in arguments:
         parser.parse_args(arguments)  # a SystemExit fails the test; its message is on standard error
@@ -110,6 +113,33 @@ def test_links_lead_somewhere(page: Path) -> None:
     for target in targets:
         if "://" not in target:
             assert (page.parent / target).exists(), target
+
+
+def test_pictures_of_the_readme_are_made_from_what_commands_write(tmp_path: Path) -> None:
+    shades = np.linspace(0, 255, 9).astype(np.uint8)
+    frames = [np.full((64, 96, 3), shade, np.uint8) for shade in shades]
+    imageio.mimwrite(tmp_path / "one.mp4", frames, fps=20, macro_block_size=16)  # type: ignore[arg-type]
+    Image.new("RGB", (40, 30), "red").save(tmp_path / "sheet.png")
+    script = [sys.executable, str(ROOT / "docs" / "make_pictures.py")]
+    gif = ["gif", str(tmp_path / "one.mp4"), "--out", str(tmp_path / "one.gif"), "--width", "48"]
+    crop = [
+        "map",
+        str(tmp_path / "sheet.png"),
+        "--out",
+        str(tmp_path / "map.png"),
+        "--top",
+        "5",
+        "--bottom",
+        "25",
+    ]
+    for arguments in (gif, crop):
+        subprocess.run([*script, *arguments], check=True, capture_output=True)
+    with Image.open(tmp_path / "one.gif") as made:
+        assert made.size == (48, 32)
+        assert len(list(ImageSequence.Iterator(made))) == 5  # every second of eight, and the last
+        assert made.info["loop"] == 0
+    with Image.open(tmp_path / "map.png") as made:
+        assert made.size == (40, 20)
 
 
 def test_nothing_names_a_package_registry_or_a_path_of_one_machine() -> None:
@@ -124,7 +154,11 @@ def test_nothing_names_a_package_registry_or_a_path_of_one_machine() -> None:
     found = []
     for name in filter(None, listed.stdout.split("\0")):
         path = ROOT / name
-        if path.suffix in (".safetensors", ".png", ".mp4") or path.name == "Cargo.lock" or not path.is_file():
+        if (
+            path.suffix in (".safetensors", ".png", ".gif", ".mp4")
+            or path.name == "Cargo.lock"
+            or not path.is_file()
+        ):
             continue
         text = path.read_text(errors="replace")
         found += [f"{name}: {word}" for word in words if word in text]

@@ -1,4 +1,4 @@
-"""The pages on the ways in are run as they are written, in a folder with the checkpoints that they name."""
+"""Runs the pages for owners of a checkpoint, in a folder with the checkpoints that they name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from published import published
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = ("lerobot", "nvidia", "fork", "resize")
-#: The names on the pages, and the layouts of what is there under these names.
+#: Names on the pages, and the layouts of these checkpoints.
 CHECKPOINTS = {
     "GR00T-N1.5-3B": "nvidia",
     "GR00T-N1.7": "n17",
@@ -25,8 +25,10 @@ CHECKPOINTS = {
 
 
 def commands(page: Path) -> list[list[str]]:
-    """What is to be run, from top to bottom. The Python blocks of a page are one program: those between two
-    blocks of the shell are run together, after all that were before them.
+    """The commands of a page, from top to bottom.
+
+    The Python blocks of a page are one program. Blocks between two shell blocks run together, after all
+    earlier Python blocks.
     """
     found: list[list[str]] = []
     program = ""
@@ -51,7 +53,7 @@ def test_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     for folder, layout in CHECKPOINTS.items():
         if folder in page.read_text():
             shutil.copytree(published(layout), tmp_path / folder)
-    # The commands of the environment that runs the test go before others of the same name.
+    # Commands of the test's own environment take precedence.
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     for command in asked:
         done = subprocess.run(
@@ -63,6 +65,6 @@ def test_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
             check=False,
         )
         assert done.returncode == 0, f"{command[-1]}\n{done.stdout}\n{done.stderr}"
-    # Nothing was written but what the page names.
+    # Only files that the page names were written.
     unknown = [found.name for found in tmp_path.iterdir() if found.name not in page.read_text()]
     assert unknown == []

@@ -26,15 +26,17 @@ def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_real_time_counts_every_tick() -> None:
-    finished = run("real_time.py", "--seconds", "0.5", "--rate", "40", "--backbone-ms", "1", "--threads", "2")
+    finished = run(
+        "real_time.py", "--seconds", "0.5", "--rate", "40", "--backbone-ms", "1", "--num-threads", "2"
+    )
     assert finished.returncode == 0, finished.stderr
-    counts = re.search(r"40 a second for 0.5 s, (\d+) chunks, (\d+) deadlines missed", finished.stdout)
+    counts = re.search(r"40 per second for 0.5 s, (\d+) chunks, (\d+) deadlines missed", finished.stdout)
     assert counts is not None, finished.stdout
     chunks, missed = map(int, counts.groups())
     assert chunks >= 1
     # 20 ticks are due; the last chunk may run over the end.
     assert chunks + missed >= 20
-    for title in ("tick begins after it was due", "state to actions", "pictures to actions"):
+    for title in ("start of a tick after its due time", "state to actions", "images to actions"):
         block = finished.stdout.split(f"{title}, ms:")[1].splitlines()[1:]
         shown = [re.match(r"  up to +[\d.]+ ms +(\d+)", line) for line in block]
         lengths = [int(line[1]) for line in shown[: shown.index(None) if None in shown else None] if line]
@@ -42,7 +44,7 @@ def test_real_time_counts_every_tick() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--rate", "0"], ["--seconds", "-1"], ["--size", "n2"], ["--threads", "0"]]
+    "arguments", [["--rate", "0"], ["--seconds", "-1"], ["--size", "n2"], ["--num-threads", "0"]]
 )
 def test_real_time_refuses_nonsense(arguments: list[str]) -> None:
     finished = run("real_time.py", *arguments)

@@ -15,6 +15,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from released import Released, load_released
+from safetensors import safe_open
 
 import saccade
 
@@ -236,6 +237,16 @@ def test_bf16_stays_bf16_in_memory() -> None:
     released = load_released("n15_bf16")
     stored = os.path.getsize(released.path)  # noqa: PTH202
     assert load(released).nbytes < 2 * stored
+
+
+def test_future_tokens_are_the_checkpoints(head: saccade.ActionHead, tiny: Released) -> None:
+    tokens = head.future_tokens
+    with safe_open(tiny.path, framework="np") as file:
+        stored = file.get_tensor("action_head.future_tokens.weight")
+    np.testing.assert_array_equal(tokens, stored)
+    assert tokens.dtype == np.float32
+    tokens[:] = 0.0
+    np.testing.assert_array_equal(head.future_tokens, stored)  # a copy each time
 
 
 def test_pickle_loads_anew(head: saccade.ActionHead, tiny: Released) -> None:

@@ -136,6 +136,10 @@ def test_commands_take_ids(cache: Path, checkpoint: Path, capsys: pytest.Capture
     cached(cache, checkpoint)
     assert cli.main(["inspect", NAME, "--no-time", "--json"]) == 0
     assert '"version": "n1.5"' in capsys.readouterr().out
-    for command in (["bench", "nvidia/absent"], ["parity", "nvidia/absent"], ["inspect", "nvidia/absent"]):
+    for command in (
+        ["bench", "--checkpoint", "nvidia/absent"],
+        ["parity", "--checkpoint", "nvidia/absent"],
+        ["inspect", "nvidia/absent"],
+    ):
         assert cli.main(command) == 2
         assert "hf download nvidia/absent" in capsys.readouterr().err

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import layouts
 import numpy as np
@@ -20,9 +19,13 @@ from torch import Tensor, nn
 import saccade
 from saccade import _saccade, cli
 from saccade.checkpoints import quantize
+from saccade.checkpoints.findings import Counts, Inspection, Part
+from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
+from saccade.checkpoints.inspection import inspect
+from saccade.checkpoints.parts import parameters
+from saccade.checkpoints.survey import robust_z
+from saccade.checkpoints.tokens import token_statistics
 from saccade.errors import CheckpointError, InputError
-from saccade.initialisation import Draw, distance, draw, is_as_drawn, sample
-from saccade.inspection import inspect, parameters, robust_z, token_statistics
 from saccade.reference.random_weights import CONFIGS, whole_config
 
 #: Of the fork's head, at published sizes: the specification, section 2.3.
@@ -40,7 +43,7 @@ N15_PARTS = {
 }
 
 
-def published_parts(kind: str) -> dict[str, dict[str, int]]:
+def published_parts(kind: str) -> dict[str, Part]:
     """Parameters by part of a head with the sizes of the published one."""
     shapes = _saccade.tensor_shapes(json.dumps(whole_config(CONFIGS[kind])))
     return parameters({name: tuple(shape) for name, shape in shapes})
@@ -48,17 +51,17 @@ def published_parts(kind: str) -> dict[str, dict[str, int]]:
 
 def test_parts_add_up_to_the_published_heads() -> None:
     parts = published_parts("n1.5")
-    assert {name: (part["tensors"], part["parameters"]) for name, part in parts.items()} == N15_PARTS
+    assert {name: (part.tensors, part.parameters) for name, part in parts.items()} == N15_PARTS
     totals = {
-        kind: sum(part["parameters"] for part in published_parts(kind).values())
+        kind: sum(part.parameters for part in published_parts(kind).values())
         for kind in ("n1.5", "n1.6", "n1.7")
     }
     assert totals == {"n1.5": 1_068_806_144, "n1.6": 1_418_624_000, "n1.7": 1_620_515_968}
-    fork = sum(part["parameters"] for part in published_parts("fork").values())
+    fork = sum(part.parameters for part in published_parts("fork").values())
     assert fork + 2 == 1_101_868_546  # and the two logarithms of loss weights
     for kind in ("n1.6", "n1.7"):
         transformer = ("DiT blocks", "timestep encoder", "output projections")
-        assert sum(published_parts(kind)[name]["parameters"] for name in transformer) == 1_091_722_240
+        assert sum(published_parts(kind)[name].parameters for name in transformer) == 1_091_722_240
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +74,9 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
 def test_memory_is_what_a_head_holds(tmp_path: Path, layout: str, precision: str) -> None:
     folder = layouts.write(tmp_path / layout, layout)
-    memory = inspect(folder, time=False)["memory"][precision]
-    assert memory["all"] == saccade.ActionHead.load(folder, precision=precision).nbytes
-    assert memory["one"] == saccade.ActionHead.load(folder, precision=precision, embodiment_ids=[4]).nbytes
+    memory = inspect(folder, time=False).memory[precision]
+    assert memory.all == saccade.ActionHead.load(folder, precision=precision).nbytes
+    assert memory.one == saccade.ActionHead.load(folder, precision=precision, embodiment_ids=[4]).nbytes
 
 
 @pytest.mark.parametrize("isa", _saccade.available_isas())
@@ -82,54 +85,56 @@ def test_memory_on_every_instruction_set_and_of_an_int8_checkpoint(
 ) -> None:
     quantize(base, tmp_path / "int8")
     monkeypatch.setenv("SACCADE_ISA", isa)
-    for precision, memory in inspect(tmp_path / "int8", time=False)["memory"].items():
-        assert memory["all"] == saccade.ActionHead.load(tmp_path / "int8", precision=precision).nbytes
+    for precision, memory in inspect(tmp_path / "int8", time=False).memory.items():
+        assert memory.all == saccade.ActionHead.load(tmp_path / "int8", precision=precision).nbytes
 
 
 def test_the_report_of_a_checkpoint(base: Path) -> None:
     tensors = layouts.read(base, "action_head.")
     told: list[tuple[int, int]] = []
     report = inspect(base, num_vl_tokens=9, progress=lambda done, total: told.append((done, total)))
-    assert report["parameters"] == sum(tensor.numel() for tensor in tensors.values())
-    assert sum(part["tensors"] for part in report["parts"].values()) == len(tensors)
-    assert sum(part["nbytes"] for part in report["parts"].values()) == sum(t.nbytes for t in tensors.values())
-    assert report["parts"]["VL self-attention"]["dtypes"] == {"BF16": 32}
-    assert report["outside"] == {"backbone": {"tensors": 2, "nbytes": 2 * 6 * 8 * 2}}
+    assert report.parameters == sum(tensor.numel() for tensor in tensors.values())
+    assert sum(part.tensors for part in report.parts.values()) == len(tensors)
+    assert sum(part.nbytes for part in report.parts.values()) == sum(t.nbytes for t in tensors.values())
+    assert report.parts["VL self-attention"].dtypes == {"BF16": 32}
+    assert report.outside == {"backbone": Counts(tensors=2, nbytes=2 * 6 * 8 * 2)}
     assert told[-1][0] == told[-1][1] == sum(tensor.nbytes for tensor in tensors.values())
     assert len(told) == len(tensors)
-    assert report["odd"] == []
-    assert report["machine"]["isa"] == _saccade.selected_isa()
-    for seconds in report["seconds"].values():
+    assert report.odd == []
+    assert report.machine is not None
+    assert report.seconds is not None
+    assert report.machine.isa == _saccade.selected_isa()
+    for seconds in report.seconds.values():
         assert seconds["encode"] > 0.0
         assert seconds["sample"] > 0.0
-    assert json.loads(json.dumps(report)) == json.loads(json.dumps(report, default=list))
+    json.dumps(dataclasses.asdict(report), allow_nan=False)  # nothing in it needs a converter
 
 
 def test_which_embodiments_look_trained(base: Path) -> None:
     tensors = layouts.read(base, "action_head.")
-    entries = inspect(base, time=False)["embodiments"]
-    assert [entry["id"] for entry in entries if entry["looks"] == "trained"] == [17, 24, 26]
-    assert {entry["looks"] for entry in entries if entry["id"] not in (17, 24, 26)} == {"as initialised"}
-    assert entries[31]["names"] == ["new_embodiment"]
-    assert entries[26]["names"][0] == "agibot_genie1"
+    entries = inspect(base, time=False).embodiments
+    assert [entry.id for entry in entries if entry.looks == "trained"] == [17, 24, 26]
+    assert {entry.looks for entry in entries if entry.id not in (17, 24, 26)} == {"as initialised"}
+    assert entries[31].names == ["new_embodiment"]
+    assert entries[26].names[0] == "agibot_genie1"
     squares = sum(t.double().square().sum((1, 2) if t.ndim == 3 else 1)
                   for name, t in tensors.items() if name.endswith((".W", ".b")))  # fmt: skip
     norms = torch.as_tensor(squares).sqrt()
-    np.testing.assert_allclose([entry["norm"] for entry in entries], norms, rtol=1e-12)
+    np.testing.assert_allclose([entry.norm for entry in entries], norms, rtol=1e-12)
     median = norms.quantile(0.5)
     expected = (norms - median) / (1.4826 * (norms - median).abs().quantile(0.5))
-    np.testing.assert_allclose([entry["robust_z"] for entry in entries], expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose([entry.robust_z for entry in entries], expected, rtol=1e-9, atol=1e-9)
 
 
 def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:
     folder = layouts.write(tmp_path / "n17", "n17")
-    names = [entry["names"] for entry in inspect(folder, time=False)["embodiments"]]
+    names = [entry.names for entry in inspect(folder, time=False).embodiments]
     assert names[2] == ["libero_sim"]
     assert names[10] == ["new_embodiment"]
     assert names[31] == []
     for text in ("[]", '{"a": "b", "c": [1]}', "{", '{"x": 7}'):
         (folder / "embodiment_id.json").write_text(text)
-        names = [entry["names"] for entry in inspect(folder, time=False)["embodiments"]]
+        names = [entry.names for entry in inspect(folder, time=False).embodiments]
     assert names[7] == ["x"]
 
 
@@ -149,22 +154,22 @@ def test_statistics_of_future_tokens_beside_torch() -> None:
     for name, values in (("norm", norms), ("cosine", pairs)):
         expected = [values.mean(), values.min(), values.max()]
         np.testing.assert_allclose(
-            list(found[name].values()), [float(value) for value in expected], rtol=1e-12
+            list(vars(getattr(found, name)).values()), [float(value) for value in expected], rtol=1e-12
         )
-    assert math.isclose(found["effective_rank"], math.exp(torch.special.entr(shares).sum()), rel_tol=1e-12)
-    assert math.isclose(found["std"], wide.std(correction=0), rel_tol=1e-7)
-    assert (found["count"], found["identical"], found["zero"]) == (13, [], [])
+    assert math.isclose(found.effective_rank, math.exp(torch.special.entr(shares).sum()), rel_tol=1e-12)
+    assert math.isclose(found.std, wide.std(correction=0), rel_tol=1e-7)
+    assert (found.count, found.identical, found.zero) == (13, [], [])
 
 
 def test_tokens_that_are_not_distinct() -> None:
     one = np.ones((1, 6), np.float32)
     found = token_statistics(np.concatenate([one, 0 * one, one, 2 * one, 0 * one]))
-    assert found["identical"] == [[0, 2], [1, 4]]
-    assert found["zero"] == [1, 4]
-    assert math.isclose(found["effective_rank"], 1.0, rel_tol=1e-12)
+    assert found.identical == [[0, 2], [1, 4]]
+    assert found.zero == [1, 4]
+    assert math.isclose(found.effective_rank, 1.0, rel_tol=1e-12)
     alone = token_statistics(one)
-    assert alone["cosine"] is None
-    assert token_statistics(0 * one)["effective_rank"] == 0.0
+    assert alone.cosine is None
+    assert token_statistics(0 * one).effective_rank == 0.0
 
 
 def test_the_distance_is_that_of_kolmogorov_and_smirnov() -> None:
@@ -216,10 +221,10 @@ def test_too_few_numbers_are_not_judged() -> None:
     assert is_as_drawn(np.zeros(100), Draw("normal", 0.02)) is None
 
 
-def sides(report: Mapping[str, Any]) -> dict[str, str]:
+def sides(report: Inspection) -> dict[str, str]:
     """Of each sentence's first words, the side that it is on."""
     return {
-        sentence.partition(":")[0]: side for side, given in report["from_noise"].items() for sentence in given
+        sentence.partition(":")[0]: side for side, given in report.from_noise.items() for sentence in given
     }
 
 
@@ -227,9 +232,10 @@ def test_evidence_on_a_checkpoint_as_the_constructors_left_it(tmp_path: Path) ->
     report = inspect(layouts.write(tmp_path / "fork", "fork", fresh=True), time=False)
     assert set(sides(report).values()) == {"for"}
     assert {"DiT blocks", "VL self-attention", "future tokens"} <= set(sides(report))
-    assert report["future_tokens"]["as_drawn"] is True
-    for part in report["parts"].values():
-        assert part["as_drawn"] == part["judged"]
+    assert report.future_tokens is not None
+    assert report.future_tokens.as_drawn is True
+    for part in report.parts.values():
+        assert part.as_drawn == part.judged
 
 
 def test_evidence_on_a_trained_checkpoint(base: Path) -> None:
@@ -247,8 +253,8 @@ def test_tokens_that_are_not_finite(tmp_path: Path) -> None:
     tensors = load_file(folder / "model.safetensors")
     tensors["action_head.future_tokens.weight"][0, 0] = torch.nan
     save_file(tensors, folder / "model.safetensors")
-    assert inspect(folder, time=False)["odd"] == [
-        "future_tokens.weight holds 1 numbers that are NaN or infinite"
+    assert inspect(folder, time=False).odd == [
+        "future_tokens.weight contains 1 values that are NaN or infinite"
     ]
 
 
@@ -270,19 +276,22 @@ def fine_tuned(base: Path, folder: Path, tensors: dict[str, Tensor] | None = Non
 
 def test_beside_the_checkpoint_that_it_was_trained_from(base: Path, tmp_path: Path) -> None:
     report = inspect(fine_tuned(base, tmp_path / "kept"), reference=base, time=False)
-    found = report["reference"]
-    state = found["parts"]["state encoder"]
-    assert state["identical"] == state["pieces"] - 2  # all but the weights of one embodiment
-    assert found["parts"]["DiT blocks"]["cosine"]["min"] > 0.999
-    assert found["parts"]["DiT blocks"]["largest_change"] == pytest.approx(0.01, rel=0.1)
-    assert found["different_shapes"] == []
-    assert {name.partition(".")[0] for name in found["not_in_reference"]} == {
+    found = report.reference
+    assert found is not None
+    state = found.parts["state encoder"]
+    assert state.identical == state.pieces - 2  # all but the weights of one embodiment
+    cosine = found.parts["DiT blocks"].cosine
+    assert cosine is not None
+    assert cosine.min > 0.999
+    assert found.parts["DiT blocks"].largest_change == pytest.approx(0.01, rel=0.1)
+    assert found.different_shapes == []
+    assert {name.partition(".")[0] for name in found.not_in_reference} == {
         "action_arm_decoder",
         "action_claw_decoder",
         "task_log_sigma",
     }
-    assert sides(report)["DiT blocks beside the reference"] == "against"
-    assert sides(report)["state encoder beside the reference"] == "against"
+    assert sides(report)["DiT blocks compared with the reference"] == "against"
+    assert sides(report)["state encoder compared with the reference"] == "against"
 
 
 def test_beside_a_checkpoint_that_was_dropped(base: Path, tmp_path: Path) -> None:
@@ -290,12 +299,11 @@ def test_beside_a_checkpoint_that_was_dropped(base: Path, tmp_path: Path) -> Non
     config = layouts.head_config("fork") | {"num_target_vision_tokens": 64}
     folder = layouts.write(tmp_path / "dropped", "fork", config=config, seed=9, trained=[31])
     report = inspect(folder, reference=base, time=False)
-    assert sides(report)["DiT blocks beside the reference"] == "for"
+    assert sides(report)["DiT blocks compared with the reference"] == "for"
     assert sides(report)["embodiment 24 (gr1), which NVIDIA trained"] == "for"
-    assert report["reference"]["different_shapes"] == [
-        "future_tokens.weight: (64, 96), in the reference (32, 96)"
-    ]
-    assert any("64 future tokens" in sentence for sentence in report["from_noise"]["neither"])
+    assert report.reference is not None
+    assert report.reference.different_shapes == ["future_tokens.weight: (64, 96), in the reference (32, 96)"]
+    assert any("64 future tokens" in sentence for sentence in report.from_noise["neither"])
 
 
 def test_what_is_odd(base: Path, tmp_path: Path) -> None:
@@ -311,9 +319,9 @@ def test_what_is_odd(base: Path, tmp_path: Path) -> None:
         "model.transformer_blocks.2.ff.net.0.proj.weight": broken,
     }
     report = inspect(fine_tuned(base, tmp_path / "odd", odd), time=False)
-    assert report["odd"] == [
-        "model.transformer_blocks.1.attn1.to_q.weight is 0 throughout",
-        "model.transformer_blocks.2.ff.net.0.proj.weight holds 3 numbers that are NaN or infinite",
+    assert report.odd == [
+        "every value of model.transformer_blocks.1.attn1.to_q.weight is 0",
+        "model.transformer_blocks.2.ff.net.0.proj.weight contains 3 values that are NaN or infinite",
         "future tokens 3, 7 are identical",
         "future token 9 is zero",
     ]
@@ -327,9 +335,9 @@ def test_embodiments_whose_layers_are_zero(base: Path, tmp_path: Path) -> None:
             tensor[[2, 5]] = 0.0
     save_file(tensors, folder / "model.safetensors")
     report = inspect(folder, time=False)
-    assert [entry["id"] for entry in report["embodiments"] if entry["looks"] == "zero"] == [2, 5]
-    assert report["odd"] == [
-        "the layers of 2 embodiments are zero, as after convert with others: 2, 5",
+    assert [entry.id for entry in report.embodiments if entry.looks == "zero"] == [2, 5]
+    assert report.odd == [
+        "the layers of 2 embodiments are zero, as after saccade convert: 2, 5",
     ]
 
 

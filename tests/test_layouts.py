@@ -70,17 +70,17 @@ def test_every_layout_loads_as_with_the_config_and_the_tensors_alone(
 @pytest.mark.parametrize("layout", layouts.LAYOUTS)
 def test_every_layout_is_described(written: dict[str, Path], layout: str) -> None:
     found = describe(written[layout])
-    assert (found["layout"], found["version"], found["prefix"]) == EXPECTED[layout]
-    assert json.loads(json.dumps(found["head_config"])) == found["head_config"]
-    again = saccade.HeadConfig.from_dict(found["head_config"])
+    assert (found.layout, found.version, found.prefix) == EXPECTED[layout]
+    assert json.loads(json.dumps(found.head_config)) == found.head_config
+    again = saccade.HeadConfig.from_dict(found.head_config)
     assert again == saccade.HeadConfig.from_dict(layouts.head_config(layout))
     stored = load_file(sorted(written[layout].glob("model*.safetensors"))[0])
-    tensors = {tensor["name"]: tensor for tensor in found["tensors"]}
+    tensors = {tensor.name: tensor for tensor in found.tensors}
     names = {torch.float32: "F32", torch.bfloat16: "BF16"}
     for name, tensor in stored.items():
-        assert tensors[name]["dtype"] == names[tensor.dtype]
-        assert tuple(tensors[name]["shape"]) == tuple(tensor.shape)
-        assert tensors[name]["nbytes"] == tensor.nbytes
+        assert tensors[name].dtype == names[tensor.dtype]
+        assert tuple(tensors[name].shape) == tuple(tensor.shape)
+        assert tensors[name].nbytes == tensor.nbytes
 
 
 def change_config(folder: Path, change: Callable[[Json], object]) -> None:
@@ -111,19 +111,19 @@ def test_sizes_that_lerobots_config_lacks_come_from_the_tensors(tmp_path: Path) 
 def test_lerobot_trains_at_most_sixteen_actions(tmp_path: Path, chunk_size: int, horizon: int) -> None:
     folder = layouts.write(tmp_path / "policy", "lerobot")
     change_config(folder, lambda config: config.update(chunk_size=chunk_size))
-    assert describe(folder)["config"]["action_horizon"] == horizon
+    assert describe(folder).config.action_horizon == horizon
 
 
 def test_lerobots_n17_takes_its_chunk_from_the_model_not_from_chunk_size(tmp_path: Path) -> None:
     folder = layouts.write(tmp_path / "policy", "lerobot-n17")
     change_config(folder, lambda config: config.update(chunk_size=10))
-    assert describe(folder)["config"]["action_horizon"] == 40
+    assert describe(folder).config.action_horizon == 40
     processors = json.loads((folder / "policy_preprocessor.json").read_text())
     processors["steps"][2]["config"]["action_horizon"] = 50
     (folder / "policy_preprocessor.json").write_text(json.dumps(processors))
-    assert describe(folder)["config"]["action_horizon"] == 50
+    assert describe(folder).config.action_horizon == 50
     (folder / "policy_preprocessor.json").write_text("{")
-    assert describe(folder)["config"]["action_horizon"] == 40
+    assert describe(folder).config.action_horizon == 40
 
 
 def test_n15_as_it_was_first_published_has_no_future_tokens(tmp_path: Path) -> None:

@@ -513,8 +513,15 @@ def test_without_image_tokens_there_is_no_occlusion_map(
     (tmp_path / "config.json").write_text(json.dumps(given.config))
     names = ("backbone_features", "state", "embodiment_id")
     features = written(tmp_path / "f.npz", {name: getattr(given, name) for name in names})
-    arguments = [str(given.path), "--config", str(tmp_path / "config.json"), "--features", str(features)]
-    chosen = ["--layout", "text:*", "--row", "1", "--steps", "0", "--threads", "1"]
+    arguments = [
+        "--checkpoint",
+        str(given.path),
+        "--config",
+        str(tmp_path / "config.json"),
+        "--features",
+        str(features),
+    ]
+    chosen = ["--layout", "text:*", "--row", "1", "--steps", "0", "--num-threads", "1"]
     assert main(["attention", *arguments, *chosen, "--out", str(tmp_path / "out")]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert NO_IMAGES in shown
@@ -546,7 +553,7 @@ def no_probe(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_probe")
 def test_the_command_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--task", "reach", "--seed", "1", "--after", "8", "--blocks", "1,2", "--steps", "0,3"]
-    assert main(["attention", *arguments, "--threads", "1", "--json", "--out", str(tmp_path)]) == 0
+    assert main(["attention", *arguments, "--num-threads", "1", "--json", "--out", str(tmp_path)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found == json.loads((tmp_path / "attention.json").read_text())
     assert {path.name for path in tmp_path.iterdir()} == {"attention.json", "page.html", "sheet.png"}
@@ -581,8 +588,8 @@ def test_a_checkpoint_without_future_tokens(tmp_path: Path, capsys: pytest.Captu
     tensors = read_tensors(DEMO_CHECKPOINT)
     del tensors["action_head.future_tokens.weight"]
     save_file(tensors, checkpoint / "model.safetensors")
-    arguments = ["attention", str(checkpoint), "--blocks", "0", "--steps", "0", "--cell", "4"]
-    assert main([*arguments, "--threads", "1", "--out", str(tmp_path / "out")]) == 0
+    arguments = ["attention", "--checkpoint", str(checkpoint), "--blocks", "0", "--steps", "0", "--cell", "4"]
+    assert main([*arguments, "--num-threads", "1", "--out", str(tmp_path / "out")]) == 0
     assert NO_FUTURE in " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "out/attention.json").read_text())
     assert found["num_future_tokens"] == 0
@@ -594,8 +601,15 @@ def test_a_file_of_another_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixt
     given = load_released("n15_single_view")
     (tmp_path / "config.json").write_text(json.dumps(given.config))
     features = written(tmp_path / "f.npz", feature_arrays())
-    arguments = [str(given.path), "--config", str(tmp_path / "config.json"), "--features", str(features)]
-    chosen = ["--blocks", "2", "--steps", "3", "--heads", "1", "--cell", "8", "--threads", "1", "--json"]
+    arguments = [
+        "--checkpoint",
+        str(given.path),
+        "--config",
+        str(tmp_path / "config.json"),
+        "--features",
+        str(features),
+    ]
+    chosen = ["--blocks", "2", "--steps", "3", "--heads", "1", "--cell", "8", "--num-threads", "1", "--json"]
     assert main(["attention", *arguments, *chosen, "--out", str(tmp_path / "out")]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [entry["head"] for entry in found["summaries"]] == ["mean", 1] * 3
@@ -622,12 +636,13 @@ CASES: list[tuple[list[str], str]] = [
     (["--steps", "0,4"], "--steps: given 0, 4, the checkpoint has steps 0 to 3"),
     (["--heads", "7"], "--heads: given 7, the checkpoint has heads 0 to 3"),
     (["--heads", "one"], "--heads: given 'one', expected numbers"),
+    (["--heads", "mean", "1"], "--heads: given mean and numbers"),
     (["--task", "fly"], "unknown name 'fly'"),
     (["--seed", "1000000"], "evaluation seeds"),
     (["--after", "-1"], "--after: given -1"),
-    (["--threads", "0"], "--threads: given 0"),
-    (["--cell", "0"], "cell: given 0"),
-    (["--out", "f.npz"], "--out: f.npz is no directory"),
+    (["--num-threads", "0"], "--num-threads: given 0"),
+    (["--cell", "0"], "--cell: given 0"),
+    (["--out", "f.npz"], "--out: f.npz is not a directory"),
     (["--layout", "text:*"], "--layout: only with --features"),
     (["--grid", "2x2", "--row", "1"], "--grid, --row: only with --features"),
     (["--features", "f.npz", "--task", "push"], "expected one observation"),
@@ -635,8 +650,8 @@ CASES: list[tuple[list[str], str]] = [
     (["--features", "f.npz"], "f.npz: backbone_features: shape (1, 296, 64), the checkpoint expects"),
     (["--features", "fits.npz", "--layout", "image:4x4"], "the features have T_vl 20"),
     (["--features", "fits.npz", "--grid", "3x"], "grid: given '3x'"),
-    (["nowhere"], "nowhere"),
-    (["head.safetensors", "--config", "config.json"], "--features FILE"),
+    (["--checkpoint", "nowhere"], "nowhere"),
+    (["--checkpoint", "head.safetensors", "--config", "config.json"], "--features FILE"),
 ]
 
 

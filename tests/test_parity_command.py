@@ -16,7 +16,7 @@ from saccade import cli
 from saccade.cli import parity
 from saccade.reference.random_weights import CONFIGS
 
-SMALL = ["parity", "--vl-tokens", "5"]
+SMALL = ["parity", "--num-vl-tokens", "5"]
 
 
 def test_a_small_random_head_passes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -41,7 +41,20 @@ def test_versions_are_those_of_the_random_weights() -> None:
 
 def test_json_has_every_engine(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
-        cli.main([*SMALL, "--json", "--batch", "2", "--num-steps", "2", "--bf16", "--embodiment-id", "1"])
+        cli.main(
+            [
+                *SMALL,
+                "--json",
+                "--batch",
+                "2",
+                "--num-steps",
+                "2",
+                "--dtype",
+                "bfloat16",
+                "--embodiment-id",
+                "1",
+            ]
+        )
         == 0
     )
     report = json.loads(capsys.readouterr().out)
@@ -59,7 +72,8 @@ def test_json_has_every_engine(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_checkpoint_with_recorded_inputs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     released = load_released(name)
     # The recorded files carry weights, config and inputs in one.
-    assert cli.main(["parity", str(released.path), "--inputs", str(released.path), "--json"]) == 0
+    path = str(released.path)
+    assert cli.main(["parity", "--checkpoint", path, "--features", path, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["largest_action"] == pytest.approx(np.abs(released.actions_f64).max(), rel=1e-6)
 
@@ -83,18 +97,18 @@ def test_isa_of_the_environment_is_left_as_it_was(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["nowhere"], "nowhere"),
-        (["--inputs", "nowhere"], "nowhere"),
-        ([".", "--full"], "leave out the checkpoint"),
-        ([".", "--bf16"], "leave out the checkpoint"),
-        ([".", "--version", "n1"], "leave out the checkpoint"),
-        (["--version", "n1.7", "--vl-tokens", "1"], "--vl-tokens is 1"),
-        (["--full", "--bf16", "--batch", "0"], "--batch is 0"),
-        (["--vl-tokens", "-3"], "--vl-tokens is -3"),
-        (["--num-steps", "0"], "--num-steps is 0"),
+        (["--checkpoint", "nowhere"], "nowhere"),
+        (["--features", "nowhere"], "nowhere"),
+        (["--checkpoint", ".", "--full"], "leave out --checkpoint"),
+        (["--checkpoint", ".", "--dtype", "bfloat16"], "leave out --checkpoint"),
+        (["--checkpoint", ".", "--version", "n1"], "leave out --checkpoint"),
+        (["--version", "n1.7", "--num-vl-tokens", "1"], "--num-vl-tokens: given 1, expected at least 2"),
+        (["--full", "--dtype", "bfloat16", "--batch", "0"], "--batch: given 0, expected at least 1"),
+        (["--num-vl-tokens", "-3"], "--num-vl-tokens: given -3, expected at least 1"),
+        (["--num-steps", "0"], "--num-steps: given 0, expected at least 1"),
         (["--num-steps", "1001"], "1000"),
-        (["--threads", "0"], "--threads is 0"),
-        (["--tolerance", "nan"], "--tolerance is nan"),
+        (["--num-threads", "0"], "--num-threads: given 0, expected at least 1"),
+        (["--tolerance", "nan"], "--tolerance: given nan"),
         (["--embodiment-id", "99"], "embodiment_id"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -118,7 +132,7 @@ def test_bad_arguments_are_one_line(
 def test_inputs_that_do_not_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "inputs.safetensors"
     path.write_bytes(b"no safetensors")
-    assert cli.main(["parity", "--inputs", str(path)]) == cli.EXIT_BAD_INPUT
+    assert cli.main(["parity", "--features", str(path)]) == cli.EXIT_BAD_INPUT
     good = {
         "backbone_features": torch.zeros(1, 5, 128),
         "state": torch.zeros(1, 64),
@@ -126,11 +140,14 @@ def test_inputs_that_do_not_fit(tmp_path: Path, capsys: pytest.CaptureFixture[st
         "noise": torch.zeros(1, 16, 32),
     }
     save_file(good, path)
-    assert cli.main(["parity", "--inputs", str(path)]) == 0
+    assert cli.main(["parity", "--features", str(path)]) == 0
     for name in good:
         save_file({other: tensor for other, tensor in good.items() if other != name}, path)
-        assert cli.main(["parity", "--inputs", str(path)]) == cli.EXIT_BAD_INPUT
-        assert name in capsys.readouterr().err.splitlines()[-1]
+        if name == "noise":  # is drawn
+            assert cli.main(["parity", "--features", str(path)]) == 0
+        else:
+            assert cli.main(["parity", "--features", str(path)]) == cli.EXIT_BAD_INPUT
+            assert name in capsys.readouterr().err.splitlines()[-1]
         save_file(good | {name: torch.zeros(*good[name].shape, 2, dtype=good[name].dtype)}, path)
-        assert cli.main(["parity", "--inputs", str(path)]) == cli.EXIT_BAD_INPUT
+        assert cli.main(["parity", "--features", str(path)]) == cli.EXIT_BAD_INPUT
         assert name in capsys.readouterr().err.splitlines()[-1]

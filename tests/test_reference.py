@@ -22,7 +22,7 @@ import saccade
 from saccade import _saccade
 from saccade.errors import CheckpointError
 from saccade.reference import ActionHead, TimeDistribution, tables
-from saccade.reference.model import Attention
+from saccade.reference.attention import Attention
 from saccade.reference.random_weights import (
     CONFIGS,
     random_head,
@@ -465,7 +465,7 @@ def test_load_reads_int8_weights_as_what_they_stand_for(tmp_path: Path) -> None:
         {**tensors, f"{name}_scale": scales},
         {**quantised, f"{name}_scale": scales[1:]},
     ):
-        with pytest.raises(CheckpointError, match=r"to_k\.weight: expected an int8 matrix beside"):
+        with pytest.raises(CheckpointError, match=r"to_k\.weight: expected an int8 matrix with scales"):
             load(broken)
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 import saccade
 from saccade import cli
-from saccade.checkpoints import action_changes, convert, resize
+from saccade.checkpoints import convert, resize
+from saccade.comparison import action_changes
 from saccade.errors import CheckpointError, InputError
 
 TOKENS = "action_head.future_tokens.weight"
@@ -360,7 +361,7 @@ def test_the_command(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     out = str(tmp_path / "out")
     assert cli.main(["resize", str(source), "--num-future-tokens", "64", "--out", out]) == 0
     printed = capsys.readouterr().out
-    for part in ("32 future tokens are 64", "in saccade", "in other programs", "that is rounding"):
+    for part in ("64 future tokens (was 32)", "in saccade", "in other programs", "rounding"):
         assert part in printed
     options = ["--num-future-tokens", "8", "--out", out, "--features", str(features(tmp_path)), "--force"]
     assert cli.main(["resize", str(source), *options, "--json"]) == 0

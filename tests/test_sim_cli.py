@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import saccade.sim.rollout
+from saccade._intervals import wilson
 from saccade.cli import main
 from saccade.sim import graphics, report
 from saccade.sim.policy import DEMO_CHECKPOINT
@@ -34,7 +35,7 @@ def read(path: Path) -> dict[str, Any]:
 
 def test_rollout_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    arguments = ["--tasks", "button-press-topdown", "--episodes", "2", "--threads", "1", "--video"]
+    arguments = ["--tasks", "button-press-topdown", "--episodes", "2", "--num-threads", "1", "--video"]
     assert main(["rollout", *arguments, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "2/2" in printed
@@ -79,7 +80,7 @@ def test_the_same_seeds_give_the_same_episodes_with_torch(tmp_path: Path) -> Non
             "1",
             "--seed",
             "3",
-            "--threads",
+            "--num-threads",
             "1",
         ]
         assert main(["rollout", *arguments, "--out", str(out)]) == 0
@@ -107,7 +108,7 @@ def test_ctrl_c_keeps_what_is_done(
         "reach,push",
         "--episodes",
         "3",
-        "--threads",
+        "--num-threads",
         "1",
         "--video",
         "--out",
@@ -129,7 +130,17 @@ def test_ctrl_c_keeps_what_is_done(
 def test_json_prints_the_result_file_and_nothing_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--tasks", "reach", "--episodes", "1", "--json", "--threads", "1", "--out", str(tmp_path)]
+    arguments = [
+        "--tasks",
+        "reach",
+        "--episodes",
+        "1",
+        "--json",
+        "--num-threads",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(["rollout", *arguments, "--instruction-from", "window-open"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == read(tmp_path / "results.json")
@@ -140,23 +151,23 @@ def test_json_prints_the_result_file_and_nothing_else(
 CASES: list[tuple[Sequence[str], str]] = [
     (["rollout", "--tasks", "reach,fly"], "unknown name 'fly'"),
     (["rollout", "--tasks", ","], "expected at least one name"),
-    (["rollout", "--episodes", "0"], "episodes: given 0, expected at least 1"),
+    (["rollout", "--episodes", "0"], "--episodes: given 0, expected at least 1"),
     (["rollout", "--episodes", "-3"], "episodes: given -3"),
     (["rollout", "--seed", "1000000"], "evaluation seeds"),
-    (["rollout", "--threads", "0"], "--threads: given 0"),
+    (["rollout", "--num-threads", "0"], "--num-threads: given 0"),
     (["rollout", "--instruction-from", "fly"], "unknown name 'fly'"),
     (["rollout", "--checkpoint", "nowhere"], "nowhere: no such checkpoint"),
     (["demos", "--tasks", "fly"], "unknown name 'fly'"),
-    (["demos", "--count", "0"], "--count: given 0"),
+    (["demos", "--episodes", "0"], "--episodes: given 0"),
     (["demos", "--image-size", "2"], "--image-size: given 2"),
     (["demos", "--frame-stride", "0"], "--frame-stride: given 0"),
     (["train", "--demos", "nowhere"], "nowhere: no demonstrations there"),
-    (["train", "--demos", "nowhere", "--steps", "0"], "--steps: given 0"),
+    (["train", "--demos", "nowhere", "--training-steps", "0"], "--training-steps: given 0"),
     (["train", "--demos", "nowhere", "--num-future-tokens", "-1"], "--num-future-tokens: given -1"),
     (["train", "--demos", "nowhere", "--learning-rate", "nan"], "--learning-rate: given nan"),
     (["train", "--demos", "nowhere", "--absent-share", "1"], "--absent-share: given 1.0"),
     (["train", "--demos", "nowhere", "--start-from", "missing"], "missing: no policy there"),
-    (["train", "--demos", "nowhere", "--threads", "0"], "--threads: given 0"),
+    (["train", "--demos", "nowhere", "--num-threads", "0"], "--num-threads: given 0"),
 ]
 
 
@@ -209,9 +220,9 @@ def test_a_broken_checkpoint_is_one_line(tmp_path: Path, capsys: pytest.CaptureF
 def test_demos_then_train_as_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording, policy = str(tmp_path / "demos"), str(tmp_path / "policy")
     sizes = ["--image-size", "16", "--frame-stride", "8"]
-    assert main(["demos", "--out", recording, "--tasks", "reach", "--count", "1", *sizes]) == 0
+    assert main(["demos", "--out", recording, "--tasks", "reach", "--episodes", "1", *sizes]) == 0
     settings = [
-        "--steps",
+        "--training-steps",
         "2",
         "--batch-size",
         "2",
@@ -239,8 +250,8 @@ def test_demos_then_train_as_commands(tmp_path: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_wilson_interval(successes: int, trials: int, low: float, high: float) -> None:
-    np.testing.assert_allclose(report.wilson_interval(successes, trials), (low, high), atol=1e-5)
+    np.testing.assert_allclose(wilson(successes, trials), (low, high), atol=1e-5)
 
 
 def test_wilson_interval_of_nothing_is_everything() -> None:
-    assert report.wilson_interval(0, 0) == (0.0, 1.0)
+    assert wilson(0, 0) == (0.0, 1.0)

@@ -429,7 +429,7 @@ def test_description_tells_recordings_apart(recording: Path, tmp_path: Path) -> 
     ("options", "message"),
     [
         (["--alignment-weight", "0.2", "--num-future-tokens", "0"], "there is no row to align"),
-        (["--alignment-weight", "-1"], "--alignment-weight: given -1.0, expected a number from 0 on"),
+        (["--alignment-weight", "-1"], "--alignment-weight: given -1.0, expected at least 0"),
         (["--alignment-weight", "inf"], "--alignment-weight: given inf"),
     ],
 )

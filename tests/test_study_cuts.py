@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -10,19 +11,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
+from saccade import Intervention
 from saccade.checkpoints import read_tensors
 from saccade.cli import main
 from saccade.reference import ActionHead
 from saccade.sim import graphics
-from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Policy
+from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.study import closed_loop, cuts, patching
-from saccade.study.arguments import numbers
-from saccade.study.arms import ALL_ARMS, ARMS, episode_rng
-from saccade.study.loaded import head_of, learned_tokens
-from saccade.study.observations import Rollouts
-from saccade.study.tables import read_provenance, read_table
+from saccade.study.questions import cuts, patching
+from saccade.study.questions.cuts import ALL_ARMS, ARMS
+from saccade.study.simulator import Simulator, head_of
+from saccade.study.source import changed, episode_rng, unchanged
+from saccade.study.table import read_provenance, read_table
 
 CHECKPOINT = str(DEMO_CHECKPOINT)
 
@@ -90,10 +92,11 @@ def test_cuts_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_chunks_of_an_arm_are_those_of_the_reference() -> None:
     """The change of the chunk, with the head in torch and the cut of the whole group done by hand: N = 0."""
     policy = Policy.load(num_threads=1)
-    _, looks = closed_loop.unchanged_episode(CHECKPOINT, "rust", "button-press-topdown", 0)
-    look = looks[1]
-    unread = ARMS["future-unread"].intervention(learned_tokens(CHECKPOINT), episode_rng("push", 0))
-    change = closed_loop.chunk_change(policy, look, unread)
+    source = Simulator(CHECKPOINT, ("button-press-topdown",), range(1))
+    unread = ARMS["future-unread"].intervention(source.future_tokens, episode_rng("push", 0))
+    before = unchanged(source, "button-press-topdown", 0)
+    change = np.abs(changed(source, "button-press-topdown", 0, unread) - before.actions)[1, 0]
+    given = before.observations[1]
 
     reference = ActionHead.load(DEMO_CHECKPOINT)
     without = ActionHead.load(DEMO_CHECKPOINT)
@@ -101,12 +104,9 @@ def test_chunks_of_an_arm_are_those_of_the_reference() -> None:
     assert without.future_tokens.weight.shape[0] == 0
 
     def chunk(head: ActionHead) -> np.ndarray:
-        import torch
-
         with torch.no_grad():
-            vl_embs = head.encode(torch.from_numpy(look.features))
-            state, noise = torch.from_numpy(look.state), torch.from_numpy(look.noise)
-            actions = head.sample(vl_embs, state, EMBODIMENT_ID, noise=noise)[0].numpy()
+            vl_embs = head.encode(given.backbone_features)
+            actions = head.sample(vl_embs, given.state, 0, noise=given.noise)[0].numpy()  # type: ignore[arg-type]
         return np.clip(policy.config.action.restore(actions), -1.0, 1.0)
 
     np.testing.assert_allclose(change, np.abs(chunk(without) - chunk(reference)), atol=1e-5)
@@ -213,23 +213,18 @@ def test_patching_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     np.testing.assert_allclose(before, after, rtol=1e-3)
 
 
-def test_block_zero_of_the_future_rows_holds_vision_alone(tmp_path: Path) -> None:
+def test_block_zero_of_the_future_rows_holds_vision_alone() -> None:
     """I7: told the same words about the same picture there is nothing to follow."""
-    rollouts = Rollouts(CHECKPOINT, ("reach",), range(1))
-    work = patching.Work(CHECKPOINT, (0,), (0, 1, 2, 3))
-    donor, receiver = (work.see("reach", seed, "reach the green ball") for seed in (0, 0))
-    noise = Policy.load(num_threads=1).noise(np.random.default_rng(0))
-    head = head_of(rollouts.checkpoint)
-    trace = head.trace(
-        donor.context, 1.0 + donor.state, EMBODIMENT_ID, noise=-noise, record=("hidden",), blocks=0
-    )
+    source = Simulator(CHECKPOINT, ("reach",), range(1))
+    seen = source.first("reach", 0, "reach the green ball")
+    receiver = seen.with_noise(np.random.default_rng(0), source.config)
+    assert receiver.noise is not None
+    donor = dataclasses.replace(receiver, state=1.0 + seen.state, noise=-receiver.noise)
+    head = source.head()
+    trace = donor.trace(head, record=("hidden",), blocks=0)
     rows = {place: np.asarray(hidden)[0][trace.rows["future"]] for place, hidden in trace.hidden.items()}
-    from saccade import Intervention
-
-    patched = patching.chunk(
-        head, receiver, noise, Intervention(patch={place: {"future": row} for place, row in rows.items()})
-    )
-    np.testing.assert_allclose(patched, patching.chunk(head, receiver, noise, None), atol=1e-5)
+    patch = Intervention(patch={place: {"future": row} for place, row in rows.items()})
+    np.testing.assert_allclose(receiver.sample(head, intervention=patch), receiver.sample(head), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -237,22 +232,22 @@ def test_block_zero_of_the_future_rows_holds_vision_alone(tmp_path: Path) -> Non
     [
         (
             ("cuts", "--arms", "future-cut"),
-            "arms: unknown name 'future-cut', expected one of none, future-unread",
+            "--arms: unknown name 'future-cut', expected one of none, future-unread",
         ),
-        (("cuts", "--arms", ","), "--arms: expected at least one name"),
-        (("cuts", "--tasks", "juggle"), "task: unknown name 'juggle'"),
+        (("cuts", "--arms", ","), "--arms: expected at least one NAME"),
+        (("cuts", "--tasks", "juggle"), "--tasks: unknown name 'juggle'"),
         (("cuts", "--tasks", "two-goals"), "does not know two-goals"),
-        (("cuts", "--episodes", "0"), "episodes: given 0, expected at least 1"),
+        (("cuts", "--episodes", "0"), "--episodes: given 0, expected at least 1"),
         (("cuts", "--seed", "1000000"), "leaves the evaluation seeds"),
         (("cuts", "--checkpoint", "nowhere"), "nowhere: no such checkpoint directory"),
         (("cuts", "--jobs", "0"), "jobs: given 0"),
         (("cuts", "--backend", "dask"), "backend: unknown name 'dask', expected one of loky, ray"),
         (
             ("patching", "--kinds", "colour"),
-            "kinds: unknown name 'colour', expected one of layout, words, task",
+            "--kinds: unknown name 'colour', expected one of layout, words, task",
         ),
         (("patching", "--blocks", "4"), "--blocks: given 4, expected 0 to 3"),
-        (("patching", "--steps", "one"), "--steps: given 'one', expected numbers"),
+        (("patching", "--steps", "one"), "--steps: invalid int value: 'one'"),
         (("patching", "--seed", "999990", "--episodes", "9"), "leaves the evaluation seeds"),
         (("cut",), "invalid choice: 'cut'"),
         ((), "the following arguments are required: study"),
@@ -286,7 +281,3 @@ def test_arm_results_pair_by_task_and_seed() -> None:
     assert (blind.rate.value, blind.episodes) == (0.75, 4)
     assert blind.pairs is not None
     assert (blind.pairs.pairs, blind.pairs.only_first, blind.pairs.only_second) == (3, 1, 1)
-
-
-def test_numbers_of_the_command_line() -> None:
-    assert numbers("--blocks", "2, 0,2", 3) == (0, 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,18 @@ import saccade
 from saccade import InputError
 from saccade.bench import heads
 from saccade.cli import main
+from saccade.observation import Observation
 from saccade.reference import ActionHead as Reference
 from saccade.reference import random_weights
 from saccade.sim import graphics
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.study import fast, fast_report
-from saccade.study.fast_modes import (
+from saccade.study.questions import fast, fast_results, fast_times
+from saccade.study.questions.fast_engine import ModeEngine
+from saccade.study.questions.fast_modes import (
     INTEGRATORS,
     Calibration,
     Mode,
-    ModeEngine,
     best_times,
     cross_mass,
     even_times,
@@ -37,9 +39,11 @@ from saccade.study.fast_modes import (
     many_steps,
     sample,
 )
-from saccade.study.fast_report import BASELINE, LOSS, NO_LOSS, ONE_STEP, OPEN
-from saccade.study.statistics import holm, p_of_loss, paired_difference, tango
-from saccade.study.tables import read_provenance, read_table
+from saccade.study.questions.fast_results import BASELINE, ONE_STEP
+from saccade.study.questions.fast_section import section
+from saccade.study.section import Section
+from saccade.study.statistics import holm, p_of_loss, paired_difference, tango, verdict
+from saccade.study.table import Provenance, read_provenance, read_table
 
 Float64Array = npt.NDArray[np.float64]
 PLAIN = Calibration()
@@ -59,11 +63,11 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def observation(head: saccade.ActionHead, seed: int = 0) -> tuple[Any, ...]:
-    """Features, state, embodiment and noise for one look."""
+def observation(head: saccade.ActionHead, seed: int = 0) -> Observation:
+    """A single one with six vision-language tokens."""
     inputs = random_weights.random_inputs(head.config, seed, batch=1, num_vl_tokens=6)
-    features, state, noise = (inputs[name].numpy() for name in ("backbone_features", "state", "noise"))
-    return features, state, int(inputs["embodiment_id"][0]), noise
+    names = ("backbone_features", "state", "embodiment_id", "noise")
+    return Observation(*(inputs[name].numpy() for name in names))
 
 
 @pytest.mark.parametrize("name", [*fast.SCREENED, *fast.JUDGED, "bfloat16-euler-8-refresh-3-drop-10"])
@@ -155,32 +159,31 @@ def test_times_are_moved_to_where_the_error_is_least() -> None:
 
 def test_euler_by_hand_is_what_the_head_does(checkpoint: Path) -> None:
     head = saccade.ActionHead.load(checkpoint)
-    features, state, embodiment, noise = observation(head)
-    context = head.encode(features)
+    one = observation(head)
+    context = one.encode(head)
     for steps in (1, 3, 7):
-        whole = sample(head, Mode("float32", "euler", steps), PLAIN, context, state, embodiment, noise)
+        whole = sample(head, Mode("float32", "euler", steps), PLAIN, context, one)
         grid = Calibration(times=(even_times(steps),))
-        by_hand = sample(head, Mode("float32", "times", steps), grid, context, state, embodiment, noise)
+        by_hand = sample(head, Mode("float32", "times", steps), grid, context, one)
         np.testing.assert_allclose(by_hand, whole, rtol=0, atol=3e-6)
 
 
 @pytest.mark.parametrize("integrator", ["heun", "midpoint", "adams"])
 def test_integrators_against_the_reference_in_float64(checkpoint: Path, integrator: str) -> None:
     head, reference = saccade.ActionHead.load(checkpoint), Reference.load(checkpoint, dtype=torch.float64)
-    features, state, embodiment, noise = observation(head)
-    found = sample(
-        head, Mode("float32", integrator, 2), PLAIN, head.encode(features), state, embodiment, noise
-    )
+    one = observation(head)
+    found = sample(head, Mode("float32", integrator, 2), PLAIN, one.encode(head), one)
     with torch.no_grad():
-        vl_embs = reference.encode(features)
+        vl_embs = reference.encode(one.backbone_features)
 
         def velocity(x: Float64Array, bucket: int) -> Float64Array:
             tensor: Float64Array = reference.velocity(
-                vl_embs, state, embodiment, torch.from_numpy(x), bucket
+                vl_embs, one.state, int(one.embodiment_id[0]), torch.from_numpy(x), bucket
             ).numpy()
             return tensor
 
-        x = noise.astype(np.float64)
+        assert one.noise is not None
+        x = one.noise.astype(np.float64)
         first = velocity(x, 0)
         if integrator == "heun":
             x = x + 0.25 * (first + velocity(x + 0.5 * first, 500))
@@ -198,7 +201,9 @@ def test_integrators_against_the_reference_in_float64(checkpoint: Path, integrat
 @pytest.mark.parametrize("precision", ["bfloat16", "int8"])
 def test_a_mode_loads_its_precision(checkpoint: Path, precision: str) -> None:
     exact, lower = (saccade.ActionHead.load(checkpoint, precision=one) for one in ("float32", precision))
-    features, state, _, noise = observation(exact)
+    one = observation(exact)
+    features, state, noise = one.backbone_features, one.state, one.noise
+    assert noise is not None
     engine = ModeEngine(str(checkpoint), Mode.parse(f"{precision}-euler-4"), PLAIN)
     found = engine.sample(engine.encode(features), state, noise)
     np.testing.assert_array_equal(
@@ -213,13 +218,15 @@ def test_a_mode_loads_its_precision(checkpoint: Path, precision: str) -> None:
 @pytest.mark.parametrize("refresh", [2, 3])
 def test_refresh_against_the_reference_in_float64(checkpoint: Path, refresh: int) -> None:
     head, reference = saccade.ActionHead.load(checkpoint), Reference.load(checkpoint, dtype=torch.float64)
-    features, state, embodiment, noise = observation(head)
+    one = observation(head)
+    assert one.noise is not None
     mode = Mode.parse(f"float32-euler-4-refresh-{refresh}")
-    found = sample(head, mode, PLAIN, head.encode(features), state, embodiment, noise)
+    found = sample(head, mode, PLAIN, one.encode(head), one)
     with torch.no_grad():
+        vl_embs, embodiment = reference.encode(one.backbone_features), int(one.embodiment_id[0])
         expected, exact = (
             reference.sample(
-                reference.encode(features), state, embodiment, noise=noise, num_steps=4, future_refresh=every
+                vl_embs, one.state, embodiment, noise=one.noise, num_steps=4, future_refresh=every
             ).numpy()
             for every in (refresh, None)
         )
@@ -230,19 +237,20 @@ def test_refresh_against_the_reference_in_float64(checkpoint: Path, refresh: int
 def test_many_steps_come_closer_than_any_mode() -> None:
     """On the shipped policy: a random head's velocity jumps between buckets of time."""
     head = saccade.ActionHead.load(DEMO_CHECKPOINT)
-    rng = np.random.default_rng(0)
-    context = head.encode(rng.standard_normal((1, 57, head.config.context_dim), dtype=np.float32))
-    state, noise = np.zeros((1, 4), np.float32), rng.standard_normal((1, 16, 4), dtype=np.float32)
-    limit = head.sample(context, state, 0, noise=noise, num_steps=1000)
+    one = replace(
+        Observation.random(head.config, 57, np.random.default_rng(0)), state=np.zeros((1, 4), np.float32)
+    )
+    context = one.encode(head)
+    limit = one.sample(head, context, num_steps=1000)
 
     def error(found: Any) -> float:
         return float(np.abs(found - limit).mean())
 
     by_mode = [
-        error(sample(head, Mode("float32", integrator, 4), PLAIN, context, state, 0, noise))
+        error(sample(head, Mode("float32", integrator, 4), PLAIN, context, one))
         for integrator in ("euler", "midpoint", "adams")
     ]
-    assert error(many_steps(head, context, state, 0, noise)) < 0.35 * min(by_mode)
+    assert error(many_steps(head, context, one)) < 0.35 * min(by_mode)
 
 
 def test_tokens_with_the_least_attention_go_and_removed_ones_do_not_count() -> None:
@@ -256,8 +264,10 @@ def test_tokens_with_the_least_attention_go_and_removed_ones_do_not_count() -> N
 
 def test_a_dropping_mode_encodes_without_those_tokens(checkpoint: Path) -> None:
     head = saccade.ActionHead.load(checkpoint)
-    features, state, embodiment, noise = observation(head)
-    mass = cross_mass(head, head.encode(features), state, embodiment, noise)
+    one = observation(head)
+    features, state, noise = one.backbone_features, one.state, one.noise
+    assert noise is not None
+    mass = cross_mass(head, one.encode(head), one)
     assert mass.shape == (6,)
     assert mass.sum() == pytest.approx(1.0, abs=1e-5)
     engine = ModeEngine(
@@ -287,7 +297,13 @@ def outcomes(
     )
 
 
-def test_a_task_counts_only_if_one_step_fails_for_certain() -> None:
+def section_of(table: pd.DataFrame) -> Section:
+    """The report's section on a table of the simulator."""
+    checkpoint = {"name": "policy", "sha256": "ab" * 32, "num_future_tokens": 8, "num_layers": 4}
+    return section(table, Provenance("fast", {"checkpoint": checkpoint}, done=1, total=1))
+
+
+def test_a_task_counts_only_if_one_step_measurably_fails() -> None:
     table = pd.concat(
         [
             outcomes({BASELINE: lambda seed: seed % 10 > 0, ONE_STEP: lambda seed: seed % 10 > 4}),
@@ -299,9 +315,9 @@ def test_a_task_counts_only_if_one_step_fails_for_certain() -> None:
             outcomes({BASELINE: lambda seed: True}, task="two-goals"),
         ]
     )
-    found = {task: fast_report.counts(one) for task, one in fast_report.separations(table).items()}
+    found = {task: fast_results.counts(one) for task, one in fast_results.separations(table).items()}
     assert found == {"fork": True, "reach": False, "push": False}
-    lines = fast_report.gate_lines(fast_report.separations(table))
+    lines = section_of(table).concluded
     assert lines[0].startswith("fork counts: one Euler step against four: 50 against 90 %, -40.0 (")
     assert all("judges no mode" in line for line in lines[1:])
     assert len(lines) == 3
@@ -311,60 +327,79 @@ def test_no_mode_is_judged_where_no_task_counts() -> None:
     table = outcomes(
         {BASELINE: lambda seed: True, ONE_STEP: lambda seed: True, "int8-euler-4": lambda seed: False}
     )
-    results = fast_report.results_of(table)
-    assert all(one.verdict is None for one in results.values())
-    assert "no mode is judged" in fast_report.gate_lines(fast_report.separations(table))[-1]
-    assert fast_report.verdict_lines(results) == []
+    assert all(one.verdict is None for one in fast_results.results_of(table).values())
+    lines = section_of(table).concluded
+    assert lines[1:] == [
+        "No mode is judged: no task was shown to distinguish one step from four (float32-euler-1)."
+    ]
 
 
-def test_verdicts_and_the_frontier() -> None:
-    def timed(mode: str, milliseconds: float) -> dict[str, Any]:
-        return {
-            "part": "time", "task": "n1.5", "seed": 0, "mode": mode, "encode_ms": 1.0,
-            "sample_ms": milliseconds - 1.0, "chunk_ms": milliseconds, "chunk_ms_low": milliseconds,
-            "chunk_ms_high": milliseconds, "rounds": 5, "num_threads": 2, "isa": "avx2", "num_vl_tokens": 296,
-        }  # fmt: skip
+def timed(mode: str, milliseconds: float) -> dict[str, Any]:
+    return {
+        "part": "time", "task": "n1.5", "seed": 0, "mode": mode, "encode_ms": 1.0,
+        "sample_ms": milliseconds - 1.0, "chunk_ms": milliseconds, "chunk_ms_low": milliseconds,
+        "chunk_ms_high": milliseconds, "rounds": 5, "num_threads": 2, "isa": "avx2", "num_vl_tokens": 296,
+    }  # fmt: skip
 
+
+def test_verdicts_and_the_recommendation() -> None:
     rules: dict[str, Callable[[int], bool]] = {
         BASELINE: lambda seed: seed % 10 > 0,
         ONE_STEP: lambda seed: seed % 10 > 5,
         "int8-euler-4": lambda seed: seed % 10 > 0,  # the same episodes
         "bfloat16-euler-4": lambda seed: seed % 10 > 0 and seed != 11,  # as good, but slower than int8
         "float32-euler-2": lambda seed: seed % 10 > 1,  # 10 points less
-        "float32-heun-1": lambda seed: (seed * 7) % 10 > 0 if seed % 3 else seed % 10 > 0,  # the same rate
+        # 7 won and 18 lost: worse by its own interval, but not after Holm's correction.
+        "int8-euler-2": lambda seed: (seed % 10 > 0 or seed < 70) and not 101 <= seed < 120,
     }
     spent = {
         BASELINE: 100.0,
         ONE_STEP: 40.0,
         "int8-euler-4": 20.0,
+        "int8-euler-2": 10.0,
         "bfloat16-euler-4": 50.0,
         "float32-euler-2": 60.0,
     }
     table = pd.concat([outcomes(rules), pd.DataFrame([timed(*item) for item in spent.items()])])
-    results = fast_report.results_of(table)
+    results = fast_results.results_of(table)
     assert list(results) == [
-        ONE_STEP, "float32-euler-2", BASELINE, "float32-heun-1", "bfloat16-euler-4", "int8-euler-4"
+        ONE_STEP, "float32-euler-2", BASELINE, "bfloat16-euler-4", "int8-euler-2", "int8-euler-4"
     ]  # fmt: skip
-    verdicts = {name: one.verdict for name, one in results.items()}
-    assert verdicts.pop("float32-heun-1") in (OPEN, NO_LOSS)
-    assert verdicts == {
-        BASELINE: None,
-        ONE_STEP: None,
-        "int8-euler-4": NO_LOSS,
-        "bfloat16-euler-4": NO_LOSS,
-        "float32-euler-2": LOSS,
+    pairs = results["int8-euler-2"].pairs
+    assert pairs is not None
+    assert (pairs.only_first, pairs.only_second) == (7, 18)
+    assert {name: (one.verdict, one.significant) for name, one in results.items()} == {
+        BASELINE: (None, False),
+        ONE_STEP: (None, False),
+        "int8-euler-4": ("no worse", True),
+        "bfloat16-euler-4": ("no worse", True),
+        "float32-euler-2": ("worse", True),
+        "int8-euler-2": ("worse", False),
     }
-    assert fast_report.recommended(results) == ["int8-euler-4", "bfloat16-euler-4", BASELINE]
-    # Holm: four modes are judged, and the control of the gate is not one of them.
+    assert fast_results.recommended(results) == ["int8-euler-4", "bfloat16-euler-4", BASELINE]
+    # Holm: four modes are judged, and the control that decides which tasks count is not one of them.
     p_values = [one.pairs.p_value for name, one in results.items() if one.pairs and name != ONE_STEP]
     assert [one.p_value for one in results.values() if one.p_value is not None] == holm(p_values)
-    lines = fast_report.verdict_lines(results)
+    found = section_of(table)
     assert any(
-        line.startswith("int8-euler-4: loses less than 5 points, 0.0 (") and "0.20 of the time" in line
-        for line in lines
+        line.startswith("int8-euler-4: success: no worse, 0.0 points (")
+        and "0.20 of the baseline's time" in line
+        for line in found.concluded
     )
-    assert any(line.startswith("float32-euler-2: success is lower by 10.0 points") for line in lines)
-    assert lines[-1].endswith(f"lose less than 5 points: int8-euler-4, bfloat16-euler-4, {BASELINE}.")
+    assert any(line.startswith("float32-euler-2: success: worse, -10.0 points (") for line in found.concluded)
+    assert "Not significant after Holm's correction for 4 modes: int8-euler-2 (worse)." in found.concluded
+    assert found.concluded[-1] == (
+        "The fastest mode of each precision that is no worse, also after Holm's correction: "
+        f"int8-euler-4, bfloat16-euler-4, {BASELINE}."
+    )
+    # What is said of a mode and what the table of the report says agree with the interval.
+    grid = found.grids[0]
+    for row in grid.rows:
+        cells = dict(zip(grid.columns, row, strict=True))
+        difference = results[cells["mode"]].pairs
+        if cells["verdict"]:
+            assert difference is not None
+            assert cells["verdict"] == verdict(difference.difference)
 
 
 def test_no_loss_is_the_interval_that_excludes_it() -> None:
@@ -385,13 +420,13 @@ def test_one_episode_in_every_part(
 ) -> None:
     sized = heads.sized
     monkeypatch.setattr(heads, "sized", lambda size: sized("small"))
-    monkeypatch.setattr(fast, "FULL_TOKENS", 7)
-    monkeypatch.setattr(fast, "MOST_ROUNDS", 3)
+    monkeypatch.setattr(fast_times, "FULL_TOKENS", 7)
+    monkeypatch.setattr(fast_times, "MOST_ROUNDS", 3)
     monkeypatch.setattr(fast, "CALIBRATION_EPISODES", 1)
     modes = f"{ONE_STEP},float32-times-2,float32-euler-4-drop-50"
     arguments = ["--tasks", "reach", "--episodes", "1", "--modes", modes, "--out", str(tmp_path)]
     assert main(["study", "fast", *arguments]) == 0
-    assert "no mode is judged" in capsys.readouterr().out
+    assert "No mode is judged" in capsys.readouterr().out
     table = read_table(tmp_path / "fast.csv")
     names = {*modes.split(","), BASELINE}
     for part, task in (("chunks", "reach"), ("episodes", "reach"), ("time", "own"), ("time", "n1.5")):
@@ -450,14 +485,14 @@ def on_features(checkpoint: Path, file: Path, out: Path, *more: str) -> int:
 def test_features_of_a_file_against_the_reference(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(fast, "MOST_ROUNDS", 3)
+    monkeypatch.setattr(fast_times, "MOST_ROUNDS", 3)
     file = features_file(tmp_path)
     modes = "float32-euler-2,float32-times-2,float32-euler-4-drop-50"
     assert on_features(checkpoint, file, tmp_path / "out", "--modes", modes, "--seed", "4") == 0
     printed = capsys.readouterr().out
     assert "float32-euler-2: actions change by" in printed
-    assert "times what another noise changes" in printed
-    assert "of the time of a chunk (this checkpoint)" in printed
+    assert "times as much as with another noise" in printed
+    assert "of the baseline's time (this checkpoint)" in printed
     assert "Success: not measured, a file of features has no closed loop." in printed
 
     table = read_table(tmp_path / "out" / "fast.csv")
@@ -485,7 +520,7 @@ def test_features_of_a_file_against_the_reference(
     assert "episode 3" not in printed
     assert json.loads((tmp_path / "out" / "fast.json").read_text())["settings"]["features"]["episodes"] == 2
     assert main(["study", "report", str(tmp_path / "out")]) == 0
-    assert "from a file of features" in (tmp_path / "out" / "report.md").read_text()
+    assert "on recorded observations" in (tmp_path / "out" / "report.md").read_text()
 
 
 def test_one_episode_calibrates_nothing_and_removed_positions_stay_so(

@@ -17,9 +17,10 @@ import saccade
 from saccade.cli import main
 from saccade.reference import ActionHead
 from saccade.reference.random_weights import random_inputs, write_checkpoint
-from saccade.study import features, gradients
+from saccade.study import changes as changes_of_recordings
+from saccade.study import derivatives
 from saccade.study.statistics import bootstrap_ratio
-from saccade.study.tables import read_provenance, read_table
+from saccade.study.table import read_provenance, read_table
 
 EPISODES = [7, 7, 3, 3, 7]
 STUDIES = ("cuts", "patching", "gradients", "n-runtime")
@@ -103,7 +104,7 @@ def test_cuts_are_those_of_the_reference(tmp_path: Path, capsys: pytest.CaptureF
         assert by_arm.loc[("none", row), "chunk_change"] == 0.0
 
     # Intervals are drawn by episode: of five observations there are two.
-    unread = features.arm_changes(table, ["future-unread"])["future-unread"]
+    unread = changes_of_recordings.arm_changes(table, ["future-unread"])["future-unread"]
     values = table[table["arm"] == "future-unread"]["chunk_change"].to_numpy()
     assert unread.change == bootstrap_ratio(values, np.ones(5), EPISODES)
     assert "Only 2 independent observations or episodes" in printed
@@ -196,15 +197,14 @@ def test_gradients_are_those_of_all_projections_at_once(tmp_path: Path) -> None:
             ).sum(),
             leaf,
         )[0]
-        for stopped in ((), gradients.LEAVING_FUTURE)
+        for stopped in ((), derivatives.LEAVING_FUTURE)
     )
     row = table[(table["seed"] == 1) & (table["path"] == "direct") & table["share"].notna()].iloc[0]
     assert row["share"] == pytest.approx(float((direct * whole).sum() / (whole * whole).sum()), rel=1e-3)
     assert row["length"] == pytest.approx(float(direct.norm() / whole.norm()), rel=1e-3)
     shares = table[(table["seed"] == 1) & table["share"].notna()]["share"]
     assert shares.sum() == pytest.approx(1.0, abs=1e-4)
-    conditions = gradients.Conditions(2)
-    pairs = gradients.action_sensitivity(head, vl_embs, state, noise, cotangents, conditions)
+    pairs = derivatives.action_sensitivity(head, vl_embs, state, noise, cotangents, embodiment_id=2)
     future = table[(table["seed"] == 1) & (table["group"] == "future") & (table["block"] == 2)].iloc[0]
     assert future["norm"] == pytest.approx(float(pairs[3][0][1:5].square().mean().sqrt()), rel=1e-3)
     assert future["relative"] == pytest.approx(float(pairs[3][1][1:5].square().mean().sqrt()), rel=1e-3)
@@ -291,9 +291,9 @@ def test_arguments_that_mean_nothing(tmp_path: Path, capsys: pytest.CaptureFixtu
         ("patching", ("--kinds", "layout"), "--kinds: not with --features"),
         ("gradients", ("--looks", "3", "--demos", "x"), "--looks, --demos: not with --features"),
         ("n-runtime", ("--seed", "-1"), "--seed: given -1"),
-        ("n-runtime", ("--sizes", "4"), "expected 1 to 3"),
+        ("n-runtime", ("--num-future-tokens", "4"), "expected 1 to 3"),
         ("patching", ("--blocks", "4"), "expected 0 to 3"),
-        ("probes", (), "this study asks for what only the simulator knows"),
+        ("probes", (), "this study needs what only the simulator knows"),
     ):
         assert study(name, checkpoint, file, tmp_path / "out", *arguments) == 2
         assert message in capsys.readouterr().err

@@ -14,10 +14,11 @@ from saccade.cli import main
 from saccade.reference import ActionHead, random_weights
 from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
-from saccade.study import gradients
+from saccade.study import derivatives
 from saccade.study.arms import NO_TOKENS
-from saccade.study.gradients import ALL_PATHS, DETOUR, DIRECT, PATHS, READ
-from saccade.study.tables import read_provenance, read_table
+from saccade.study.paths import ALL_PATHS, DETOUR, DIRECT, PATHS, READ
+from saccade.study.questions import gradients
+from saccade.study.table import read_provenance, read_table
 
 TASK = "button-press-topdown"
 
@@ -48,7 +49,7 @@ def cotangents(head: ActionHead, count: int, seed: int = 0) -> Tensor:
 def test_the_paths_add_up_to_the_whole_derivative(case: tuple[ActionHead, Tensor, Tensor, Tensor]) -> None:
     head, vl_embs, state, noise = case
     chosen = cotangents(head, 3)
-    parts = gradients.path_derivatives(head, vl_embs, state, noise, chosen)
+    parts = derivatives.path_derivatives(head, vl_embs, state, noise, chosen)
     assert all(part.abs().max() > 0 for part in parts.values())
 
     # The whole against central differences along a random direction.
@@ -80,12 +81,12 @@ def test_shares_of_known_parts() -> None:
     along, across = torch.zeros(2, 3, 4), torch.zeros(2, 3, 4)
     along[..., 0], across[..., 1] = 1.0, 1.0
     parts = {DIRECT: 3 * along, READ: along + across, DETOUR: -across, ALL_PATHS: 4 * along}
-    found = gradients.shares(parts)
+    found = derivatives.shares(parts)
     assert found.share == pytest.approx({DIRECT: 0.75, READ: 0.25, DETOUR: 0.0})
     assert found.length == pytest.approx({DIRECT: 0.75, READ: math.sqrt(2) / 4, DETOUR: 0.25})
     assert found.cosine[DIRECT, READ] == pytest.approx(math.sqrt(0.5))
     assert found.cosine[DIRECT, DETOUR] == 0.0
-    nothing = gradients.shares({**parts, DETOUR: 0 * along, READ: along})
+    nothing = derivatives.shares({**parts, DETOUR: 0 * along, READ: along})
     assert math.isnan(nothing.cosine[READ, DETOUR])
 
 
@@ -95,9 +96,9 @@ def test_random_projections_estimate_the_frobenius_norms(
     head, vl_embs, state, noise = case
     outputs = head.config.action_horizon * head.config.action_dim
     every = torch.eye(outputs, dtype=torch.float64).view(outputs, head.config.action_horizon, -1)
-    exact = gradients.shares(gradients.path_derivatives(head, vl_embs, state, noise, every))
+    exact = derivatives.shares(derivatives.path_derivatives(head, vl_embs, state, noise, every))
     drawn = cotangents(head, 64, seed=3)
-    estimated = gradients.shares(gradients.path_derivatives(head, vl_embs, state, noise, drawn))
+    estimated = derivatives.shares(derivatives.path_derivatives(head, vl_embs, state, noise, drawn))
     assert sum(exact.share.values()) == pytest.approx(1.0)
     for path in PATHS:
         assert estimated.length[path] == pytest.approx(exact.length[path], abs=0.15)
@@ -107,7 +108,7 @@ def test_random_projections_estimate_the_frobenius_norms(
 def test_sensitivity_of_learned_tokens_is_autograd_s(case: tuple[ActionHead, Tensor, Tensor, Tensor]) -> None:
     head, vl_embs, state, noise = case
     chosen = cotangents(head, 1)
-    measured = gradients.action_sensitivity(head, vl_embs, state, noise, chosen)
+    measured = derivatives.action_sensitivity(head, vl_embs, state, noise, chosen)
     assert len(measured) == head.config.num_layers + 1
     tokens = head.future_tokens.weight
     actions = head.sample(vl_embs, state, 0, noise=noise)
@@ -135,7 +136,7 @@ def test_sensitivity_after_a_block_is_that_of_a_patch(
     direction = torch.randn(
         head.config.width, generator=torch.Generator().manual_seed(5), dtype=torch.float64
     )
-    measured = gradients.Nudges(head, 1)
+    measured = derivatives.Nudges(head, 1)
     with measured.applied():
         actions = head.sample(vl_embs, state, 0, noise=noise)
     derivative = measured.derivatives((actions * chosen).sum())[block + 1][0, row]
@@ -163,7 +164,7 @@ def test_sensitivity_of_the_loss_is_autograd_s(case: tuple[ActionHead, Tensor, T
     mask[:, 3:] = 0.0
     draws = 4
     generator = torch.Generator().manual_seed(0)
-    measured = gradients.loss_sensitivity(head, features, state, actions, mask, generator, draws)
+    measured = derivatives.loss_sensitivity(head, features, state, actions, mask, generator, draws)
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(draws, *actions.shape[1:], generator=generator, dtype=torch.float64)
     time = head.sample_time(draws, generator)

@@ -17,11 +17,11 @@ from saccade.cli import main
 from saccade.reference import ActionHead
 from saccade.sim import graphics
 from saccade.sim.policy import DEMO_CHECKPOINT
-from saccade.study import probes
-from saccade.study.loaded import environment_of, head_of, policy_of
-from saccade.study.observations import record_looks
-from saccade.study.probes import PROPRIO, VL, Frames
-from saccade.study.tables import read_provenance, read_table
+from saccade.study import linear_probes
+from saccade.study.linear_probes import PROPRIO, VL, Frames
+from saccade.study.questions import probes
+from saccade.study.simulator import environment_of, head_of, policy_of, record_episode
+from saccade.study.table import read_provenance, read_table
 
 CHECKPOINT = str(DEMO_CHECKPOINT)
 TASK = "reach"
@@ -66,7 +66,10 @@ def known_frames(noise: float) -> Frames:
 
 
 def test_known_shares_are_found_and_controls_fail() -> None:
-    rows = {(row["rows"], row["block"]): row for row in probes.probe(known_frames(noise=1.0), dimensions=32)}
+    rows = {
+        (row["rows"], row["block"]): row
+        for row in linear_probes.probe(known_frames(noise=1.0), dimensions=32)
+    }
     assert {row["target"] for row in rows.values()} == {"goal"}  # what never moves is left out
     # Half of the variance is in the rows; the offset between tasks does not count.
     assert rows["vl_embs", -1]["r2"] == pytest.approx(0.5, abs=0.08)
@@ -91,12 +94,12 @@ def test_penalties_are_those_of_sklearn_s_search() -> None:
     easy = values[:, :3] + 0.1 * rng.standard_normal((len(episodes), 3))
     hopeless = rng.standard_normal((len(episodes), 1))
     owners = np.array([0, 0, 0, 1])
-    found = probes.best_penalties(values, np.concatenate((easy, hopeless), axis=1), owners, episodes)
+    found = linear_probes.best_penalties(values, np.concatenate((easy, hopeless), axis=1), owners, episodes)
     for penalty, target in zip(found, (easy, hopeless), strict=True):
         search = GridSearchCV(
             Ridge(),
-            {"alpha": probes.PENALTIES},
-            cv=GroupKFold(probes.INNER_FOLDS),
+            {"alpha": linear_probes.PENALTIES},
+            cv=GroupKFold(linear_probes.INNER_FOLDS),
             scoring="neg_mean_squared_error",
         )
         assert penalty == search.fit(values, target, groups=episodes).best_params_["alpha"]
@@ -109,7 +112,7 @@ def test_shuffled_targets_come_from_another_episode_of_the_task_look_by_look() -
     tasks = np.array([0, 0, 1, 1])[episodes]
     looks = np.concatenate([np.arange(length) for length in lengths])
     targets = {"goal": np.stack([episodes, looks], axis=1).astype(float)}
-    found = probes.shuffled_targets(Frames(episodes, tasks, {}, targets), seed=0)["goal"]
+    found = linear_probes.shuffled_targets(Frames(episodes, tasks, {}, targets), seed=0)["goal"]
     assert found.tolist() == [
         [1, 0], [1, 0], [1, 0],
         [0, 0],
@@ -124,20 +127,23 @@ def test_errors_are_held_out_by_episode() -> None:
     named = np.eye(30)[episodes]
     target = rng.standard_normal((30, 1))[episodes]
     frames = Frames(episodes, tasks, {PROPRIO: named, VL: named}, {"goal": target})
-    for row in probes.probe(frames, dimensions=30):
+    for row in linear_probes.probe(frames, dimensions=30):
         assert row["r2"] < 0.05
 
 
 def test_frames_are_the_rows_of_the_reference(tmp_path: Path) -> None:
-    _, looks = record_looks(environment_of(CHECKPOINT, TASK), policy_of(CHECKPOINT), 0)
-    looks, step = looks[:2], 2
-    frames = probes.frames_of(head_of(CHECKPOINT), looks, step)
+    recorded, step = record_episode(environment_of(CHECKPOINT, TASK), policy_of(CHECKPOINT), 0), 2
+    frames = probes.frames_of(head_of(CHECKPOINT), recorded, step)
     head = ActionHead.load(CHECKPOINT, dtype=torch.float64)
-    for number, look in enumerate(looks):
+    for number, look in list(enumerate(recorded.observation.rows()))[:2]:
+        assert look.noise is not None
         with torch.no_grad():
-            vl_embs = head.encode(look.features)
+            vl_embs = head.encode(look.backbone_features)
             trace = head.trace(vl_embs, look.state, 0, noise=look.noise, record=("hidden",), steps=[step])
-        expected = {VL: vl_embs[0].flatten(), ("features", -1, "mean"): look.features[0].mean(axis=0)}
+        expected = {
+            VL: vl_embs[0].flatten(),
+            ("features", -1, "mean"): look.backbone_features[0].mean(axis=0),
+        }
         for block in range(head.config.num_layers):
             rows = trace.hidden[step, block][0]
             expected["state", block, "all"] = rows[0]
@@ -145,18 +151,19 @@ def test_frames_are_the_rows_of_the_reference(tmp_path: Path) -> None:
             expected["action", block, "all"] = rows[trace.rows["action"]].flatten()
         for source, values in expected.items():
             np.testing.assert_allclose(frames.inputs[source][number], values, rtol=1e-3, atol=1e-3)
-        np.testing.assert_array_equal(frames.targets["goal"][number], look.goal)
+        np.testing.assert_array_equal(frames.targets["goal"][number], recorded.privileged.goal[number])
     assert ("state", 0, "mean") not in frames.inputs  # one token is its own mean
 
-    probes.save_frames(frames, tmp_path / "frames.npz")
-    loaded = probes.load_frames(tmp_path / "frames.npz")
+    linear_probes.save_frames(frames, tmp_path / "frames.npz")
+    loaded = linear_probes.load_frames(tmp_path / "frames.npz")
     assert loaded.inputs.keys() == frames.inputs.keys()
     for source, values in frames.inputs.items():
         np.testing.assert_array_equal(loaded.inputs[source], values)
-    both = probes.join([frames, loaded], [3, 1])
-    assert both.episodes.tolist() == [0, 0, 1, 1]
-    assert both.tasks.tolist() == [3, 3, 1, 1]
-    np.testing.assert_array_equal(both.targets["hand"][2:], frames.targets["hand"])
+    both = linear_probes.join([frames, loaded], [3, 1])
+    count = len(frames.episodes)
+    assert both.episodes.tolist() == [0] * count + [1] * count
+    assert both.tasks.tolist() == [3] * count + [1] * count
+    np.testing.assert_array_equal(both.targets["hand"][count:], frames.targets["hand"])
 
 
 def test_the_study_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

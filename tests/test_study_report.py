@@ -5,6 +5,9 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,13 +17,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from saccade._files import sha256_of
 from saccade.cli import main
 from saccade.errors import InputError
-from saccade.sim.files import sha256_of
-from saccade.study import STUDIES, cuts, patching
-from saccade.study.arms import ARMS
+from saccade.study.questions import cuts, patching
+from saccade.study.questions.cuts import ARMS
 from saccade.study.report import write_report
-from saccade.study.tables import (
+from saccade.study.study import STUDIES
+from saccade.study.table import (
     Provenance,
     read_provenance,
     read_table,
@@ -144,14 +148,13 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
 
     # 20 against 10 of 20: 0 won, 10 lost. Newcombe's and Tango's limits both lie near -0.70 and -0.28.
     label = ARMS["future-unread"].label
-    assert f"{label}: success is lower by 50.0 points" in parsed.text
+    assert f"{label}: success: worse, -50.0 points (-70.1 to -25.8)" in parsed.text
     assert "10/20" in parsed.text
     assert "10 / 0" in parsed.text
     assert "0.002" in parsed.text  # McNemar, two-sided: 2 / 2**10
-    # The same result in both arms of 20 pairs leaves 16 points open either way, so equality is not claimed.
-    assert (
-        f"{ARMS['future-blind'].label}: no effect on success was found; a loss of up to 16.1" in parsed.text
-    )
+    # Equal results in 20 pairs do not exclude a difference of 16 points, so equality is not claimed.
+    label = ARMS["future-blind"].label
+    assert f"{label}: success: undecided, 0.0 points (-16.1 to 16.1)" in parsed.text
     assert "as it must be" in parsed.text
     assert f"{ARMS['rows-blind'].label}: not measured, the checkpoint has no future tokens." in parsed.text
     # The change of the chunk: mean of 0.10 ... 0.19 by hand.
@@ -168,7 +171,7 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
         assert f"{STUDIES[name][1][1:]} (not measured)" in parsed.text
 
     text = markdown.read_text(encoding="utf-8")
-    pictures = re.findall(r"\]\((.*?)\)", text)
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert len(pictures) == sum(one.startswith("data:image/svg") for one in parsed.found) == 5
     for picture in pictures:
         with Image.open(tmp_path / picture) as image:
@@ -184,13 +187,11 @@ def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_p
         rows.append(cut_row("push", seed, "future-blind", seed >= 6, 0.1))
         rows += [cut_row("push", seed, arm, True, 0.1) for arm in ("future-alone", "future-zeroed")]
     write_study(tmp_path, "cuts", rows, {"engine": "rust"})
-    section = cuts.section(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
+    section = cuts.Cuts.summarise(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
     line = next(line for line in section.concluded if line.startswith(ARMS["future-blind"].label))
     # McNemar: 2 / 2**6 = 0.031; of three arms, 0.094.
-    assert "lower by 8.0 points" in line
-    assert (
-        "no finding after correction for the arms compared (Holm, p = 0.094); by itself, success is" in line
-    )
+    assert "success: worse, -8.0 points" in line
+    assert "(Holm, p = 0.094)" in line
 
 
 def test_report_is_made_from_the_tables_alone_and_always_alike(tmp_path: Path) -> None:
@@ -220,16 +221,16 @@ def test_half_finished_and_empty_studies_say_so(tmp_path: Path) -> None:
     write_study(tmp_path, "patching", [], {"blocks": [0], "steps": [0]}, done=0, total=40)
     text = parse(write_report(tmp_path)[0]).text
     assert "Unfinished: 100 of 120 cells are done" in text
-    assert "1 failed in the last run, the first of them reach 3 none: ValueError: no picture" in text
+    assert "1 cell failed in the last run. The first is reach 3 none: ValueError: no picture" in text
     assert "Unfinished: 0 of 40 cells are done" in text
-    assert "Not measured: no cell is done yet." in text
+    assert f"{STUDIES['patching'][1][1:]}\n\nUnfinished: 0 of 40 cells are done.\n\nNot measured." in text
 
 
 def test_arms_without_a_partner_are_not_compared(tmp_path: Path) -> None:
     """A half-finished table in which an arm has episodes that the unchanged policy has not yet run."""
     rows = [cut_row("push", 0, "none", True, 0.0), cut_row("push", 1, "future-blind", False, 0.1)]
     write_study(tmp_path, "cuts", rows, {"engine": "rust"}, done=2, total=4)
-    section = cuts.section(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
+    section = cuts.Cuts.summarise(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
     assert all("lower" not in line and "no effect" not in line for line in section.concluded)
     write_report(tmp_path)
 
@@ -244,6 +245,33 @@ def test_attention_sheets_are_put_in(tmp_path: Path) -> None:
     assert f"data:image/png;base64,{data}" in parse(page).found
     assert "attention/push/page.html" in parse(page).text
     assert "(attention/push/sheet.png)" in markdown.read_text()
+
+
+WITHOUT_A_SIMULATOR = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("mujoco", "metaworld", "gymnasium", "OpenGL", "imageio"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from saccade.cli import main
+status = main(["study", "report", sys.argv[1]])
+sys.exit(status)
+"""
+
+
+def test_the_report_of_every_study_needs_no_simulator(tmp_path: Path) -> None:
+    committed = Path(__file__).parent.parent / "studies"
+    for name in STUDIES:
+        for folder in (committed / "first", committed / "fast"):
+            for file in folder.glob(f"{name}.*"):
+                shutil.copy(file, tmp_path / file.name)
+    command = [sys.executable, "-c", WITHOUT_A_SIMULATOR, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").count("(not measured)") == 2  # tvl, vlsa
 
 
 def test_names_are_escaped(tmp_path: Path) -> None:
@@ -281,7 +309,7 @@ def test_bad_directories_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
         return error
 
     assert "no such directory" in refused(tmp_path / "nowhere")
-    assert "holds no study; expected a table such as cuts.csv" in refused(tmp_path)
+    assert "contains no study; expected a table such as cuts.csv" in refused(tmp_path)
     write_study(tmp_path, "cuts", [{"task": "push", "seed": 1}], {"engine": "rust"})
     assert "cuts.csv: not written by this study: 'arm' is missing" in refused(tmp_path)
     write_cuts(tmp_path, table_sha256=None)

@@ -22,12 +22,12 @@ from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.study import resized, sweeps, sweeps_report, trained
-from saccade.study.loaded import learned_tokens
+from saccade.study.questions import resized, sweeps, sweeps_cost, sweeps_results, sweeps_runs
+from saccade.study.questions.sweeps import FutureTokens, VlSelfAttention, VlTokens
+from saccade.study.questions.sweeps_results import PLAIN
+from saccade.study.run import run
 from saccade.study.statistics import paired_difference
-from saccade.study.sweeps import TVL, VLSA, N
-from saccade.study.sweeps_report import PLAIN
-from saccade.study.tables import read_provenance, read_table
+from saccade.study.table import read_provenance, read_table
 
 TASK = "button-press-topdown"
 TINY = train.TrainingSettings(
@@ -35,6 +35,7 @@ TINY = train.TrainingSettings(
 )
 
 
+NAMES = FutureTokens.varied.names
 RUNS: dict[str, dict[str, Any]] = {
     "n2-seed0": {"num_future_tokens": 2},
     "n2-seed1": {"num_future_tokens": 2, "seed": 1},
@@ -56,7 +57,7 @@ def quick() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "plot_history", lambda history, path: None)
         patch.setattr(train, "VALIDATION_FRAMES", 2)
-        patch.setattr(sweeps, "ROUNDS", 3)
+        patch.setattr(sweeps_cost, "ROUNDS", 3)
         yield
 
 
@@ -97,10 +98,10 @@ def test_a_sweep_over_trained_policies(
     arguments = ["--policies", str(policies), "--episodes", "1", "--out", str(tmp_path)]
     assert study("n", *arguments) == 0
     printed = capsys.readouterr()
-    assert printed.err.startswith("What these runs can detect, with 80 % power at the 5 % level:")
-    assert "N = 4 against N = 2. These policies: success: too few episodes" in printed.out
-    assert "N = 4, aligned (0.2) against N = 4." in printed.out
-    assert "N = 4, aligned (0.2) against N = 2." not in printed.out  # differs in two respects
+    assert printed.err.startswith("Detectable with 80 % power at the 5 % level:")
+    assert "N = 4 compared with N = 2. These policies: success: undecided, too few episodes" in printed.out
+    assert "N = 4, aligned (0.2) compared with N = 4." in printed.out
+    assert "N = 4, aligned (0.2) compared with N = 2." not in printed.out  # differs in two respects
     table: Any = read_table(tmp_path / "n.csv")
     provenance = read_provenance(tmp_path / "n.json")
     assert provenance.complete
@@ -132,7 +133,7 @@ def test_a_sweep_over_trained_policies(
     assert cost.loc["n4-seed0", "head_bytes"] == head.nbytes
     assert cost.loc["n4-seed0", "context_bytes"] == cost.loc["n2-seed0", "context_bytes"]
 
-    section = N.section(table, provenance)
+    section = FutureTokens.summarise(table, provenance)
     assert [grid.caption.split(":")[0] for grid in section.grids][:1] == ["Every policy"]
     assert len(section.grids) == 4
     # The same command again does nothing but read.
@@ -142,9 +143,18 @@ def test_a_sweep_over_trained_policies(
 
 
 def test_a_sweep_that_trains(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--demos", str(recording), "--patch-size", "8,16", "--training-seeds", "0", "--steps", "1"]
+    arguments = [
+        "--demos",
+        str(recording),
+        "--patch-size",
+        "8,16",
+        "--training-seeds",
+        "0",
+        "--training-steps",
+        "1",
+    ]
     assert study("tvl", *arguments, "--episodes", "1", "--out", str(tmp_path)) == 0
-    assert "trained anew: no interval, with 1 and 1 runs" in capsys.readouterr().out
+    assert "Over training runs (1 and 1): no interval." in capsys.readouterr().out
     table: Any = read_table(tmp_path / "tvl.csv")
     assert list(table[table["kind"] == "training"]["policy"]) == [
         "patch-size-16-seed-0",
@@ -152,18 +162,18 @@ def test_a_sweep_that_trains(recording: Path, tmp_path: Path, capsys: pytest.Cap
     ]
     cost = table[table["kind"] == "cost"].set_index("patch_size")
     assert cost.loc[8, "num_vl_tokens"] - cost.loc[16, "num_vl_tokens"] == 3  # 4 patches instead of 1
-    section = TVL.section(table, read_provenance(tmp_path / "tvl.json"))
+    section = VlTokens.summarise(table, read_provenance(tmp_path / "tvl.json"))
     assert "1 cameras, 16 px, patches of 8 px" in section.grids[0].rows[0][0]
 
 
 def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path) -> None:
-    runs = trained.find_runs([policies], N.varied)
-    sweeps.check_comparable(runs, N)
+    runs = sweeps_runs.find_runs([policies], NAMES)
+    FutureTokens.check_comparable(runs)
     assert [run.name for run in runs[:2]] == ["n2-seed0", "n2-seed1"]
     with pytest.raises(
         InputError, match=r"alignment_weight: .*\. num_future_tokens: 2 \(n2-seed0, n2-seed1\); 4 \("
     ):
-        sweeps.check_comparable(trained.find_runs([policies], VLSA.varied), VLSA)
+        VlSelfAttention.check_comparable(sweeps_runs.find_runs([policies], VlSelfAttention.varied.names))
 
     mixed = tmp_path / "mixed"
     shutil.copytree(policies, mixed)
@@ -171,11 +181,11 @@ def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path
     changed |= {"learning_rate": 0.5, "demonstrations": {**changed["demonstrations"], "sha256": "other"}}
     (mixed / "n4-seed0" / "settings.json").write_text(json.dumps(changed))
     with pytest.raises(InputError, match=r"learning_rate: .* 0.5 \(n4-seed0\)\. demonstrations: .*other"):
-        sweeps.check_comparable(trained.find_runs([mixed], N.varied), N)
+        FutureTokens.check_comparable(sweeps_runs.find_runs([mixed], NAMES))
     shutil.copytree(policies / "n2-seed0", mixed / "again")
     shutil.rmtree(mixed / "n4-seed0")
     with pytest.raises(InputError, match="again and n2-seed0 are the same point with the same seed"):
-        sweeps.check_comparable(trained.find_runs([mixed], N.varied), N)
+        FutureTokens.check_comparable(sweeps_runs.find_runs([mixed], NAMES))
 
 
 def test_a_run_in_training_is_not_measured(policies: Path, tmp_path: Path) -> None:
@@ -189,16 +199,17 @@ def test_a_run_in_training_is_not_measured(policies: Path, tmp_path: Path) -> No
     provenance = read_provenance(tmp_path / "n.json")
     assert not provenance.complete
     assert set(table[table["kind"] == "episode"]["policy"]) == {"n2-seed0"}
-    concluded = N.section(table, provenance).concluded
+    concluded = FutureTokens.summarise(table, provenance).concluded
     assert "n4-seed0: not measured, in training, step 1 of 2." in concluded
-    assert "Only N = 2 was measured: nothing to compare." in concluded
+    assert "Only N = 2 was measured, so there is nothing to compare." in concluded
 
 
 def test_equal_mass_is_repeated_tokens() -> None:
     """Tokens with the weight of twice as many are each token twice (spec, I2)."""
     head, context, state = shipped()
-    tokens = learned_tokens(str(DEMO_CHECKPOINT))
-    twice = resized.resized(resized.TWICE, tokens, np.random.default_rng(0))
+    tokens = head.future_tokens
+    assert tokens is not None
+    twice = resized.repeated(tokens)
     plain, heavier, repeated = (
         np.asarray(head.sample(context, state, 0, seed=1, intervention=change))
         for change in (None, sweeps.equal_mass(len(tokens), 2 * len(tokens)), twice)
@@ -210,15 +221,15 @@ def test_equal_mass_is_repeated_tokens() -> None:
 def test_difference_between_runs_is_student_s() -> None:
     first, second = [0.3, 0.4], [0.55, 0.7]
     expected = stats.ttest_ind(second, first, equal_var=True).confidence_interval()
-    found = sweeps_report.between_runs(first, second, episodes=1000)
+    found = sweeps_results.between_runs(first, second, episodes=1000)
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
     assert found.value == pytest.approx(0.275)
     # Runs that happen to agree still vary by their episodes.
-    agreeing = sweeps_report.between_runs([0.5, 0.5], [0.5, 0.5], episodes=100)
+    agreeing = sweeps_results.between_runs([0.5, 0.5], [0.5, 0.5], episodes=100)
     half = stats.t.ppf(0.975, 2) * math.sqrt(2 * 0.25 / 100 / 2)
     assert (agreeing.low, agreeing.high) == pytest.approx((-half, half))
-    assert math.isnan(sweeps_report.between_runs([0.5], [0.2, 0.3], episodes=100).low)
-    assert math.isnan(sweeps_report.between_runs([1.0, 1.0], [1.0, 1.0], episodes=100).low)
+    assert math.isnan(sweeps_results.between_runs([0.5], [0.2, 0.3], episodes=100).low)
+    assert math.isnan(sweeps_results.between_runs([1.0, 1.0], [1.0, 1.0], episodes=100).low)
 
 
 def test_difference_of_these_policies_is_paired() -> None:
@@ -232,19 +243,19 @@ def test_difference_of_these_policies_is_paired() -> None:
         )
 
     alternating = [True, False] * 10
-    found = sweeps_report.same_policies(rows([alternating] * 2), rows([[True] * 20, alternating]))
+    found = sweeps_results.same_policies(rows([alternating] * 2), rows([[True] * 20, alternating]))
     assert found.value == 0.25
     assert 0.04 < found.low < 0.25 < found.high < 0.48
     # Policies that agree in all of twenty episodes may differ in the twenty-first: z^2 / (n + z^2).
-    agreeing = sweeps_report.same_policies(rows([alternating] * 2), rows([alternating] * 2))
+    agreeing = sweeps_results.same_policies(rows([alternating] * 2), rows([alternating] * 2))
     assert agreeing.high == pytest.approx(1.959964**2 / (20 + 1.959964**2))
     assert agreeing.low == -agreeing.high
     # One run a point, one episode lost: Tango's interval, which does not exclude a loss of 5 points.
-    lost = sweeps_report.same_policies(rows([[True] * 100]), rows([[False] + [True] * 99]))
+    lost = sweeps_results.same_policies(rows([[True] * 100]), rows([[False] + [True] * 99]))
     known = paired_difference([False] + [True] * 99, [True] * 100).difference
     assert (lost.low, lost.high) == pytest.approx((known.low, known.high))
     assert lost.low < -0.05
-    few = sweeps_report.same_policies(rows([[True] * 9]), rows([[False] * 9]))
+    few = sweeps_results.same_policies(rows([[True] * 9]), rows([[False] * 9]))
     assert (few.value, math.isnan(few.low), math.isnan(few.high)) == (-1.0, True, True)
 
 
@@ -252,9 +263,9 @@ def test_policies_with_episodes_missing_are_left_out() -> None:
     plain = pd.DataFrame(
         {"policy": ["one"] * 3 + ["other"] * 2, "task": ["a", "a", "b", "a", "b"], "seed": [0, 1, 0, 0, 0]}
     )
-    assert sweeps_report.whole_runs(plain) == (["one"], ["other: left out, 2 of 3 episodes are done."])
+    assert sweeps_results.complete_policies(plain) == (["one"], [("other", 2, 3)])
     other_tasks = plain.assign(task=["a", "a", "a", "b", "b"])
-    assert sweeps_report.whole_runs(other_tasks)[0] == []
+    assert sweeps_results.complete_policies(other_tasks)[0] == []
 
 
 def test_one_directory_holds_policies_that_may_be_compared(policies: Path, tmp_path: Path) -> None:
@@ -267,27 +278,21 @@ def test_one_directory_holds_policies_that_may_be_compared(policies: Path, tmp_p
     changed = json.loads((second / "n4-seed0" / "settings.json").read_text())
     (second / "n4-seed0" / "settings.json").write_text(json.dumps({**changed, "batch_size": 3}))
     with pytest.raises(InputError, match="other settings"):
-        N.run(
-            sweeps.Settings((str(second),), (), (TASK,), range(1)),
-            tmp_path / "out",
-            backend="loky",
-            jobs=1,
-            on_done=lambda finished, done, total: None,
-        )
+        run(FutureTokens({"n4-seed0": second / "n4-seed0"}, {}, (TASK,), range(1)), tmp_path / "out")
 
 
 def test_what_is_merged_and_drawn() -> None:
     rng = np.random.default_rng(0)
     two = rng.standard_normal((2, 6)).astype(np.float32)
-    tokens = two[[0, 1, 0, 0, 1]]
-    merged, counts = resized.merge(tokens, 2)
+    merged = resized.merge(two[[0, 1, 0, 0, 1]], 2)
+    rows, bias = np.asarray(merged.future_tokens), merged.key_bias
+    assert bias is not None
+    counts = np.exp(np.asarray(bias["future", None]))  # type: ignore[index]
     order = np.argsort(counts)
-    np.testing.assert_allclose(merged[order], two[[1, 0]], rtol=1e-6)
-    assert counts[order].tolist() == [2, 3]
-    whole, ones = resized.merge(tokens, 5)
-    np.testing.assert_array_equal(whole, tokens)
-    assert ones.tolist() == [1] * 5
-    drawn = resized.resized("3 drawn, equal mass", np.arange(16, dtype=np.float32).reshape(8, 2), rng)
+    np.testing.assert_allclose(rows[order], two[[1, 0]], rtol=1e-6)
+    np.testing.assert_allclose(counts[order], [2, 3], rtol=1e-6)
+    arm = resized.drawn(3, equal_mass=True)
+    drawn = arm.intervention(np.arange(16, dtype=np.float32).reshape(8, 2), rng)
     assert drawn is not None
     assert drawn.future_tokens is not None
     assert np.asarray(drawn.future_tokens).shape == (3, 2)
@@ -298,31 +303,30 @@ def test_what_is_merged_and_drawn() -> None:
 def test_merging_equal_tokens_changes_nothing() -> None:
     """A head whose tokens are copies of four of them, merged to four: exact, by I2."""
     head, context, state = shipped()
-    copies = learned_tokens(str(DEMO_CHECKPOINT))[np.random.default_rng(0).integers(4, size=11)]
-    merged, counts = resized.merge(copies, 4)
-    assert len(merged) == 4
+    tokens = head.future_tokens
+    assert tokens is not None
+    copies = tokens[np.random.default_rng(0).integers(4, size=11)]
+    merged = resized.merge(copies, 4)
+    assert len(np.asarray(merged.future_tokens)) == 4
     whole, smaller = (
         np.asarray(head.sample(context, state, 0, seed=3, intervention=change))
-        for change in (
-            Intervention(future_tokens=copies),
-            Intervention(future_tokens=merged, key_bias={"future": np.log(counts)}),
-        )
+        for change in (Intervention(future_tokens=copies), merged)
     )
     np.testing.assert_allclose(smaller, whole, atol=1e-5)
 
 
 def test_resized_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--tasks", TASK, "--episodes", "1", "--sizes", "4", "--out", str(tmp_path)]
+    arguments = ["--tasks", TASK, "--episodes", "1", "--num-future-tokens", "4", "--out", str(tmp_path)]
     assert study("n-runtime", *arguments) == 0
     printed = capsys.readouterr().out
     assert "Control, every token twice, equal mass: the chunk changed by" in printed
     assert "as it must be" in printed
     table: Any = read_table(tmp_path / "n-runtime.csv")
-    assert set(table["arm"]) == set(resized.arms_of([4]))
+    assert set(table["arm"]) == {resized.BASELINE, *(arm.name for arm in resized.arms_of([4]))}
     by_arm = table.groupby("arm")["chunk_change"].mean()
     assert by_arm[resized.BASELINE] == 0.0
     assert by_arm["4 drawn"] > 1e-3
-    section = resized.section(table, read_provenance(tmp_path / "n-runtime.json"))
+    section = resized.Resized.summarise(table, read_provenance(tmp_path / "n-runtime.json"))
     assert [row[0] for row in section.grids[0].rows] == [
         "4 drawn",
         "4 drawn, equal mass",
@@ -338,7 +342,7 @@ def test_resizing_a_policy_without_tokens(recording: Path, tmp_path: Path) -> No
     arguments = ["--checkpoint", str(tmp_path / "policy"), "--episodes", "1", "--out", str(tmp_path)]
     assert study("n-runtime", *arguments) == 0
     table: Any = read_table(tmp_path / "n-runtime.csv")
-    section = resized.section(table, read_provenance(tmp_path / "n-runtime.json"))
+    section = resized.Resized.summarise(table, read_provenance(tmp_path / "n-runtime.json"))
     assert section.concluded == ["Not measured, the checkpoint has no future tokens."]
 
 
@@ -352,14 +356,19 @@ def test_bad_input(
     runs = ("--policies", str(policies))
     assert "expected either --policies" in refused("n")
     assert "expected either --policies" in refused("n", *runs, "--demos", str(recording))
-    assert "no runs of `saccade train` there" in refused("n", "--policies", str(recording))
+    assert "contain no runs of `saccade train`" in refused("n", "--policies", str(recording))
     assert "no such directory of policies" in refused("n", "--policies", str(tmp_path / "nowhere"))
     assert "not all policies know reach" in refused("n", *runs, "--tasks", "reach")
     assert "differ in vl_num_layers and seed only" in refused("vlsa", *runs)
     training = ("--demos", str(recording))
     assert "expected one: all runs see the same" in refused("n", *training, *training)
-    assert "steps: given 0" in refused("n", *training, "--steps", "0")
-    assert "expected numbers of at least 0" in refused("n", *training, "--alignment-weights", "-1")
-    assert "expected numbers of at least 0" in refused("n", *training, "--alignment-weights", "much")
-    assert "sizes: given 40, expected 1 to 31" in refused("n-runtime", "--sizes", "40")
+    assert "--training-steps: given 0" in refused("n", *training, "--training-steps", "0")
+    assert "--alignment-weights: given -1" in refused("n", *training, "--alignment-weights", "-1")
+    for word in ("much", "inf", "nan"):
+        with pytest.raises(SystemExit, match="2"):
+            study("n", *training, "--alignment-weights", word)
+        assert f"invalid weight value: '{word}'" in capsys.readouterr().err
+    assert "--num-future-tokens: given 40, expected 1 to 31" in refused(
+        "n-runtime", "--num-future-tokens", "40"
+    )
     assert not (tmp_path / "out").exists()

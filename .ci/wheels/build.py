@@ -2,9 +2,9 @@
 
     python .ci/wheels/build.py --out dist
 
-The sources are those of the last commit, unpacked into an empty folder, so that nothing else that lies in the
-checkout gets into the wheel; times in it are the commit's. The same commit, Rust and tools give the same
-bytes: `--twice` builds in two folders and compares. Runs in an environment that holds `requirements.txt`.
+The sources are those of the last commit, unpacked into an empty folder, so that no other file of the checkout
+gets into the wheel. Its timestamps are the commit's. The same commit, Rust and tools give the same bytes;
+`--twice` builds in two folders and compares. Needs an environment with `requirements.txt`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-#: The oldest glibc that the wheel runs with, as platform tag: the oldest that Rust supports.
+#: The oldest supported glibc as a platform tag; Rust supports none older.
 COMPATIBILITY = "manylinux_2_17"
 BUILD = (
     f"-m maturin build --release --locked --quiet --zig --compatibility {COMPATIBILITY} --auditwheel check"
@@ -27,12 +27,12 @@ BUILD = (
 
 
 def git(*args: str) -> str:
-    """What a git command prints, in the repository."""
+    """The output of a git command in the repository."""
     return subprocess.run(["git", *args], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def unpack(commit: str, folder: Path) -> None:
-    """Puts the files of a commit, and no others, into `folder`."""
+    """Unpacks the files of a commit into an empty `folder`."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     archive = subprocess.run(["git", "archive", commit], cwd=ROOT, check=True, stdout=subprocess.PIPE).stdout
@@ -43,8 +43,8 @@ def build(commit: str, folder: Path) -> Path:
     """Builds the wheel and returns it.
 
     Args:
-        commit: What is built.
-        folder: For the sources, what cargo compiles, and the wheel.
+        commit: The commit to build.
+        folder: For the sources, the build outputs and the wheel.
     """
     source, wheels = folder / "source", folder / "wheels"
     unpack(commit, source)
@@ -53,11 +53,11 @@ def build(commit: str, folder: Path) -> Path:
     environment = {
         **os.environ,
         "SOURCE_DATE_EPOCH": git("show", "--no-patch", "--format=%ct", commit),
-        # Panic messages name source files: by neither this folder nor the home directory.
+        # Panic messages contain source paths, which must name neither this folder nor the home directory.
         "RUSTFLAGS": f"--remap-path-prefix={source}=saccade --remap-path-prefix={cargo_home}=cargo",
         "CARGO_TARGET_DIR": str(folder / "target"),
         "CARGO_INCREMENTAL": "0",
-        # Where maturin looks for the Python that has Zig.
+        # maturin looks here for the Python that has Zig.
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     }
     command = [sys.executable, *BUILD.split(), "--out", str(wheels)]
@@ -72,21 +72,21 @@ def digest(file: Path) -> str:
 
 
 def main() -> int:
-    """Builds, compares if asked to, checks the platform tag."""
+    """Builds, optionally compares two builds, and checks the platform tag."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder of the wheel (default: dist)")
     parser.add_argument(
-        "--work", type=Path, default=ROOT / "target" / "wheel", help="what is kept between builds"
+        "--work", type=Path, default=ROOT / "target" / "wheel", help="folder that is kept between builds"
     )
     parser.add_argument(
-        "--twice", action="store_true", help="build again from nothing; the bytes must be equal"
+        "--twice", action="store_true", help="build a second time from scratch; the bytes must be equal"
     )
     args = parser.parse_args()
     if git("status", "--porcelain", "--untracked-files=no"):
-        print("note: built from the last commit; changes that are not committed are left out", flush=True)
-    commit = git("rev-parse", "HEAD")  # another may come while this one is built
+        print("note: building the last commit; uncommitted changes are not included", flush=True)
+    commit = git("rev-parse", "HEAD")  # another commit may be made during the build
     built = build(commit, args.work.resolve())
     if args.twice:
         with tempfile.TemporaryDirectory() as folder:

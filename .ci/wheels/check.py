@@ -1,8 +1,8 @@
-"""What an environment that holds the wheel and NumPy, and nothing else, can do. Run in it by `test.py`.
+"""Tests the wheel in an environment with NumPy and nothing else. `test.py` runs this program in it.
 
     python check.py OUT.npz
 
-Stops with an error at the first thing that is wrong. Writes the actions of the shipped head in each precision
+Stops with an error at the first failure. Writes the actions of the bundled policy's head in each precision
 to OUT.npz, and prints one line of JSON. Starts no other process, so that it can run under an emulator.
 """
 
@@ -38,7 +38,7 @@ def uniform(*shape: int) -> npt.NDArray[np.float32]:
 
 
 def check_import() -> None:
-    """Comes from the environment, brings its types, and imports nothing but NumPy."""
+    """The package is the installed one, has its types, and imports nothing but NumPy."""
     assert Path(sys.prefix) in PACKAGE.parents, f"saccade was imported from {PACKAGE}"
     assert (PACKAGE / "py.typed").is_file()
     assert (PACKAGE / "_saccade.pyi").is_file()
@@ -48,7 +48,7 @@ def check_import() -> None:
 
 
 def check_cross_attention() -> float:
-    """Beside the formula in float64; the largest difference."""
+    """The largest difference from the formula in float64."""
     width, context_dim, heads = 48, 40, 4
     sizes = {"to_q": width, "to_k": context_dim, "to_v": context_dim, "to_out.0": width}
     weights: dict[str, Any] = {f"{name}.weight": uniform(width, size) / 4 for name, size in sizes.items()}
@@ -74,7 +74,7 @@ def check_cross_attention() -> float:
 
 
 def sample(source: Path, precision: str) -> npt.NDArray[np.float32]:
-    """Actions of a head on the same inputs each time."""
+    """Actions of a head on fixed inputs."""
     head = saccade.ActionHead.load(source, precision=precision)
     config = head.config
     RANDOM.seed(7)
@@ -88,7 +88,7 @@ def sample(source: Path, precision: str) -> npt.NDArray[np.float32]:
 
 
 def check_files(actions: npt.NDArray[np.float32]) -> None:
-    """Written anew: in shards, the same bits; with more future tokens, the same actions."""
+    """Conversion to shards keeps the bits; more future tokens keep the actions."""
     with tempfile.TemporaryDirectory() as folder:
         shards, more = Path(folder, "shards"), Path(folder, "more")
         convert(DEMO, shards, max_shard_bytes=1_000_000)
@@ -99,7 +99,7 @@ def check_files(actions: npt.NDArray[np.float32]) -> None:
 
 
 def run(*args: str) -> tuple[int, str, str]:
-    """Exit status and what a `saccade` command prints."""
+    """Exit status and output of a `saccade` command."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         try:
@@ -110,7 +110,7 @@ def run(*args: str) -> tuple[int, str, str]:
 
 
 def check_commands() -> list[str]:
-    """Every command explains itself, and works or names the extra that it lacks; returns those that work."""
+    """Every command has `--help`, and works or names the missing extra; returns those that work."""
     status, text, _ = run("--help")
     assert status == 0
     assert all(name in text for name in cli.COMMANDS)
@@ -137,7 +137,7 @@ def check_commands() -> list[str]:
 
 
 def check_torch_is_named() -> None:
-    """The parts that need torch say so by their import."""
+    """Importing a part that needs torch fails with a message that names it."""
     for name in ("saccade.torch", "saccade.reference"):
         missing = None
         try:
@@ -148,7 +148,7 @@ def check_torch_is_named() -> None:
 
 
 def main() -> None:
-    """Everything above."""
+    """Runs all checks."""
     check_import()
     error = check_cross_attention()
     actions = {precision: sample(DEMO, precision) for precision in ("float32", "bfloat16", "int8")}

@@ -1,11 +1,11 @@
-"""Tries the wheel as a user meets it, prints what came of it, and writes a page about it.
+"""Tests the wheel as users install it, prints the results, and writes a page about them.
 
     python .ci/wheels/test.py dist --page docs/wheels.md
 
-Fresh environments with the wheel and one NumPy, for each CPython and NumPy; one of them with each instruction
-set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with what the extra `sim`
-brings. What fails is named in its row; the exit status is then 1. Needs the environment that built the wheel,
-the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
+Runs: a fresh environment with the wheel and one NumPy, for each CPython and NumPy; one environment with each
+instruction set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with the extra
+`sim`. A failure is named in its row, and the exit status is then 1. Needs the environment that built the
+wheel, the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy.typing as npt
 from elftools.elf.elffile import ELFFile
 
 CHECK = Path(__file__).resolve().with_name("check.py")
-PAGE = CHECK.with_name("page.md")  # with places for what is found
+PAGE = CHECK.with_name("page.md")  # a template
 #: CPython -> NumPy: the oldest that saccade accepts and that has a wheel for it, 1.26, 2.0, the newest.
 MATRIX = {
     "3.10": ("1.24.0", "1.26.4", "newest"),
@@ -36,11 +36,11 @@ MATRIX = {
     "3.12": ("1.26.4", "2.0.0", "newest"),
     "3.13": ("2.1.0", "newest"),
 }
-#: CPUs that qemu models; the first is x86-64-v2 and no more.
-CPUS = {"Nehalem": "no AVX", "Haswell": "AVX2, FMA", "max": "all that qemu has"}
-#: How far actions may be from those of the portable path, by precision: int8 may round to a neighbour.
+#: CPUs that qemu emulates; the first is x86-64-v2 and no more.
+CPUS = {"Nehalem": "no AVX", "Haswell": "AVX2, FMA", "max": "everything qemu has"}
+#: Tolerance of actions against the portable path, by precision; int8 may round to a neighbour.
 TOLERANCE = {"float32": 1e-5, "bfloat16": 0.05, "int8": 0.1}
-#: Dies of an illegal instruction where there is no AVX2: shows that the emulated CPU refuses what it lacks.
+#: Stops with an illegal instruction without AVX2: shows that the emulated CPU refuses what it lacks.
 AVX2_PROGRAM = """
 #include <immintrin.h>
 int main(int count, char **arguments) {
@@ -53,23 +53,23 @@ Actions = dict[str, npt.NDArray[np.float32]]
 
 
 class Failed(Exception):
-    """One row's check did not hold; the text is for the table."""
+    """A check of one row failed; the text is for the table."""
 
 
 def run(command: Iterable[str | Path], folder: Path, **environment: str) -> str:
-    """What a command prints.
+    """The standard output of a command.
 
     Raises:
         Failed: its exit status is not 0; with the last line it wrote.
     """
-    # Nothing of this process's own packages, nor of the checkout.
+    # Neither the packages of this process nor the checkout may be visible.
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "SACCADE"))}
     done = subprocess.run(
         [str(word) for word in command], cwd=folder, env=kept | environment, capture_output=True, text=True
     )
     if done.returncode:
         lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
-        raise Failed(f"exit status {done.returncode}: {lines[-1] if lines else 'nothing said'}")
+        raise Failed(f"exit status {done.returncode}: {lines[-1] if lines else 'no output'}")
     return done.stdout
 
 
@@ -95,7 +95,7 @@ def find_python(version: str) -> Path:
 
 
 def pin(numpy: str) -> str:
-    """What to ask pip for."""
+    """The requirement for pip."""
     return "numpy" if numpy == "newest" else f"numpy=={numpy}"
 
 
@@ -109,7 +109,7 @@ def environment(version: str, folder: Path, *requirements: str | Path) -> Path:
 
 
 def check(python: Path, folder: Path, *prefix: str, **variables: str) -> tuple[dict[str, Any], Actions]:
-    """Runs check.py with an interpreter; what it printed and the actions it wrote."""
+    """Runs check.py with an interpreter; returns the report that it printed and the actions that it wrote."""
     out = folder / "actions.npz"
     said = run([*prefix, python, "-I", CHECK, out], folder, **variables)
     with np.load(out) as actions:
@@ -117,7 +117,7 @@ def check(python: Path, folder: Path, *prefix: str, **variables: str) -> tuple[d
 
 
 def contents(wheel: Path, folder: Path) -> dict[str, Any]:
-    """What is in the wheel.
+    """Sizes and properties of the wheel's contents.
 
     Raises:
         Failed: something is missing, or does not belong there.
@@ -180,13 +180,13 @@ def try_versions(wheel: Path, work: Path) -> list[list[str]]:
 
 
 def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
-    """A row for each instruction set of this CPU, and for each emulated one."""
+    """A row for each instruction set of this CPU, and for each emulated CPU."""
     python = environment("3.12", work / "cpus", wheel, "numpy")
     native: dict[str, Actions] = {}
     portable: Actions = {}
     available = check(python, work)[0]["available_isas"]
     arms: list[tuple[str, tuple[str, ...], dict[str, str]]] = [
-        (f"this one, `SACCADE_ISA={isa}`", (), {"SACCADE_ISA": isa}) for isa in available
+        (f"this CPU, `SACCADE_ISA={isa}`", (), {"SACCADE_ISA": isa}) for isa in available
     ]
     qemu = shutil.which("qemu-x86_64") or "qemu-x86_64"
     arms += [(f"qemu {cpu} ({has})", (qemu, "-cpu", cpu), {}) for cpu, has in CPUS.items()]
@@ -213,7 +213,7 @@ def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
 
 
 def refuses_avx2(qemu: str, work: Path) -> str:
-    """Whether the oldest emulated CPU stops at an AVX2 instruction: else the rows above mean nothing."""
+    """Whether the oldest emulated CPU stops at an AVX2 instruction; if not, the rows above prove nothing."""
     program = work / "avx2"
     program.with_suffix(".c").write_text(AVX2_PROGRAM)
     try:
@@ -226,7 +226,7 @@ def refuses_avx2(qemu: str, work: Path) -> str:
 
 
 def try_rollouts(wheel: Path, work: Path) -> list[list[str]]:
-    """A row for each CPython with NumPy 1.26, where there is one, and with the newest: one episode."""
+    """A row for each CPython, with NumPy 1.26 where it exists and with the newest: one episode."""
     rows = []
     pairs = [(version, numpy) for version, numpys in MATRIX.items() for numpy in numpys]
     for version, numpy in pairs:
@@ -263,12 +263,12 @@ def table(header: str, rows: list[list[str]]) -> str:
 
 
 def main() -> int:
-    """Tries all, prints all, writes the page."""
+    """Runs everything, prints it, and writes the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("wheel", type=Path, help="the wheel, or a folder that holds one")
-    parser.add_argument("--page", type=Path, help="where the page goes")
+    parser.add_argument("--page", type=Path, help="where to write the page")
     args = parser.parse_args()
     wheels = sorted(args.wheel.resolve().glob("*.whl")) if args.wheel.is_dir() else [args.wheel.resolve()]
     if len(wheels) != 1:

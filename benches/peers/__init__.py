@@ -1,1 +1,1 @@
-"""saccade beside every engine that can run the same head: what `make bench-peers` measures and reports."""
+"""Comparison of saccade with other engines that run the same head: `make bench-peers`."""

@@ -1,21 +1,20 @@
-"""saccade beside its peers: what runs the same head on this machine, and how fast.
+"""Compares saccade with other engines that run the same head, on this machine.
 
     make bench-peers                                       the usual set, about a quarter of an hour
     make bench-peers PEERS_ARGS="--only blocks --threads 2 --rounds 9"
     make bench-peers PEERS_ARGS="--full"                   every piece at every size: hours
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
-    python -m benches.peers report                         the report of what was measured, again
-    python -m benches.peers report --readme                the README's table, and nothing else
-    python -m benches.peers report --write                 the tables of README and docs/performance.md
+    python -m benches.peers report                         write the report of existing measurements
+    python -m benches.peers report --write                 write docs/performance.md and its figures
 
-Every contender lives in a process of its own with the thread count it is asked for and waits while another
-works; a round lets each do every piece of work once, in an order that rotates. Before it is timed its result
-is compared with the reference in float32. Measurements are added to a JSON file: what was cut short goes on
-where it stopped, and contenders that have all their rounds are not started again.
+Every contender runs in a separate process with the requested number of threads and waits while another one
+works. In a round, each does every piece of work once, in an order that rotates. Before anything is timed, its
+result is compared with the reference in float32. Measurements are added to a JSON file, so an interrupted run
+resumes, and contenders that have all their rounds are not started again.
 
-Needs the environment that `make bench-peers` sets up; a contender whose package is missing is left out, with
-the reason in the report. The whole head in all contenders takes 12 GB of memory; `--memory` sets how much may
-be used at a time.
+Needs the environment that `make bench-peers` sets up. A contender whose package is missing is left out, with
+the reason in the report. The whole head in all contenders takes 12 GB of memory; `--memory` limits how much
+is used at a time.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from benches.peers.contenders import CONTENDERS, GROUPS
 from benches.peers.processes import Ready, note
 from benches.peers.results import Results
 
-BUILDING = 40.0  # seconds that the slowest batch takes to build, once its graphs are written
+BUILDING = 40.0  # seconds to build the slowest batch, once its graphs are written
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -45,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         return report.command(results, args)
     machine_now = machine.describe()
     if results.begin(machine_now):
-        note(f"{args.results} was of another machine or build; it is set aside, and all is measured anew")
+        note(f"{args.results} is from another machine or build; it is set aside and measured again")
     measure_all(results, args)
     if not args.prepare:
         report.write(results, args.results.parent)
@@ -53,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measure_all(results: Results, args: argparse.Namespace) -> None:
-    """All cases, until they are done or the time is up."""
+    """Measures all cases, until they are done or the time limit is reached."""
     end = time.monotonic() + args.seconds if args.seconds else float("inf")
     cases = chosen_cases(args)
     if not args.prepare:
@@ -65,14 +64,14 @@ def measure_all(results: Results, args: argparse.Namespace) -> None:
     for case in cases:
         for batch in batches(results, case, args):
             if time.monotonic() + BUILDING > end:
-                note("the time is up; the next run goes on here")
+                note("the time limit is reached; the next run continues here")
                 return
             processes.prepare(case, args.work)
             measure(results, case, batch, args, end)
 
 
 def chosen_cases(args: argparse.Namespace) -> list[Case]:
-    """What the command line asks for."""
+    """The cases that the command line selects."""
     cases = full_cases(args.threads) if args.full else default_cases(args.threads)
     changed = {
         name: getattr(args, name)
@@ -84,7 +83,7 @@ def chosen_cases(args: argparse.Namespace) -> list[Case]:
 
 
 def batches(results: Results, case: Case, args: argparse.Namespace) -> list[list[str]]:
-    """Contenders with rounds to do, as many at a time as fit into memory, behind the first of their group."""
+    """Batches of contenders with unfinished rounds that fit into memory, each with the first of its group."""
     found: list[list[str]] = []
     for group in GROUPS.values():
         able = [name for name in group if case.piece in group[name].pieces and name in args.contenders]
@@ -100,7 +99,7 @@ def batches(results: Results, case: Case, args: argparse.Namespace) -> list[list
                     batch.append(name)
                     used += gigabytes(case, name)
             if len(batch) == 1 and pending != [anchor]:
-                batch = pending[:1]  # it has no room beside the anchor
+                batch = pending[:1]  # it does not fit into memory together with the anchor
             found.append(batch)
             pending = [name for name in pending if name not in batch]
     return found
@@ -112,7 +111,7 @@ def gigabytes(case: Case, name: str) -> float:
 
 
 def measure(results: Results, case: Case, names: list[str], args: argparse.Namespace, end: float) -> None:
-    """Builds a batch and lets it run its rounds; the file is written after each of them."""
+    """Builds a batch and runs its rounds; the file is written after each round."""
     with processes.contenders(names, case, args.work) as (pipes, said):
         if args.prepare:
             for name, answer in said.items():
@@ -130,7 +129,7 @@ def measure(results: Results, case: Case, names: list[str], args: argparse.Names
         rounds = max(args.rounds - min(results.rounds(case, name) for name in names), 0)
         for index in range(rounds if pipes else 0):
             if time.monotonic() > end:
-                note("the time is up; the next run goes on here")
+                note("the time limit is reached; the next run continues here")
                 break
             note(f"{case}: round {index + 1} of {rounds}")
             seconds = processes.round_of(pipes, said, case.works, index)
@@ -158,38 +157,36 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         nargs="+",
         choices=CONTENDERS,
         metavar="NAME",
-        help="default: all but the settings that another one beats; of: " + ", ".join(CONTENDERS),
+        help="default: all except settings that are slower than another setting of the same engine; of: "
+        + ", ".join(CONTENDERS),
     )
     parser.add_argument("--threads", type=int, nargs="+", default=[2, 1], help="thread counts (default 2 1)")
     parser.add_argument("--rounds", type=int, default=5, help="repetitions of everything (default 5)")
     parser.add_argument(
-        "--linear-rounds", type=int, default=8, help="of `cargo bench --bench linear`; 0: without (default 8)"
+        "--linear-rounds",
+        type=int,
+        default=8,
+        help="rounds of `cargo bench --bench linear`; 0 skips it (default 8)",
     )
-    parser.add_argument("--seconds", type=float, help="stop after so long; the next run goes on")
+    parser.add_argument("--seconds", type=float, help="time limit; the next run continues")
     parser.add_argument("--memory", type=float, default=12, help="GB that contenders may use (default 12)")
     parser.add_argument(
         "--prepare", action="store_true", help="write inputs and graphs, compare results, time nothing"
     )
     for name in ("num-vl-tokens", "num-future-tokens", "batch", "samples", "steps"):
-        parser.add_argument(f"--{name}", type=int, help="this one, in every case")
-    parser.add_argument(
-        "--size", choices=("full", "small"), default="full", help="small: to see that it works"
-    )
+        parser.add_argument(f"--{name}", type=int, help="use this value in every case")
+    parser.add_argument("--size", choices=("full", "small"), default="full", help="small: for a quick trial")
     parser.add_argument(
         "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
     )
     parser.add_argument(
         "--results",
         type=Path,
-        help="the JSON file (default results.json in the folder of --work; report --readme and --write: the "
-        "committed one)",
+        help="the JSON file (default: results.json in --work; for report --write: the committed one)",
     )
-    parser.add_argument("--readme", action="store_true", help="report: print the README's table only")
-    parser.add_argument(
-        "--write", action="store_true", help="report: write README.md and docs/performance.md"
-    )
+    parser.add_argument("--write", action="store_true", help="report: write docs/performance.md")
     args = parser.parse_args(arguments)
-    committed = args.command == "report" and (args.readme or args.write)
+    committed = args.command == "report" and args.write
     args.results = args.results or (report.COMMITTED if committed else args.work / "results.json")
     if args.contenders is None:
         args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]
@@ -199,6 +196,6 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the contenders' processes too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # also ends the contenders' processes
     with contextlib.suppress(KeyboardInterrupt):
         sys.exit(main())

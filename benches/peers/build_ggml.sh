@@ -1,6 +1,6 @@
 #!/bin/sh
-# Builds ggml from the sources in llama-cpp-python's source package: build_ggml.sh ENVIRONMENT; the libraries lie in
-# ENVIRONMENT/ggml/build/bin. The version is that of constraints.txt.
+# Builds ggml from the sources in llama-cpp-python's source package: build_ggml.sh ENVIRONMENT. The libraries
+# are written to ENVIRONMENT/ggml/build/bin. constraints.txt names the version.
 set -eu
 environment=$(cd "$1" && pwd)
 constraints=$(cd "$(dirname "$0")" && pwd)/constraints.txt

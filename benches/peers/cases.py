@@ -1,4 +1,4 @@
-"""What is measured: pieces of the head, their sizes, and how many multiply-adds each takes."""
+"""The measured cases: pieces of the head, their sizes, and the multiply-adds of each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COST: dict[str, tuple[int, ...]] = {
     "steps": (1, 2, 4, 8),
     "samples": (1, 2, 4, 8),
 }
-"""What the time of a chunk is measured against, each varied alone about the released size."""
+"""Sizes for the cost model; each is varied alone, the others as released."""
 FIELDS = {"N": "num_future_tokens", "T_vl": "num_vl_tokens"}
 """The fields of a case by the names of `COST`, where they differ."""
 WORKS: dict[str, tuple[str, ...]] = {
@@ -30,8 +30,8 @@ WORKS: dict[str, tuple[str, ...]] = {
         *(f"sample, {name} {value}" for name, values in COST.items() for value in values),
     ),
 }
-"""What is timed of a piece. `held`: keys and values of the observation are held from before; `both`: they are
-computed too. Of the whole head `both` is the sum of its two works in the same round.
+"""The timed works of each piece. `held`: keys and values of the observation are cached; `both`: they are
+computed too. For the whole head, `both` is the sum of its two works in the same round.
 """
 
 
@@ -62,16 +62,16 @@ class Case:
 
     @property
     def works(self) -> tuple[str, ...]:
-        """What is timed of it."""
+        """The works that are timed."""
         return WORKS[self.piece]
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """What is reported of it."""
+        """The works that are reported."""
         return (*self.works, "both") if self.piece == "head" else self.works
 
     def as_dict(self) -> dict[str, Any]:
-        """Its fields, for JSON."""
+        """The fields, for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -82,7 +82,7 @@ class Case:
 
 
 def default_cases(threads: list[int]) -> list[Case]:
-    """What fits a quarter of an hour: the released size, one view, N 32, one observation, one chunk."""
+    """The cases for a quarter of an hour: the released size, one view, N 32, one observation, one chunk."""
     cases = [Case(piece, count) for count in threads for piece in ("head", "blocks", "cross", "linear")]
     return [*cases, Case("cost", max(threads))]
 
@@ -105,11 +105,11 @@ def full_cases(threads: list[int]) -> list[Case]:
 
 
 def exact_macs(config: HeadConfig, case: Case) -> dict[str, float]:
-    """Multiply-adds of the exact computation by work: the floor that every engine is measured against.
+    """Multiply-adds of the exact computation by work: the floor for every engine.
 
-    Of the whole head nothing is counted that can be saved without changing a result: keys and values of the
-    cross blocks once an observation, the last self-attention block and the output for the action rows only,
-    all that depends on the time alone kept from earlier.
+    For the whole head, work that can be skipped without changing a result is not counted: keys and values of
+    the cross blocks count once per observation, the last self-attention block and the output count for the
+    action rows only, and time-only values count as cached.
     """
     if case.piece == "linear":
         products = (float(rows * inputs * outputs) for rows, inputs, outputs in LINEAR_SHAPES)

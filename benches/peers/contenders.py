@@ -1,4 +1,4 @@
-"""Who is measured."""
+"""The contenders: engines and their settings."""
 
 from __future__ import annotations
 
@@ -124,9 +124,7 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         ),
     },
 }
-"""By arithmetic, so that a batch of them fits into memory; the first of each is the one that the others'
-times are divided by, round by round.
-"""
+"""By arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds."""
 
 CONTENDERS: Mapping[str, Contender] = {
     name: contender for group in GROUPS.values() for name, contender in group.items()

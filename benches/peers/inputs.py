@@ -1,4 +1,4 @@
-"""The same random weights and inputs for everybody, and what the reference makes of them.
+"""Random weights and inputs, the same for every contender, and the result of the reference.
 
 Weights are rounded to bfloat16, so that storing them in bfloat16 loses nothing. Checkpoints and expected
 results are kept under a folder between runs.
@@ -18,14 +18,14 @@ from saccade import HeadConfig
 
 Arrays = dict[str, NDArray[Any]]
 EMBODIMENT = 1
-NUM_EMBODIMENTS = 2  # the work does not depend on how many there are, memory does
+NUM_EMBODIMENTS = 2  # affects memory, not the work
 
 
 def config_of(case: Case) -> dict[str, Any]:
-    """The head's config, in the published names, that the case's piece is cut from.
+    """Config, in the published names, of the head that contains the case's piece.
 
-    Four blocks are a head without VL self-attention, with a narrow output, so that an engine that has whole
-    heads only does next to nothing beside the blocks.
+    "Four blocks" is a head without VL self-attention and with a narrow output, so that an engine that only
+    has whole heads does almost nothing except the blocks.
     """
     from saccade.reference import random_weights
 

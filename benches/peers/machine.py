@@ -1,4 +1,4 @@
-"""The machine: its name, what it is running, and what it can do at most."""
+"""The machine: its name, the installed versions, and its peak rates."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def describe() -> dict[str, Any]:
 
 
 def version(name: str) -> str:
-    """Of an installed package; empty if it is not."""
+    """Version of an installed package; empty if it is not installed."""
     if name == "saccade":
         return saccade.__version__
     try:
@@ -57,20 +57,20 @@ def version(name: str) -> str:
 
 
 def said(*command: str) -> str:
-    """What a command printed, or nothing if it failed."""
+    """Output of a command; empty if it failed."""
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def peaks(threads: int) -> dict[str, Any]:
-    """What the CPU can do now: multiply-adds a second from registers, of every instruction set and
+    """Current peak rates of the CPU: multiply-adds per second from registers, of every instruction set and
     arithmetic; read bandwidth; clock.
     """
     return {"threads": threads, **saccade._saccade.measure_peaks(threads)}
 
 
 def linear_bench(threads: list[int], rounds: int) -> Any:
-    """What `cargo bench --bench linear` measures of saccade's linear layers beside the peak."""
+    """Rates of saccade's linear layers relative to the peak, by `cargo bench --bench linear`."""
     with tempfile.NamedTemporaryFile(suffix=".json") as file:
         command = [
             "cargo",

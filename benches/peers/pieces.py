@@ -1,9 +1,9 @@
 """The pieces as a careful user of torch would write them; every engine of modules or graphs runs these.
 
-They save all that the exact computation allows, so that engines are compared and not the care of whoever
-wrote the model: keys and values held between Euler steps, all that depends on the time alone precomputed, the
-last block's rows that nobody reads left out, one linear layer for what reads the same rows. Weights are those
-of `saccade.reference.ActionHead`.
+They contain every optimisation that keeps the computation exact, so that engines are compared and not ways to
+write the model: keys and values are cached between Euler steps, time-only values are precomputed, unused rows
+of the last block are skipped, and linear layers with the same input are merged. Weights are those of
+`saccade.reference.ActionHead`.
 
 Shapes: B observations, S samples of each, R rows of a sequence, E the width, C the features' width, T_vl
 features.
@@ -26,7 +26,7 @@ Modules = Any  # reference modules, whose attributes torch does not type
 
 
 def joined(*layers: nn.Linear) -> nn.Linear:
-    """One linear layer whose outputs are those of all the layers side by side."""
+    """One linear layer with the concatenated outputs of all the layers."""
     linear = nn.Linear(layers[0].in_features, sum(layer.out_features for layer in layers), device="meta")
     linear.weight = nn.Parameter(torch.cat([layer.weight for layer in layers]), requires_grad=False)
     linear.bias = nn.Parameter(torch.cat([layer.bias for layer in layers]), requires_grad=False)
@@ -44,14 +44,14 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 
 
 class Linears(nn.Module):
-    """Linear layers of one size, so many that their weights come from memory."""
+    """Linear layers of one size, with enough weights to exceed the caches."""
 
     def __init__(self, weights: list[Tensor]) -> None:
         super().__init__()
         self.weights = nn.ParameterList(frozen(weight) for weight in weights)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
-        """`(B, rows, inputs)` to as many `(B, rows, outputs)` as there are layers."""
+        """`(B, rows, inputs)` to one `(B, rows, outputs)` per layer."""
         return tuple(F.linear(x, weight) for weight in self.weights)
 
 
@@ -72,7 +72,7 @@ class Project(nn.Module):
 
 
 class CrossAttentions(nn.Module):
-    """Cross-attentions of the same rows, on held keys and values."""
+    """Cross-attentions of the same rows, with cached keys and values."""
 
     def __init__(self, attentions: list[Modules]) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class CrossAttentions(nn.Module):
         self.to_out = nn.ModuleList(each.to_out[0] for each in attentions)
 
     def forward(self, rows: Tensor, *held: Tensor) -> tuple[Tensor, ...]:
-        """`(B, S R, E)` to as many of the same shape as there are attentions."""
+        """`(B, S R, E)` to one result of the same shape per attention."""
         results = []
         for index, (to_q, to_out) in enumerate(zip(self.to_q, self.to_out, strict=True)):
             q = split_heads(to_q(rows), self.num_heads)
@@ -127,7 +127,7 @@ class Block(nn.Module):
 
 
 class Blocks(nn.Module):
-    """DiT blocks on held keys and values, all rows in every block."""
+    """DiT blocks with cached keys and values, all rows in every block."""
 
     def __init__(self, blocks: list[Modules]) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ class Encode(nn.Module):
         self.project = Project([block.attn1 for block in modules.model.transformer_blocks if block.is_cross])
 
     def forward(self, features: Tensor) -> tuple[Tensor, ...]:
-        """`(B, T_vl, C)` to what `Project` gives."""
+        """`(B, T_vl, C)` to the result of `Project`."""
         x = self.norm(features)
         for block in self.blocks:
             x = block(x)
@@ -194,7 +194,7 @@ class State(nn.Module):
 
 
 class Step(nn.Module):
-    """The velocity at one Euler step, on held keys and values."""
+    """The velocity at one Euler step, with cached keys and values."""
 
     def __init__(self, head: ActionHead, embodiment: int, samples: int) -> None:
         super().__init__()
@@ -265,5 +265,5 @@ def of_category(layer: Modules, embodiment: int) -> nn.Linear:
 
 
 def frozen(tensor: Tensor) -> nn.Parameter:
-    """A copy in memory of its own, without gradient."""
+    """A copy in newly allocated memory, without gradient."""
     return nn.Parameter(tensor.detach().clone(memory_format=torch.contiguous_format), requires_grad=False)

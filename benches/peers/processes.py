@@ -1,7 +1,8 @@
-"""One process for each contender, which waits while another works, and rounds over all of them.
+"""One process per contender, and rounds in which they take turns.
 
-No idle thread of one spins beside another that is measured, and nobody shares an allocator. A round lets
-every contender do every work once, in an order that rotates, so that a drift of the clock meets all.
+Only one contender runs at a time, so idle threads of another do not disturb it, and no allocator is shared.
+In a round every contender does every work once, in an order that rotates, so that a drift of the clock
+affects all.
 """
 
 from __future__ import annotations
@@ -27,9 +28,7 @@ from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Built, Task
 
 PAUSE = 0.2  # seconds of rest before a measurement; the threads of the one before have gone to sleep by then
-SAMPLE = (
-    0.05  # a sample lasts at least so many seconds: long against the clock and against a scheduler's tick
-)
+SAMPLE = 0.05  # minimum seconds of a sample: long compared with the clock's resolution and a scheduler tick
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Ready:
         error: Largest absolute difference from the reference.
         scale: Largest absolute value of the reference.
         notes: The engine's.
-        works: What it can be asked to do.
+        works: The works that it can time.
     """
 
     error: float
@@ -87,7 +86,7 @@ def difference(result: Any, expected: Any) -> tuple[float, float]:
 
 
 def seconds_of(built: Built, work: str, repeats: dict[str, int]) -> float:
-    """Seconds of one layer or piece: of one call, or the mean of so many as fill a sample."""
+    """Seconds of one call of a layer or piece; the mean over a sample if calls are short."""
     run, times = built.works[work], repeats.get(work, 1)
     start = time.perf_counter()
     for _ in range(times):
@@ -101,13 +100,13 @@ def seconds_of(built: Built, work: str, repeats: dict[str, int]) -> float:
 
 
 def graphs_folder(case: Case, work_folder: Path) -> Path:
-    """Where the graphs of a case lie, whatever its threads and steps."""
+    """Folder of the graphs of a case, independent of its threads and steps."""
     parts = (case.size, case.piece, case.num_vl_tokens, case.num_future_tokens, case.batch, case.samples)
     return work_folder / "graphs" / "-".join(map(str, parts))
 
 
 def prepare(case: Case, work_folder: Path) -> None:
-    """Writes the case's checkpoint and expected result, in a process of its own: this one stays small."""
+    """Writes checkpoint and expected result in a separate process, so that this one stays small."""
     process = multiprocessing.get_context("spawn").Process(target=write_inputs, args=(case, work_folder))
     process.start()
     process.join()
@@ -116,7 +115,7 @@ def prepare(case: Case, work_folder: Path) -> None:
 
 
 def write_inputs(case: Case, work_folder: Path) -> None:
-    """The work of `prepare`."""
+    """Runs in the process of `prepare`."""
     inputs.expected_of(case, work_folder)
     inputs.checkpoint(case, work_folder, "bfloat16")
 
@@ -167,7 +166,7 @@ def contenders(
 
 @contextlib.contextmanager
 def environment_of(name: str, case: Case, work_folder: Path) -> Iterator[None]:
-    """The environment that a contender's process is started with."""
+    """Environment variables of a contender's process."""
     before = os.environ.copy()
     os.environ.update(
         {
@@ -207,5 +206,5 @@ def round_of(
 
 
 def note(message: str) -> None:
-    """Progress, beside the result."""
+    """Prints progress on stderr."""
     print(f"bench-peers: {message}", file=sys.stderr, flush=True)

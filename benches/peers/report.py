@@ -1,41 +1,35 @@
-"""Tables and figures of what was measured, as Markdown and PNG; README and docs hold the same text."""
+"""The report of `make bench-peers`: Markdown and figures; docs/performance.md is one of them."""
 
 from __future__ import annotations
 
 import argparse
-import re
-from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
-from benches.peers import inputs
-from benches.peers.cases import COST, LINEAR_SHAPES, Case, exact_macs
+from benches.peers.cases import LINEAR_SHAPES, Case, exact_macs
 from benches.peers.contenders import CONTENDERS
+from benches.peers.figures import cost_lines, straight, write_figures
+from benches.peers.goals import goals
 from benches.peers.results import Results
-from saccade import HeadConfig
+from benches.peers.text import (
+    PART_TITLES,
+    PIECES,
+    WORK_TITLES,
+    arithmetic,
+    calls,
+    config,
+    number,
+    plural,
+    size,
+    table,
+    usual,
+)
 from saccade.bench.timing import quartiles
 
-ROOT = Path(__file__).resolve().parents[2]
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE, IMAGES = DOCS / "performance.md", DOCS / "images"
 NOTES = Path(__file__).with_name("notes.md")
-PAGE = ROOT / "docs" / "performance.md"
-IMAGES = ROOT / "docs" / "images"
 COMMITTED = Path(__file__).with_name("results.json")
-BEGIN, END = (
-    "<!-- performance: written by `python -m benches.peers report --write` -->",
-    "<!-- /performance -->",
-)
-PIECES = {
-    "head": "The whole head",
-    "blocks": "Four DiT blocks",
-    "cross": "The cross-attention of one block",
-}
-WORK_TITLES = {
-    "encode": "encode",
-    "sample": "sample on a held context",
-    "both": "encode + sample",
-}
-PART_TITLES = {"held": "on held keys and values", "both": "with its keys and values"}
-README_ROWS = (
+OVERVIEW_ROWS = (
     "saccade-float32",
     "saccade-bfloat16",
     "saccade-int8",
@@ -55,102 +49,35 @@ README_ROWS = (
 )
 
 
-@dataclass(frozen=True)
-class Goal:
-    """A ratio to reach: time of the peer over that of saccade."""
-
-    what: str
-    piece: str
-    work: str
-    peers: tuple[str, ...]
-    ours: str
-    least: float
-    beyond: float
-
-
-LEROBOT_BF16 = ("lerobot-bfloat16", "lerobot-bfloat16-pure")
-GOALS = (
-    Goal("float32, encode + sample", "head", "both", ("lerobot-float32",), "saccade-float32", 3.7, 4.0),
-    Goal(
-        "float32, sample on a held context",
-        "head",
-        "sample",
-        ("lerobot-float32",),
-        "saccade-float32",
-        5.0,
-        5.5,
-    ),
-    Goal("bfloat16, encode + sample", "head", "both", LEROBOT_BF16, "saccade-bfloat16", 1.8, 2.0),
-    Goal("bfloat16, sample on a held context", "head", "sample", LEROBOT_BF16, "saccade-bfloat16", 2.5, 2.8),
-    Goal(
-        "bfloat16, four DiT blocks with their keys and values",
-        "blocks",
-        "both",
-        ("openvino-bfloat16",),
-        "saccade-bfloat16",
-        1.1,
-        1.2,
-    ),
-    Goal("int8, encode + sample", "head", "both", LEROBOT_BF16, "saccade-int8", 3.2, 3.6),
-    *(
-        Goal(
-            f"int8, future_refresh={refresh}, sample on a held context",
-            "head",
-            "sample",
-            LEROBOT_BF16,
-            f"saccade-int8-refresh{refresh}",
-            7.0,
-            9.0,
-        )
-        for refresh in (2, 4)
-    ),
-)
-LINEAR_GOALS = {1: ((0.86, 0.94), (0.90, 0.97)), 2: ((0.82, 0.91), (0.90, 0.97))}
-"""Threads -> shares of the peak at (49, 296) rows: to reach, and beyond it."""
-
-
 def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report`."""
     if not results.data["machine"]:
-        raise SystemExit(f"bench-peers: {args.results} holds no measurement; `make bench-peers` makes some")
-    if args.readme:
-        print(readme(results))
-    elif args.write:
-        page, images = PAGE, IMAGES
-        page.write_text(document(results, "images"))
-        figures(results, images)
-        path = ROOT / "README.md"
-        path.write_text(between_markers(path.read_text(), readme(results)))
+        raise SystemExit(f"bench-peers: {args.results} has no measurements; run `make bench-peers`")
+    if args.write:
+        PAGE.write_text(document(results, "images"))
+        write_figures(results, IMAGES)
     else:
         write(results, args.results.parent)
     return 0
 
 
 def write(results: Results, folder: Path) -> None:
-    """`report.md` and its figures, beside the JSON file."""
-    figures(results, folder)
+    """Writes `report.md` and its figures into the folder of the JSON file."""
+    write_figures(results, folder)
     (folder / "report.md").write_text(document(results, "."))
     print(folder / "report.md")
 
 
-def between_markers(text: str, table: str) -> str:
-    """The text with the table between its two markers."""
-    pattern = re.compile(f"{re.escape(BEGIN)}\n.*?{re.escape(END)}", re.DOTALL)
-    if not pattern.search(text):
-        raise SystemExit(f"bench-peers: README.md lacks the lines\n{BEGIN}\n{END}")
-    return pattern.sub(lambda _: f"{BEGIN}\n{table}\n{END}", text)
-
-
 def document(results: Results, images: str) -> str:
-    """The whole report; `images` is the folder of the figures as seen from it."""
+    """The whole report; `images` is the folder of the figures, relative to it."""
     parts = [
         "# Performance",
-        "Written by `python -m benches.peers report --write` from `benches/peers/results.json`: what "
-        "`make bench-peers` left in `out/peers/results.json` on the machine below.",
-        readme(results),
+        "Written by `python -m benches.peers report --write` from `benches/peers/results.json`, which "
+        "`make bench-peers` wrote to `out/peers/results.json` on the machine below.",
+        overview(results),
         machine(results),
         NOTES.read_text().strip(),
-        "## Goals",
+        "## Targets",
         goals(results),
         f"![The whole head, encode + sample, in every engine]({images}/performance.png)",
         *sections(results),
@@ -163,16 +90,16 @@ def document(results: Results, images: str) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def readme(results: Results) -> str:
-    """The README's table: the whole head at the released size in every engine."""
+def overview(results: Results) -> str:
+    """A table of the whole head at the released size in every engine."""
     cases = usual(results, "head")
     if not cases:
         return "Nothing measured yet."
     threads = [case.threads for case in cases]
     titles = [f"encode + sample, {plural(count)}" for count in threads]
-    titles += [f"sample on a held context, {plural(count)}" for count in threads]
+    titles += [f"sample from a cached context, {plural(count)}" for count in threads]
     rows = []
-    for name in README_ROWS:
+    for name in OVERVIEW_ROWS:
         if not any(name in results.names(case) for case in cases):
             continue
         cells = [CONTENDERS[name].label]
@@ -187,18 +114,8 @@ def readme(results: Results) -> str:
     return f"{table(head, rows)}\n\n{sentence}"
 
 
-def usual(results: Results, piece: str) -> list[Case]:
-    """The measured cases of a piece at the released size, one view, one observation, by threads."""
-    return sorted(case for case in results.cases if case == Case(piece, case.threads))
-
-
-def plural(threads: int) -> str:
-    """`1 thread`, `2 threads`."""
-    return f"{threads} thread" + ("s" if threads != 1 else "")
-
-
 def machine(results: Results) -> str:
-    """What it was measured on."""
+    """The machine and the peaks measured on it."""
     held = results.data["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in held["versions"].items() if version)
     lines = [
@@ -219,94 +136,17 @@ def machine(results: Results) -> str:
                 rows.append([plural(threads), isa, *rates, gigabytes(results.bandwidth(threads))])
     if rows:
         head = ["", "instruction set", "float32 GMAC/s", "bfloat16 GMAC/s", "int8 GMAC/s", "read GB/s"]
-        lines += ["Peaks, from registers, measured in the same runs (medians):", table(head, rows)]
+        lines += ["Peaks of arithmetic on registers, measured in the same runs (medians):", table(head, rows)]
     return "\n\n".join(lines)
 
 
 def gigabytes(rate: float | None) -> str:
-    """A bandwidth in GB/s."""
+    """A bandwidth in GB/s; empty if it was not measured."""
     return "" if rate is None else f"{rate / 1e9:.0f}"
 
 
-def goals(results: Results) -> str:
-    """What was to be reached, and whether it was."""
-    rows = []
-    for goal in GOALS:
-        for case in usual(results, goal.piece):
-            peers = [name for name in goal.peers if name in results.names(case)]
-            if not peers or goal.ours not in results.names(case):
-                continue
-            peer = min(peers, key=lambda name: quartiles(results.seconds(case, name, goal.work))[1])
-            measured = results.ratio(case, peer, goal.ours, goal.work)
-            if measured is not None:
-                rows.append(
-                    [
-                        f"{goal.what}, beside {CONTENDERS[peer].label}",
-                        plural(case.threads),
-                        f"{goal.least} x ({goal.beyond} x)",
-                        f"{'' if results.ratios(case, peer, goal.ours, goal.work) else '~'}"
-                        f"{measured[1]:.2f} x ({measured[0]:.2f}–{measured[2]:.2f})",
-                        verdict(measured[1], goal.least, goal.beyond),
-                    ]
-                )
-    for threads, (least, beyond) in LINEAR_GOALS.items():
-        for kind in ("float32", "bfloat16", "int8"):
-            shares = linear_shares(results, kind, threads)
-            if shares:
-                met = [verdict(*numbers) for numbers in zip(shares, least, beyond, strict=True)]
-                rows.append(
-                    [
-                        f"linear kernels, {kind}, 49 / 296 rows, of the peak",
-                        plural(threads),
-                        f"{percent(least)} ({percent(beyond)})",
-                        percent(shares),
-                        met[0] if met[0] == met[1] else " / ".join(met),
-                    ]
-                )
-    return (
-        table(["what", "", "goal (beyond it)", "measured", "reached"], rows)
-        if rows
-        else "Nothing measured yet."
-    )
-
-
-def verdict(measured: float, least: float, beyond: float) -> str:
-    """Whether a goal is reached."""
-    return "beyond" if measured >= beyond else "yes" if measured >= least else "**no**"
-
-
-def percent(shares: Iterable[float]) -> str:
-    """`86 / 94 %`."""
-    return " / ".join(f"{100 * share:.0f}" for share in shares) + " %"
-
-
-def linear_shares(results: Results, kind: str, threads: int) -> list[float]:
-    """Shares of the peak of the best instruction set: the least of the shapes with 49 rows, that with 296."""
-    best = results.data["machine"]["isa"]
-    found: dict[int, list[float]] = {49: [], 296: []}
-    for rows, inputs_, outputs in LINEAR_SHAPES:
-        values = [
-            rate["of_peak"]["median"]
-            for bench in results.data["linear"]
-            for case in bench["cases"]
-            if case["case"] == f"{rows} x {inputs_} x {outputs}"
-            for rate in case["rates"]
-            if rate["threads"] == threads
-            and is_linear(rate["name"], best, kind)
-            and rate["of_peak"]["samples"]
-        ]
-        if values:
-            found[rows].append(quartiles(values)[1])
-    return [min(values) for values in found.values()] if all(found.values()) else []
-
-
-def is_linear(name: str, isa: str, kind: str) -> bool:
-    """Whether `cargo bench --bench linear` means this instruction set and arithmetic by that name."""
-    return name in (f"saccade {isa}, {kind}", f"saccade {isa}, {kind} arithmetic")
-
-
 def sections(results: Results) -> list[str]:
-    """A table a case, the usual sizes first."""
+    """One table per case, the usual sizes first."""
     parts = []
     for piece, title in PIECES.items():
         cases = sorted(case for case in results.cases if case.piece == piece and case.size == "full")
@@ -318,7 +158,7 @@ def sections(results: Results) -> list[str]:
 
 
 def section(results: Results, case: Case) -> str:
-    """Times of every contender, beside the first of its group and as a share of the floor."""
+    """Times of every contender, relative to saccade's in the same arithmetic and as a share of the floor."""
     titles = WORK_TITLES if case.piece == "head" else PART_TITLES
     macs = exact_macs(config(case), case)
     floors = ", ".join(f"{titles[work]} {value / 1e9 / calls(case):.1f}" for work, value in macs.items())
@@ -346,46 +186,22 @@ def section(results: Results, case: Case) -> str:
     head += ["times saccade's", "share of the floor", "max abs error"]
     parts = [
         f"### {size(case)}",
-        f"Multiply-adds of the exact computation, 1e9: {floors}.",
+        f"Multiply-adds of the exact computation, in 1e9: {floors}.",
         table(head, rows),
     ]
     return "\n\n".join(parts + [f"Could not run: {'; '.join(dict.fromkeys(failed))}."] * bool(failed))
 
 
 def error_cell(results: Results, case: Case, name: str) -> str:
-    """Largest difference from the reference, and what is to be said about it."""
+    """Largest difference from the reference, marked if the result is not correct."""
     error, scale = results.error(case, name)
     if "future_refresh" in CONTENDERS[name].options:
         return f"{error:.1e}, since it computes less"
     return f"{error:.1e}" + ("" if results.is_correct(case, name) else f" of {scale:.1f}: **not correct**")
 
 
-def size(case: Case) -> str:
-    """The case's sizes in words."""
-    parts = [f"T_vl {case.num_vl_tokens}", f"N {case.num_future_tokens}"]
-    parts += [f"{case.batch} observations"] * (case.batch > 1) + [f"{case.samples} samples"] * (
-        case.samples > 1
-    )
-    return ", ".join([*parts, plural(case.threads)])
-
-
-def calls(case: Case) -> int:
-    """How many layers a work goes through, of which the time is that of one."""
-    return config(case).num_layers // 2 if case.piece == "cross" else 1
-
-
-def config(case: Case) -> HeadConfig:
-    """Of the head that the piece is cut from."""
-    return HeadConfig.from_dict(inputs.config_of(case))
-
-
-def arithmetic(name: str) -> str:
-    """`float32`, `bfloat16` or `int8`."""
-    return next((kind for kind in ("float32", "int8") if kind in name), "bfloat16")
-
-
 def floor_share(results: Results, case: Case, name: str, macs: float) -> str:
-    """Time that the exact multiply-adds take at the peak of the contender's arithmetic, over its own time."""
+    """Time of the exact multiply-adds at the peak of the contender's arithmetic, divided by its own time."""
     isa = CONTENDERS[name].environment.get("SACCADE_ISA", results.data["machine"]["isa"])
     peak = results.peak(case.threads, isa, arithmetic(name))
     seconds = results.seconds(case, name, "both")
@@ -394,19 +210,13 @@ def floor_share(results: Results, case: Case, name: str, macs: float) -> str:
     return f"{100 * macs / peak / quartiles(seconds)[1]:.0f} %"
 
 
-def number(seconds: float) -> str:
-    """Milliseconds with four digits at most."""
-    value = 1e3 * seconds
-    return f"{value:.0f}" if value >= 1000 else f"{value:.1f}" if value >= 10 else f"{value:.3f}"
-
-
 def milliseconds(seconds: list[float]) -> str:
-    """The median."""
+    """The median in milliseconds; empty if it was not measured."""
     return f"{1e3 * quartiles(seconds)[1]:.0f}" if seconds else ""
 
 
 def faster_peers(results: Results) -> str:
-    """Every case in which a correct peer beats saccade in the same arithmetic."""
+    """Every case in which a peer with a correct result is faster than saccade in the same arithmetic."""
     lines = []
     for case in results.cases:
         if case.piece not in PIECES or case.size != "full":
@@ -427,11 +237,11 @@ def faster_peers(results: Results) -> str:
                         f"- {CONTENDERS[name].label}: {PIECES[case.piece].lower()}, {title}, {size(case)}: "
                         f"{compared[1]:.2f} times as fast as {CONTENDERS[ours].label}."
                     )
-    return "\n".join(lines) or "Nowhere in what was measured, arithmetic by arithmetic."
+    return "\n".join(lines) or "In none of the measured cases, compared within each arithmetic."
 
 
 def linear(results: Results) -> list[str]:
-    """Linear layers as `cargo bench --bench linear` measured them, then the engines timed from here."""
+    """Linear layers as `cargo bench --bench linear` measured them, then those of the engines timed here."""
     parts = []
     shapes = Case("linear", 1).works
     benched = {
@@ -449,12 +259,12 @@ def linear(results: Results) -> list[str]:
             error = "" if results.is_correct(case, name) else ": **not correct**"
             rows.append([CONTENDERS[name].label + error, *(f"{rate:.0f}" for rate in rates)])
         parts += [f"### {plural(threads)}", table(["GMAC/s, rows x inputs x outputs", *shapes], rows)]
-    how = "`cargo bench --bench linear`; in brackets the share of the peak of the same arithmetic."
+    how = "Measured by `cargo bench --bench linear`. Brackets: share of the peak of the same arithmetic."
     return ["## Linear layers, weights from memory", how, *parts] if parts else []
 
 
 def benched_linear(results: Results, threads: int) -> dict[str, list[str]]:
-    """Rate and share of the peak of the linear layers that `cargo bench` measured, by name and shape."""
+    """Rates and shares of the peak of the linear layers that `cargo bench` measured, by name and shape."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for bench in results.data["linear"]:
         for case in bench["cases"]:
@@ -478,7 +288,7 @@ def benched_linear(results: Results, threads: int) -> dict[str, list[str]]:
 
 
 def settings(results: Results) -> list[str]:
-    """Settings of a peer that were tried and that another one of the same engine beats."""
+    """Settings of a peer that were tried and are slower than another setting of the same engine."""
     tried = {name for name, contender in CONTENDERS.items() if not contender.usual}
     cases = [case for case in results.cases if tried & set(results.names(case))]
     if not cases:
@@ -506,7 +316,7 @@ def settings(results: Results) -> list[str]:
 
 
 def taken_instead(name: str) -> str:
-    """The usual contender of the engine and arithmetic of one that is not."""
+    """The usual contender with the same engine and arithmetic."""
     contender = CONTENDERS[name]
     return next(
         (
@@ -522,7 +332,7 @@ def taken_instead(name: str) -> str:
 
 
 def cost(results: Results, images: str) -> list[str]:
-    """How the time grows with each size, and how near that is to a straight line."""
+    """How the time grows with each size, and how well a straight line describes it."""
     rows = []
     for case in [case for case in results.cases if case.piece == "cost" and case.size == "full"]:
         for name in results.names(case):
@@ -544,101 +354,6 @@ def cost(results: Results, images: str) -> list[str]:
     return [
         "## The cost model",
         f"![Time against N, T_vl, steps and samples]({images}/cost.png)",
-        "One size varied, the others as released (N 32, T_vl 296, 4 steps, 1 sample); least squares.",
+        "One size varies, the others are as released (N 32, T_vl 296, 4 steps, 1 sample); least squares.",
         table(head, rows),
     ]
-
-
-def cost_lines(results: Results, case: Case, name: str) -> dict[str, list[tuple[float, float]]]:
-    """`work, size` -> points (size, median seconds)."""
-    lines: dict[str, list[tuple[float, float]]] = {}
-    for work in case.works:
-        seconds = results.seconds(case, name, work)
-        if seconds:
-            title, _, value = work.rpartition(" ")
-            lines.setdefault(title, []).append((float(value), quartiles(seconds)[1]))
-    return lines
-
-
-def straight(points: list[tuple[float, float]]) -> tuple[float, float, float]:
-    """Slope, start and R² of the least-squares line."""
-    xs, ys = zip(*points, strict=True)
-    middle_x, middle_y = sum(xs) / len(xs), sum(ys) / len(ys)
-    spread = sum((x - middle_x) ** 2 for x in xs)
-    slope = sum((x - middle_x) * (y - middle_y) for x, y in points) / spread
-    start = middle_y - slope * middle_x
-    left = sum((y - start - slope * x) ** 2 for x, y in points)
-    total = sum((y - middle_y) ** 2 for y in ys)
-    return slope, start, 1.0 - left / total if total else 1.0
-
-
-def table(head: list[str], rows: Iterable[list[str]]) -> str:
-    """Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def figures(results: Results, folder: Path) -> None:
-    """`performance.png`: the whole head in every engine; `cost.png`: the cost model; where measured."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    folder.mkdir(parents=True, exist_ok=True)
-    if usual(results, "head"):
-        draw_head(results, folder / "performance.png")
-    if any(case.piece == "cost" for case in results.cases):
-        draw_cost(results, folder / "cost.png")
-
-
-def draw_head(results: Results, path: Path) -> None:
-    """Bars: encode and sample in every engine, one panel a thread count."""
-    from matplotlib import pyplot as plt
-
-    cases = usual(results, "head")
-    names = [name for name in CONTENDERS if any(name in results.names(case) for case in cases)][::-1]
-    figure, axes = plt.subplots(
-        1, len(cases), figsize=(5.5 * len(cases), 0.34 * len(names) + 1.2), sharey=True, squeeze=False
-    )
-    for axis, case in zip(axes[0], cases, strict=True):
-        for row, name in enumerate(names):
-            if name in results.names(case):
-                colour = "#1b6ca8" if name.startswith("saccade") else "#9a9a9a"
-                encode, sample = (
-                    1e3 * quartiles(results.seconds(case, name, work))[1] for work in ("encode", "sample")
-                )
-                axis.barh(row, encode, color=colour, alpha=0.55)
-                axis.barh(row, sample, left=encode, color=colour)
-                axis.text(encode + sample, row, f" {encode + sample:.0f}", va="center", fontsize=8)
-        axis.set_title(f"{plural(case.threads)}: encode (light) + sample", fontsize=10)
-        axis.set_xlabel("ms")
-        axis.margins(x=0.12)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0][0].set_yticks(range(len(names)), [CONTENDERS[name].label for name in names], fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-
-
-def draw_cost(results: Results, path: Path) -> None:
-    """Points and least-squares lines, one panel a size."""
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, len(COST) + 1, figsize=(16, 3.4))
-    case = next(case for case in results.cases if case.piece == "cost")
-    for name in results.names(case):
-        for axis, (title, points) in zip(axes, sorted(cost_lines(results, case, name).items()), strict=True):
-            slope, start, fit = straight(points)
-            xs = [0.0, max(x for x, _ in points)]
-            (line,) = axis.plot(xs, [1e3 * (start + slope * x) for x in xs], linewidth=1)
-            label = f"{CONTENDERS[name].label}, R² {fit:.4f}"
-            axis.plot(
-                [x for x, _ in points], [1e3 * y for _, y in points], "o", color=line.get_color(), label=label
-            )
-            axis.set_title(f"{title}, {plural(case.threads)}", fontsize=10)
-            axis.set_ylim(bottom=0)
-            axis.spines[["top", "right"]].set_visible(False)
-            axis.legend(fontsize=7, frameon=False)
-    axes[0].set_ylabel("ms")
-    figure.tight_layout()
-    figure.savefig(path, dpi=130)
-    plt.close(figure)

@@ -1,4 +1,4 @@
-"""What was measured, as a JSON file that grows from run to run, and the statistics of it."""
+"""The measurements, a JSON file that grows from run to run, and their statistics."""
 
 from __future__ import annotations
 
@@ -13,17 +13,15 @@ from saccade.bench.timing import quartiles
 
 FORMAT = 1
 TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
-"""Of the reference's largest absolute value; what differs by more is not ranked."""
+"""Tolerances relative to the reference's largest absolute value; larger differences are not ranked."""
 
 
 class Results:
     """The measurements of one machine.
 
-    Attributes:
-        path: The file; written after every round.
-        data: Its content: `machine`, `peaks` (one entry a run and thread count), `linear` (what
-            `cargo bench --bench linear` printed), and `records`: a case, and the seconds of contenders that
-            ran in turn, with as many rounds for each.
+    Attributes: path: The file; written after every round. data: Its content: `machine`, `peaks` (one entry
+    per run and thread count), `linear` (the output of `cargo bench --bench linear`), and `records`: a case,
+    and the seconds of contenders that ran in the same rounds.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +44,7 @@ class Results:
         return other
 
     def save(self) -> None:
-        """Writes the file; renamed when it is whole."""
+        """Writes the file under a temporary name, then renames it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         part = self.path.with_name(self.path.name + ".part")
         part.write_text(json.dumps(rounded(self.data), indent=1) + "\n")
@@ -54,7 +52,7 @@ class Results:
 
     @property
     def cases(self) -> list[Case]:
-        """The cases that hold a record, in the order in which they were first measured."""
+        """The cases with a record, in the order in which they were first measured."""
         return list(dict.fromkeys(Case(**record["case"]) for record in self.data["records"]))
 
     def records(self, case: Case) -> Iterator[dict[str, Any]]:
@@ -68,13 +66,13 @@ class Results:
         return record
 
     def entries(self, case: Case, name: str) -> Iterator[dict[str, Any]]:
-        """What was recorded of a contender."""
+        """The recorded entries of a contender."""
         for record in self.records(case):
             if name in record["contenders"]:
                 yield record["contenders"][name]
 
     def rounds(self, case: Case, name: str) -> int:
-        """How many rounds a contender has done; a contender that failed has none to do."""
+        """Number of finished rounds of a contender; one that failed counts as finished."""
         entries = list(self.entries(case, name))
         if entries and "failed" in entries[-1]:
             return 1 << 30
@@ -95,13 +93,13 @@ class Results:
         return entry["error"], entry["scale"]
 
     def is_correct(self, case: Case, name: str) -> bool:
-        """Whether the contender's result is as near as its arithmetic allows."""
+        """Whether the contender's result is within the tolerance of its arithmetic."""
         error, scale = self.error(case, name)
         arithmetic = next((kind for kind in TOLERANCE if kind in name), "bfloat16")
         return error <= TOLERANCE[arithmetic] * scale
 
     def ratios(self, case: Case, slower: str, faster: str, work: str) -> list[float]:
-        """Time of `slower` over that of `faster`, of the rounds that both did in turn."""
+        """Time of `slower` divided by that of `faster`, for each round that both did."""
         pairs: list[float] = []
         for record in self.records(case):
             both = [times(record["contenders"].get(name, {}), work) for name in (slower, faster)]
@@ -109,7 +107,7 @@ class Results:
         return pairs
 
     def ratio(self, case: Case, slower: str, faster: str, work: str) -> tuple[float, float, float] | None:
-        """Quartiles of `ratios`; of all pairs of their times where the two were never measured in turn."""
+        """Quartiles of `ratios`, or of all pairs of times if the two never ran in the same round."""
         pairs = self.ratios(case, slower, faster, work)
         if not pairs:
             both = [self.seconds(case, name, work) for name in (slower, faster)]
@@ -117,7 +115,7 @@ class Results:
         return quartiles(pairs) if pairs else None
 
     def peak(self, threads: int, isa: str, arithmetic: str) -> float | None:
-        """Multiply-adds a second from registers, the median over the runs; None if not measured."""
+        """Multiply-adds per second from registers, the median over the runs; None if not measured."""
         values = [
             entry["macs_per_second"].get(isa, {}).get(arithmetic)
             for entry in self.data["peaks"]
@@ -127,7 +125,7 @@ class Results:
         return statistics.median(known) if known else None
 
     def bandwidth(self, threads: int) -> float | None:
-        """Bytes a second read from memory, the median over the runs; None if not measured."""
+        """Bytes per second read from memory, the median over the runs; None if not measured."""
         values = [
             entry["read_bytes_per_second"] for entry in self.data["peaks"] if entry["threads"] == threads
         ]
@@ -136,7 +134,7 @@ class Results:
 
 
 def times(entry: dict[str, Any], work: str) -> list[float]:
-    """A contender's times in one record, one a round; `both` of the whole head is the sum of its works."""
+    """A contender's times in one record, one per round; `both` of the whole head is the sum of its works."""
     seconds = entry.get("seconds", {})
     if work == "both" and "encode" in seconds:
         return [sum(pair) for pair in zip(seconds["encode"], seconds["sample"], strict=True)]
@@ -144,7 +142,7 @@ def times(entry: dict[str, Any], work: str) -> list[float]:
 
 
 def rounded(value: Any) -> Any:
-    """Numbers to six digits, which is more than any of them holds."""
+    """Numbers rounded to six digits, more than the measurements resolve."""
     if isinstance(value, dict):
         return {key: rounded(each) for key, each in value.items()}
     if isinstance(value, list):

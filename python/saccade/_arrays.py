@@ -1,7 +1,8 @@
-"""Arguments to the arrays that the engine takes, and results back to what the caller uses: NumPy or torch."""
+"""Converts arguments to the arrays of the engine, and results to NumPy or torch like the arguments."""
 
 from __future__ import annotations
 
+import math
 import operator
 import sys
 from collections.abc import Collection, Mapping, Sequence, Set
@@ -17,39 +18,39 @@ if TYPE_CHECKING:
 
     Tensor: TypeAlias = torch.Tensor
 
-#: No head has as many tokens; a range that reaches it would only be slow to write out.
+#: No head has as many tokens. A larger range is refused, since it would be slow to write out.
 LARGEST_RANGE = 1 << 20
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
-#: A tensor as the engine takes it: float32, or what 16 bits are and the bits.
+#: A tensor as the engine takes it: float32, or the name of a 16-bit type and the bits.
 StoredTensor: TypeAlias = "Float32Array | tuple[str, npt.NDArray[np.uint16]]"
-#: What array arguments may be: NumPy arrays of any strides, torch CPU tensors, or nested sequences of floats.
+#: Array arguments: NumPy arrays of any strides, torch CPU tensors, or nested sequences of floats.
 ArrayLike: TypeAlias = "npt.ArrayLike | Tensor"
-#: What results are: float32, NumPy or torch like the features they come from.
+#: Results: float32, NumPy or torch like the features that they were computed from.
 Array: TypeAlias = "Float32Array | Tensor"
 
 
 def is_torch(value: object) -> bool:
-    """Whether ``value`` is a torch tensor; torch is not imported to find out."""
+    """Whether ``value`` is a torch tensor. Does not import torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
 
 
 def float32(name: str, value: ArrayLike) -> Float32Array:
-    """``value`` as a C-contiguous float32 array, without a copy where it is one already.
+    """``value`` as a C-contiguous float32 array. It is not copied if it is one already.
 
-    float64, float16 and bfloat16 are converted; a value beyond float32's range becomes infinite, which the
-    engine refuses.
+    float64, float16 and bfloat16 are converted. A value beyond the range of float32 becomes infinite, which
+    the engine refuses.
 
     Raises:
-        DtypeError: ``value`` holds integers, booleans or anything else that is not a real float, or is not
+        DtypeError: ``value`` contains integers, booleans or anything else that is not a real float, or is not
             on the CPU.
         ShapeError: ``value`` is a ragged sequence.
     """
     if is_torch(value):
         value = _from_torch(name, value, "floating point")
     array = _asarray(name, value)
-    # What a control loop gives: the rest takes a microsecond or two, as long as all other checks of a call.
+    # The case of a control loop. The rest takes a microsecond or two, as long as all other checks of a call.
     if array.dtype == np.float32 and array.flags.carray:
         return cast("Float32Array", array)
     # bfloat16 of the ml_dtypes package is of kind "V".
@@ -60,11 +61,12 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
 
 
 def as_stored(tensors: Mapping[str, ArrayLike]) -> dict[str, StoredTensor]:
-    """Tensors in the type that they have, C-contiguous, without a copy of those that are so already.
+    """Tensors in their own dtype, C-contiguous. Those that are contiguous already are not copied.
 
     Raises:
         DtypeError: ``tensors`` is not a mapping of names to arrays of float32, bfloat16 or float16 on the
-            CPU; all that is wrong is listed.
+            CPU. The message lists every problem.
+        InputError: A name is not valid Unicode.
     """
     if not isinstance(tensors, Mapping):
         raise DtypeError(f"tensors: expected a mapping of names to arrays, got {type(tensors).__name__}")
@@ -73,6 +75,7 @@ def as_stored(tensors: Mapping[str, ArrayLike]) -> dict[str, StoredTensor]:
         try:
             if not isinstance(name, str):
                 raise DtypeError(f"{name!r}: expected a name, got {type(name).__name__}")
+            text("tensors", name)
             found[name] = _as_stored(name, tensor)
         except DtypeError as error:
             problems.append(str(error))
@@ -104,11 +107,40 @@ def _as_stored(name: str, tensor: Any) -> StoredTensor:
     return np.require(tensor, np.float32, ["C", "A"])
 
 
-def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
-    """``value`` as a C-contiguous boolean array; None stays None.
+def text(name: str, value: Any) -> str:
+    """``value`` as text that the engine can take.
 
     Raises:
-        DtypeError: ``value`` holds anything but booleans, or is not on the CPU.
+        InputError: It is not a string, or contains a surrogate, which UTF-8 cannot encode.
+    """
+    if not isinstance(value, str):
+        raise InputError(f"{name}: expected a string, got {value!r} ({type(value).__name__})")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{name}: expected valid Unicode, got {value!r} ({error.reason})") from None
+    return value
+
+
+def check_precision(precision: str) -> None:
+    """Checks that ``precision`` is text. The engine checks which text.
+
+    Raises:
+        InputError: It is anything else.
+    """
+    if not isinstance(precision, str):
+        raise InputError(
+            "precision: expected one of 'float32', 'bfloat16', 'int8', got "
+            f"{precision!r} ({type(precision).__name__})"
+        )
+    text("precision", precision)
+
+
+def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
+    """``value`` as a C-contiguous boolean array. None stays None.
+
+    Raises:
+        DtypeError: ``value`` contains anything but booleans, or is not on the CPU.
     """
     if value is None:
         return None
@@ -121,10 +153,10 @@ def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
 
 
 def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
-    """``value``, one integer or several, as a C-contiguous int64 array.
+    """One or several integers as a C-contiguous int64 array.
 
     Raises:
-        InputError: ``value`` is not made of integers that int64 can hold.
+        InputError: ``value`` contains anything but integers in the range of int64.
     """
     if is_torch(value):
         value = _from_torch(name, value, "integer")
@@ -143,22 +175,26 @@ def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
 
 
 def optional_integers(name: str, values: Sequence[int] | None) -> list[int] | None:
-    """``values`` as a list of integers, None as it is.
+    """A sequence of integers as a list. None stays None.
 
     Raises:
-        InputError: as :func:`int64`.
+        InputError: ``values`` is not a sequence of integers in the range of int64.
     """
     if values is None:
         return None
-    # An empty list is one of floats to NumPy.
-    return int64(name, values).reshape(-1).tolist() if len(values) else []
+    try:
+        is_empty = len(values) == 0
+    except TypeError:
+        raise InputError(f"{name}: expected a sequence of integers, such as [0], got {values!r}") from None
+    # NumPy takes an empty list for one of floats.
+    return [] if is_empty else int64(name, values).reshape(-1).tolist()
 
 
 def integer(name: str, value: int, least: int = 1) -> int:
     """``value`` as an integer of at least ``least``.
 
     Raises:
-        InputError: it is not one.
+        InputError: ``value`` is not an integer, or is less than ``least``.
     """
     try:
         if isinstance(value, (bool, np.bool_)):
@@ -175,10 +211,10 @@ def integer(name: str, value: int, least: int = 1) -> int:
 
 
 def indices(name: str, value: Any) -> tuple[int, ...] | None:
-    """One index or several, distinct, in the order given (sets: ascending); None stays None.
+    """One or several distinct indices in the order given; those of a set in ascending order. None stays None.
 
     Raises:
-        InputError: ``value`` is not made of distinct integers of at least 0.
+        InputError: ``value`` contains anything but distinct integers of at least 0.
     """
     if value is None:
         return None
@@ -207,18 +243,19 @@ def indices(name: str, value: Any) -> tuple[int, ...] | None:
 
 
 def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:
-    """The array that a result of this shape is written to: a new one, or ``out``'s own memory.
+    """The array that a result of this shape is written to: a new one, or the memory of ``out``.
 
     Raises:
-        DtypeError: ``out`` is not an array of float32 on the CPU.
+        DtypeError: ``out`` is not a float32 array on the CPU.
         ShapeError: ``out`` has another shape.
         InputError: ``out`` cannot be written to, or is not C-contiguous.
+        MemoryError: There is no memory for a new array.
     """
     if out is None:
         try:
             return np.empty(shape, np.float32)
-        except (MemoryError, ValueError) as error:
-            raise InputError(f"a result of shape {shape} does not fit in memory: {error}") from None
+        except (MemoryError, ValueError):
+            raise does_not_fit("a result", shape) from None
     array: Any = out
     if is_torch(out):
         if out.requires_grad:  # type: ignore[union-attr]
@@ -235,13 +272,19 @@ def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:
     return array
 
 
+def does_not_fit(what: str, shape: tuple[int, ...]) -> MemoryError:
+    """The error for a float32 array that cannot be allocated."""
+    gigabytes = 4 * math.prod(shape) / 1e9
+    return MemoryError(f"{what} of shape {shape} ({gigabytes:,.1f} GB) does not fit in memory")
+
+
 def apart(array: Float32Array, output: Float32Array) -> Float32Array:
-    """``array``, copied if it lies in the memory that the result will be written to."""
+    """``array``, or a copy of it if it may share memory with the output."""
     return array.copy() if np.may_share_memory(array, output) else array
 
 
 def like_features(array: npt.NDArray[Any], use_torch: bool) -> Array:
-    """``array`` as it is, or as a torch tensor on the same memory."""
+    """``array``, or a torch tensor that shares its memory."""
     return cast("Array", sys.modules["torch"].from_numpy(array)) if use_torch else array
 
 

@@ -1,29 +1,35 @@
-"""Cross-attention alone."""
+"""Cross-attention without the rest of the head, with keys and values that are computed once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, overload
+from typing import Any, Literal, NoReturn, overload
 
 import numpy as np
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade._arrays import (
     Array,
     ArrayLike,
     apart,
     boolean,
+    check_precision,
     float32,
     integer,
     is_torch,
     like_features,
     result,
+    text,
 )
 from saccade.errors import DtypeError, InputError
 
 
 class KeyValues:
-    """Held keys and values of :class:`CrossAttention`: immutable, for any number of calls and threads."""
+    """Keys and values of :class:`CrossAttention`, computed once. Returned by :meth:`CrossAttention.project`.
+
+    Immutable: any number of calls and threads may use them at the same time. ``copy.copy`` and
+    ``copy.deepcopy`` return the object itself. It cannot be pickled.
+    """
 
     def __init__(self, held: _saccade.KeyValues, use_torch: bool) -> None:
         self._held = held
@@ -31,36 +37,50 @@ class KeyValues:
 
     @property
     def batch(self) -> int:
-        """Sequences."""
+        """Number of sequences."""
         return self._held.batch
 
     @property
     def num_vl_tokens(self) -> int:
-        """Keys of each sequence."""
+        """Number of keys of each sequence."""
         return self._held.num_vl_tokens
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """Size in memory, in bytes."""
         return self._held.nbytes
+
+    def __copy__(self) -> KeyValues:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> KeyValues:
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise DtypeError(
+            "KeyValues cannot be pickled, because they belong to one CrossAttention: pickle the tokens and "
+            "call project again"
+        )
 
 
 class CrossAttention:
     """Multi-head cross-attention with its projections: ``to_out(softmax(q k^T / sqrt(head_dim)) v)``.
 
-    Heads are contiguous slices of the width, as in the released head (diffusers' ``Attention``).
+    Attention heads are contiguous slices of the width, as in the released head (``Attention`` of diffusers).
+    An instance is immutable and may be called by any number of threads at the same time.
 
     Args:
         tensors: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
             ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
             ``to_out.0.bias (width,)``.
-        num_heads: A divisor of the width.
+        num_heads: Number of attention heads, a divisor of the width.
         precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in :meth:`saccade.ActionHead.load`.
 
     Raises:
-        CheckpointError: tensors are missing, unknown or misshaped; all of them are listed.
-        DtypeError: a tensor is not floating point or not on the CPU.
-        InputError: ``num_heads`` does not divide the width, or the precision is unknown.
+        CheckpointError: Tensors are missing, unknown or of the wrong shape. The message lists all of them.
+        DtypeError: A tensor is not floating point or not on the CPU.
+        InputError: ``num_heads`` does not divide the width, the precision is unknown, or a tensor is not
+            finite.
 
     Example:
         >>> import numpy as np, saccade
@@ -80,7 +100,10 @@ class CrossAttention:
         if not isinstance(tensors, Mapping):
             raise DtypeError(f"tensors: expected a mapping of names to arrays, got {type(tensors).__name__}")
         check_precision(precision)
-        arrays = {str(name): float32(f"tensors[{name!r}]", value) for name, value in tensors.items()}
+        arrays = {
+            text("tensors", str(name)): float32(f"tensors[{name!r}]", value)
+            for name, value in tensors.items()
+        }
         for name, array in arrays.items():
             if not np.isfinite(array).all():
                 raise InputError(f"tensors[{name!r}]: expected finite values")
@@ -88,37 +111,38 @@ class CrossAttention:
 
     @property
     def num_heads(self) -> int:
-        """Attention heads."""
+        """Number of attention heads."""
         return self._attention.num_heads
 
     @property
     def width(self) -> int:
-        """Width of queries and output."""
+        """Width of the queries and of the output."""
         return self._attention.width
 
     @property
     def context_dim(self) -> int:
-        """Width of the tokens attended to."""
+        """Width of the tokens that are attended to."""
         return self._attention.context_dim
 
     @property
     def precision(self) -> str:
-        """What it computes in: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
+        """How it computes: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
         return self._attention.precision
 
     @property
     def nbytes(self) -> int:
-        """Bytes of weights in memory."""
+        """Size of the weights in memory, in bytes."""
         return self._attention.nbytes
 
     def project(self, encoder_hidden_states: ArrayLike) -> KeyValues:
-        """Projects tokens to keys and values, to be held over many calls.
+        """Computes keys and values, which any number of calls can share.
 
         Args:
-            encoder_hidden_states: ``(batch, T_vl, context_dim)``.
+            encoder_hidden_states: ``(batch, T_vl, context_dim)``, floating point.
 
         Raises:
-            ShapeError, DtypeError, InputError: wrong shape or dtype; NaN or infinity.
+            ShapeError, DtypeError, InputError: The tokens have the wrong shape or dtype, or are not finite.
+            MemoryError: There is not enough memory.
         """
         held = self._attention.project(float32("encoder_hidden_states", encoder_hidden_states))
         return KeyValues(held, is_torch(encoder_hidden_states))
@@ -155,23 +179,25 @@ class CrossAttention:
         return_weights: bool = False,
         out: ArrayLike | None = None,
     ) -> Array | tuple[Array, Array]:
-        """Attends from ``hidden_states`` to the held keys and values.
+        """Attends from ``hidden_states`` to keys and values.
 
         Args:
             hidden_states: ``(batch, queries, width)``.
             kv: From :meth:`project`.
-            key_mask: bool ``(batch, T_vl)``, True = attended. A query with no key left gets zeros: the
-                output is then ``to_out``'s bias.
-            key_bias: ``(batch, T_vl)``, added to the logits; minus infinity removes a key.
-            return_weights: Also return the attention probabilities.
-            out: Where the result goes: writable float32, C-contiguous, ``(batch, queries, width)``.
+            key_mask: bool ``(batch, T_vl)``, True where a key is attended. If no key is left, the attention
+                of a query is zero and its output is the bias of ``to_out``.
+            key_bias: ``(batch, T_vl)``, added to the logits. Minus infinity removes a key.
+            return_weights: Whether to return the attention probabilities as well.
+            out: The array that the result is written to: writable float32, C-contiguous, ``(batch, queries,
+                width)``. It is also returned.
 
         Returns:
-            ``(batch, queries, width)`` float32, torch if the tokens of ``kv`` were torch; with
-            ``return_weights`` also ``(batch, heads, queries, T_vl)``.
+            ``(batch, queries, width)`` float32; a torch tensor if the tokens of ``kv`` were torch. With
+            ``return_weights`` a pair of this and the probabilities ``(batch, heads, queries, T_vl)``.
 
         Raises:
-            ShapeError, DtypeError, InputError: an argument does not fit.
+            ShapeError, DtypeError, InputError: An argument does not fit or is not finite.
+            MemoryError: There is not enough memory.
         """
         if not isinstance(kv, KeyValues):
             raise InputError(f"kv: expected what project returns, got {type(kv).__name__}")
@@ -179,7 +205,7 @@ class CrossAttention:
         output = result(states.shape, out)
         weights = None
         if return_weights:
-            weights = np.empty((kv.batch, self.num_heads, *states.shape[1:2], kv.num_vl_tokens), np.float32)
+            weights = result((kv.batch, self.num_heads, *states.shape[1:2], kv.num_vl_tokens), None)
         bias = None if key_bias is None else apart(float32("key_bias", key_bias), output)
         self._attention.attend(
             apart(states, output), kv._held, boolean("key_mask", key_mask), bias, weights, output
@@ -188,12 +214,3 @@ class CrossAttention:
         if weights is None:
             return attended  # type: ignore[return-value]
         return attended, like_features(weights, kv._torch)  # type: ignore[return-value]
-
-
-def check_precision(precision: str) -> None:
-    """That it is text; which texts there are, the engine knows."""
-    if not isinstance(precision, str):
-        raise InputError(
-            "precision: expected one of 'float32', 'bfloat16', 'int8', got "
-            f"{precision!r} ({type(precision).__name__})"
-        )

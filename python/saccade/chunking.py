@@ -1,4 +1,4 @@
-"""Real-time chunking: a chunk begins as the last one ended."""
+"""Real-time chunking: a chunk that continues the previous one."""
 
 from __future__ import annotations
 
@@ -11,31 +11,35 @@ from saccade.errors import InputError
 
 @dataclass(frozen=True)
 class Chunking:
-    """How a chunk takes over the end of the chunk before it.
+    """How a chunk continues the previous one.
 
-    While a robot carries out a chunk, the next one is computed. Its first actions must agree with those that
-    the robot carries out meanwhile, or it jerks at the seam. So the last ``overlap`` of the first ``horizon``
-    actions of the chunk before become the first ones of the new chunk, in place of noise. Of these, action j
-    follows the velocity by a factor ``g``: 0 for the first ``frozen``, which stay as they are; then
-    ``(1 - exp(-a r)) / (1 - exp(-a))`` with ``a = ramp_rate`` and
-    ``r = (j - frozen + 1) / (overlap - frozen + 1)``, which grows from 0 to 1; and 1 from ``overlap`` on. It
-    is GR00T N1.7's rule (its options ``rtc_overlap_steps``, ``rtc_frozen_steps``, ``rtc_ramp_rate``), here
-    for every head; with ``integrator="midpoint"`` the factor stands before both velocities of a step.
+    While a robot executes a chunk, the next one is computed. The first actions of the next chunk must agree
+    with the actions that the robot executes meanwhile. Otherwise the robot jerks at the transition.
+
+    The last ``overlap`` of the first ``horizon`` actions of the previous chunk become the first actions of
+    the new one, in place of noise. The velocity of action ``j`` is multiplied by a factor: 0 for the first
+    ``frozen`` actions, which do not change; ``(1 - exp(-a r)) / (1 - exp(-a))`` for the rest of the overlap,
+    with ``a = ramp_rate`` and ``r = (j - frozen + 1) / (overlap - frozen + 1)``, which increases from 0 to 1;
+    and 1 from ``overlap`` on. This is the rule of GR00T N1.7 (its options ``rtc_overlap_steps``,
+    ``rtc_frozen_steps`` and ``rtc_ramp_rate``), here available for every head. With
+    ``integrator="midpoint"`` the factor applies to both velocities of a step.
 
     Attributes:
-        overlap: Actions that are taken over, at most ``horizon``.
-        frozen: Of these, the first that do not change, at most ``overlap``: those that are carried out before
-            the new chunk is there.
-        ramp_rate: How soon the rest become free; above 0. The smaller, the straighter the ramp.
-        horizon: Actions of the chunk before that count, at most the head's ``action_horizon``. Default all.
+        overlap: Number of actions that are taken from the previous chunk, at most ``horizon``.
+        frozen: Number of these that do not change, counted from the first, at most ``overlap``. The robot
+            executes them before the new chunk is available.
+        ramp_rate: How fast the factor increases; above 0. A smaller rate gives a straighter ramp.
+        horizon: Number of actions of the previous chunk that are used, at most the head's ``action_horizon``.
+            Default: all.
 
     Raises:
-        InputError: a number is out of range.
+        InputError: A number is out of range.
 
     Example:
-        A robot carries out 8 actions of a chunk of 16 and then wants the next chunk, which takes as long as 3
-        actions. So the next one is asked for after 5 of the 8, and begins with the last 11 of the old chunk,
-        of which the first 3 are carried out while it is computed:
+        A robot executes 8 actions of a chunk of 16 and then needs the next chunk, which takes as long to
+        compute as 3 actions take to execute. Therefore the next chunk is requested after 5 of the 8 actions.
+        It begins with the last 11 actions of the old one, the first 3 of which are executed while it is
+        computed:
 
         >>> import importlib.resources
         >>> import numpy as np, saccade

@@ -1,4 +1,4 @@
-"""The head's configuration."""
+"""The configuration of a head."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade.errors import CheckpointError
 
-#: No config is longer; the same for one that is found beside the weights.
+#: A longer file is refused. The engine has the same limit for the config in a checkpoint's directory.
 MOST_BYTES = 100_000_000
 
 
@@ -21,44 +21,46 @@ MOST_BYTES = 100_000_000
 class HeadConfig:
     """Sizes and switches of an action head.
 
-    The names of a published ``config.json`` are in parentheses where they differ.
+    If the name in a published ``config.json`` differs, it is given in parentheses.
 
     Attributes:
-        version: Release of the architecture, ``"n1"``, ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``. What the head
-            computes is said by the other fields.
+        version: Release of the architecture: ``"n1"``, ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``. The other fields
+            determine what the head computes.
         width: Width of the diffusion transformer (``input_embedding_dim``).
-        num_layers: Its blocks.
-        num_heads: Its attention heads (``num_attention_heads``).
-        head_dim: Width of one of them (``attention_head_dim``).
+        num_layers: Number of its blocks.
+        num_heads: Number of its attention heads (``num_attention_heads``).
+        head_dim: Width of an attention head (``attention_head_dim``).
         context_dim: Width of the vision-language tokens (``backbone_embedding_dim``; N1:
             ``cross_attention_dim``).
-        interleave_self_attention: Every second block is self-attention; otherwise all are cross-attention.
-        mask_mode: What masks do in the cross-attention blocks: ``"none"``, they are ignored; ``"alternate"``,
-            a block sees the attended positions of text, or those of images.
-        attend_text_every_n_blocks: Of the alternating cross-attention blocks every so many see text, from the
-            first one on, the others images; 0 with ``mask_mode`` ``"none"``.
-        use_vlln: Whether the vision-language tokens pass a norm.
-        vl_num_layers: Blocks of the VL self-attention, 0 without one.
-        vl_num_heads: Its attention heads.
+        interleave_self_attention: Whether every second block is a self-attention block. Otherwise all blocks
+            are cross-attention.
+        mask_mode: How cross-attention blocks use masks. ``"none"``: not at all. ``"alternate"``: a block
+            attends to the attended positions of text, or to those of images.
+        attend_text_every_n_blocks: With ``mask_mode`` ``"alternate"``, every n-th cross-attention block,
+            starting with the first, attends to text; the others to images. 0 with ``"none"``.
+        use_vlln: Whether the vision-language tokens are normalised first.
+        vl_num_layers: Number of blocks of the VL self-attention; 0 if there is none.
+        vl_num_heads: Number of its attention heads.
         vl_head_dim: Width of one of them.
-        num_future_tokens: Learned query rows between state and actions (``num_target_vision_tokens``).
-        future_key_bias: What is added to the logits of each future key in every self-attention block, the
-            logarithms of how many tokens each stands for; None is zeros. Saccade's own
-            (``{"saccade": {"future_key_bias": [...]}}``): no published program reads it.
-        action_horizon: Actions in a chunk.
-        action_dim: Width of an action as it is returned.
-        encoder_action_dim: Width of an action as it is denoised (``pretrained_action_dim``); what it has
-            beyond ``action_dim`` is held at zero.
-        decoders: Module and width of each decoder, in the order in which their outputs stand side by side;
-            together ``action_dim`` wide.
+        num_future_tokens: Number of learned rows between state and actions (``num_target_vision_tokens``).
+        future_key_bias: A number for each future token, added to the logits of its key in every
+            self-attention block: the logarithm of the number of tokens that it represents. None means zeros.
+            This is an extension by saccade (``{"saccade": {"future_key_bias": [...]}}``), which no other
+            program reads.
+        action_horizon: Number of actions in a chunk.
+        action_dim: Width of a returned action.
+        encoder_action_dim: Width of an action during sampling (``pretrained_action_dim``). Dimensions beyond
+            ``action_dim`` are kept at zero.
+        decoders: Module name and width of each decoder in the order of their outputs, which are concatenated.
+            The widths add up to ``action_dim``.
         state_dim: Width of the state vector (``max_state_dim``).
-        state_history: State vectors that make the state row (``state_history_length``).
+        state_history: Number of state vectors in the state row (``state_history_length``).
         hidden_dim: Hidden width of encoders and decoders (``hidden_size``).
-        num_embodiments: Slices of the category-specific layers (``max_num_embodiments``).
-        num_timestep_buckets: Buckets that the time 0..1 is cut into.
-        num_steps: Euler steps unless a call says otherwise (``num_inference_timesteps``).
-        max_positions: Rows of the position table (``max_seq_len``).
-        add_pos_embed: Whether action rows get a position.
+        num_embodiments: Number of embodiments of the category-specific layers (``max_num_embodiments``).
+        num_timestep_buckets: Number of buckets of the time from 0 to 1.
+        num_steps: Default number of Euler steps (``num_inference_timesteps``).
+        max_positions: Number of rows of the position table (``max_seq_len``).
+        add_pos_embed: Whether positions are added to the action rows.
     """
 
     version: str
@@ -91,40 +93,53 @@ class HeadConfig:
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> HeadConfig:
-        """Reads a published config: a whole checkpoint's (with ``action_head_cfg``, or flat as those of N1.6
-        and N1.7 are) or the head's own. ``model_type`` says the version; without it the keys do.
+        """Reads a published config.
+
+        Args:
+            config: The config of a whole checkpoint (with ``action_head_cfg``, or flat as those of N1.6 and
+                N1.7) or of the head alone. The version is that of ``model_type``. Without this key, it is
+                recognised by the other keys.
 
         Raises:
-            CheckpointError: with everything that is missing, of the wrong type or contradictory.
+            CheckpointError: Values are missing, of the wrong type or contradictory. The message lists all of
+                them.
         """
         return cls(**_saccade.parse_config(to_json(config)))
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> HeadConfig:
-        """Reads ``path``, a ``config.json``; see :meth:`from_dict`.
+        """Reads a ``config.json`` file; see :meth:`from_dict`.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            CheckpointError: as :meth:`from_dict`.
+            FileNotFoundError: The file does not exist.
+            CheckpointError: As :meth:`from_dict`.
         """
         return cls(**_saccade.parse_config(read_json(path)))
 
 
 def to_json(config: Mapping[str, Any] | str | os.PathLike[str]) -> str:
-    """The JSON text of a config given as a mapping or as the path of a file."""
+    """The JSON text of a config.
+
+    Args:
+        config: A mapping, or the path of a JSON file.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        CheckpointError: The mapping contains values that JSON cannot represent, or the file cannot be read.
+    """
     if isinstance(config, (str, os.PathLike)):
         return read_json(config)
     try:
         return json.dumps(dict(config), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"config: expected a mapping as JSON has it, or a path: {error}") from None
+        raise CheckpointError(f"config: expected a mapping of JSON values, or a path: {error}") from None
 
 
 def read_json(path: str | os.PathLike[str]) -> str:
-    """The text of a config file."""
+    """The text of a config file; raises as :func:`to_json`."""
     try:
         about = Path(path).stat()
-        # A pipe would be waited for, a device read without end.
+        # Reading a pipe might wait forever, and a device might never end.
         if not stat.S_ISREG(about.st_mode):
             raise ValueError("not a regular file")
         if about.st_size > MOST_BYTES:

@@ -1,13 +1,14 @@
-"""What saccade uses on this machine."""
+"""The instruction set, threads and processor of this machine."""
 
 from __future__ import annotations
 
 import platform
+from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 
 
 @overload
@@ -15,15 +16,19 @@ def show_config(mode: Literal["stdout"] = "stdout") -> None: ...
 @overload
 def show_config(mode: Literal["dicts"]) -> dict[str, Any]: ...
 def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] | None:
-    """Prints, or with ``mode="dicts"`` returns, what a head loaded now would use.
+    """Prints what a head that is loaded now would use on this machine.
 
-    ``isa`` is the instruction set (``SACCADE_ISA`` forces one of ``available_isas``), ``dot_products`` what
-    it multiplies in one instruction on this CPU: ``bf16`` for the precision bfloat16, ``vnni`` for int8,
-    which run with what there is without them. ``num_threads`` is the default thread count
-    (``SACCADE_NUM_THREADS``).
+    - ``isa``: the instruction set. The environment variable ``SACCADE_ISA`` selects one of
+      ``available_isas``.
+    - ``dot_products``: the dot product instructions of this CPU: ``bf16`` for the precision bfloat16 and
+      ``vnni`` for int8. Both precisions also work without them.
+    - ``num_threads``: the default number of threads, which ``SACCADE_NUM_THREADS`` sets.
+
+    Args:
+        mode: ``"stdout"`` prints, ``"dicts"`` returns a dict instead.
 
     Raises:
-        InputError: ``SACCADE_ISA`` or ``SACCADE_NUM_THREADS`` holds something that cannot be used here.
+        InputError: ``SACCADE_ISA`` or ``SACCADE_NUM_THREADS`` has a value that cannot be used here.
 
     Example:
         >>> import saccade
@@ -45,3 +50,13 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     for name, value in config.items():
         print(f"{name}: {', '.join(value) or 'none' if isinstance(value, list) else value}")
     return None
+
+
+def cpu_name() -> str:
+    """Name of the processor as Linux reports it, or as Python's ``platform`` does."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,9 +1,11 @@
-"""The exceptions of saccade: each is also the built-in that a caller would expect."""
+"""The exceptions of saccade. Each one is also a subclass of the matching built-in exception."""
 
 
 class SaccadeError(Exception):
-    """Base of everything that saccade raises on its own, except ``FileNotFoundError`` for a path that is not
-    there.
+    """Base class of all errors that saccade raises itself.
+
+    The exceptions are ``FileNotFoundError`` for a path that does not exist and ``MemoryError`` for an
+    allocation that does not fit.
     """
 
     def __str__(self) -> str:
@@ -11,26 +13,36 @@ class SaccadeError(Exception):
 
 
 class ShapeError(SaccadeError, ValueError):
-    """An array has the wrong number of axes, or the wrong size on one of them."""
+    """An array has the wrong number of axes or the wrong size along an axis."""
 
 
 class DtypeError(SaccadeError, TypeError):
-    """An array holds elements of the wrong kind, or lies on another device than the CPU."""
+    """An argument has the wrong type, or an array has the wrong dtype or is not on the CPU."""
 
 
 class InputError(SaccadeError, ValueError):
-    """A value is out of range, not finite, or belongs to another head."""
+    """A value is out of range, is not finite, or belongs to another head."""
 
 
 class CheckpointError(SaccadeError, ValueError):
-    """A checkpoint or its config is broken, incomplete, or of another kind; the message lists all that is
-    wrong.
+    """A checkpoint or its config is damaged, incomplete or of an unknown kind.
+
+    The message lists every problem that was found.
+    """
+
+
+class MissingExtraError(SaccadeError, ModuleNotFoundError):
+    """An optional dependency is not installed. The message contains a command that installs it.
+
+    ``name`` is the missing module.
     """
 
 
 def printable(message: str) -> str:
-    """A message that does nothing to a terminal: what stands in files, and so in names and values, may be
-    anything. Lines stay lines.
+    """Escapes control characters, except line breaks.
+
+    Names and values from files appear in messages and may contain anything, escape sequences of terminals
+    included.
 
     Example:
         >>> print(printable("a\\x1b[2Jb"))

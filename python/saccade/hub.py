@@ -1,7 +1,6 @@
-"""Ids of published checkpoints: found where ``huggingface_hub`` keeps what was downloaded.
+"""Finds published checkpoints in the local cache of ``huggingface_hub``.
 
-The one place in which a source that a user gives becomes a path; every function and command that takes one
-comes here.
+Every function and command that accepts a checkpoint resolves it here.
 """
 
 from __future__ import annotations
@@ -11,9 +10,10 @@ import os
 import re
 from pathlib import Path
 
+from saccade._extras import pip_install
 from saccade.errors import InputError
 
-#: ``owner/name``, and after an ``@`` a branch, a tag or a commit.
+#: ``owner/name``, optionally followed by ``@`` and a branch, tag or commit.
 PUBLISHED = re.compile(r"(?P<id>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(?P<revision>[\w./-]+))?")
 
 
@@ -21,17 +21,18 @@ def resolve(source: str | os.PathLike[str]) -> Path:
     """The path of a checkpoint.
 
     Args:
-        source: A path; or, if there is no such path, the id of a published checkpoint such as
-            ``nvidia/GR00T-N1.5-3B``, ``@`` and a revision behind it or not. Its files are those in the local
-            cache of ``huggingface_hub`` (``HF_HOME`` and ``HF_HUB_CACHE`` say where that is).
+        source: A path, or the id of a published checkpoint, such as ``nvidia/GR00T-N1.5-3B`` or
+            ``nvidia/GR00T-N1.5-3B@main``. An existing path takes precedence. The files of an id are looked up
+            in the local cache of ``huggingface_hub`` (environment variables ``HF_HOME`` and
+            ``HF_HUB_CACHE``). Nothing is downloaded.
 
     Returns:
-        An id's folder; everything else as it is given, whether it is there or not.
+        The directory of an id. A path is returned unchanged, whether it exists or not.
 
     Raises:
-        InputError: ``source`` is no path.
-        FileNotFoundError: it has the form of an id, and neither the path nor the id's files are there. The
-            message says which command downloads them.
+        InputError: ``source`` is not a path.
+        FileNotFoundError: ``source`` has the form of an id, but neither the path exists nor are the files of
+            the id in the cache. The message contains a command that downloads them.
 
     Example:
         >>> resolve("policy.safetensors").name
@@ -44,7 +45,7 @@ def resolve(source: str | os.PathLike[str]) -> Path:
     if not isinstance(text, str):
         raise InputError(f"source: expected a path, got {type(source).__name__}")
     if "\0" in text:
-        raise InputError("source: expected a path, got one with a null character")
+        raise InputError(f"source: expected a path without null characters, got {text!r}")
     path = Path(text)
     published = PUBLISHED.fullmatch(text)
     if published is None or text.endswith((".safetensors", ".json")):
@@ -55,34 +56,35 @@ def resolve(source: str | os.PathLike[str]) -> Path:
 
 
 def _snapshot(name: str, revision: str | None) -> Path:
-    """The folder of the cache in which this revision's files are."""
+    """The directory of a revision in the cache."""
     download = f"hf download {name}" + ("" if revision is None else f" --revision {revision}")
     start = f"source: {name}{'' if revision is None else '@' + revision}: no such path, and "
     try:
         from huggingface_hub import snapshot_download
     except ImportError:
         raise FileNotFoundError(
-            f"{start}huggingface_hub, which keeps published checkpoints, is not installed: "
-            f"pip install huggingface_hub, then {download}"
+            f"{start}huggingface_hub, which downloads published checkpoints, is not installed. Install it "
+            f"with: {pip_install('huggingface_hub')}, then run: {download}"
         ) from None
     try:
         folder = Path(snapshot_download(name, revision=revision, local_files_only=True))
-    except (FileNotFoundError, ValueError):  # it is not there; it is no id
+    except (FileNotFoundError, ValueError):  # it is not in the cache; it is not an id
         from huggingface_hub.constants import HF_HUB_CACHE
 
         raise FileNotFoundError(
-            f"{start}not in the cache {HF_HUB_CACHE}; nothing is downloaded here, but by: {download}"
+            f"{start}not in the cache {HF_HUB_CACHE}. Download it with: {download}"
         ) from None
     missing = _missing(folder)
     if missing:
         raise FileNotFoundError(
-            f"{start}the cache has only a part of it ({folder} lacks {', '.join(missing)}): {download}"
+            f"{start}the cache contains only a part of it ({folder} lacks {', '.join(missing)}). Download "
+            f"the rest with: {download}"
         )
     return folder
 
 
 def _missing(folder: Path) -> list[str]:
-    """Files that a loader needs and a download of some files only did not bring."""
+    """Required files that a partial download does not contain."""
     missing = [] if (folder / "config.json").exists() else ["config.json"]
     indexes = sorted(folder.glob("*.safetensors.index.json"))
     if not indexes:
@@ -91,4 +93,4 @@ def _missing(folder: Path) -> list[str]:
         shards = set(json.loads(indexes[0].read_text(encoding="utf-8"))["weight_map"].values())
         return missing + sorted(shard for shard in shards if not (folder / shard).exists())
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return missing  # what is wrong with an index, its reader says
+        return missing  # the reader of the index reports what is wrong with it

@@ -1,18 +1,18 @@
-"""How the velocity is followed from noise to actions in one step."""
+"""How a step follows the velocity from noise to actions."""
 
 from __future__ import annotations
 
 from saccade.errors import InputError
 
-#: Evaluations of the velocity in one step of each.
+#: Velocity evaluations in one step of each integrator.
 INTEGRATORS = {"euler": 1, "midpoint": 2}
 
 
 def check_integrator(integrator: object) -> str:
-    """The integrator's name; None stands for Euler's.
+    """The name of the integrator. None means ``"euler"``.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: There is no integrator of that name.
     """
     if integrator is None:
         return "euler"

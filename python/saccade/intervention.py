@@ -1,4 +1,4 @@
-"""What to change inside the head while it runs: cuts, biases, patches, replaced tokens."""
+"""Changes inside the head during a call: cuts, biases, patches, other future tokens."""
 
 from __future__ import annotations
 
@@ -13,60 +13,70 @@ import numpy.typing as npt
 from saccade._arrays import ArrayLike, Float32Array, float32, indices, integer
 from saccade.errors import InputError, ShapeError
 
-#: The rows of the head in the order in which they lie, and the tokens that cross-attention blocks read.
+#: The groups of rows of the head in their order, and with the keys of cross-attention blocks.
 ROW_GROUPS = ("state", "future", "action")
 GROUPS = (*ROW_GROUPS, "vl")
 
-#: A group's name, or the name and the indices of some of its tokens.
+#: The name of a group, or its name and the indices of some of its tokens.
 Tokens: TypeAlias = "str | tuple[str, int | Collection[int]]"
-#: A group and the indices of its tokens; None stands for all of them.
+#: A group and the indices of its tokens. None selects all of them.
 Chosen: TypeAlias = tuple[str, tuple[int, ...] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Intervention:
-    """A change of what the head computes, for :meth:`ActionHead.sample`, ``velocity`` and ``trace``, and for
-    those of :class:`saccade.reference.ActionHead`.
+    """A change inside the head, for :meth:`saccade.ActionHead.sample`, ``velocity`` and ``trace``.
 
-    Groups of tokens are ``"state"``, ``"future"`` and ``"action"`` (the rows of the head) and ``"vl"`` (what
-    cross-attention blocks read). Where a group stands, ``(group, indices)`` may stand for some of its tokens.
-    Cross-attention blocks have the keys ``vl``, self-attention blocks those of the three others; a cut or
-    bias acts where its keys are. All batch elements and samples are treated alike. Keys of a mapping must be
-    hashable: ``("future", (0, 1))``. Indices of ``vl`` are of all positions, in blocks that see only some of
-    them too; what such a block does not see is neither cut nor biased there.
+    :class:`saccade.reference.ActionHead` accepts the same object.
 
-    Several interventions given in a sequence act together: biases add up, of two patches of one row the later
-    one counts, and at most one replaces the future tokens.
+    The groups of tokens are ``"state"``, ``"future"`` and ``"action"``, which are the rows of the head, and
+    ``"vl"``, the vision-language tokens. ``(group, indices)`` selects some tokens of a group. As the key of a
+    mapping it must be hashable: ``("future", (0, 1))``. All observations and samples of a call are changed in
+    the same way.
+
+    Cross-attention blocks have ``vl`` keys, and self-attention blocks have ``state``, ``future`` and
+    ``action`` keys. Therefore an edge (reader, source) exists in cross-attention blocks if the source is
+    ``vl``, and otherwise in self-attention blocks. A cut or bias has no effect in the other kind of block. If
+    none of the cuts and biases of an intervention exists in any of its ``blocks``, the call raises an
+    ``InputError``, because a result without effect would be misleading. With interleaved self-attention, the
+    even blocks are cross-attention and the odd blocks are self-attention.
+
+    Indices of ``vl`` count all positions, also in blocks that attend only to text or only to images. Tokens
+    that such a block does not attend to are not affected there.
+
+    Several interventions in a sequence act together. Their biases add up. If two of them patch the same row,
+    the later one applies. At most one may replace the future tokens.
 
     Args:
-        cut: Pairs ``(reader, source)``: the reader's rows no longer see the source's keys. A row with no key
-            left gets zero from the attention, so that the block adds only its output bias.
-        key_bias: Group to a number or ``(tokens,)`` numbers, added to the logits of these keys for every
-            reader. Minus infinity removes a key.
-        patch: ``{(step, block): {group: rows}}``, rows after that block replaced; ``rows`` is
-            ``(tokens, width)`` or ``(batch, tokens, width)``. A patch names its own step and block, and
-            ``blocks``, ``steps`` and ``heads`` do not limit it.
-        future_tokens: ``(N', width)``, used in place of the learned ones at every step; N' may be any number,
-            0 included, and the group ``future`` then has N' tokens. They come without the config's
-            ``future_key_bias``.
-        blocks: Blocks in which cuts and biases act; default all.
-        steps: Euler steps at which they act; default all. ``velocity`` is step 0.
-        heads: Attention heads in which they act; default all.
+        cut: Pairs ``(reader, source)``. The rows of the reader no longer attend to the keys of the source. If
+            a row has no key left, its attention is zero, and the block adds only the bias of its output
+            layer.
+        key_bias: For a group, a number or an array ``(tokens,)`` that is added to the logits of its keys for
+            every reader. Minus infinity removes a key.
+        patch: ``{(step, block): {group: rows}}``. Replaces rows after that block. ``rows`` is ``(tokens,
+            width)`` or ``(batch, tokens, width)``. A patch has its own step and block; ``blocks``, ``steps``
+            and ``heads`` do not apply to it.
+        future_tokens: ``(N', width)``, used at every step in place of the learned future tokens. N' may be
+            any number, 0 included, and the group ``future`` then has N' tokens. The ``future_key_bias`` of
+            the config is not applied to them.
+        blocks: The blocks where cuts and biases apply. Default: all.
+        steps: The steps at which they apply. Default: all. ``velocity`` is step 0.
+        heads: The attention heads in which they apply. Default: all.
 
     Raises:
-        InputError: an unknown group, a reader that is not a row, indices that are no distinct integers of at
-            least 0, a bias that is not a number below infinity, rows that are not finite. What depends on the
-            head's sizes is checked when it is used.
-        DtypeError, ShapeError: arrays that are not floating point, or of the wrong number of axes.
+        InputError: A group is unknown, a reader is ``vl``, indices are not distinct integers of at least 0,
+            ``blocks``, ``steps`` or ``heads`` is empty, a bias is NaN or plus infinity, or rows are not
+            finite. Sizes are checked when the intervention is used.
+        DtypeError, ShapeError: An array is not floating point, or has the wrong number of axes.
 
     Example:
-        Nothing but the vision-language tokens reaches the actions, and only by way of the future tokens:
+        The vision-language tokens reach the actions only through the future tokens:
 
         >>> through_future = Intervention(cut=[("action", "vl"), ("state", "vl")])
         >>> through_future.cut
         ((('action', None), ('vl', None)), (('state', None), ('vl', None)))
 
-        The first two future tokens hidden from the actions, in block 1 only:
+        The actions do not attend to the first two future tokens in block 1:
 
         >>> Intervention(cut=[("action", ("future", [0, 1]))], blocks=[1]).cut
         ((('action', None), ('future', (0, 1))),)
@@ -89,14 +99,17 @@ class Intervention:
         keep("patch", _patches(self.patch))
         keep("future_tokens", _future_tokens(self.future_tokens))
         for name in ("blocks", "steps", "heads"):
-            keep(name, indices(name, getattr(self, name)))
+            chosen = indices(name, getattr(self, name))
+            if chosen == ():
+                raise InputError(f"{name}: expected at least one, or None for all, got none")
+            keep(name, chosen)
 
 
 def as_interventions(given: Intervention | Sequence[Intervention] | None) -> tuple[Intervention, ...]:
-    """One, several or none as a tuple.
+    """No, one or several interventions as a tuple.
 
     Raises:
-        InputError: it is anything else.
+        InputError: ``given`` is anything else.
     """
     if given is None:
         return ()
@@ -124,7 +137,7 @@ def _cuts(cut: Any) -> tuple[tuple[Chosen, Chosen], ...]:
         reader, source = _chosen("cut", pair[0]), _chosen("cut", pair[1])
         if reader[0] == "vl":
             raise InputError(
-                "cut: 'vl' is read, it does not read; expected a reader among state, future, action"
+                "cut: expected a reader among state, future, action, got 'vl', which attends to nothing"
             )
         pairs.append((reader, source))
     return tuple(pairs)
@@ -150,13 +163,15 @@ def _biases(key_bias: Any) -> dict[Chosen, Float32Array] | None:
 
 
 def _number(name: str, bias: Any) -> Any:
-    """A plain number as a float, integers too; anything else as it is."""
+    """A plain number, integers included, as a float. Anything else is returned unchanged."""
     if isinstance(bias, bool) or not isinstance(bias, Real):
-        return bias  # arrays of integers are refused like everywhere else
+        return bias  # arrays of integers are refused as everywhere else
     try:
         return float(bias)
     except OverflowError:
-        raise InputError(f"{name}: expected a number below infinity, got one that no float holds") from None
+        raise InputError(
+            f"{name}: expected a number below infinity, got one beyond the range of float"
+        ) from None
 
 
 def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | None:
@@ -179,7 +194,9 @@ def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | 
             name = f"patch[{key}][{tokens!r}]"
             chosen = _chosen(name, tokens)
             if chosen[0] == "vl":
-                raise InputError(f"{name}: blocks change rows, not 'vl'; expected state, future or action")
+                raise InputError(
+                    f"{name}: expected state, future or action, got 'vl', which blocks do not change"
+                )
             values = float32(name, rows)
             if values.ndim not in (2, 3):
                 raise ShapeError(
@@ -199,7 +216,11 @@ def _future_tokens(future_tokens: Any) -> Float32Array | None:
 
 
 def _kept(name: str, values: Float32Array, good: npt.NDArray[np.bool_], expected: str) -> Float32Array:
-    """A copy that nobody can change; refused unless all of it is good."""
+    """A read-only copy.
+
+    Raises:
+        InputError: A value is not ``good``.
+    """
     if not good.all():
         index = tuple(np.argwhere(~good)[0].tolist())
         where = f" at index {index}" if index else ""

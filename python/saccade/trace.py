@@ -1,4 +1,4 @@
-"""What is kept of the inside of the head: attention probabilities, and the rows after a block."""
+"""What a run of the head recorded: attention probabilities, and the rows after each block."""
 
 from __future__ import annotations
 
@@ -15,22 +15,33 @@ RECORDS = ("attention", "hidden")
 ArrayT = TypeVar("ArrayT")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trace(Generic[ArrayT]):
-    """One run of the Euler loop, seen from inside; made by :meth:`ActionHead.trace`, and by that of
-    :class:`saccade.reference.ActionHead`.
+    """What one call of :meth:`saccade.ActionHead.trace` recorded. ``repr`` lists keys, shapes and sizes.
 
-    Arrays are float32, NumPy or torch like the features; the reference's are tensors of its own dtype.
+    Arrays are float32, NumPy or torch like the features. Those of :class:`saccade.reference.ActionHead` are
+    torch tensors in its dtype.
 
     Attributes:
-        attention: By ``(step, block)``, the probabilities used, ``(batch, heads, queries, keys)``. Queries
-            are all rows; keys are the vision-language tokens in a cross-attention block and the rows in a
-            self-attention block, those that a block does not see included. Such a key, and a removed
-            one, has exactly 0.
-        hidden: By ``(step, block)``, the rows as the next block reads them (after the block, and after what
-            was patched there), ``(batch, rows, width)``.
-        rows: Where the groups ``"state"``, ``"future"`` and ``"action"`` lie on the axes of rows.
-        actions: The result, ``(batch, action_horizon, action_dim)``.
+        attention: The attention probabilities by ``(step, block)``, ``(batch, heads, queries, keys)``.
+            Queries are all rows. Keys are all vision-language tokens in a cross-attention block, and all rows
+            in a self-attention block. A key that a block cannot attend to has probability 0.
+        hidden: The rows by ``(step, block)`` as the next block reads them, patches included, ``(batch, rows,
+            width)``.
+        rows: The slice of the rows of each group, ``"state"``, ``"future"`` and ``"action"``.
+        actions: The sampled actions, ``(batch, action_horizon, action_dim)``.
+
+    Example:
+        >>> import importlib.resources
+        >>> import numpy as np, saccade
+        >>> head = saccade.ActionHead.load(importlib.resources.files("saccade") / "sim" / "demo")
+        >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
+        >>> head.trace(context, np.zeros((1, head.config.state_dim)), 0, seed=7, blocks=[0, 2])
+        <saccade.Trace 0.3 MB
+          attention[step, block]: steps 0-3, blocks 0, 2: (1, 4, 33, 60)
+          hidden: not recorded
+          rows: state 0, future 1-16, action 17-32
+          actions: (1, 16, 4)>
     """
 
     attention: Mapping[tuple[int, int], ArrayT]
@@ -38,15 +49,32 @@ class Trace(Generic[ArrayT]):
     rows: Mapping[str, slice]
     actions: ArrayT
 
+    def __repr__(self) -> str:
+        nbytes = _nbytes(self.attention, self.hidden) + getattr(self.actions, "nbytes", 0)
+        rows = ", ".join(
+            f"{group} {_span(range(*span.indices(span.stop)))}" for group, span in self.rows.items()
+        )
+        lines = [
+            f"<saccade.Trace {_size(nbytes)}",
+            *_listed("attention", self.attention),
+            *_listed("hidden", self.hidden),
+            f"  rows: {rows}",
+            f"  actions: {_shape(self.actions)}>",
+        ]
+        return "\n".join(lines)
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Record:
-    """The VL self-attention of one :meth:`ActionHead.encode`, seen from inside.
+    """What one call of :meth:`saccade.ActionHead.encode` recorded. ``repr`` lists keys, shapes and sizes.
+
+    Arrays are float32, NumPy or torch like the features.
 
     Attributes:
-        attention: By block, the probabilities used, ``(batch, heads, T_vl, T_vl)``. A dropped key has exactly
-            0; as a query, a dropped position means nothing.
-        hidden: By block, the tokens after it, ``(batch, T_vl, context_dim)``; dropped positions mean nothing.
+        attention: The probabilities of the VL self-attention by block, ``(batch, heads, T_vl, T_vl)``. A
+            dropped key has probability 0. The rows of a dropped query have no meaning.
+        hidden: The vision-language tokens after each block, ``(batch, T_vl, context_dim)``. Dropped positions
+            have no meaning.
     """
 
     attention: Mapping[int, Array]
@@ -54,15 +82,23 @@ class Record:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
-        return sum(int(array.nbytes) for kept in (self.attention, self.hidden) for array in kept.values())
+        """Size in memory, in bytes."""
+        return _nbytes(self.attention, self.hidden)
+
+    def __repr__(self) -> str:
+        lines = [
+            f"<saccade.Record {_size(self.nbytes)}",
+            *_listed("attention", self.attention),
+            *_listed("hidden", self.hidden),
+        ]
+        return "\n".join(lines) + ">"
 
 
 def check_record(record: Any) -> tuple[bool, bool]:
-    """Whether attention, and whether hidden rows, are to be recorded.
+    """Whether to record attention, and whether to record hidden rows.
 
     Raises:
-        InputError: ``record`` is not made of the names ``"attention"`` and ``"hidden"``.
+        InputError: ``record`` contains anything but the names ``"attention"`` and ``"hidden"``.
     """
     try:
         names = None if isinstance(record, str) else list(record)
@@ -71,3 +107,44 @@ def check_record(record: Any) -> tuple[bool, bool]:
     if names is None or any(not isinstance(name, str) or name not in RECORDS for name in names):
         raise InputError(f"record: expected a tuple of names among {', '.join(RECORDS)}, got {record!r}")
     return "attention" in names, "hidden" in names
+
+
+def _nbytes(*recorded: Mapping[Any, Any]) -> int:
+    return sum(int(array.nbytes) for arrays in recorded for array in arrays.values())
+
+
+def _listed(name: str, arrays: Mapping[Any, Any]) -> list[str]:
+    """The keys and shapes of recorded arrays: a line for each shape."""
+    if not arrays:
+        return [f"  {name}: not recorded"]
+    by_shape: dict[str, list[Any]] = {}
+    for place, array in arrays.items():
+        by_shape.setdefault(_shape(array), []).append(place)
+    lines = []
+    for shape, places in by_shape.items():
+        if isinstance(places[0], tuple):
+            steps, blocks = ([place[axis] for place in places] for axis in (0, 1))
+            lines.append(f"  {name}[step, block]: steps {_span(steps)}, blocks {_span(blocks)}: {shape}")
+        else:
+            lines.append(f"  {name}[block]: blocks {_span(places)}: {shape}")
+    return lines
+
+
+def _span(indices: Any) -> str:
+    """Indices with runs of neighbours shortened, such as ``"0-3, 6"``."""
+    ordered = sorted(set(indices))
+    runs: list[list[int]] = []
+    for index in ordered:
+        if runs and index == runs[-1][-1] + 1:
+            runs[-1].append(index)
+        else:
+            runs.append([index])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs) or "none"
+
+
+def _shape(array: Any) -> str:
+    return str(tuple(array.shape))
+
+
+def _size(nbytes: int) -> str:
+    return f"{nbytes / 1e6:,.1f} MB"

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.patches import Circle
 
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.files import write_atomically
+from saccade._files import write_atomically
 from saccade.sim.rollout import Episode, run_episode
 from saccade.sim.scenarios import TOUCH, Fork
 from saccade.study import figures

@@ -1,4 +1,4 @@
-"""The Normalizer beside lerobot's own processor steps: `make test-compat` runs this in each environment."""
+"""The Normalizer against lerobot's own processor steps: `make test-compat` runs this in each environment."""
 
 # lerobot has no types.
 # mypy: disable-error-code="no-any-return, no-untyped-call, attr-defined"

@@ -1,7 +1,7 @@
 """lerobot's own policies, accelerated: `make test-compat` runs this in an environment of each release.
 
-The backbone's constructor asks the Hub for assets, so a small module of our own stands in its place; policy,
-model and head are lerobot's classes, small. What was run goes to the file that SACCADE_COMPAT_OUT names.
+The backbone's constructor downloads assets from the Hub, so a small module replaces it; policy, model and
+head are small instances of lerobot's classes. Results are written to the file named by SACCADE_COMPAT_OUT.
 """
 
 # Calls of torch modules are untyped, and lerobot has no types.

@@ -1,10 +1,10 @@
-"""Runs what is tested against released lerobot packages, each in an environment of its own; writes the page.
+"""Runs the tests against released lerobot packages, each in a separate environment, and writes the page.
 
     python tests/compat/run.py [--releases 0.6.1] [--python312 PATH] [--page docs/compatibility.md]
 
-`make test-compat` runs all. Environments are `.venv-compat-lerobot-*` beside the Makefile; they are made anew
-when their list of packages changes. lerobot and the others are installed without what they ask for besides:
-the lists beside this file are complete. torch is large, so two environments look for it in another one.
+`make test-compat` runs all releases. Environments are `.venv-compat-lerobot-*` next to the Makefile. They are
+recreated when their list of packages changes. All packages are installed without their dependencies, because
+the lists in this folder are complete. torch is large, so two environments use the torch of another one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--q
 
 @dataclass(frozen=True)
 class Release:
-    """A release of lerobot and where it is tried."""
+    """A release of lerobot and its environment."""
 
     lerobot: str
     on_top_of: str | None
@@ -45,7 +45,7 @@ class Release:
         return ROOT / "out" / "compat" / f"lerobot-{self.lerobot}.json"
 
 
-#: In the order in which their environments build on each other; "" is the one that runs this.
+#: In the order in which the environments build on each other; "" is the environment that runs this program.
 RELEASES = (
     Release("0.4.4", "", ("policies.py", "normalizers.py")),
     Release("0.6.1", None, ("policies.py", "normalizers.py", "n17_parity.py")),
@@ -55,12 +55,12 @@ RELEASES = (
 INTRODUCTION = """\
 # What `accelerate` was tested with
 
-lerobot's own policy, model and head, small and with random weights, around a stub of the backbone, whose
-constructor asks the Hub for assets. `make test-compat` sets up an environment for each release, runs the
-tests in it and writes this page. Errors are of whole chunks against the original `get_action` with equal
-seeds: root mean square of the difference beside that of the actions, the largest over the tests. float32
-differs by the order of sums and by torch's own sine tables. Where the original rounds to bfloat16, the
-difference is its rounding.
+The tests use lerobot's own policy, model and head, small and with random weights. The backbone is a stub,
+because its constructor downloads assets from the Hub. `make test-compat` creates an environment for each
+release, runs the tests in it and writes this page. Errors compare whole chunks with the original `get_action`
+for equal seeds: the root-mean-square difference divided by the root mean square of the actions, and of that
+the largest over the tests. In float32 the differences come from the order of sums and from torch's own sine
+tables. Where the original rounds to bfloat16, the difference is its rounding.
 """
 
 ERRORS = {
@@ -76,39 +76,43 @@ ERRORS = {
 }
 
 CHECKED = """\
-Batches of 1 and 3, with padding and images of other lengths in every row where the head reads masks. In each
-environment also passed:
+Batches of 1 and 3, with padding and images of different lengths in every row if the head reads masks. In each
+environment these tests passed too:
 
-- `select_action` over more than a chunk; `save_pretrained`; an optimizer's step between evaluations.
-- `restore` is bit for bit the original; twice accelerated is an error; copies and pickles hold the original.
-- Weights that change are taken anew: optimizer step, `load_state_dict` (also with `assign`), `.data`, NumPy,
-  a replaced parameter, a replaced layer, `.to(bfloat16)`. Steps set on the torch head are read live.
-- Refused: training mode, hooks, gradients, a replaced `get_action` or `forward`, `torch.compile` inside,
-  float64, changed code under the same names, other draws from the generator.
+- `select_action` over more than one chunk; `save_pretrained`; an optimizer step between evaluations.
+- `restore` gives the original bit for bit; accelerating twice is an error; copies and pickles hold the
+  original.
+- Changed weights are reloaded: optimizer step, `load_state_dict` (also with `assign`), `.data`, NumPy, a
+  replaced parameter, a replaced layer, `.to(bfloat16)`. The number of steps set on the torch head is read at
+  each call.
+- These are refused: training mode, hooks, gradients, a replaced `get_action` or `forward`, `torch.compile`
+  inside, float64, changed code under the same names, other draws from the generator.
 - Calls from several threads, at 1 and 2 threads, give the same bits.
 
 ## What is not in the table
 
-- **lerobot 0.4.0 to 0.4.3, 0.5.0, 0.6.0**: their heads' files equal those of the releases above (in 0.4.0 to
-  0.4.2 the policy around it differs).
+- **lerobot 0.4.0 to 0.4.3, 0.5.0, 0.6.0**: the files of their heads equal those of the releases above (in
+  0.4.0 to 0.4.2 the policy around the head differs).
 - **N1, N1.6, the two-decoder fork and its split arms**: `tests/test_integrations.py` has classes of the same
-  shape with saccade's own arithmetic. The fork's own head file was run once by hand, with errors as above.
-- **Isaac-GR00T's classes** are in no package, so nothing here runs them. N1.5's head is lerobot's; N1.6's and
-  N1.7's have the attributes, arguments and results that the classes of the same shape have.
-- **A GPU**: a head there is copied, computed on the CPU and its results put back; that path has not been run.
-- **Trained weights**: random ones have errors of another size at reduced precision:
+  structure with saccade's own arithmetic. The fork's own head file was run once by hand, with errors as
+  above.
+- **Isaac-GR00T's classes** are in no package, so they are not run here. N1.5's head is lerobot's. N1.6's and
+  N1.7's heads have the attributes, arguments and results of the test classes of the same structure.
+- **GPUs**: a head on a GPU is copied, computed on the CPU, and the results are copied back. This path has not
+  been run.
+- **Trained weights**: random weights have errors of another size at reduced precision: see
   [precision](precision.md).
 """
 
 
 def main() -> None:
-    """Sets up, tests, writes the page if all passed."""
+    """Sets up, runs the tests, and writes the page if all passed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--releases", nargs="+", choices=[release.lerobot for release in RELEASES])
     parser.add_argument(
-        "--python312", default=shutil.which("python3.12"), help="lerobot 0.5 and later need it"
+        "--python312", default=shutil.which("python3.12"), help="needed for lerobot 0.5 and later"
     )
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "compatibility.md")
     options = parser.parse_args()
@@ -121,14 +125,14 @@ def main() -> None:
 
 
 def set_up(release: Release, python312: str | None) -> None:
-    """An environment with exactly the listed packages, unless there is one."""
+    """Creates an environment with exactly the listed packages, unless it exists."""
     stamp = release.folder / "packages.txt"
     if stamp.is_file() and stamp.read_text() == release.packages.read_text():
         return
     python = sys.executable if release.on_top_of == "" else python312
     if python is None:
         sys.exit(f"lerobot {release.lerobot} needs Python 3.12: --python312 PATH (make: COMPAT_ARGS=...)")
-    print(f"setting up: lerobot {release.lerobot}", flush=True)
+    print(f"setup: lerobot {release.lerobot}", flush=True)
     subprocess.run([python, "-m", "venv", "--clear", release.folder], check=True)
     if release.on_top_of is not None:
         base = [other.folder for other in RELEASES if other.lerobot == release.on_top_of]
@@ -140,19 +144,19 @@ def set_up(release: Release, python312: str | None) -> None:
 
 
 def site_packages(python: Path) -> Path:
-    """Where an interpreter's packages are."""
+    """The site-packages folder of an interpreter."""
     code = "import sysconfig; print(sysconfig.get_path('purelib'))"
     found = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True)
     return Path(found.stdout.strip())
 
 
 def run_tests(release: Release) -> None:
-    """The release's tests, with the saccade of this tree."""
+    """Runs the release's tests with the saccade of this checkout."""
     print(f"testing: lerobot {release.lerobot}", flush=True)
     release.result.parent.mkdir(parents=True, exist_ok=True)
     paths = os.pathsep.join([str(ROOT / "python"), str(ROOT / "tests")])
     environment = os.environ | {"PYTHONPATH": paths, "SACCADE_COMPAT_OUT": str(release.result)}
-    # The suite's own settings ask for plugins that are not here.
+    # The settings of the main suite need packages that this environment lacks.
     command = [str(release.folder / "bin" / "python"), "-m", "pytest", "--noconftest", "--quiet"]
     tests = [str(HERE / test) for test in release.tests]
     done = subprocess.run([*command, *tests], cwd=ROOT, env=environment)
@@ -161,7 +165,7 @@ def run_tests(release: Release) -> None:
 
 
 def page(reports: list[dict[str, Any]]) -> str:
-    """The page of what was run."""
+    """The page for the given results."""
     reports = sorted(reports, key=lambda report: report["versions"]["lerobot"])
     rows = [["", *(f"lerobot {report['versions']['lerobot']}" for report in reports)]]
     rows.append(["head", *(f"GR00T {report['kind'].upper()}" for report in reports)])

@@ -15,7 +15,7 @@ from benches.peers.cases import Case
 
 @dataclass(frozen=True)
 class Task:
-    """What an engine's process is asked to build.
+    """The task of an engine's process.
 
     Attributes:
         case: Piece and sizes.
@@ -34,7 +34,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Built:
-    """What an engine built.
+    """The result of an engine's `build`.
 
     Attributes:
         works: By name, what can be timed.

@@ -1,4 +1,4 @@
-"""What every engine that runs torch modules, or graphs exported from them, does with the pieces."""
+"""Code shared by the engines that run torch modules or graphs exported from them."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Graph = Callable[..., tuple[Any, ...]]
 
 
 class Engine(Protocol):
-    """Runs modules; arrays in and out are of its own kind, with `+` and `*` as usual."""
+    """Runs modules. Its arrays are of its own type and support `+` and `*`."""
 
     def graph(self, name: str, module: Callable[[], nn.Module], inputs: tuple[Tensor, ...]) -> Graph:
-        """The module as this engine runs it; `module` builds it, and is not called if `name` is at hand."""
+        """The module in this engine. `module` builds it, and is not called if `name` is cached."""
 
     def array(self, tensor: Tensor) -> Any:
-        """An input as the engine wants it."""
+        """An input converted for the engine."""
 
     def numpy(self, array: Any) -> NDArray[np.float32]:
-        """An output in float32."""
+        """An output converted to float32."""
 
 
 def build(engine: Engine, task: Task) -> Built:
@@ -46,12 +46,14 @@ def build(engine: Engine, task: Task) -> Built:
     with torch.no_grad():
         built = {"linear": linear, "cross": cross, "blocks": blocks, "head": whole}[task.case.piece]
         result = built(engine, task, loaded)
-        result.result()  # engines that compile at the first call do so while the weights are at hand
+        result.result()  # some engines compile at the first call, which needs the weights
         return result
 
 
 def linear(engine: Engine, task: Task, loaded: Callable[[], ActionHead]) -> Built:
-    """Each shape with so many weights that they come from memory; rolled: equal ones might be merged."""
+    """Linear layers of each shape, with enough weights to exceed the caches. They are rolled, because equal
+    weights might be merged.
+    """
     del loaded
     works, calls, firsts = {}, {}, []
     for index, (name, (_, inputs, outputs)) in enumerate(zip(task.case.works, LINEAR_SHAPES, strict=True)):

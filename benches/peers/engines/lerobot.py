@@ -24,7 +24,7 @@ def build(task: Task) -> Built:
     dtype = torch.float32 if arithmetic == "float32" else torch.bfloat16
     head.load_state_dict(ActionHead.load(task.source, dtype=dtype).state_dict(), assign=True)
     head.requires_grad_(False)
-    # In memory of its own: that of a mapped file has no huge pages.
+    # Copied, because a mapped file has no huge pages.
     for parameter in head.parameters():
         parameter.data = parameter.data.clone()
 

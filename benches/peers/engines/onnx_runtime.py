@@ -49,19 +49,19 @@ class OnnxRuntime:
         return np.ascontiguousarray(tensor.numpy())
 
     def numpy(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
-        """As it is."""
+        """The output unchanged."""
         return array
 
 
 def export(module: nn.Module, inputs: tuple[Tensor, ...], path: Path) -> None:
-    """Writes the module as ONNX with its weights beside it; renamed when it is whole."""
+    """Writes the module as ONNX with external weights, under a temporary name first."""
     part = path.with_name(f"part-{path.name}")
     torch.onnx.export(module.eval(), inputs, part, dynamo=True, external_data=True, verbose=False)
     part.rename(path)
 
 
 def quantize(path: Path, narrow: Path) -> None:
-    """Weights of matrix products to int8, one scale an output channel."""
+    """Weights of matrix products to int8, one scale per output channel."""
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     part = narrow.with_name(f"part-{narrow.name}")

@@ -51,7 +51,7 @@ class OpenVino:
         return np.ascontiguousarray(tensor.numpy())
 
     def numpy(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
-        """As it is."""
+        """The output unchanged."""
         return array
 
 

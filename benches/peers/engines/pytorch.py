@@ -30,7 +30,7 @@ class Torch:
         """The module, called in inference mode."""
         del name, inputs
         built = module().requires_grad_(False).eval()
-        # In memory of its own: that of a mapped file has no huge pages.
+        # Copied, because a mapped file has no huge pages.
         for parameter in built.parameters():
             parameter.data = parameter.data.to(self.dtype, copy=True)
         for layer in built.modules():

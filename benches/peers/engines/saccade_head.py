@@ -16,7 +16,7 @@ from saccade.checkpoints import read_tensors
 
 
 def build(task: Task) -> Built:
-    """The works of the task's piece. Options: `precision`, and `future_refresh` if it is wanted."""
+    """The works of the task's piece. Options: `precision`, and optionally `future_refresh`."""
     return {"cross": cross, "blocks": blocks, "head": whole, "cost": cost}[task.case.piece](task)
 
 
@@ -55,7 +55,7 @@ def cross(task: Task) -> Built:
 
 
 def blocks(task: Task) -> Built:
-    """Four DiT blocks, all rows in every block: one Euler step of a head that has little else."""
+    """Four DiT blocks, all rows in every block: one Euler step of a head with few other layers."""
     head = load(task)
     features, state, noise = (task.arrays[name] for name in ("features", "state", "noise"))
     last = NUM_BLOCKS - 1

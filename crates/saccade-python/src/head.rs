@@ -67,6 +67,11 @@ impl ActionHead {
         self.0.embodiment_ids().to_vec()
     }
 
+    fn future_tokens<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let tokens = self.0.future_tokens();
+        to_numpy(py, tokens.data.to_vec(), tokens.shape)
+    }
+
     #[getter]
     fn num_threads(&self) -> usize {
         self.0.num_threads()

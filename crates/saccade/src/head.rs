@@ -133,7 +133,8 @@ pub struct ActionHead {
     vl: VlEncoder,
     state_encoder: [CategoryLinear; 2],
     action_encoder: ActionEncoder,
-    future_tokens: Vec<f32>,
+    /// `(num_future_tokens, width)`.
+    future_tokens: OwnedArray,
     /// Its first `action_horizon` rows; none without `add_pos_embed`.
     position_embedding: Option<Vec<f32>>,
     dit: Dit,
@@ -272,10 +273,13 @@ impl ActionHead {
             vl: VlEncoder::load(tensors, engine, &config, names)?,
             state_encoder: [category(state_1)?, category(state_2)?],
             action_encoder: ActionEncoder::load(tensors, engine, &names.action_encoder, ids)?,
-            future_tokens: match config.num_future_tokens {
-                0 => Vec::new(),
-                _ => tensors.tensor(&names.future_tokens.0)?.into_f32(),
-            },
+            future_tokens: OwnedArray::new(
+                match config.num_future_tokens {
+                    0 => Vec::new(),
+                    _ => tensors.tensor(&names.future_tokens.0)?.into_f32(),
+                },
+                &[config.num_future_tokens, config.width],
+            ),
             position_embedding: match &names.position_embedding {
                 None => None,
                 Some((name, _)) => Some(tensors.slices(name, 0..config.action_horizon)?.into_f32()),
@@ -305,6 +309,12 @@ impl ActionHead {
         &self.embodiment_ids
     }
 
+    /// The learned future tokens, `(num_future_tokens, width)`: what the future rows are before the first block.
+    #[must_use]
+    pub fn future_tokens(&self) -> Array<'_> {
+        self.future_tokens.view()
+    }
+
     /// Threads that a call uses.
     #[must_use]
     pub fn num_threads(&self) -> usize {
@@ -330,7 +340,7 @@ impl ActionHead {
         self.vl.nbytes()
             + category(&self.state_encoder)
             + self.action_encoder.nbytes()
-            + 4 * (self.future_tokens.len() + self.position_embedding.as_ref().map_or(0, Vec::len))
+            + 4 * (self.future_tokens.data.len() + self.position_embedding.as_ref().map_or(0, Vec::len))
             + self.dit.nbytes()
             + self.decoders.iter().map(|layers| category(layers)).sum::<usize>()
     }
@@ -633,7 +643,7 @@ impl ActionHead {
     ) -> Result<Extent<'a>> {
         Extent::new(
             &self.config,
-            &self.future_tokens,
+            &self.future_tokens.data,
             interventions,
             context,
             num_steps,

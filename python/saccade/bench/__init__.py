@@ -1,1 +1,1 @@
-"""How long the head takes here, beside what this machine allows: timing, floors, and a cost model."""
+"""How long the head takes on this machine: timing, floors and a cost model."""

@@ -1,8 +1,8 @@
-"""What a call must take at least on this machine, and what it is expected to take.
+"""The cost model: the least time that a call can take on this machine, and the time it is expected to take.
 
-The floor of a part is the longer of two times: its multiply-adds at the CPU's peak in the arithmetic that it
-runs in, and its weights at the rate at which memory can be read. The cost model divides the peak by how much
-of it the kernels reach.
+The floor of a part is the longer of two times: its multiply-adds at the CPU's peak rate in the arithmetic of
+the part, and reading its weights at the memory's bandwidth. The expected time divides the floor by the share
+of it that the kernels reach.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ from saccade.config import HeadConfig
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 
-#: Bytes of a weight, or of a held key or value, in memory. A float32 head keeps weights that are stored as
-#: bfloat16 so: floors are then too high where reading sets them, as it may where only action rows run.
+#: Bytes of a weight, or of a cached key or value, in memory. A float32 head keeps weights that are stored as
+#: bfloat16 in bfloat16. Floors that reading sets are then too high, which may happen where only action rows
+#: are computed.
 ELEMENT_BYTES = {"float32": 4, "bfloat16": 2, "int8": 1}
 
-#: What an int8 head runs in bfloat16: a hundredth of the work.
+#: The parts that an int8 head computes in bfloat16, a hundredth of the work.
 NOT_INT8 = (*ATTENTION, "embodiment", "output")
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What a CPU can do at most, as measured on it.
+    """The measured peak rates of a CPU.
 
     Attributes:
-        isa: the instruction set.
-        num_threads: that all rates are for.
-        macs_per_second: multiply-adds, by arithmetic.
-        read_bytes_per_second: from memory.
-        clock_hz: cycles a second, if that is known.
+        isa: The instruction set.
+        num_threads: Threads that the rates are for.
+        macs_per_second: Multiply-adds per second, by arithmetic.
+        read_bytes_per_second: Bandwidth of reading memory.
+        clock_hz: Clock rate, if it is known.
     """
 
     isa: str
@@ -44,7 +45,7 @@ class Machine:
 
     @classmethod
     def measured(cls, isa: str, num_threads: int) -> Machine:
-        """This machine now; takes about a second."""
+        """Measures this machine; takes about a second."""
         peaks = _saccade.measure_peaks(num_threads)
         return cls(
             isa,
@@ -57,14 +58,14 @@ class Machine:
 
 @dataclass(frozen=True)
 class Efficiency:
-    """Which share of its floor each kind of part reaches, and what comes on top.
+    """The share of its floor that each kind of part reaches, and the time of everything else.
 
     Attributes:
-        few_rows: linear layers over up to 96 rows, whose weights come from memory.
-        many_rows: linear layers over more.
-        attention: scores, softmax and the sum of values.
-        rest: time of everything else (norms, packing, copies, activations, waking threads) as a share of
-            these three together.
+        few_rows: Linear layers over up to 96 rows, whose weights come from memory.
+        many_rows: Linear layers over more rows.
+        attention: Scores, softmax and the weighted sum of values.
+        rest: Time of everything else (norms, packing, copies, activations, waking threads), relative to the
+            time of these three.
     """
 
     few_rows: float
@@ -73,8 +74,9 @@ class Efficiency:
     rest: float
 
 
-#: Measured by `saccade bench --size n1.5 --profile --threads 2` on a 2-core Zen 4 (AVX-512, its bfloat16 and
-#: int8 dot products; 114, 227, 450 GMAC/s, 32 GB/s), T_vl 296, medians of 5; good to some 10 % there.
+#: Measured by `saccade bench --version n1.5 --profile --num-threads 2` on a 2-core Zen 4 (AVX-512 with its
+#: bfloat16 and int8 dot products; 114, 227, 450 GMAC/s, 32 GB/s), T_vl 296, medians of 5; accurate to about
+#: 10 % there.
 EFFICIENCY = {
     "float32": Efficiency(few_rows=0.88, many_rows=0.86, attention=0.45, rest=0.02),
     "bfloat16": Efficiency(few_rows=0.88, many_rows=0.88, attention=0.45, rest=0.04),
@@ -83,12 +85,12 @@ EFFICIENCY = {
 
 
 def arithmetic(part: str, precision: str) -> str:
-    """The arithmetic that a part runs in at this precision of the head."""
+    """The arithmetic of a part in a head of this precision."""
     return "bfloat16" if precision == "int8" and part in NOT_INT8 else precision
 
 
 def floor(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float) -> float:
-    """Seconds below which this work cannot be done."""
+    """The least time of this work, in seconds."""
     return max(
         multiply_adds / machine.macs_per_second[runs_in],
         num_bytes / machine.read_bytes_per_second,
@@ -96,13 +98,13 @@ def floor(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float
 
 
 def floor_of(machine: Machine, precision: str, part: str, work: Work) -> float:
-    """`floor` of one part of the head."""
+    """`floor` of one part of a call, in seconds."""
     runs_in = arithmetic(part, precision)
     return floor(machine, runs_in, work.multiply_adds, work.elements * ELEMENT_BYTES[runs_in])
 
 
 def floors(machine: Machine, precision: str, works: Works) -> dict[str, float]:
-    """By part, in seconds."""
+    """`floor` of every part of a call, in seconds."""
     return {part: floor_of(machine, precision, part, work) for part, work in works.items()}
 
 
@@ -110,10 +112,10 @@ def predict(config: HeadConfig, call: Call, precision: str, machine: Machine) ->
     """Seconds that `encode` and `sample` are expected to take.
 
     Args:
-        config: the head's.
-        call: what is asked of it.
-        precision: its.
-        machine: where it runs, measured there.
+        config: of the head.
+        call: its sizes.
+        precision: of the head.
+        machine: the machine that it runs on.
 
     Returns:
         `{"encode": seconds, "sample": seconds}`.
@@ -131,7 +133,7 @@ def predict(config: HeadConfig, call: Call, precision: str, machine: Machine) ->
 
 
 def share(reached: Efficiency, part: str, work: Work) -> float:
-    """Which share of its floor a part reaches."""
+    """The share of its floor that a part reaches."""
     if part in ATTENTION:
         return reached.attention
     rows = work.multiply_adds / work.elements  # the mean over its products, weighted by their weights

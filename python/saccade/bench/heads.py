@@ -1,4 +1,4 @@
-"""Heads of any size with random weights, written quickly and without torch: for timing, not for actions."""
+"""Checkpoints of published sizes with random weights, written quickly and without torch, for timing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from saccade import _saccade
 
-#: Sizes of nvidia/GR00T-N1.5-3B with one embodiment: the others cost memory and no time.
+#: Sizes of nvidia/GR00T-N1.5-3B with one embodiment; further embodiments cost memory but no time.
 N15: Mapping[str, Any] = {
     "action_dim": 32,
     "action_horizon": 16,
@@ -47,7 +47,7 @@ N15: Mapping[str, Any] = {
     },
 }
 
-#: What differs in nvidia/GR00T-N1.6-3B and nvidia/GR00T-N1.7-3B, whose configs say all in one object.
+#: What differs in nvidia/GR00T-N1.6-3B and nvidia/GR00T-N1.7-3B, whose configs have one flat object.
 LATER: Mapping[str, Mapping[str, Any]] = {
     "n1.6": {
         "model_type": "Gr00tN1d6",
@@ -66,12 +66,12 @@ LATER: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
-#: What `sized` knows.
+#: The sizes of `sized`.
 SIZES = ("n1.5", "n1.6", "n1.7", "small")
 
 
 def sized(size: str) -> dict[str, Any]:
-    """The config of a size: a version's, or `small`, N1.5's structure in milliseconds."""
+    """The config of a version's size, or of `small`: N1.5's structure, but fast enough for tests."""
     config = copy.deepcopy(dict(N15))
     if size in LATER:
         absent = ["action_dim", "num_target_vision_tokens"]
@@ -91,10 +91,10 @@ def sized(size: str) -> dict[str, Any]:
 
 
 def write(folder: Path, config: Mapping[str, Any]) -> None:
-    """Writes `config.json` and `model.safetensors`, whose weights keep activations of order one.
+    """Writes `config.json` and `model.safetensors`; the weights keep activations of order one.
 
-    Stored as bfloat16. One block of random numbers is repeated, so that the disk sets the pace: 1.5 GB for
-    the size of N1.5, 2.2 GB and 2.6 GB for those of N1.6 and N1.7.
+    They are stored as bfloat16. One block of random numbers is repeated, so that the disk is the limit:
+    1.5 GB for N1.5, 2.2 GB for N1.6, 2.6 GB for N1.7.
     """
     text = json.dumps(dict(config) if "model_type" in config else {"action_head_cfg": dict(config)})
     (folder / "config.json").write_text(text)

@@ -1,25 +1,26 @@
-"""Timing pieces of work by turns, and profiles of one."""
+"""Timing pieces of work in turn, and profiling one of them."""
 
 from __future__ import annotations
 
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 import saccade
 from saccade import _saccade
+from saccade.observation import Observation
 
-#: What a user waits for: an observation, a chunk from one that is held, and both.
+#: What a user waits for: encoding an observation, sampling a chunk from its context, and both.
 PIECES = ("encode", "sample", "both")
 
 
 @dataclass(frozen=True)
 class Counter:
-    """What was counted of one part."""
+    """What one part did in a run: its calls, their time, multiply-adds and bytes of weights read."""
 
     calls: int
     seconds: float
@@ -37,38 +38,29 @@ def pieces(
     num_future_tokens: int | None = None,
     num_image_tokens: int | None = None,
 ) -> dict[str, Callable[[], Any]]:
-    """Calls of a head on a random observation: those of `PIECES`, warmed up.
+    """Calls of a head on a random observation: those of `PIECES`, each called once before it is returned.
 
-    The first tokens are those of images, half of them unless a number is given.
+    The first tokens are image tokens: half of them, unless `num_image_tokens` is given.
     """
     config = head.config
     rng = np.random.default_rng(0)
-    features = rng.standard_normal((1, num_vl_tokens, config.context_dim), np.float32)
+    drawn = Observation.random(config, num_vl_tokens, rng, head.embodiment_ids[0])
     images = num_vl_tokens // 2 if num_image_tokens is None else num_image_tokens
-    image_mask = np.arange(num_vl_tokens)[None] < images
-    state = rng.standard_normal((1, config.state_history, config.state_dim), np.float32)
-    leading = (1,) if num_samples is None else (1, num_samples)
-    noise = rng.standard_normal((*leading, config.action_horizon, config.encoder_action_dim), np.float32)
+    observation = replace(drawn, noise=None, image_mask=np.arange(num_vl_tokens)[None] < images)
+    observation = observation.with_noise(rng, config, num_samples)
     changes = []
     if num_future_tokens is not None and num_future_tokens != config.num_future_tokens:
         tokens = rng.standard_normal((num_future_tokens, config.width), np.float32)
         changes = [saccade.Intervention(future_tokens=tokens)]
 
     def encode() -> saccade.Context:
-        return head.encode(features, image_mask=image_mask)
+        return observation.encode(head)
 
     context = encode()
 
-    def sample(observed: saccade.Context) -> Any:
-        return head.sample(
-            observed,
-            state,
-            head.embodiment_ids[0],
-            noise=noise,
-            num_steps=num_steps,
-            num_samples=num_samples,
-            future_refresh=future_refresh,
-            intervention=changes,
+    def sample(context: saccade.Context) -> Any:
+        return observation.sample(
+            head, context, num_steps=num_steps, future_refresh=future_refresh, intervention=changes
         )
 
     sample(context)
@@ -84,13 +76,13 @@ def by_turns(
 ) -> dict[Any, list[float]]:
     """Seconds of each piece of work in each round.
 
-    A round does every one of them once, in an order that rotates, so that a drift of the machine's clock
-    meets all of them.
+    A round does every piece once, in an order that rotates, so that a drift of the machine's clock affects
+    all of them.
 
     Args:
-        works: by any name.
-        rounds: of them.
-        note: is told the number of each round that is done.
+        works: the pieces by name.
+        rounds: how often each is done.
+        note: called with the number of rounds done, after each of them.
     """
     names = list(works)
     seconds: dict[Any, list[float]] = {name: [] for name in names}
@@ -106,7 +98,7 @@ def by_turns(
 
 
 def profiled(work: Callable[[], Any]) -> tuple[float, dict[str, Counter]]:
-    """Seconds of one run of `work`, and what its parts did, those that did something."""
+    """Seconds of one run of `work`, and the counters of the parts that were called."""
     _saccade.start_profile()
     start = time.perf_counter()
     try:

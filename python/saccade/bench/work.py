@@ -1,7 +1,6 @@
-"""How much there is to compute: multiply-adds and weights of one call, by part, from the head's sizes.
+"""The work of one call by part, computed from the head's sizes: multiply-adds, and weights that are read.
 
-The parts are those of the engine's profile; a test holds both to the same counts. Numbers of the
-specification are those of its section 4.
+The parts are those of the engine's profile; a test compares the counts of both.
 """
 
 from __future__ import annotations
@@ -17,18 +16,18 @@ ATTENTION = ("attention",)
 
 @dataclass(frozen=True)
 class Call:
-    """What is asked of a head: encode an observation, then sample from it.
+    """The sizes of one call of a head: encode an observation, then sample from it.
 
     Attributes:
         num_vl_tokens: T_vl.
         num_steps: Euler steps.
-        batch: observations.
-        num_samples: chunks of each.
-        future_refresh: as `ActionHead.sample` takes it, 1 where that is None.
-        num_future_tokens: N, which an intervention may have changed.
-        num_image_tokens: how many of the T_vl are of images, for heads whose blocks see either these or the
-            others; None is half of them, which is as much work as any number where as many blocks see the
-            ones as the others.
+        batch: Observations.
+        num_samples: Chunks of each observation.
+        future_refresh: As in `ActionHead.sample`; 1 for None.
+        num_future_tokens: N, which an intervention may change.
+        num_image_tokens: How many of the T_vl tokens are image tokens, for heads whose blocks attend to
+            either text or images; None for half of them. The number does not change the work if as many
+            blocks attend to text as to images.
     """
 
     num_vl_tokens: int
@@ -41,19 +40,19 @@ class Call:
 
     @classmethod
     def of(cls, config: HeadConfig, num_vl_tokens: int, num_steps: int | None = None, **sizes: int) -> Call:
-        """A call with the config's steps and future tokens where none are given."""
+        """A call; steps and future tokens default to those of the config."""
         sizes = {"num_future_tokens": config.num_future_tokens} | sizes
         return cls(num_vl_tokens, config.num_steps if num_steps is None else num_steps, **sizes)
 
 
 @dataclass
 class Work:
-    """One part of a call.
+    """The work of one part of a call.
 
     Attributes:
-        multiply_adds: of its matrix products.
-        elements: weights, or held keys and values, that it reads at least once for each product.
-        rows: rows of activations, summed over its products.
+        multiply_adds: Of its matrix products.
+        elements: Weights, or cached keys and values, that it reads at least once for each product.
+        rows: Rows of activations, summed over its products.
     """
 
     multiply_adds: int = 0
@@ -87,10 +86,10 @@ def encode_work(config: HeadConfig, call: Call) -> Works:
 
 
 def sample_work(config: HeadConfig, call: Call) -> Works:
-    """`ActionHead.sample` on a held context, once what depends on the time alone is known.
+    """`ActionHead.sample` on a context, when what depends on the timestep alone is cached.
 
-    In the last block, and at steps at which the rows of state and future tokens do not run, only the action
-    rows do.
+    The last block computes the action rows only, and so do steps at which the rows of state and future tokens
+    are not recomputed.
     """
     width, hidden, horizon = config.width, config.hidden_dim, config.action_horizon
     chunks = call.batch * call.num_samples
@@ -124,7 +123,7 @@ def total(works: Works) -> Work:
 
 
 def cross_keys(config: HeadConfig, call: Call) -> Iterator[int | None]:
-    """For each block how many of the vision-language tokens it reads; None if it is self-attention."""
+    """For each block the number of vision-language tokens that it attends to; None for self-attention."""
     images = call.num_vl_tokens // 2 if call.num_image_tokens is None else call.num_image_tokens
     every = config.attend_text_every_n_blocks
     for block in range(config.num_layers):
@@ -137,18 +136,18 @@ def cross_keys(config: HeadConfig, call: Call) -> Iterator[int | None]:
 
 
 def add_feed_forward(works: Works, rows: int, width: int) -> None:
-    """Two layers, four times as wide in between."""
+    """Adds two layers with a hidden width of `4 * width`."""
     add_linear(works, "feed_forward_in", rows, width, 4 * width)
     add_linear(works, "feed_forward_out", rows, 4 * width, width)
 
 
 def add_linear(works: Works, part: str, rows: int, in_features: int, out_features: int) -> None:
-    """`rows` through one layer."""
+    """Adds one linear layer over `rows` rows."""
     weights = in_features * out_features
     works[part] = works.get(part, Work()) + Work(rows * weights, weights, rows)
 
 
 def add_attention(works: Works, sequences: int, queries: int, keys: int, width: int) -> None:
-    """Scores and the sum of values of `sequences` sequences of so many queries."""
+    """Adds scores and weighted sums of values for `sequences` sequences."""
     counted = Work(2 * sequences * queries * keys * width, 2 * sequences * keys * width, sequences * queries)
     works["attention"] = works.get("attention", Work()) + counted

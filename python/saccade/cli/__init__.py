@@ -1,8 +1,14 @@
-"""The `saccade` command: one file a command, imported only when that command is chosen."""
+"""The `saccade` command: one file per command, imported only when that command is chosen.
+
+Exit status: 0, or what the command returned (`parity` returns 1 for a difference); 2 with one line on
+standard error for bad input, missing packages, and paths or streams that cannot be used; 130 after Ctrl-C;
+141 if the reader of standard output went away, as a shell reports for a program that SIGPIPE ended.
+"""
 
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import sys
@@ -10,46 +16,42 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn, Protocol, cast
 
-# A command is the module of its name in this package. Its one line of help stands here as well, so that
-# `saccade --help` imports none of them; a test keeps the two equal.
+# A command is the module of its name in this package. Its line of help is repeated here, so that
+# `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
-    "rollout": "drive the simulated robot with a policy and report how often it succeeds",
+    "rollout": "run a policy on the simulated robot and report how often it succeeds",
     "demos": "record demonstrations of the tasks with scripted experts",
-    "train": "train the policy on recorded demonstrations",
-    "attention": "show what the rows of the action head look at",
-    "study": "measure what the future tokens do, in closed loop and inside the head",
-    "bench": "time the action head beside what this machine allows",
-    "parity": "compare the Rust head with the reference in torch",
-    "inspect": "show what is in a checkpoint",
-    "resize": "change the number of future tokens of a checkpoint",
-    "convert": "write a checkpoint with other embodiments, dtype or shards",
-    "quantize": "write a copy of a checkpoint with int8 weights",
+    "train": "train a policy on recorded demonstrations",
+    "attention": "show what the rows of the action head attend to",
+    "study": "measure what the parts of an action head contribute",
+    "bench": "time the action head and compare it with the limits of this machine",
+    "parity": "compare the Rust head with the torch reference",
+    "inspect": "show what a checkpoint contains",
+    "resize": "write a checkpoint with another number of future tokens",
+    "convert": "write a checkpoint with other embodiments, another dtype or other shards",
+    "quantize": "write a checkpoint with int8 weights",
 }
 
-# Which extra brings a module that a command may find missing.
-EXTRAS: dict[str, str] = {
-    "rich": "cli",
-    "torch": "torch",
-    "safetensors": "torch",
-    "gymnasium": "sim",
-    "imageio": "sim",
-    "imageio_ffmpeg": "sim",
-    "jinja2": "study",
-    "joblib": "study",
-    "matplotlib": "sim",
-    "metaworld": "sim",
-    "mujoco": "sim",
-    "packaging": "sim",
-    "pandas": "study",
-    "PIL": "sim",
-    "ray": "ray",
-    "scipy": "study",
-    "sklearn": "study",
-    "threadpoolctl": "sim",
+_PICTURES = ("matplotlib", "PIL")
+_SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
+# The optional packages that each command needs, checked once its arguments have been: a message then names
+# all that are missing. Commands without an entry need NumPy only. See `saccade._extras` for the extras.
+NEEDS: dict[str, tuple[str, ...]] = {
+    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg"),
+    "demos": ("rich", *_SIMULATOR),
+    "train": ("rich", "matplotlib", "torch", "safetensors"),
+    "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
+    "study": (
+        *("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors"),
+        *("jinja2", "joblib", "pandas", "scipy", "sklearn"),
+    ),
+    "parity": ("torch", "safetensors"),
 }
 
-# A path that the user named and that cannot be used. Other `OSError`s are not the user's doing.
+# Failures of a path that the user named. Python raises these without an error number in places of our own.
 PATH_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+# Failures of a write, which do not know the file's name.
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 EXIT_OK = 0
 EXIT_BAD_INPUT = 2
@@ -58,19 +60,23 @@ EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 
 class UsageError(Exception):
-    """Arguments of a command that cannot be followed; shown as one line, without a traceback."""
+    """Arguments that a command cannot follow; printed as one line, without a traceback."""
 
 
 class Command(Protocol):
-    """What a module in this package offers."""
+    """The interface of a command's module in this package."""
 
     HELP: str
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declares the command's arguments and sets `parser.epilog` to examples."""
+        """Declares the command's arguments and sets `parser.epilog`, which ends with examples."""
 
     def run(self, args: argparse.Namespace) -> int:
-        """Does the work; returns the exit status."""
+        """Checks the arguments, then the optional packages (`require`), then works.
+
+        Returns:
+            The exit status.
+        """
 
 
 class Parser(argparse.ArgumentParser):
@@ -102,19 +108,21 @@ def load_command(name: str) -> Command:
 
 
 def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
-    """The parser of the command line; only the chosen command's arguments are declared.
+    """The parser of the command line. Only the arguments of the chosen command are declared.
 
     Args:
-        chosen: the command whose module is imported; `None` (or an unknown name) imports none.
+        chosen: the command whose module is imported; None or an unknown name imports none.
     """
     from saccade import __version__
 
     parser = Parser(
         prog="saccade",
-        description="GR00T-style action heads on CPUs: run a policy closed-loop, train one, check it.",
+        description="GR00T-style action heads on CPUs: run and train policies, inspect and convert "
+        "checkpoints.",
         epilog="examples:\n"
         "  saccade rollout --help\n"
-        "  saccade rollout --tasks reach --episodes 2 --out out/rollout",
+        "  saccade rollout --tasks reach --episodes 2\n"
+        "  saccade inspect checkpoint/",
     )
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command", title="commands", parser_class=Parser)
@@ -136,55 +144,61 @@ def describe(error: BaseException) -> str:
         >>> describe(ValueError("first\\n  second"))
         'first; second'
     """
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return (
+            error.strerror if error.filename is None else f"{os.fsdecode(error.filename)}: {error.strerror}"
+        )
     lines = [line.strip() for line in str(error).splitlines()]
     return "; ".join(line for line in lines if line) or type(error).__name__
 
 
-def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """How to install the module that was not found, or `None` if no extra of saccade brings it.
+def require(command: str) -> None:
+    """Checks that the optional packages of a command are installed, without importing them.
 
-    Example:
-        >>> missing_extra(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
-        "mujoco is not installed: pip install 'saccade[sim]'"
+    Raises:
+        MissingExtraError: names those that are missing and a command that installs them.
     """
-    module = (error.name or "").partition(".")[0]
-    extra = EXTRAS.get(module)
-    return None if extra is None else f"{module} is not installed: pip install 'saccade[{extra}]'"
+    from saccade import _extras
+
+    _extras.require(*NEEDS[command])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line.
 
     Args:
-        argv: the arguments after the program's name; `None` takes those of the process.
+        argv: the arguments after the program's name; None takes those of the process.
 
     Returns:
-        The exit status: 0, or what the command returned; 2 for bad input, with one line on standard error;
-        130 after Ctrl-C.
+        The exit status, see the module.
 
     Raises:
         SystemExit: from `--help`, `--version` and arguments that do not parse (status 2).
     """
+    from saccade.cli import _output
+
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
+        _output.prepare_streams()
         try:
             return dispatch(argv)
         finally:
-            sys.stdout.flush()  # a closed pipe is found here, not while the interpreter shuts down
+            _output.flush()  # finds a closed pipe or a full disk here, not while the interpreter ends
     except KeyboardInterrupt:
         print("saccade: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output is gone (`| head`): no message, and nothing more to flush at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _output.discard_output()
         return EXIT_BROKEN_PIPE
+    except _output.OutputError as error:
+        _output.discard_output()
+        return refuse(str(error))
 
 
 def dispatch(argv: list[str]) -> int:
     """Parses `argv`, runs the chosen command and turns bad input into one line and status 2."""
-    from saccade import SaccadeError
+    from saccade import SaccadeError, _extras
+    from saccade.cli import _output
 
     # The program's own options take no value, so the first word that is no option is the command.
     chosen = next((word for word in argv if not word.startswith("-")), None)
@@ -197,13 +211,21 @@ def dispatch(argv: list[str]) -> int:
         return load_command(args.command).run(args)
     except (UsageError, SaccadeError, *PATH_ERRORS) as error:
         return refuse(describe(error))
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        if error.filename is None:
+            _output.flush()  # raises if the error is that of standard output
+            if error.errno not in DISK_ERRORS:
+                raise
+        return refuse(describe(error))
     except MemoryError as error:
         return refuse(f"too large for this machine's memory: {error}".removesuffix(": "))
     except ModuleNotFoundError as error:
-        advice = missing_extra(error)
-        if advice is None:
+        missing = _extras.explain(error)
+        if missing is None:
             raise
-        return refuse(advice)
+        return refuse(describe(missing))
 
 
 def refuse(message: str) -> int:

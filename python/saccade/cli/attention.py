@@ -1,14 +1,14 @@
-"""`saccade attention`: what the rows of the action head look at, as a sheet, a page and numbers."""
+"""`saccade attention`: shows what the rows of the action head attend to, as a sheet, a page and numbers."""
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from saccade.cli import EXIT_OK, UsageError
+from saccade._files import writable_directory, write_json
+from saccade.cli import EXIT_OK, UsageError, _output, arguments, require
 
 if TYPE_CHECKING:
     from saccade.config import HeadConfig
@@ -17,124 +17,130 @@ if TYPE_CHECKING:
     from saccade.maps.occlusion import Occlusion
     from saccade.maps.record import Maps
 
-HELP = "show what the rows of the action head look at"
+HELP = "show what the rows of the action head attend to"
 
 EPILOG = """\
-The observation is one of the simulator (--task, --seed, --after) or one of a file of backbone features.
+The observation comes from the simulator (--task, --seed, --after) or from a file of backbone features.
 
-A file is .npz or .safetensors with backbone_features (batch, T_vl, context_dim), state (batch, state_dim) and
-embodiment_id, as the head takes them; it may hold noise (batch, horizon, action_dim), input_ids, image_mask,
-attention_mask (batch, T_vl), images (batch, cameras, H, W, 3) uint8 and tokens (batch, T_vl) strings
-(in .safetensors: a JSON list in the metadata).
+The file is .npz or .safetensors with backbone_features (batch, T_vl, context_dim), state (batch, state_dim)
+and embodiment_id, as ActionHead takes them. It may contain noise (batch, horizon, action_dim), input_ids,
+image_mask, attention_mask (batch, T_vl), images (batch, cameras, H, W, 3) uint8 and tokens (batch, T_vl)
+strings (in .safetensors a JSON list in the metadata).
 
-Where the image tokens are is told by --layout, else by input_ids, else by image_mask. A layout is a list of
-parts in the order of their positions, KIND:SIZE or KIND:SIZE=NAME. KIND is image, text, special or pad; SIZE
-is ROWSxCOLUMNS for image, a number for the others, and * once for what is left:
+The positions of image tokens are given by --layout, else by input_ids, else by image_mask. A layout lists the
+parts in the order of their positions, KIND:SIZE or KIND:SIZE=NAME. KIND is image, text, special or pad. SIZE
+is ROWSxCOLUMNS for image and a number for the others; one part may have * for all remaining positions:
   text:20,image:16x16=left,special:1=</img>,text:*
 
-OUT receives sheet.png (means over heads and Euler steps), page.html (one file, opens without a network: pick
+DIR receives sheet.png (means over heads and Euler steps), page.html (one file that needs no network; choose
 block, step, head, token and camera) and attention.json (mass, entropy, overlap, occlusion).
 
-A map says what is read, not what matters; the occlusion map beside it says what the actions depend on.
+A map shows what a row attends to, not what matters; the occlusion map shows what the actions depend on.
 
 examples:
   saccade attention --task push --seed 3
-  saccade attention out/train/policy --task reach --after 24 --blocks 0,2 --steps 3
-  saccade attention checkpoint/ --features step.npz --heads 0,5,12
-  saccade attention checkpoint/ --features step.safetensors --layout "text:20,image:16x16,text:*" --json
+  saccade attention --checkpoint out/policy --task reach --after 24 --blocks 0,2 --steps 3
+  saccade attention --checkpoint checkpoint/ --features step.npz --heads 0,5,12
+  saccade attention --checkpoint checkpoint/ --features step.safetensors \\
+    --layout "text:20,image:16x16,text:*" --json
 """
 
-# Maps shown head by head are embedded in the page, two bytes a probability. Without a limit the page of a
-# full-size checkpoint would grow to tens of megabytes; beyond this only named heads are shown one by one.
+# Maps of single heads are embedded in the page, two bytes per probability. Without a limit the page of a
+# full-size checkpoint would have tens of megabytes. Above it, only heads given by --heads are shown.
 MAX_PROBABILITIES = 500_000
 
-WIDTH = 160  # letters of a table in a file or a pipe, where there is no edge to keep to
+WIDTH = 160  # characters in a line where the output is not a terminal
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     parser.epilog = EPILOG
-    parser.add_argument(
-        "checkpoint",
-        nargs="?",
-        type=Path,
-        help="directory or .safetensors file (default: the shipped policy)",
+    arguments.add_checkpoint(parser, "directory or .safetensors file (default: the bundled policy)")
+    arguments.add_config(parser)
+    arguments.add_seed(
+        parser, "seed of the task's layout, words and noise; of the noise if a file contains none"
     )
-    parser.add_argument("--config", type=Path, help="the head's config (default: config.json beside it)")
-    parser.add_argument(
-        "--seed",
-        type=int,
-        default=0,
-        help="of the task's layout, words and noise; of the noise, if a file has none (default: 0)",
-    )
-    simulator = parser.add_argument_group("an observation of the simulator")
-    simulator.add_argument("--task", metavar="NAME", help="task (default: push, if it knows it)")
+    simulator = parser.add_argument_group("an observation from the simulator")
     simulator.add_argument(
-        "--after", type=int, default=0, metavar="K", help="control steps before it looks (default: 0)"
+        "--task", metavar="NAME", help="task (default: push, or the policy's first task if it lacks push)"
     )
-    file = parser.add_argument_group("an observation of a file")
-    file.add_argument("--features", type=Path, metavar="FILE", help="backbone features, .npz or .safetensors")
-    file.add_argument("--row", type=int, default=0, help="which observation of the file (default: 0)")
-    file.add_argument("--layout", metavar="PARTS", help="where the image tokens are, see below")
-    file.add_argument("--grid", metavar="RxC", help="patches of a picture (default: 16x16 with input_ids)")
+    arguments.add_integer(
+        simulator, "--after", minimum=0, default=0, help="control steps before the observation"
+    )
+    file = parser.add_argument_group("an observation from a file")
+    arguments.add_features(file, "backbone features, .npz or .safetensors")
+    arguments.add_integer(file, "--row", minimum=0, default=0, help="which observation of the file")
+    file.add_argument("--layout", metavar="PARTS", help="positions of the image tokens, see below")
     file.add_argument(
-        "--image-token-index", type=int, metavar="ID", help="image token in input_ids (default: 151669)"
+        "--grid",
+        metavar="RxC",
+        help="rows and columns of patches of an image (default: 16x16 with input_ids)",
+    )
+    file.add_argument(
+        "--image-token-index",
+        type=int,
+        metavar="ID",
+        help="the image token in input_ids (default: 151669)",
     )
     maps = parser.add_argument_group("maps")
-    maps.add_argument("--blocks", metavar="N,...", help="blocks (default: all)")
-    maps.add_argument("--steps", metavar="N,...", help="Euler steps (default: all)")
-    maps.add_argument(
+    arguments.add_list(maps, "--blocks", item=int, metavar="N", help="blocks (default: all)")
+    arguments.add_list(maps, "--steps", item=int, metavar="N", help="Euler steps (default: all)")
+    arguments.add_list(
+        maps,
         "--heads",
-        metavar="N,...",
-        help="heads to show one by one, and to take the mean over; mean: only the mean of all "
-        "(default: all, or their mean where that is too much for a page)",
+        item=head,
+        metavar="N",
+        help="heads to show one by one and to average over, or mean for the mean of all heads only (default: "
+        "all, or their mean where all would be too much for a page)",
     )
-    maps.add_argument(
-        "--cell", type=int, metavar="N", help="occlude N x N patches at once (default: at most 8 x 8 cells)"
+    arguments.add_integer(
+        maps, "--cell", help="occlude N x N patches at a time (default: at most 8 x 8 cells)"
     )
-    parser.add_argument("--threads", type=int, help="threads of the action head (default: the engine's own)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/attention"), help="where results go (default: out/attention)"
-    )
-    parser.add_argument("--json", action="store_true", help="print attention.json instead of a table")
+    arguments.add_num_threads(parser)
+    arguments.add_out(parser, "out/attention")
+    arguments.add_json(parser, "print attention.json instead of a table")
+
+
+def head(word: str) -> int | str:
+    """An item of `--heads`."""
+    return word if word == "mean" else int(word)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Checks everything that can be wrong, then looks, measures and writes."""
-    from rich.console import Console
-
+    """Checks everything that can be wrong, then computes and writes the maps."""
+    check(args)
+    require("attention")
     from saccade.maps.page import write_page
     from saccade.maps.sheet import write_sheet
-    from saccade.sim.files import writable_directory, write_json
 
     maps = look(args)
     writable_directory(args.out)
-    with Console(stderr=True).status("numbers, sheet and page"):  # 21 s with 16 blocks, 32 heads, T_vl 825
+    # 21 s with 16 blocks, 32 heads, T_vl 825
+    with _output.console(stderr=True).status("numbers, sheet and page"):
         record = maps.to_dict()
         write_sheet(maps, args.out / "sheet.png")
         write_page(maps, args.out / "page.html")
         write_json(args.out / "attention.json", record)
     if args.json:
-        print(json.dumps(record, indent=2))
+        _output.print_json(record, indent=2)
     else:
         show(maps, record, args.out)
     return EXIT_OK
 
 
 def look(args: argparse.Namespace) -> Maps:
-    """Loads the head, takes the observation and computes all that is shown."""
+    """Loads the head and the observation, and computes everything that is shown."""
     from saccade.head import ActionHead
     from saccade.maps import record
     from saccade.maps.occlusion import cell_for
     from saccade.sim.policy import DEMO_CHECKPOINT
 
-    check(args)
     checkpoint = args.checkpoint or DEMO_CHECKPOINT
-    head = ActionHead.load(checkpoint, config=args.config, num_threads=args.threads)
-    blocks = record.choose("blocks", numbers("--blocks", args.blocks), head.config.num_layers)
-    steps = record.choose("steps", numbers("--steps", args.steps), head.config.num_steps)
-    named = args.heads not in (None, "mean")
-    heads = record.choose("heads", numbers("--heads", args.heads) if named else None, head.config.num_heads)
+    head = ActionHead.load(checkpoint, config=args.config, num_threads=args.num_threads)
+    blocks = record.choose("blocks", args.blocks, head.config.num_layers)
+    steps = record.choose("steps", args.steps, head.config.num_steps)
+    named = args.heads not in (None, ("mean",))
+    heads = record.choose("heads", args.heads if named else None, head.config.num_heads)
     inputs = take(args, checkpoint, head.config)
     few = probabilities(head.config, inputs, len(blocks), len(steps)) <= MAX_PROBABILITIES
     shown = heads if named or (args.heads is None and few) else ()
@@ -158,42 +164,33 @@ def look(args: argparse.Namespace) -> Maps:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises `UsageError` for arguments that contradict each other or are out of range on their own."""
-    if args.threads is not None and args.threads < 1:
-        raise UsageError(f"--threads: given {args.threads}, expected at least 1")
-    if args.after < 0:
-        raise UsageError(f"--after: given {args.after}, expected at least 0")
-    if args.seed < 0:
-        raise UsageError(f"--seed: given {args.seed}, expected at least 0")
+    """Raises `UsageError` or `InputError` for arguments that are wrong whatever the checkpoint is."""
     if args.out.exists() and not args.out.is_dir():
-        raise UsageError(f"--out: {args.out} is no directory")
+        raise UsageError(f"--out: {args.out} is not a directory")
+    if args.heads is not None and "mean" in args.heads and len(args.heads) > 1:
+        raise UsageError("--heads: given mean and numbers, expected one or the other")
+    if args.task is not None:
+        arguments.check_known("--task", [args.task], arguments.known_tasks())
     if args.features is not None and (args.task is not None or args.after):
-        raise UsageError("--features, --task: expected one observation, of a file or of the simulator")
+        raise UsageError("--features, --task: expected one observation, from a file or from the simulator")
     if args.features is None:
+        from saccade.sim.tasks import check_evaluation_seeds
+
+        check_evaluation_seeds(args.seed, 1)
         given = {"--layout": args.layout, "--grid": args.grid, "--image-token-index": args.image_token_index}
         wrong = [name for name, value in given.items() if value is not None] + ["--row"] * bool(args.row)
         if wrong:
             raise UsageError(f"{', '.join(wrong)}: only with --features")
 
 
-def numbers(name: str, text: str | None) -> tuple[int, ...] | None:
-    """`"0,2"` to numbers; None stays None."""
-    if text is None:
-        return None
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(f"{name}: given {text!r}, expected numbers with commas between them") from None
-
-
 def probabilities(config: HeadConfig, inputs: Inputs, blocks: int, steps: int) -> int:
-    """About how many there are in the maps of all heads."""
+    """About how many probabilities the maps of all heads contain."""
     rows = 1 + config.num_future_tokens + config.action_horizon
     return blocks * steps * config.num_heads * rows * inputs.layout.num_tokens
 
 
 def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> Inputs:
-    """The observation that was asked for."""
+    """The observation that the arguments ask for."""
     from saccade.errors import CheckpointError
     from saccade.maps import inputs, layout
 
@@ -208,25 +205,21 @@ def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> Inpu
         return inputs.from_file(args.features, config, row=args.row, options=options, seed=args.seed)
     from saccade.sim import graphics
     from saccade.sim.policy import Policy, check_trained_on
-    from saccade.sim.tasks import check_evaluation_seeds, find_task
 
-    check_evaluation_seeds(args.seed, 1)
     try:
-        policy = Policy.load(checkpoint, num_threads=args.threads)
+        policy = Policy.load(checkpoint, num_threads=args.num_threads)
     except (CheckpointError, FileNotFoundError) as error:
         raise UsageError(f"{error}; for another checkpoint: --features FILE") from None
     known = policy.config.tasks
-    task = find_task(args.task or ("push" if "push" in known else known[0])).name
+    task = args.task or ("push" if "push" in known else known[0])
     check_trained_on(policy, [task])
     graphics.check()
     return inputs.from_simulator(policy, task, args.seed, args.after)
 
 
 def occlude(head: ActionHead, inputs: Inputs, cell: int) -> Occlusion:
-    """The occlusion map, behind a progress bar."""
+    """The occlusion map, with a progress bar."""
     import numpy as np
-    from rich.console import Console
-    from rich.progress import Progress
 
     from saccade.maps.occlusion import measure, places_of
 
@@ -236,30 +229,20 @@ def occlude(head: ActionHead, inputs: Inputs, cell: int) -> Occlusion:
         chunks = head.sample(context, inputs.state, inputs.embodiment_id, seed=0, num_samples=count)
         return np.asarray(chunks)[0]
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task("occlusion", total=len(places_of(inputs.layout, cell)))
-        return measure(
-            head,
-            inputs.layout,
-            inputs.occluder,
-            whole,
-            cell=cell,
-            on_done=lambda done: progress.update(bar, completed=done),
-        )
+    total = len(places_of(inputs.layout, cell))
+    with _output.progress_bar("occlusion", total, transient=True) as update:
+        return measure(head, inputs.layout, inputs.occluder, whole, cell=cell, on_done=update)
 
 
 def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
     """Prints where attention goes, and where the files are."""
     from rich import box
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     from saccade.maps.sheet import NO_FUTURE, NO_IMAGES
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDTH)
+    console = _output.console(width=WIDTH)
     console.print(maps.inputs.title, style="bold", markup=False, soft_wrap=True)
     entries = [entry for entry in record["summaries"] if entry["head"] == "mean"]
     for reads, blocks in (("vl", maps.cross_blocks()), ("rows", maps.self_blocks())):
@@ -267,7 +250,7 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
             continue
         parts = list(maps.parts(blocks[0]))
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        for heading in (f"reads {reads}", "rows"):
+        for heading in (f"attends to {reads}", "rows"):
             table.add_column(heading, no_wrap=True)
         for heading in (*parts, "keys", "distinct"):
             table.add_column(escape(heading), justify="right", no_wrap=True)
@@ -290,7 +273,7 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
             console.print(message, soft_wrap=True)
     console.print(maps.caveat, style="italic", soft_wrap=True)
     for label, name in (("sheet", "sheet.png"), ("page", "page.html"), ("numbers", "attention.json")):
-        console.print(f"{label:8} {out / name}", soft_wrap=True, highlight=False, markup=False)
+        print(f"{label:8} {out / name}")
 
 
 def cells(entries: Sequence[dict[str, Any]], parts: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""`saccade bench`: how long a chunk takes here, beside what this machine allows."""
+"""`saccade bench`: times the action head and compares it with the limits of this machine."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import contextlib
 import importlib.resources
 import json
 import statistics
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +27,23 @@ from saccade.bench.cost import (
 )
 from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
 from saccade.bench.work import Call, Works, encode_work, sample_work, total
-from saccade.cli import UsageError
+from saccade.cli import EXIT_OK, UsageError, _output, arguments
 from saccade.hub import resolve
 
-HELP = "time the action head beside what this machine allows"
-EPILOG = """examples:
-  saccade bench                                   the shipped policy, every precision
-  saccade bench checkpoint/ --num-vl-tokens 559   a checkpoint with two camera views
-  saccade bench --size n1.5 --profile             random weights at N1.5's size, time by part
-  saccade bench --size n1.5 --model               measured beside expected times over N, T_vl, steps, samples
-  saccade bench --precision int8 --future-refresh 4 --json
+HELP = "time the action head and compare it with the limits of this machine"
+EPILOG = """\
+The floor is the least time that the multiply-adds and the reading of weights take at this machine's measured
+peak rates.
+
+examples:
+  saccade bench                                  the bundled policy at every precision
+  saccade bench --checkpoint checkpoint/ --num-vl-tokens 559
+                                                 a checkpoint with two camera views
+  saccade bench --version n1.5 --profile         random weights at N1.5's size, time by part
+  saccade bench --version n1.5 --cost-model      measured and expected times for other N, T_vl, steps, samples
+  saccade bench --precisions int8 --future-refresh 4 --json
 """
-#: What `--model` varies, one at a time, from the call that is asked for.
+#: What `--cost-model` varies, one size at a time.
 VARIED: dict[str, tuple[int, ...]] = {
     "num_future_tokens": (0, 32, 64),
     "num_vl_tokens": (64, 296, 559, 822),
@@ -48,112 +53,121 @@ VARIED: dict[str, tuple[int, ...]] = {
 }
 DEFAULT_VL_TOKENS = 296  # one camera view of N1.5
 
+note = partial(_output.note, "bench")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
-    parser.add_argument(
-        "checkpoint", nargs="?", type=Path, help="directory or .safetensors file; default: the shipped policy"
+    arguments.add_checkpoint(
+        parser, "directory, .safetensors file or published id (default: the bundled policy)"
     )
     parser.add_argument(
-        "--size",
+        "--version",
         choices=heads.SIZES,
-        help="random weights of this size (n1.5: 1.5 GB of disk, n1.6 2.2, n1.7 2.6)",
+        help="random weights at the size of this version instead (n1.5: 1.5 GB of disk, n1.6 2.2, n1.7 2.6)",
     )
+    arguments.add_list(
+        parser,
+        "--precisions",
+        default=PRECISIONS,
+        help=f"precisions, of {', '.join(PRECISIONS)} (default: all)",
+    )
+    arguments.add_num_threads(parser)
+    arguments.add_num_vl_tokens(
+        parser, None, f"vision-language tokens (default: the bundled policy's, else {DEFAULT_VL_TOKENS})"
+    )
+    arguments.add_num_steps(parser)
+    arguments.add_integer(parser, "--num-samples", default=1, help="chunks per observation")
+    arguments.add_integer(parser, "--future-refresh", default=1, help="as in ActionHead.sample; 1 is exact")
+    arguments.add_integer(parser, "--rounds", default=7, help="measurements of each time")
+    parser.add_argument("--profile", action="store_true", help="time by part, with the part's floor")
     parser.add_argument(
-        "--precision",
-        default=",".join(PRECISIONS),
-        help=f"of {', '.join(PRECISIONS)}, by commas (default all)",
+        "--cost-model", action="store_true", help="measured times and those that the cost model expects"
     )
-    parser.add_argument("--threads", type=int, help="threads of a call (default: the physical cores)")
-    parser.add_argument("--num-vl-tokens", type=int, help="T_vl (default: the shipped policy's, else 296)")
-    parser.add_argument("--num-steps", type=int, help="Euler steps (default: the checkpoint's)")
-    parser.add_argument("--num-samples", type=int, default=1, help="chunks of the observation (default 1)")
-    parser.add_argument(
-        "--future-refresh", type=int, default=1, help="as ActionHead.sample takes it (default 1: exact)"
-    )
-    parser.add_argument("--rounds", type=int, default=7, help="times each is measured (default 7)")
-    parser.add_argument("--profile", action="store_true", help="time by part beside its floor")
-    parser.add_argument("--model", action="store_true", help="measured times beside those of the cost model")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    arguments.add_json(parser, "print JSON instead of tables")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measures and prints."""
-    precisions = check(args)
+    check(args)
     with ExitStack() as stack:
         source, name = stack.enter_context(head_source(args))
         loaded = {}
-        for precision in precisions:
+        for precision in args.precisions:
             note(f"loading {name} in {precision}")
-            loaded[precision] = saccade.ActionHead.load(source, precision=precision, num_threads=args.threads)
-        head = next(iter(loaded.values()))
-        config = head.config
-        call = Call.of(
-            config,
-            args.num_vl_tokens or default_vl_tokens(source),
-            args.num_steps,
-            num_samples=args.num_samples,
-            future_refresh=args.future_refresh,
-        )
-        note("measuring the machine's peaks")
-        machine = Machine.measured(head.isa, head.num_threads)
-        report = {
-            "saccade": saccade.__version__,
-            "head": name,
-            "machine": asdict(machine),
-            "call": asdict(call),
-            "rounds": args.rounds,
-            "results": timed(loaded, call, machine, args.rounds),
-        }
-        if args.profile:
-            report["profile"] = [
-                profile(loaded[precision], precision, piece, call, machine, args.rounds)
-                for precision in loaded
-                for piece in ("encode", "sample")
-            ]
-        if args.model:
-            report["model"] = modelled(loaded, call, machine, args.rounds)
-    print(json.dumps(report, indent=1) if args.json else tables(report))
-    return 0
+            loaded[precision] = saccade.ActionHead.load(
+                source, precision=precision, num_threads=args.num_threads
+            )
+        report = measure(loaded, name, args, args.num_vl_tokens or default_vl_tokens(source))
+    if args.json:
+        _output.print_json(report, indent=1)
+    else:
+        print(tables(report))
+    return EXIT_OK
 
 
-def check(args: argparse.Namespace) -> list[str]:
-    """The precisions; refuses arguments that cannot be followed before anything long has run."""
-    if args.checkpoint is not None and args.size is not None:
-        raise UsageError("--size is about random weights: leave out the checkpoint")
+def check(args: argparse.Namespace) -> None:
+    """Refuses arguments that contradict each other before anything long has run."""
+    if args.checkpoint is not None and args.version is not None:
+        raise UsageError("--version describes random weights: leave out --checkpoint")
+    arguments.check_known("--precisions", args.precisions, PRECISIONS)
     if args.checkpoint is not None:
         args.checkpoint = resolve(args.checkpoint)
         if not args.checkpoint.exists():
             raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
-    for name in ("threads", "num_vl_tokens", "num_steps", "num_samples", "future_refresh", "rounds"):
-        value = getattr(args, name)
-        if value is not None and value < 1:
-            raise UsageError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
-    precisions: list[str] = args.precision.split(",")
-    for precision in precisions:
-        if precision not in PRECISIONS:
-            raise UsageError(f"--precision is {precision!r}, expected some of {', '.join(PRECISIONS)}")
-    return list(dict.fromkeys(precisions))
+
+
+def measure(
+    loaded: dict[str, saccade.ActionHead], name: str, args: argparse.Namespace, num_vl_tokens: int
+) -> dict[str, Any]:
+    """All that the arguments ask for, as a dict for JSON."""
+    head = next(iter(loaded.values()))
+    call = Call.of(
+        head.config,
+        num_vl_tokens,
+        args.num_steps,
+        num_samples=args.num_samples,
+        future_refresh=args.future_refresh,
+    )
+    note("measuring the machine's peak rates")
+    machine = Machine.measured(head.isa, head.num_threads)
+    report = {
+        "saccade": saccade.__version__,
+        "head": name,
+        "machine": asdict(machine),
+        "call": asdict(call),
+        "rounds": args.rounds,
+        "results": timed(loaded, call, machine, args.rounds),
+    }
+    if args.profile:
+        report["profile"] = [
+            profile(loaded[precision], precision, piece, call, machine, args.rounds)
+            for precision in loaded
+            for piece in ("encode", "sample")
+        ]
+    if args.cost_model:
+        report["model"] = modelled(loaded, call, machine, args.rounds)
+    return report
 
 
 @contextlib.contextmanager
 def head_source(args: argparse.Namespace) -> Iterator[tuple[Path, str]]:
-    """Where the head is loaded from, and what it is called."""
+    """The checkpoint to load, and its name in the report."""
     if args.checkpoint is not None:
         yield args.checkpoint, str(args.checkpoint)
-    elif args.size is not None:
+    elif args.version is not None:
         with tempfile.TemporaryDirectory(prefix="saccade-bench-") as folder:
             note("writing random weights")
-            heads.write(Path(folder), heads.sized(args.size))
-            yield Path(folder), f"random weights, size {args.size}"
+            heads.write(Path(folder), heads.sized(args.version))
+            yield Path(folder), f"random weights, size {args.version}"
     else:
         with importlib.resources.as_file(importlib.resources.files("saccade") / "sim" / "demo") as demo:
-            yield demo, "the shipped policy"
+            yield demo, "the bundled policy"
 
 
 def default_vl_tokens(source: Path) -> int:
-    """As many as the backbone beside the head gives, if its config says so."""
+    """T_vl of the backbone in the same config, if it has one."""
     try:
         backbone = json.loads((source / "config.json").read_text())["backbone_cfg"]
         patches = (backbone["image_size"] // backbone["patch_size"]) ** 2
@@ -174,7 +188,7 @@ def options(call: Call) -> dict[str, int | None]:
 
 
 def works_of(head: saccade.ActionHead, call: Call) -> dict[str, list[Works]]:
-    """What there is to do in each of `PIECES`."""
+    """The work of each of `PIECES`."""
     encode, sample = encode_work(head.config, call), sample_work(head.config, call)
     return {"encode": [encode], "sample": [sample], "both": [encode, sample]}
 
@@ -182,7 +196,7 @@ def works_of(head: saccade.ActionHead, call: Call) -> dict[str, list[Works]]:
 def timed(
     loaded: dict[str, saccade.ActionHead], call: Call, machine: Machine, rounds: int
 ) -> list[dict[str, Any]]:
-    """Every piece of work in every precision, by turns."""
+    """Times every piece of work in every precision, in turn."""
     calls: dict[tuple[str, str], Callable[[], Any]] = {}
     for precision, head in loaded.items():
         for piece, work in pieces(head, call.num_vl_tokens, **options(call)).items():
@@ -213,7 +227,7 @@ def timed(
 def profile(
     head: saccade.ActionHead, precision: str, piece: str, call: Call, machine: Machine, rounds: int
 ) -> dict[str, Any]:
-    """The run of median length, by part."""
+    """The time of each part in the run of median length."""
     note(f"profile of {piece} in {precision}")
     work = pieces(head, call.num_vl_tokens, **options(call))[piece]
     runs = sorted((profiled(work) for _ in range(rounds)), key=lambda one: one[0])
@@ -243,7 +257,7 @@ def profile(
 def modelled(
     loaded: dict[str, saccade.ActionHead], call: Call, machine: Machine, rounds: int
 ) -> list[dict[str, Any]]:
-    """Median times beside those of the cost model, one size after the other changed."""
+    """Median times and those that the cost model expects; one size is changed at a time."""
     records = []
     for varied, values in VARIED.items():
         for value in values:
@@ -268,11 +282,6 @@ def modelled(
                     }
                 )
     return records
-
-
-def note(message: str) -> None:
-    """Progress, beside the result."""
-    print(f"bench: {message} ...", file=sys.stderr, flush=True)
 
 
 def tables(report: dict[str, Any]) -> str:
@@ -305,7 +314,7 @@ def tables(report: dict[str, Any]) -> str:
 
 
 def profile_table(one: dict[str, Any]) -> list[str]:
-    """Time by part of one piece of work."""
+    """The times of one piece of work by part, as text."""
     whole = one["seconds"]
     lines = [
         "",
@@ -327,7 +336,7 @@ def profile_table(one: dict[str, Any]) -> list[str]:
 
 
 def model_table(records: list[dict[str, Any]]) -> list[str]:
-    """Measured beside expected times."""
+    """Measured and expected times, as text."""
     lines = [
         "",
         "one size changed at a time, ms",

@@ -1,28 +1,27 @@
-"""`saccade convert`: a copy of a checkpoint with other embodiments, another type, or other files."""
+"""`saccade convert`: writes a checkpoint with other embodiments, another dtype or other shards."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import re
 
-from saccade.cli import EXIT_OK, UsageError
-from saccade.cli._copying import add_copy_arguments, copying, left_behind
+from saccade.cli import EXIT_OK, UsageError, _output, arguments
+from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
-HELP = "write a checkpoint with other embodiments, dtype or shards"
+HELP = "write a checkpoint with other embodiments, another dtype or other shards"
 
 EPILOG = """\
-What is not asked to change is copied bit for bit: tensors, config.json, and what lies beside the weights,
-such as statistics, processors and tokenizers. The copy appears under its name when all of it is written.
+Everything else is copied bit for bit: tensors, config.json, and other files of the checkpoint such as
+statistics, processors and tokenizers. The copy appears under its name once it is complete.
 
-Embodiments that are left out become zero and stay in place: ids keep their numbers, and every program that
-read SOURCE reads the copy. On file systems with holes the zeros take no room (du says what is taken).
-A narrower dtype rounds; by how much is reported.
+The weights of embodiments that are left out become zero and stay in place: ids keep their numbers, and every
+program that reads CHECKPOINT reads the copy. On file systems with sparse files the zeros take no space (see
+du). A narrower dtype rounds; the report says by how much.
 
 examples:
   saccade convert GR00T-N1.5-3B/ --out GR00T-N1.5-3B-bf16 --dtype bfloat16
-  saccade convert GR00T-N1.5-3B/ --out one-robot --embodiment-ids 31 --head-only
+  saccade convert GR00T-N1.5-3B/ --out two-robots --embodiment-ids 24,31 --head-only
   saccade convert my-finetune/ --out my-finetune-shards --max-shard-size 2GB --json
 """
 
@@ -33,33 +32,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
     add_copy_arguments(parser)
-    parser.add_argument(
-        "--embodiment-ids", type=int, nargs="+", metavar="ID", help="keep only these (default: all)"
+    arguments.add_list(
+        parser, "--embodiment-ids", item=int, metavar="ID", help="embodiments to keep (default: all)"
     )
     parser.add_argument(
         "--dtype",
         choices=("float32", "bfloat16", "float16"),
-        help="of all floating point tensors (default: what each is)",
+        help="dtype of all floating point tensors (default: unchanged)",
     )
     parser.add_argument(
         "--max-shard-size",
         metavar="SIZE",
-        help="close a file before it grows larger, such as 5GB (default: one file of one, 5GB of several)",
+        help="largest file, such as 5GB (default: one file if the source is one file, else 5GB)",
     )
-    parser.add_argument("--head-only", action="store_true", help="leave out tensors outside the head")
+    parser.add_argument("--head-only", action="store_true", help="leave out the tensors outside the head")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Writes the copy and reports what is in it."""
+    """Writes the copy and reports what it contains."""
     from saccade.checkpoints import convert
 
     max_shard_bytes = None if args.max_shard_size is None else size(args.max_shard_size)
     with copying("converting") as progress:
         report = convert(
-            args.source,
+            args.checkpoint,
             args.out,
             config=args.config,
-            embodiment_ids=args.embodiment_ids,
+            embodiment_ids=None if args.embodiment_ids is None else list(args.embodiment_ids),
             dtype=args.dtype,
             max_shard_bytes=max_shard_bytes,
             head_only=args.head_only,
@@ -67,34 +66,33 @@ def run(args: argparse.Namespace) -> int:
             progress=progress,
         )
     if args.json:
-        print(json.dumps(dataclasses.asdict(report), default=str))
+        _output.print_json(dataclasses.asdict(report), default=str)
         return EXIT_OK
     files = f"{len(report.files)} file{'s' if len(report.files) > 1 else ''}"
-    beside = f"{len(report.carried)} file{'' if len(report.carried) == 1 else 's'}"
+    others = f"{len(report.carried)} other file{'' if len(report.carried) == 1 else 's'}"
     print(
-        f"{args.out}: {files}, {report.bytes_before / 1e6:.1f} MB are {report.bytes_after / 1e6:.1f} MB; "
-        f"{report.num_converted} tensors converted, {report.num_dropped} left out; "
-        f"{beside} beside the weights carried over"
+        f"{args.out}: {files}, {report.bytes_after / 1e6:.1f} MB (was {report.bytes_before / 1e6:.1f} MB); "
+        f"{report.num_converted} tensors converted, {report.num_dropped} left out; {others} copied"
     )
     if report.embodiment_ids is not None:
         kept = ", ".join(map(str, report.embodiment_ids))
-        print(f"embodiments {kept} kept; {report.zeroed_bytes / 1e6:.1f} MB of the others are zero")
+        print(f"kept embodiments {kept}; {report.zeroed_bytes / 1e6:.1f} MB of the others are zero")
     if report.num_rounded:
         print(
-            f"rounded: {report.num_rounded} numbers, by at most {report.largest_error:.3g} (in "
-            f"{report.largest_error_in}), {report.largest_relative_error:.3g} of a number's size"
+            f"rounded {report.num_rounded} numbers: largest error {report.largest_error:.3g} (in "
+            f"{report.largest_error_in}), largest relative error {report.largest_relative_error:.3g}"
         )
     elif args.dtype is not None:
-        print("nothing was rounded: each number is what it was")
-    left_behind(report)
+        print("nothing was rounded: every number kept its value")
+    print_files_not_copied(report)
     return EXIT_OK
 
 
 def size(text: str) -> int:
-    """Bytes of a size such as `5GB` or `500 MiB`.
+    """The bytes of a size such as `5GB` or `500 MiB`.
 
     Raises:
-        UsageError: it is none.
+        UsageError: `text` is not a size.
 
     Example:
         >>> size("1.5GB")

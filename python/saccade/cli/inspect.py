@@ -1,26 +1,28 @@
-"""`saccade inspect`: what is in a checkpoint."""
+"""`saccade inspect`: prints what a checkpoint contains."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from saccade.cli import EXIT_OK, UsageError
+from saccade.cli import EXIT_OK, _output, arguments
 
-HELP = "show what is in a checkpoint"
+if TYPE_CHECKING:
+    from saccade.checkpoints.findings import Embodiment, Inspection, Resemblance, Spread, TokenStatistics
+
+HELP = "show what a checkpoint contains"
 
 EPILOG = """\
-Reads every tensor of the head once, one at a time: some ten seconds for a published checkpoint.
+Reads every tensor of the head once, one at a time: about ten seconds for a published checkpoint.
 
-What looks as initialised is distributed as the released constructors draw it (uniform, 1 / sqrt(inputs), for
-linear layers; normal, 0.02, for the embodiments' layers, tokens and positions). The last table lists what
-speaks for or against "this checkpoint was trained from a random start"; docs/fork.md says when that happens.
+A tensor counts "as initialised" if it is distributed as the released constructors draw it: uniform with
+1 / sqrt(inputs) for linear layers; normal with 0.02 for the embodiments' layers, tokens and positions. The
+last table lists the evidence for and against "this checkpoint was trained from a random start"; docs/fork.md
+explains when that happens.
 
 examples:
   saccade inspect GR00T-N1.5-3B/
@@ -28,67 +30,49 @@ examples:
   saccade inspect my-fork/ --reference GR00T-N1.5-3B/  is it still the checkpoint that it started from?
 """
 
+WIDTH = 110  # characters in a line where the output is not a terminal
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
+    arguments.add_checkpoint_argument(parser)
+    arguments.add_config(parser)
     parser.add_argument(
-        "source", type=Path, help="checkpoint: a directory, one .safetensors file or a published id"
+        "--reference", type=Path, metavar="PATH", help="checkpoint to compare with, tensor by tensor"
     )
-    parser.add_argument("--config", type=Path, help="default: config.json beside the weights")
-    parser.add_argument(
-        "--reference", type=Path, metavar="OTHER", help="checkpoint to compare with, tensor by tensor"
-    )
-    parser.add_argument(
-        "--num-vl-tokens", type=int, default=296, help="T_vl of the expected times (default 296: one camera)"
+    arguments.add_num_vl_tokens(
+        parser, 296, "vision-language tokens for the expected times; 296 is one camera"
     )
     parser.add_argument(
-        "--no-time", action="store_true", help="expect no times: what this CPU can do is then not measured"
+        "--no-time", action="store_true", help="leave out the expected times and do not measure this CPU"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    arguments.add_json(parser, "print JSON instead of tables")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Reads the checkpoint and prints what is in it."""
-    from saccade.inspection import inspect
+    """Reads the checkpoint and prints what it contains."""
+    from saccade.checkpoints.inspection import inspect
 
-    if args.num_vl_tokens < 1:
-        raise UsageError(f"--num-vl-tokens is {args.num_vl_tokens}, expected at least 1")
-    with progress_bar() as progress:
+    with _output.progress_bar("reading", in_bytes=True, transient=True) as update:
         report = inspect(
-            args.source,
+            args.checkpoint,
             config=args.config,
             reference=args.reference,
             num_vl_tokens=args.num_vl_tokens,
             time=not args.no_time,
-            progress=progress,
+            progress=lambda done, total: update(done, total),
         )
     if args.json:
-        print(json.dumps(report, indent=1))
+        _output.print_json(dataclasses.asdict(report), indent=1)
     else:
         show(sections(report))
     return EXIT_OK
 
 
-@contextmanager
-def progress_bar() -> Iterator[Callable[[int, int], object]]:
-    """A bar of bytes on standard error, where rich is there to draw it."""
-    try:
-        from rich.console import Console
-        from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-    except ModuleNotFoundError:
-        yield lambda done, total: None
-        return
-    columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        bar = bars.add_task("", total=None)
-        yield lambda done, total: bars.update(bar, completed=done, total=total)
-
-
 @dataclass(frozen=True)
 class Section:
-    """A table: columns whose names begin with ">" are numbers and stand to the right."""
+    """A table; columns whose names begin with ">" are numbers, aligned right."""
 
     title: str
     columns: Sequence[str]
@@ -96,15 +80,14 @@ class Section:
 
 
 def show(tables: Sequence[Section]) -> None:
-    """Prints the tables: through rich where it is there, else in plain columns."""
+    """Prints the tables: with rich if it is installed, else in plain columns."""
     try:
-        from rich.console import Console
         from rich.table import Table
         from rich.text import Text
     except ModuleNotFoundError:
         print("\n\n".join(map(plain, tables)))
         return
-    console = Console(width=None if sys.stdout.isatty() else 110)
+    console = _output.console(width=WIDTH)
     for section in tables:
         console.print(Text(section.title, style="bold"))
         table = Table(box=None, show_header=any(column.lstrip(">") for column in section.columns))
@@ -117,7 +100,7 @@ def show(tables: Sequence[Section]) -> None:
 
 
 def plain(section: Section) -> str:
-    """A table in plain columns."""
+    """A table as text in plain columns."""
     rows = [[column.lstrip(">") for column in section.columns], *section.rows]
     widths = [max(len(row[index]) for row in rows) for index in range(len(section.columns))]
     lines = [
@@ -130,75 +113,73 @@ def plain(section: Section) -> str:
     return "\n".join([section.title, *lines])
 
 
-def sections(report: Mapping[str, Any]) -> list[Section]:
-    """What is shown, top to bottom."""
+def sections(report: Inspection) -> list[Section]:
+    """All tables, top to bottom."""
     found = [checkpoint(report), sizes(report), parts(report), memory(report), embodiments(report)]
-    if report["future_tokens"] is not None:
-        found.append(future_tokens(report["future_tokens"]))
-    if report["reference"] is not None:
-        found.append(reference(report["reference"]))
-    odd = [[sentence] for sentence in report["odd"]] or [["nothing"]]
-    return [*found, Section("What is odd", [""], odd), from_noise(report["from_noise"])]
+    if report.future_tokens is not None:
+        found.append(future_tokens(report.future_tokens))
+    if report.reference is not None:
+        found.append(reference(report.reference))
+    odd = [[sentence] for sentence in report.odd] or [["nothing"]]
+    return [*found, Section("Unusual", [""], odd), from_noise(report.from_noise)]
 
 
-def checkpoint(report: Mapping[str, Any]) -> Section:
-    """What it is and how that is known."""
-    size = sum(file["nbytes"] for file in report["files"])
-    beside = [f"{counts['tensors']} tensors, {megabytes(counts['nbytes'])} MB of {name}"
-              for name, counts in report["outside"].items()]  # fmt: skip
+def checkpoint(report: Inspection) -> Section:
+    """What the checkpoint is, and the evidence for it."""
+    size = sum(file.nbytes for file in report.files)
+    outside = [f"{counts.tensors} tensors, {megabytes(counts.nbytes)} MB of {name}"
+              for name, counts in report.outside.items()]  # fmt: skip
     rows = [
-        ["version", f"GR00T {report['version'].upper()}"],
-        ["layout", report["layout"]],
-        ["files", f"{len(report['files'])}, {megabytes(size)} MB"],
-        ["prefix of the head", report["prefix"] or "none"],
-        ["beside the head", "; ".join(beside) or "nothing"],
-        *([["known by" if index == 0 else "", what] for index, what in enumerate(report["evidence"])]),
+        ["version", f"GR00T {report.version.upper()}"],
+        ["layout", report.layout],
+        ["files", f"{len(report.files)}, {megabytes(size)} MB"],
+        ["prefix of the head", report.prefix or "none"],
+        ["outside the head", "; ".join(outside) or "nothing"],
+        *([["evidence" if index == 0 else "", what] for index, what in enumerate(report.evidence)]),
     ]
-    return Section(str(report["source"]), ["", ""], rows)
+    return Section(str(report.source), ["", ""], rows)
 
 
-def sizes(report: Mapping[str, Any]) -> Section:
-    """The sizes that a user asks for."""
-    config = report["config"]
+def sizes(report: Inspection) -> Section:
+    """The sizes that users need."""
+    config = report.config
     rows = [
-        ["future tokens (N)", str(config["num_future_tokens"])],
-        ["actions in a chunk (T)", str(config["action_horizon"])],
-        ["width of an action", str(config["action_dim"])],
-        ["decoders", ", ".join(f"{name} {width}" for name, width in config["decoders"])],
-        ["width of a state", str(config["state_dim"])],
-        ["embodiments", str(config["num_embodiments"])],
-        ["blocks", f"{config['num_layers']}, {config['num_heads']} heads of {config['head_dim']}"],
-        ["VL self-attention", f"{config['vl_num_layers']} blocks" if config["vl_num_layers"] else "none"],
-        ["width of VL tokens", str(config["context_dim"])],
-        ["Euler steps", str(config["num_steps"])],
+        ["future tokens (N)", str(config.num_future_tokens)],
+        ["actions in a chunk (T)", str(config.action_horizon)],
+        ["width of an action", str(config.action_dim)],
+        ["decoders", ", ".join(f"{name} {width}" for name, width in config.decoders)],
+        ["width of a state", str(config.state_dim)],
+        ["embodiments", str(config.num_embodiments)],
+        ["blocks", f"{config.num_layers}, {config.num_heads} heads of {config.head_dim}"],
+        ["VL self-attention", f"{config.vl_num_layers} blocks" if config.vl_num_layers else "none"],
+        ["width of VL tokens", str(config.context_dim)],
+        ["Euler steps", str(config.num_steps)],
     ]
-    if config["encoder_action_dim"] != config["action_dim"]:
-        rows.insert(3, ["width of an action while denoised", str(config["encoder_action_dim"])])
-    if config["state_history"] != 1:
-        rows.insert(5, ["states in a history", str(config["state_history"])])
+    if config.encoder_action_dim != config.action_dim:
+        rows.insert(3, ["width of an action while denoised", str(config.encoder_action_dim)])
+    if config.state_history != 1:
+        rows.insert(5, ["states in a history", str(config.state_history)])
     return Section("Sizes", ["", ""], rows)
 
 
-def parts(report: Mapping[str, Any]) -> Section:
-    """Parameters by part."""
+def parts(report: Inspection) -> Section:
+    """Tensors, parameters and bytes by part."""
     rows = []
-    for name, part in report["parts"].items():
-        types = ", ".join(f"{count} {dtype}" for dtype, count in part["dtypes"].items())
-        fresh = f"{part['as_drawn']} of {part['judged']}" if part["judged"] else "-"
-        rows.append(
-            [name, str(part["tensors"]), f"{part['parameters']:,}", megabytes(part["nbytes"]), types, fresh]
-        )
-    tensors = sum(part["tensors"] for part in report["parts"].values())
-    nbytes = sum(part["nbytes"] for part in report["parts"].values())
-    rows.append(["head", str(tensors), f"{report['parameters']:,}", megabytes(nbytes), "", ""])
+    for name, part in report.parts.items():
+        types = ", ".join(f"{count} {dtype}" for dtype, count in part.dtypes.items())
+        fresh = f"{part.as_drawn} of {part.judged}" if part.judged else "-"
+        rows.append([name, str(part.tensors), f"{part.parameters:,}", megabytes(part.nbytes), types, fresh])
+    tensors = sum(part.tensors for part in report.parts.values())
+    nbytes = sum(part.nbytes for part in report.parts.values())
+    rows.append(["head", str(tensors), f"{report.parameters:,}", megabytes(nbytes), "", ""])
     return Section("Parts", ["", ">tensors", ">parameters", ">MB", "types", ">as initialised"], rows)
 
 
-def memory(report: Mapping[str, Any]) -> Section:
-    """Memory and expected time at each precision."""
-    rows, seconds = [], report["seconds"]
-    for precision, nbytes in report["memory"].items():
-        row = [precision, megabytes(nbytes["all"]), megabytes(nbytes["one"])]
+def memory(report: Inspection) -> Section:
+    """Memory, and expected time, at each precision."""
+    rows, seconds = [], report.seconds
+    for precision, nbytes in report.memory.items():
+        row = [precision, megabytes(nbytes.all), megabytes(nbytes.one)]
         if seconds is not None:
             times = [seconds[precision][name] for name in ("encode", "sample")]
             row += [f"{1000 * time:.1f}" for time in (*times, sum(times))]
@@ -206,43 +187,41 @@ def memory(report: Mapping[str, Any]) -> Section:
     columns = ["", ">MB, all embodiments", ">MB, one"]
     if seconds is None:
         return Section("Memory", columns, rows)
-    machine = report["machine"]
+    machine = report.machine
     title = (
-        f"Memory, and expected time of a chunk with {report['num_vl_tokens']} VL tokens "
-        f"({machine['isa']}, {machine['num_threads']} threads, by the cost model)"
+        f"Memory, and expected time of a chunk with {report.num_vl_tokens} VL tokens "
+        f"({machine.isa}, {machine.num_threads} threads, by the cost model)"
     )
     return Section(title, [*columns, ">ms, encode", ">ms, sample", ">ms, chunk"], rows)
 
 
-def embodiments(report: Mapping[str, Any]) -> Section:
-    """Which ids look trained; neighbours without a name that look alike are one row."""
+def embodiments(report: Inspection) -> Section:
+    """Which embodiments look trained; consecutive ids without a name that look alike share a row."""
     rows: list[list[str]] = []
-    run: list[Mapping[str, Any]] = []
+    run: list[Embodiment] = []
 
     def close() -> None:
         if not run:
             return
-        ids = str(run[0]["id"]) if len(run) == 1 else f"{run[0]['id']} to {run[-1]['id']}"
-        norms, scores = [one["norm"] for one in run], [one["robust_z"] for one in run]
-        rows.append(
-            [ids, ", ".join(run[0]["names"]), span(norms, ".2f"), span(scores, ".1f"), run[0]["looks"]]
-        )
+        ids = str(run[0].id) if len(run) == 1 else f"{run[0].id} to {run[-1].id}"
+        norms, scores = [one.norm for one in run], [one.robust_z for one in run]
+        rows.append([ids, ", ".join(run[0].names), span(norms, ".2f"), span(scores, ".1f"), run[0].looks])
         run.clear()
 
-    for entry in report["embodiments"]:
-        if run and (entry["names"] or run[-1]["names"] or entry["looks"] != run[-1]["looks"]):
+    for entry in report.embodiments:
+        if run and (entry.names or run[-1].names or entry.looks != run[-1].looks):
             close()
         run.append(entry)
     close()
     title = (
-        "Embodiments: norms of their layers, and how many robust deviations these are from the median; "
-        '"trained" are those that are not distributed as before any training'
+        "Embodiments: norms of their layers, and the robust z-scores of these; "
+        '"trained" if not distributed as initialised'
     )
     return Section(title, [">id", "name", ">norm", ">robust z", "looks"], rows)
 
 
 def span(values: Sequence[float | None], form: str) -> str:
-    """One number, or the least and the largest."""
+    """One number, or the smallest and the largest."""
     known = [value for value in values if value is not None]
     if not known:
         return "-"
@@ -250,54 +229,50 @@ def span(values: Sequence[float | None], form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def future_tokens(tokens: Mapping[str, Any]) -> Section:
-    """Are they distinct, and far from how they are drawn?"""
-    drawn = tokens["drawn"]
-
-    def row(what: str, key: str) -> list[str]:
-        return [what, *(spread(values[key]) for values in (tokens, drawn))]
-
+def future_tokens(tokens: TokenStatistics) -> Section:
+    """Statistics of the future tokens, next to those of a random draw."""
+    drawn = tokens.drawn
     rows = [
-        row("norm", "norm"),
-        row("cosine of pairs", "cosine"),
+        ["norm", spread(tokens.norm), spread(drawn.norm)],
+        ["cosine of pairs", spread(tokens.cosine), spread(drawn.cosine)],
         [
             "effective rank",
-            f"{tokens['effective_rank']:.2f} of {tokens['count']}",
-            f"{drawn['effective_rank']:.2f}",
+            f"{tokens.effective_rank:.2f} of {tokens.count}",
+            f"{drawn.effective_rank:.2f}",
         ],
-        ["standard deviation", f"{tokens['std']:.4f}", "0.0200"],
-        ["distance from N(0, 0.02)", f"{tokens['distance']:.4f}", ""],
+        ["standard deviation", f"{tokens.std:.4f}", "0.0200"],
+        ["distance from N(0, 0.02)", f"{tokens.distance:.4f}", ""],
     ]
-    return Section("Future tokens: mean (least to largest)", ["", "these", "a random draw"], rows)
+    return Section("Future tokens: mean (smallest to largest)", ["", "these", "a random draw"], rows)
 
 
-def spread(values: Mapping[str, float] | None) -> str:
+def spread(values: Spread | None) -> str:
     """Mean, minimum and maximum on one line."""
     if values is None:
         return "-"
-    return f"{values['mean']:.4f} ({values['min']:.4f} to {values['max']:.4f})"
+    return f"{values.mean:.4f} ({values.min:.4f} to {values.max:.4f})"
 
 
-def reference(found: Mapping[str, Any]) -> Section:
-    """How alike it and the reference are."""
+def reference(found: Resemblance) -> Section:
+    """The comparison with the reference checkpoint."""
     rows = [
         [
             name,
-            f"{part['identical']} of {part['pieces']}",
-            spread(part["cosine"]),
-            f"{part['largest_change']:.3g}" if part["cosine"] else "-",
+            f"{part.identical} of {part.pieces}",
+            spread(part.cosine),
+            f"{part.largest_change:.3g}" if part.cosine else "-",
         ]
-        for name, part in found["parts"].items()
+        for name, part in found.parts.items()
     ]
-    rows += [[what, "", "another shape", ""] for what in found["different_shapes"]]
-    modules = dict.fromkeys(name.partition(".")[0] for name in found["not_in_reference"])
+    rows += [[what, "", "different shape", ""] for what in found.different_shapes]
+    modules = dict.fromkeys(name.partition(".")[0] for name in found.not_in_reference)
     rows += [[module, "", "not in the reference", ""] for module in modules]
-    title = f"Beside {found['source']}: tensors, the embodiments' slices one by one"
+    title = f"Compared with {found.source}: tensors, one slice per embodiment"
     return Section(title, ["", ">identical", "cosine of other weights", ">largest change"], rows)
 
 
 def from_noise(found: Mapping[str, Sequence[str]]) -> Section:
-    """The evidence, side by side."""
+    """The evidence on a random start."""
     rows = [
         [side if index == 0 else "", sentence]
         for side in ("for", "against", "neither")
@@ -307,5 +282,5 @@ def from_noise(found: Mapping[str, Sequence[str]]) -> Section:
 
 
 def megabytes(nbytes: int) -> str:
-    """In units of 10^6."""
+    """Bytes in units of 10^6, as text."""
     return f"{nbytes / 1e6:,.1f}"

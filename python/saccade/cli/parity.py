@@ -1,13 +1,10 @@
-"""`saccade parity`: the Rust head beside the torch reference in float64, on every instruction set."""
+"""`saccade parity`: compares the Rust head with the torch reference in float64, on every instruction set."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
-import platform
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import saccade
-from saccade.cli import UsageError
+from saccade.cli import UsageError, _output, arguments, require
+from saccade.environment import cpu_name
 from saccade.hub import resolve
+from saccade.observation import Observation, read
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -29,20 +28,25 @@ if TYPE_CHECKING:
 
     Outputs: TypeAlias = tuple[NDArray[Any], NDArray[Any]]  # vl_embs, actions
 
-HELP = "compare the Rust head with the reference in torch"
-EPILOG = """examples:
-  saccade parity                                  a small random head, a second or two
-  saccade parity checkpoint/ --embodiment-id 31   a checkpoint, on random inputs
-  saccade parity checkpoint/ --inputs step.safetensors
-                                                  on recorded features, state, embodiment_id and noise
+HELP = "compare the Rust head with the torch reference"
+EPILOG = """\
+The reference runs in float64. Its float32 result is shown for comparison. The exit status is 1 if an action
+differs from the reference by more than --tolerance; at a precision below float32 there is no verdict.
+
+examples:
+  saccade parity                                  a small random head; a second or two
+  saccade parity --checkpoint checkpoint/ --embodiment-id 31
+                                                  a checkpoint, on random inputs
+  saccade parity --checkpoint checkpoint/ --features step.safetensors
+                                                  a checkpoint, on recorded inputs
   saccade parity --version n1.7                   a small random head of another version
-  saccade parity --full                           N1.5's full size; 3 GB of disk, 8 GB of memory
-  saccade parity --full --version n1.7 --bf16     N1.7's; 3 GB of disk, more than 11 GB of memory
-  saccade parity --full --json                    as a program reads it
-  saccade parity checkpoint/ --precision int8     how far int8 is from float64; no verdict
+  saccade parity --full                           N1.5 at full size; 3 GB of disk, 8 GB of memory
+  saccade parity --full --version n1.7 --dtype bfloat16
+                                                  N1.7 at full size; 3 GB of disk, over 11 GB of memory
+  saccade parity --full --json
+  saccade parity --checkpoint checkpoint/ --precision int8
+                                                  how far int8 is from float64
 """
-INPUTS = ("backbone_features", "state", "embodiment_id", "noise")
-MASKS = ("attention_mask", "image_mask")  # beside them where the head reads text and images in turn
 VERSIONS = ("n1", "n1.5", "n1.6", "n1.7", "fork", "split-arms")
 DEFAULT_VERSION = "n1.5"
 
@@ -78,105 +82,101 @@ class Result:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
+    arguments.add_checkpoint(parser, "directory, .safetensors file or published id (default: a random head)")
     parser.add_argument(
-        "checkpoint", nargs="?", type=Path, help="directory or .safetensors file; default: a random head"
+        "--version",
+        choices=VERSIONS,
+        help=f"version of the random head (default: {DEFAULT_VERSION}); the last two are a fork's",
     )
     parser.add_argument(
-        "--full", action="store_true", help="a random head of the full width and depth (two embodiments)"
+        "--full", action="store_true", help="a random head of full width and depth (two embodiments)"
     )
     parser.add_argument(
-        "--version", choices=VERSIONS, help="of the random head (default n1.5); the last two are a fork's"
+        "--dtype",
+        choices=("float32", "bfloat16"),
+        help="dtype in which the random weights are stored (default: float32)",
     )
-    parser.add_argument("--bf16", action="store_true", help="store the random weights in bfloat16")
-    parser.add_argument(
-        "--inputs",
-        type=Path,
-        help="safetensors file with " + ", ".join((*INPUTS, *MASKS)) + " (or _in.NAME), masks where needed",
+    arguments.add_features(
+        parser, "recorded inputs, .npz or .safetensors as for `saccade attention` (default: random inputs)"
     )
-    parser.add_argument("--embodiment-id", type=int, help="for random inputs; default: random ids")
-    parser.add_argument("--batch", type=int, default=1, help="rows of random inputs (default 1)")
-    parser.add_argument(
-        "--vl-tokens", type=int, default=296, help="vision-language tokens of random inputs (default 296)"
+    arguments.add_integer(
+        parser, "--embodiment-id", minimum=0, help="embodiment of random inputs (default: random ids)"
     )
-    parser.add_argument("--num-steps", type=int, help="Euler steps (default: the checkpoint's)")
+    arguments.add_integer(parser, "--batch", default=1, help="rows of random inputs")
+    arguments.add_num_vl_tokens(parser, 296, "vision-language tokens of random inputs")
+    arguments.add_num_steps(parser)
     parser.add_argument(
         "--precision",
-        choices=("float32", "bfloat16", "int8"),
+        choices=arguments.PRECISIONS,
         default="float32",
-        help="of the Rust head (default float32); the tolerance is for float32",
+        help="precision of the Rust head (default: float32)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of random weights and inputs (default 0)")
-    parser.add_argument("--threads", type=int, help="threads of the Rust head (default: the physical cores)")
-    parser.add_argument(
-        "--tolerance",
-        type=float,
-        default=1e-5,
-        help="exit status 1 above this max |error| / max(1, |action|) (default 1e-5)",
+    arguments.add_seed(parser, "seed of random weights and inputs")
+    arguments.add_num_threads(parser)
+    arguments.add_number(
+        parser, "--tolerance", minimum=1e-300, default=1e-5, help="largest |error| / max(1, |action|)"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    arguments.add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Compares, prints, and returns 1 if an engine is further from the reference than the tolerance."""
     check(args)
+    require("parity")
     with ExitStack() as stack:
         source = args.checkpoint
         if source is None:
             source = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="saccade-parity-")))
             write_random(source, args)
-        inputs = read_inputs(args.inputs) if args.inputs else random_inputs(source, args)
+        inputs = recorded_inputs(source, args) if args.features else random_inputs(source, args)
         outputs = {}
-        for engine, run_engine in engines(
-            source, inputs, args
-        ):  # the Rust head first: it refuses bad inputs in plain words
-            note(engine)
+        for engine, run_engine in engines(source, inputs, args):
+            _output.note("parity", engine)
             outputs[engine] = run_engine()
-        note(f"reference in float64: {describe(inputs)}")
+        _output.note("parity", f"reference in float64: {describe(inputs)}")
         expected = run_reference(source, inputs, args.num_steps, "float64")
     results = [
         Result(engine, Deviation.between(vl_embs, expected[0]), Deviation.between(actions, expected[1]))
         for engine, (vl_embs, actions) in outputs.items()
     ]
-    rust = [result for result in results if result.engine.startswith("rust")]
-    # How far is too far for a lower precision, the task decides.
-    judged = rust if args.precision == "float32" else []
+    # At a lower precision it depends on the task which error is too large.
+    judged = [
+        result for result in results if result.engine.startswith("rust") and args.precision == "float32"
+    ]
     passed = all(result.actions.max_rel <= args.tolerance for result in judged)
     random = f"random {args.version or DEFAULT_VERSION} {'full size' if args.full else 'small'}"
     report = {
         "head": str(args.checkpoint or random),
         "precision": args.precision,
         "inputs": describe(inputs),
-        "machine": cpu_model(),
+        "machine": cpu_name(),
         "saccade": saccade.__version__,
         "largest_action": float(np.abs(expected[1]).max()),
         "tolerance": args.tolerance,
         "passed": passed,
         "results": [dataclasses.asdict(result) for result in results],
     }
-    print(json.dumps(report, indent=1) if args.json else table(report, results))
+    if args.json:
+        _output.print_json(report, indent=1)
+    else:
+        print(table(report, results))
     return 0 if passed else EXIT_DIFFERENT
 
 
 def check(args: argparse.Namespace) -> None:
     """Refuses arguments that contradict each other before anything long has run."""
-    if args.checkpoint is not None and (args.full or args.bf16 or args.version is not None):
-        raise UsageError("--full, --bf16 and --version are about random weights: leave out the checkpoint")
+    if args.checkpoint is not None and (args.full or args.dtype is not None or args.version is not None):
+        raise UsageError("--full, --dtype and --version describe random weights: leave out --checkpoint")
     if args.checkpoint is not None:
         args.checkpoint = resolve(args.checkpoint)
         if not args.checkpoint.exists():
             raise FileNotFoundError(f"{args.checkpoint}: no such checkpoint")
-    if args.inputs is not None and not args.inputs.is_file():
-        raise FileNotFoundError(f"{args.inputs}: no such file")
-    for name in ("batch", "vl_tokens", "num_steps", "threads"):
-        value = getattr(args, name)
-        if value is not None and value < 1:
-            raise UsageError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
-    if not args.tolerance > 0:
-        raise UsageError(f"--tolerance is {args.tolerance}, expected more than 0")
+    if args.features is not None and not args.features.is_file():
+        raise FileNotFoundError(f"{args.features}: no such file")
 
 
 def write_random(folder: Path, args: argparse.Namespace) -> None:
-    """A random checkpoint of the size asked for."""
+    """Writes a random checkpoint of the requested version and size."""
     import torch
 
     from saccade.reference import random_weights
@@ -185,103 +185,105 @@ def write_random(folder: Path, args: argparse.Namespace) -> None:
     config = random_weights.small_config(version)
     if args.full:
         config = random_weights.sized_config(version, num_embodiments=2)
-    note("writing random weights")
-    random_weights.write_checkpoint(
-        folder, config, args.seed, dtype=torch.bfloat16 if args.bf16 else torch.float32
-    )
+    _output.note("parity", "writing random weights")
+    dtype = torch.bfloat16 if args.dtype == "bfloat16" else torch.float32
+    random_weights.write_checkpoint(folder, config, args.seed, dtype=dtype)
 
 
-def random_inputs(source: Path, args: argparse.Namespace) -> dict[str, NDArray[Any]]:
+def random_inputs(source: Path, args: argparse.Namespace) -> Observation:
     """Standard normal inputs that fit the checkpoint."""
-    from saccade.reference import loading, random_weights
+    from saccade.reference import random_weights
 
-    config = saccade.HeadConfig.from_dict(loading.described(source)["head_config"])
-    if config.mask_mode == "alternate" and args.vl_tokens < 2:
-        raise UsageError("--vl-tokens is 1, expected at least 2: this head reads text and images in turn")
+    config = head_config(source)
+    if config.mask_mode == "alternate" and args.num_vl_tokens < 2:
+        raise UsageError(
+            "--num-vl-tokens: given 1, expected at least 2: this head reads text and images in turn"
+        )
     drawn = random_weights.random_inputs(
-        config, args.seed + 1, batch=args.batch, num_vl_tokens=args.vl_tokens
+        config, args.seed + 1, batch=args.batch, num_vl_tokens=args.num_vl_tokens
     )
-    inputs = {name: tensor.numpy() for name, tensor in drawn.items()}
+    inputs = Observation(**{name: tensor.numpy() for name, tensor in drawn.items()})
     if args.embodiment_id is not None:
-        inputs["embodiment_id"] = np.full(args.batch, args.embodiment_id)
+        inputs = dataclasses.replace(inputs, embodiment_id=np.full(args.batch, args.embodiment_id))
     return inputs
 
 
-def read_inputs(path: Path) -> dict[str, NDArray[Any]]:
-    """Recorded inputs, under their names or with `_in.` before them, with the masks that are there.
+def recorded_inputs(source: Path, args: argparse.Namespace) -> Observation:
+    """The inputs of a file; noise is drawn if there is none."""
+    config = head_config(source)
+    inputs = read(args.features, config).with_noise(np.random.default_rng(args.seed), config)
+    assert inputs.noise is not None
+    return dataclasses.replace(
+        inputs,
+        backbone_features=np.asarray(inputs.backbone_features, np.float32),
+        state=np.asarray(inputs.state, np.float32),
+        noise=np.asarray(inputs.noise, np.float32),
+    )
 
-    Raises:
-        UsageError: one is missing.
-    """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
 
-    try:
-        tensors = load_file(path)
-    except SafetensorError as error:
-        raise UsageError(f"{path}: {error}") from None
-    inputs = {}
-    for name in INPUTS:
-        tensor = tensors.get(name, tensors.get(f"_in.{name}"))
-        if tensor is None:
-            raise UsageError(f"{path}: no tensor {name}, expected " + ", ".join(INPUTS))
-        inputs[name] = (tensor.long() if name == "embodiment_id" else tensor.float()).numpy()
-    for name in MASKS:
-        mask = tensors.get(name, tensors.get(f"_in.{name}"))
-        if mask is not None:
-            inputs[name] = mask.numpy()
-    return inputs
+def head_config(source: Path) -> saccade.HeadConfig:
+    """The config of the head in a checkpoint, whichever layout it has."""
+    from saccade.reference import loading
+
+    return saccade.HeadConfig.from_dict(loading.described(source).head_config)
 
 
 def engines(
-    source: Path, inputs: dict[str, NDArray[Any]], args: argparse.Namespace
+    source: Path, inputs: Observation, args: argparse.Namespace
 ) -> Iterator[tuple[str, Callable[[], Outputs]]]:
-    """The Rust head on each instruction set, then torch in float32 as a yardstick."""
+    """The Rust head on each instruction set, then torch in float32 for comparison.
+
+    The Rust head comes first because its messages about bad inputs are clearer.
+    """
     for isa in saccade.show_config("dicts")["available_isas"]:
         name = f"rust {isa}" + ("" if args.precision == "float32" else f" {args.precision}")
         yield name, partial(run_rust, source, inputs, args, isa)
     yield "torch float32", partial(run_reference, source, inputs, args.num_steps, "float32")
 
 
-def run_reference(
-    source: Path, inputs: dict[str, NDArray[Any]], num_steps: int | None, dtype: str
-) -> Outputs:
-    """`vl_embs` and actions of the reference; its weights are gone when this returns."""
+def run_reference(source: Path, inputs: Observation, num_steps: int | None, dtype: str) -> Outputs:
+    """`vl_embs` and actions of the reference. Its weights are freed when this returns."""
     import torch
 
     from saccade.reference import ActionHead
 
     kind: torch.dtype = getattr(torch, dtype)
     head = ActionHead.load(source, dtype=kind)
+    assert inputs.noise is not None
     with torch.no_grad():
-        vl_embs = head.encode(inputs["backbone_features"])
-        rest: dict[str, Any] = {name: array for name, array in inputs.items() if name != "backbone_features"}
-        actions = head.sample(vl_embs, **rest, num_steps=num_steps)
+        vl_embs = head.encode(inputs.backbone_features, drop_vl=inputs.drop_vl)
+        actions = head.sample(
+            vl_embs,
+            inputs.state,
+            inputs.embodiment_id,
+            noise=inputs.noise,
+            num_steps=num_steps,
+            drop_vl=inputs.drop_vl,
+            attention_mask=inputs.attention_mask,
+            image_mask=inputs.image_mask,
+        )
     return vl_embs.numpy(), actions.numpy()
 
 
-def run_rust(source: Path, inputs: dict[str, NDArray[Any]], args: argparse.Namespace, isa: str) -> Outputs:
+def run_rust(source: Path, inputs: Observation, args: argparse.Namespace, isa: str) -> Outputs:
     """`vl_embs` and actions of the Rust head on one instruction set."""
     from saccade.reference import loading
 
     with forced_isa(isa):
         head = saccade.ActionHead.load(
             source,
-            config=loading.described(source)["head_config"],
+            config=loading.described(source).head_config,
             precision=args.precision,
-            num_threads=args.threads,
+            num_threads=args.num_threads,
         )
-        masks: dict[str, Any] = {name: inputs[name] for name in MASKS if name in inputs}
-        context = head.encode(inputs["backbone_features"], **masks)
-        actions = head.sample(
-            context, inputs["state"], inputs["embodiment_id"], noise=inputs["noise"], num_steps=args.num_steps
-        )
-    return np.asarray(context.vl_embs), np.asarray(actions)
+        context = inputs.encode(head)
+        actions = inputs.sample(head, context, num_steps=args.num_steps)
+    return np.asarray(context.vl_embs), actions
 
 
 @contextmanager
 def forced_isa(isa: str) -> Iterator[None]:
-    """Sets `SACCADE_ISA`, which is read when a head is built, and puts back what was there."""
+    """Sets `SACCADE_ISA`, which is read when a head is built, and restores it at the end."""
     before = os.environ.get("SACCADE_ISA")
     os.environ["SACCADE_ISA"] = isa
     try:
@@ -293,27 +295,12 @@ def forced_isa(isa: str) -> Iterator[None]:
             os.environ["SACCADE_ISA"] = before
 
 
-def describe(inputs: dict[str, NDArray[Any]]) -> str:
+def describe(inputs: Observation) -> str:
     """The sizes of the inputs, in words."""
-    batch, num_vl_tokens, _ = inputs["backbone_features"].shape
-    return f"batch {batch}, {num_vl_tokens} vision-language tokens, horizon {inputs['noise'].shape[1]}"
-
-
-def cpu_model() -> str:
-    """The processor's name as the system gives it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
-        platform.machine(),
+    assert inputs.noise is not None
+    return (
+        f"batch {len(inputs)}, {inputs.num_vl_tokens} vision-language tokens, horizon {inputs.noise.shape[1]}"
     )
-
-
-def note(message: str) -> None:
-    """Progress, beside the result."""
-    print(f"parity: {message} ...", file=sys.stderr, flush=True)
 
 
 def table(report: dict[str, Any], results: list[Result]) -> str:
@@ -335,6 +322,6 @@ def table(report: dict[str, Any], results: list[Result]) -> str:
         f"actions are {'within' if report['passed'] else 'ABOVE'} the tolerance of {report['tolerance']:.0e}"
     )
     if report["precision"] != "float32":
-        verdict = "no tolerance is set for a precision below float32: see docs/precision.md"
+        verdict = "there is no tolerance for a precision below float32: see docs/precision.md"
     lines += ["", f"rel is |error| / max(1, |value|); {verdict}"]
     return "\n".join(lines)

@@ -1,27 +1,26 @@
-"""`saccade resize`: a copy of a checkpoint with another number of future tokens."""
+"""`saccade resize`: writes a checkpoint with another number of future tokens."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saccade.cli import EXIT_OK
-from saccade.cli._copying import add_copy_arguments, copying, left_behind
+from saccade.cli import EXIT_OK, _output, arguments
+from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
 if TYPE_CHECKING:
-    from saccade.checkpoints import ActionChanges, ResizeReport
+    from saccade.checkpoints import ResizeReport
+    from saccade.comparison import ActionChanges
 
-HELP = "change the number of future tokens of a checkpoint"
+HELP = "write a checkpoint with another number of future tokens"
 
 EPILOG = """\
-Going up, tokens are copied; saccade's own key in config.json takes ln of the number of copies off their
-keys' logits, so that in saccade actions stay what they were but for rounding. Other programs do not know that
-key: to them the copies weigh more, and the report says how far their actions move. Going down, tokens that
-are alike are merged. Everything else is copied bit for bit. docs/resize.md says what is exact and what is
-not.
+To add tokens, tokens are copied. A key of saccade in config.json subtracts ln of the number of copies from
+the logits of their keys, so that actions in saccade are unchanged except for rounding. Other programs ignore
+that key and give the copies more weight; the report says how far their actions move. To remove tokens,
+similar tokens are merged. Everything else is copied bit for bit. docs/resize.md says what is exact and what
+is not.
 
 examples:
   saccade resize GR00T-N1.5-3B/ --num-future-tokens 64 --out GR00T-N1.5-3B-64
@@ -35,35 +34,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     add_copy_arguments(parser)
     parser.add_argument(
-        "--num-future-tokens", type=int, required=True, metavar="M", help="how many the copy is to have"
+        "--num-future-tokens",
+        type=int,
+        required=True,
+        metavar="N",
+        help="number of future tokens of the new checkpoint",
     )
     parser.add_argument(
         "--perturbation",
         type=float,
         default=0.0,
         metavar="X",
-        help="add noise to the copies, of X times the tokens' root mean square, so that training can tell "
-        "them apart (default: 0)",
+        help="add noise of X times the tokens' root mean square to the copies, so that training can "
+        "distinguish them (default: 0)",
     )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="of that noise and of random observations (default: 0)"
-    )
-    parser.add_argument(
-        "--features",
-        type=Path,
-        metavar="FILE",
-        help="observations to compare actions on, .npz or .safetensors as for saccade attention (default: "
+    arguments.add_seed(parser, "seed of that noise and of random observations")
+    arguments.add_features(
+        parser,
+        "observations to compare actions on, .npz or .safetensors as for `saccade attention` (default: "
         "random ones)",
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Writes the copy, and reports what is in it and how far actions move."""
-    from saccade.checkpoints import action_changes, resize
+    """Writes the copy and reports what it contains and how far actions move."""
+    from saccade.checkpoints import resize
+    from saccade.comparison import action_changes
 
     with copying("resizing") as progress:
         report = resize(
-            args.source,
+            args.checkpoint,
             args.out,
             num_future_tokens=args.num_future_tokens,
             perturbation=args.perturbation,
@@ -73,14 +73,14 @@ def run(args: argparse.Namespace) -> int:
             progress=progress,
         )
     changes = action_changes(
-        args.source, args.out, config=args.config, features=args.features, seed=args.seed
+        args.checkpoint, args.out, config=args.config, features=args.features, seed=args.seed
     )
     if args.json:
         both = {**dataclasses.asdict(report), "actions": dataclasses.asdict(changes)}
-        print(json.dumps(both, default=str))
+        _output.print_json(both, default=str)
         return EXIT_OK
     describe(args, report, changes)
-    left_behind(report)
+    print_files_not_copied(report)
     return EXIT_OK
 
 
@@ -89,19 +89,19 @@ def describe(args: argparse.Namespace, report: ResizeReport, changes: ActionChan
     merged = sum(len(group) > 1 for group in report.sources)
     copied = max(0, report.num_after - report.num_before)
     print(
-        f"{args.out}: {report.num_before} future tokens are {report.num_after}: {copied} copies added, "
-        f"{merged} merged of several"
+        f"{args.out}: {report.num_after} future tokens (was {report.num_before}); {copied} copies added, "
+        f"{merged} merged from several"
     )
     if report.perturbation_rms:
-        print(f"noise of root mean square {report.perturbation_rms:.3g} was added to the copies")
+        print(f"added noise with root mean square {report.perturbation_rms:.3g} to the copies")
     if report.is_widened:
-        print("the tokens are float32 now: the type that they had cannot hold the new ones")
+        print("the tokens are float32 now, because their dtype cannot represent the new values")
     observations = "random observations" if args.features is None else f"observations of {args.features}"
     print(
-        f"on {changes.observations} {observations}, in float32, an action (root mean square "
-        f"{changes.actions_rms:.3g}; another noise moves it by {changes.of_other_noise.mean:.3g}) moves by"
+        f"change of actions on {changes.observations} {observations}, in float32 (root mean square of "
+        f"actions {changes.actions_rms:.3g}; mean change by another noise {changes.of_other_noise.mean:.3g}):"
     )
     for where, change in (("saccade", changes.in_saccade), ("other programs", changes.in_other_programs)):
-        print(f"  in {where:14}  {change.mean:.3g} in the mean, {change.largest:.3g} at most")
+        print(f"  in {where:14}  mean {change.mean:.3g}, largest {change.largest:.3g}")
     if report.is_exact:
-        print("in saccade that is rounding: the copies are together what the tokens were")
+        print("the difference in saccade is floating-point rounding")

@@ -1,16 +1,16 @@
-"""`saccade rollout`: closed loop on camera pixels, with a table, videos and a result file."""
+"""`saccade rollout`: runs a policy on camera images in closed loop; writes a result file and videos."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, UsageError
+from saccade._files import writable_directory, write_json
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, arguments, require
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,56 +21,51 @@ if TYPE_CHECKING:
     from saccade.sim.report import Summary
     from saccade.sim.rollout import Episode
 
-HELP = "drive the simulated robot with a policy and report how often it succeeds"
+HELP = "run a policy on the simulated robot and report how often it succeeds"
 
 EPILOG = """\
-Tasks of the demo, which the shipped policy knows: reach, push, drawer-open, button-press-topdown,
-window-open. Harder ones, for policies of your own: two-goals, stereo-reach, two-stage, fork.
+Tasks of the demo, which the bundled policy knows: reach, push, drawer-open, button-press-topdown,
+window-open. Harder tasks, for policies of your own: two-goals, stereo-reach, two-stage, fork.
 
-The same seed gives the same layout, wording and noise, whichever engine runs. Seeds from 1000000 on are kept
-for training and are refused.
+The same seed gives the same layout, wording and noise with either engine. Seeds from 1000000 on are reserved
+for training and refused.
 
-OUT receives results.json (after every episode), contact-sheet.png and, with --video, videos/TASK-SEED.mp4.
-Ctrl-C stops; the episodes that are done are kept.
+DIR receives results.json (after every episode), contact-sheet.png and, with --video, videos/TASK-SEED.mp4.
+After Ctrl-C the episodes that are done are kept.
 
 examples:
   saccade rollout --video
   saccade rollout --tasks reach,push --episodes 20 --out out/twenty
-  saccade rollout --engine torch --threads 1 --json
-  saccade rollout --instruction-from push --tasks reach     tell it another task's words: it should fail
+  saccade rollout --checkpoint out/policy --engine torch --num-threads 1 --json
+  saccade rollout --tasks reach --instruction-from push     the wrong instruction: it should fail
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     parser.epilog = EPILOG
+    arguments.add_checkpoint(parser)
     parser.add_argument(
-        "--checkpoint", type=Path, metavar="DIR", help="policy to run (default: the one shipped)"
+        "--engine",
+        choices=("rust", "torch"),
+        default="rust",
+        help="what computes the action head (default: rust)",
     )
-    parser.add_argument(
-        "--engine", choices=("rust", "torch"), default="rust", help="what computes the action head"
-    )
-    parser.add_argument(
-        "--tasks", metavar="NAME,...", help="tasks, separated by commas (default: all that it knows)"
-    )
-    parser.add_argument("--episodes", type=int, default=4, help="episodes per task (default: 4)")
-    parser.add_argument(
-        "--seed", type=int, default=0, help="first seed; the next episodes count up (default: 0)"
-    )
-    parser.add_argument("--threads", type=int, help="threads of the action head (default: the engine's own)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/rollout"), help="where results go (default: out/rollout)"
-    )
+    arguments.add_tasks(parser)
+    arguments.add_episodes(parser, 4)
+    arguments.add_seed(parser, "seed of the first episode; the next ones count up")
+    arguments.add_num_threads(parser)
+    arguments.add_out(parser, "out/rollout")
     parser.add_argument("--video", action="store_true", help="write an MP4 of every episode")
     parser.add_argument(
-        "--instruction-from", metavar="TASK", help="tell the policy this task's instruction instead"
+        "--instruction-from", metavar="TASK", help="give the policy the instruction of this task instead"
     )
-    parser.add_argument("--json", action="store_true", help="print the result file instead of a table")
+    arguments.add_json(parser, "print results.json instead of a table")
 
 
 @dataclass
 class Session:
-    """One call of the command: what was asked for, and what has been done so far."""
+    """One run of the command: what was asked for, and what is done so far."""
 
     policy: Policy
     tasks: list[str]
@@ -82,7 +77,7 @@ class Session:
     pictures: list[tuple[Episode, UInt8Array]] = field(default_factory=list)
 
     def record(self) -> dict[str, Any]:
-        """What the result file holds now."""
+        """The content of the result file."""
         from saccade.sim.report import result_record
 
         return result_record(
@@ -94,8 +89,7 @@ class Session:
         )
 
     def run(self, on_episode: Callable[[Episode], None]) -> None:
-        """Runs all episodes; what is done is in the result file after each of them."""
-        from saccade.sim.files import write_json
+        """Runs all episodes and writes the result file after each of them."""
         from saccade.sim.rollout import environment_for
 
         for task in self.tasks:
@@ -129,83 +123,66 @@ class Session:
 
 def run(args: argparse.Namespace) -> int:
     """Checks everything that can be wrong, then rolls out."""
-    from rich.console import Console
+    from saccade.sim.tasks import check_evaluation_seeds
 
-    from saccade.sim.files import writable_directory, write_json
-
-    session = prepare(args)
-    from saccade.sim.report import write_contact_sheet  # imports mujoco, which needs a working OpenGL
+    seeds = check_evaluation_seeds(args.seed, args.episodes)
+    arguments.check_tasks(args.tasks or ())
+    if args.instruction_from is not None:
+        arguments.check_known("--instruction-from", [args.instruction_from], arguments.known_tasks())
+    require("rollout")
+    session = prepare(args, seeds)
+    from saccade.sim.report import write_contact_sheet
 
     writable_directory(session.out)
     if session.video:
         writable_directory(session.out / "videos")
     interrupted = False
     try:
-        roll_out(session, Console(stderr=True))
+        roll_out(session)
     except KeyboardInterrupt:
         interrupted = True
     write_json(session.out / "results.json", session.record())
     if session.pictures:
         write_contact_sheet(session.pictures, session.out / "contact-sheet.png")
     if args.json:
-        print(json.dumps(session.record(), indent=2))
+        _output.print_json(session.record(), indent=2)
     else:
-        show(session, Console())
+        show(session)
     return EXIT_INTERRUPTED if interrupted else EXIT_OK
 
 
-def prepare(args: argparse.Namespace) -> Session:
-    """Loads the policy and checks the arguments; nothing is written yet."""
+def prepare(args: argparse.Namespace, seeds: range) -> Session:
+    """Loads the policy; nothing is written yet."""
     from saccade.sim import graphics
     from saccade.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
-    from saccade.sim.tasks import check_evaluation_seeds, find_task
 
-    seeds = check_evaluation_seeds(args.seed, args.episodes)
-    if args.threads is not None and args.threads < 1:
-        raise UsageError(f"--threads: given {args.threads}, expected at least 1")
-    named = None if args.tasks is None else parse_tasks(args.tasks)
-    if args.instruction_from is not None:
-        find_task(args.instruction_from)
     graphics.check()
-    policy = Policy.load(args.checkpoint or DEMO_CHECKPOINT, engine=args.engine, num_threads=args.threads)
-    tasks = named or list(policy.config.tasks)
+    policy = Policy.load(args.checkpoint or DEMO_CHECKPOINT, engine=args.engine, num_threads=args.num_threads)
+    tasks = list(args.tasks or policy.config.tasks)
     check_trained_on(policy, tasks)
     policy.warmup()
     return Session(policy, tasks, seeds, args.instruction_from, args.out, args.video)
 
 
-def parse_tasks(text: str) -> list[str]:
-    """Task names out of a list with commas, each once."""
-    from saccade.sim.tasks import find_task
-
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if not names:
-        raise UsageError("--tasks: expected at least one name")
-    return list(dict.fromkeys(find_task(name).name for name in names))
-
-
-def roll_out(session: Session, console: Any) -> None:
-    """Runs the episodes behind a progress bar."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("rollout", total=len(session.seeds) * len(session.tasks))
+def roll_out(session: Session) -> None:
+    """Runs the episodes with a progress bar."""
+    with _output.progress_bar("rollout", len(session.seeds) * len(session.tasks)) as update:
 
         def on_episode(episode: Episode) -> None:
-            done = sum(episode.success for episode in session.episodes)
-            description = f"{episode.task}: {done} of {len(session.episodes)} succeeded"
-            progress.update(bar, advance=1, description=description)
+            done = len(session.episodes)
+            succeeded = sum(episode.success for episode in session.episodes)
+            update(done, description=f"{episode.task}: {succeeded} of {done} succeeded")
 
         session.run(on_episode)
 
 
-def show(session: Session, console: Any) -> None:
+def show(session: Session) -> None:
     """Prints the table and where the files are."""
     from saccade.sim.report import summarize, summarize_tasks
 
+    console = _output.console()
     if not session.episodes:
-        console.print("no episode was completed")
+        print("no episode was completed")
         return
     engine = session.policy.engine.describe()
     described = ", ".join(f"{key} {value}" for key, value in engine.items() if key != "name")
@@ -215,10 +192,10 @@ def show(session: Session, console: Any) -> None:
     table.add_section()
     table.add_row(*cells(summarize("all", session.episodes)), style="bold")
     console.print(table)
-    console.print(f"results        {session.out / 'results.json'}", soft_wrap=True, highlight=False)
-    console.print(f"contact sheet  {session.out / 'contact-sheet.png'}", soft_wrap=True, highlight=False)
+    print(f"results        {session.out / 'results.json'}")
+    print(f"contact sheet  {session.out / 'contact-sheet.png'}")
     if session.video:
-        console.print(f"videos         {session.out / 'videos'}", soft_wrap=True, highlight=False)
+        print(f"videos         {session.out / 'videos'}")
 
 
 def make_table(title: str) -> Table:

@@ -1,4 +1,4 @@
-"""`saccade study`: what the parts of an action head do, measured and reported with intervals."""
+"""`saccade study`: measures what the parts of an action head contribute, and reports it with intervals."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from saccade.cli import EXIT_OK, Parser
-from saccade.study import STUDIES, load_study
+from saccade._files import writable_directory
+from saccade.cli import EXIT_OK, Parser, _output, arguments, require
+from saccade.study.study import STUDIES, load_study
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-HELP = "measure what the future tokens do, in closed loop and inside the head"
+HELP = "measure what the parts of an action head contribute"
 
 EPILOG = """\
-OUT receives <study>.csv (a row a measurement) and <study>.json (settings, hashes, versions), after every cell
-of work. Stopped at any time, the same command goes on where it was; with more tasks, episodes or arms it does
-only what is new. `saccade study report OUT` makes one page of all studies in OUT.
+DIR receives STUDY.csv (one row per measurement) and STUDY.json (settings, hashes, versions) after every cell
+of work. If a study is interrupted, run the same command again: it continues where it stopped. With more
+tasks, episodes or arms it computes only what is missing. `saccade study report DIR` makes one page of all
+studies in DIR.
 
 examples:
   saccade study cuts --episodes 15 --out out/study
@@ -28,7 +30,7 @@ examples:
 
 
 class StudyParser(Parser):
-    """The parser of one study, which imports it only when its arguments are to be read."""
+    """The parser of one study, whose module is imported only if that study was chosen."""
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         super().__init__(*args, **kwargs)
@@ -37,8 +39,9 @@ class StudyParser(Parser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """See argparse, which calls this for the chosen one only."""
+        """See argparse, which calls this for the chosen study only."""
         if self.study is not None:
+            require("study")
             load_study(self.study).add_arguments(self)
             add_common_arguments(self)
             self.study = None
@@ -55,67 +58,70 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         sub = studies.add_parser(name, help=help_line, description=help_line[0].upper() + help_line[1:] + ".")
         sub.study = name
     report = studies.add_parser(
-        "report", help="one page of all studies in a directory", description="Makes one page of all studies."
+        "report",
+        help="one page of all studies in a directory",
+        description="Makes one page of all studies in a directory, from their tables alone.",
+        epilog="examples:\n  saccade study report out/study",
     )
-    report.add_argument("directory", type=Path, metavar="DIR", help="what the studies had as --out")
-    report.add_argument("--json", action="store_true", help="print where the files are as JSON")
+    report.add_argument("directory", type=Path, metavar="DIR", help="the --out of the studies")
+    arguments.add_json(report, "print the paths of the files as JSON")
 
 
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares what every study takes."""
+    arguments.add_out(parser, "out/study", "directory of the tables")
     parser.add_argument(
-        "--out", type=Path, default=Path("out/study"), help="where tables go (default: out/study)"
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="cells computed at the same time; with loky -1 for all cores (default: 1)",
     )
     parser.add_argument(
-        "--jobs", type=int, default=1, help="cells at once; with loky -1 takes all cores (default: 1)"
+        "--backend",
+        default="loky",
+        metavar="loky|ray",
+        help="processes on this machine, or on a Ray cluster (default: loky)",
     )
-    parser.add_argument(
-        "--backend", default="loky", metavar="loky|ray", help="processes here, or of a Ray cluster"
-    )
-    parser.add_argument("--json", action="store_true", help="print table and provenance as JSON")
+    arguments.add_json(parser, "print table and provenance as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Runs the study, or makes the report."""
-    return run_report(args) if args.study == "report" else run_study(args)
+    require("study")
+    return run_report(args) if args.study == "report" else measure(args)
 
 
-def run_study(args: argparse.Namespace) -> int:
-    """Checks the arguments, works through the cells behind a progress bar, and says what came out."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from saccade.sim.files import writable_directory
-    from saccade.study.cells import Finished, check_workers
+def measure(args: argparse.Namespace) -> int:
+    """Checks the arguments, works through the cells with a progress bar, and prints the conclusions."""
+    from saccade.study.run import Finished, check_workers
+    from saccade.study.run import run as run_study
 
     check_workers(args.backend, args.jobs)
-    study = load_study(args.study)
-    settings = study.settings(args)
+    study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = progress.add_task(args.study, total=None)
+    with _output.progress_bar(args.study) as update:
 
         def on_done(finished: Finished, done: int, total: int) -> None:
-            progress.update(bar, completed=done, total=total, description=finished.cell.name)
+            update(done, total, finished.cell.name)
 
-        study.run(settings, out, backend=args.backend, jobs=args.jobs, on_done=on_done)
+        run_study(study, out, backend=args.backend, jobs=args.jobs, on_done=on_done)
     show(args.study, out, args.json)
     return EXIT_OK
 
 
 def show(name: str, out: Path, as_json: bool) -> None:
-    """Prints what the table allows to be said, and where it is."""
-    from saccade.study import tables
+    """Prints the conclusions that the table supports, and where it is."""
+    from saccade.study import table as tables
 
     provenance = tables.read_provenance(tables.provenance_path(out, name))
     if as_json:
         rows: list[dict[str, Any]] = json.loads(
             tables.read_table(tables.table_path(out, name)).to_json(orient="records", double_precision=15)
         )
-        print(json.dumps({"provenance": vars(provenance), "rows": rows}, indent=2, ensure_ascii=False))
+        _output.print_json({"provenance": vars(provenance), "rows": rows}, indent=2)
         return
-    section = load_study(name).section(tables.read_table(tables.table_path(out, name)), provenance)
+    section = load_study(name).summarise(tables.read_table(tables.table_path(out, name)), provenance)
     for line in section.concluded:
         print(f"- {line}")
     print(f"table   {tables.table_path(out, name)}")
@@ -123,12 +129,12 @@ def show(name: str, out: Path, as_json: bool) -> None:
 
 
 def run_report(args: argparse.Namespace) -> int:
-    """Makes the report and says where it is."""
+    """Makes the report and prints where it is."""
     from saccade.study.report import write_report
 
     page, markdown = write_report(args.directory)
     if args.json:
-        print(json.dumps({"html": str(page), "markdown": str(markdown)}))
+        _output.print_json({"html": str(page), "markdown": str(markdown)})
     else:
         print(f"page      {page}")
         print(f"markdown  {markdown}")

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from saccade._files import write_atomically
 from saccade.maps.record import MEAN, Maps
 from saccade.maps.sheet import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES
-from saccade.sim.files import write_atomically
 
 TEMPLATE = "page.html.j2"
 LEVELS = 65535  # probabilities are stored as shares of their row's largest, in 16 bits

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 import saccade
+from saccade._files import sha256_of
 from saccade.checkpoints import read_tensors
 from saccade.config import HeadConfig
 from saccade.errors import InputError
@@ -21,7 +22,6 @@ from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.maps.inputs import Inputs
 from saccade.maps.occlusion import Occlusion
 from saccade.maps.summary import Overlap, overlap, summarize
-from saccade.sim.files import sha256_of
 
 Float32Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
+from saccade._files import write_atomically
 from saccade.maps.layout import Camera
 from saccade.maps.record import BASELINES, MEAN, Maps
-from saccade.sim.files import write_atomically
 
 Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]

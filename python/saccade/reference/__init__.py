@@ -1,10 +1,15 @@
-"""The same action head in plain torch: the oracle of the Rust head, and the module that is trained.
+"""The same action head in plain torch: it is trained, and the Rust head is tested against it.
 
-Slow and plain on purpose: nothing is cached, every row is computed in every block. `model.py` reads from top
-to bottom; `intervene.py` says what an intervention does in each block. Needs torch and safetensors (`pip
-install saccade[torch]`).
+It favours clarity over speed: nothing is cached, and every row is computed in every block. `head` is the
+sampler and the loss, `layers` the modules, `intervene` the effect of an intervention in each block. Needs
+torch and safetensors.
 """
 
-from saccade.reference.model import ActionHead, TimeDistribution
+from saccade._extras import require
+
+require("torch", "safetensors")
+
+from saccade.reference.head import ActionHead  # noqa: E402
+from saccade.reference.training import TimeDistribution  # noqa: E402
 
 __all__ = ["ActionHead", "TimeDistribution"]

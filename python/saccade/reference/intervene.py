@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from saccade._arrays import boolean
+from saccade._arrays import boolean, indices
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS, Chosen, Intervention, Tokens, as_interventions
@@ -91,7 +91,12 @@ class Edit:
 
     def acts(self, step: int, block: int) -> bool:
         """Whether its limits include this block of this Euler step."""
-        return (self.blocks is None or block in self.blocks) and (self.steps is None or step in self.steps)
+        return includes(self.blocks, block) and includes(self.steps, step)
+
+
+def includes(limit: tuple[int, ...] | None, index: int) -> bool:
+    """Whether a limit includes this index. None includes all."""
+    return limit is None or index in limit
 
 
 class Run:
@@ -147,7 +152,8 @@ class Run:
         self.future_tokens = self.replaced_tokens(interventions)
         self.edits = [Edit.of(one, vl_embs) for one in interventions]
         self.stopped = Edit.of(stopped_edges(stop_gradient), vl_embs)
-        self.kept = Edit.of(Intervention(blocks=blocks, steps=steps), vl_embs)  # for its limits alone
+        self.recorded_blocks = indices("blocks", blocks)
+        self.recorded_steps = indices("steps", steps)
 
         num_future = config.num_future_tokens if self.future_tokens is None else len(self.future_tokens)
         self.sizes = {
@@ -170,7 +176,9 @@ class Run:
         self.held: dict[int, Tensor] = {}
         self.attention: dict[tuple[int, int], Tensor] = {}
         self.hidden: dict[tuple[int, int], Tensor] = {}
-        for edit in (*self.edits, self.kept):
+        check_indices("blocks", self.recorded_blocks, config.num_layers)
+        check_indices("steps", self.recorded_steps, num_steps)
+        for edit in self.edits:
             self.check(edit)
         self.check_edges("stop_gradient", self.stopped)
 
@@ -188,7 +196,7 @@ class Run:
         place, cross = (step, block), is_cross(self.config, block)
         first = self.first_row(evaluation)
         holds = not cross and first == 0 and self.future_refresh > 1
-        shown = self.kept.acts(step, block)
+        shown = includes(self.recorded_blocks, block) and includes(self.recorded_steps, step)
         attention, hidden = shown and self.keep_attention, shown and self.keep_hidden
         bias = self.logit_bias(step, block, cross)
         return BlockChange(
@@ -283,6 +291,7 @@ class Run:
         for chosen, biases in edit.key_bias.items():
             size = self.count("key_bias", chosen)
             check_shape(f"key_bias: {chosen[0]}", biases, (size,) if biases.ndim == 1 else ())
+        self.check_effect(edit)
         for (step, block), groups in edit.patch.items():
             check_indices("patch: step", [step], self.num_steps)
             check_indices("patch: block", [block], self.config.num_layers)
@@ -303,6 +312,27 @@ class Run:
         for pair in edit.cut:
             for chosen in pair:
                 self.count(name, chosen)
+
+    def check_effect(self, edit: Edit) -> None:
+        """Refuses cuts and biases none of which exists in any of the blocks where they apply.
+
+        Raises:
+            InputError: Says in which blocks the edges exist.
+        """
+        edges = [(f"cut of {source[0]} keys", source[0]) for _, source in edit.cut]
+        edges += [(f"key_bias on {chosen[0]} keys", chosen[0]) for chosen in edit.key_bias]
+        blocks = range(self.config.num_layers) if edit.blocks is None else edit.blocks
+        kinds = {is_cross(self.config, block) for block in blocks}
+        if not edges or any((group == "vl") in kinds for _, group in edges):
+            return
+        what, group = edges[0]
+        existing = [b for b in range(self.config.num_layers) if is_cross(self.config, b) == (group == "vl")]
+        kind = "cross-attention" if group == "vl" else "self-attention"
+        where = ", ".join(map(str, existing)) or "none in this head"
+        raise InputError(
+            f"intervention: a {what} has no effect in blocks {', '.join(map(str, blocks))}: these keys exist "
+            f"in {kind} blocks only ({where})"
+        )
 
     def count(self, name: str, chosen: Chosen) -> int:
         """How many tokens these are; refuses those that the group does not have."""

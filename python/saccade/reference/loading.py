@@ -1,4 +1,4 @@
-"""Reads checkpoints for the reference: every layout that the Rust head reads."""
+"""Reads checkpoints for the reference head, in every layout that the Rust head reads."""
 
 import json
 from collections.abc import Mapping
@@ -10,47 +10,48 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from saccade import checkpoints
+from saccade.checkpoints.description import Description, describe
 from saccade.errors import CheckpointError
 
-# Added to the name of an int8 weight: the scales of its rows.
+# The name of an int8 weight with this suffix is that of its scales, one for each row.
 SCALE_SUFFIX = "_scale"
 
 
 def described(
     source: str | PathLike[str], config: Mapping[str, Any] | str | PathLike[str] | None = None
-) -> dict[str, Any]:
-    """What `saccade.checkpoints.describe` says; the config may also be in the metadata of a single file."""
+) -> Description:
+    """As `saccade.checkpoints.describe`, but the config may also be in the metadata of a single file."""
     path = Path(source)
     if config is None and path.is_file() and not (path.parent / "config.json").is_file():
         with safe_open(path, framework="pt") as opened:
             inside = (opened.metadata() or {}).get("config")
         config = None if inside is None else json.loads(inside)
-    return checkpoints.describe(source, config)
+    return describe(source, config)
 
 
-def tensor_names(checkpoint: Mapping[str, Any]) -> list[str]:
-    """The names of the head's tensors in what was `described`, without their prefix."""
-    prefix = checkpoint["prefix"]
-    names = [tensor["name"] for tensor in checkpoint["tensors"]]
+def tensor_names(checkpoint: Description) -> list[str]:
+    """The names of the head's tensors without their prefix."""
+    prefix = checkpoint.prefix
+    names = [tensor.name for tensor in checkpoint.tensors]
     return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
 
 
 def read_tensors(
-    checkpoint: Mapping[str, Any], expected: Mapping[str, torch.Size], dtype: torch.dtype
+    checkpoint: Description, expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """The head's tensors without their prefix, in `dtype`; int8 weights as what they stand for, the integers
-    of each row times its scale.
+    """Reads the head's tensors in `dtype`, by their names without prefix. int8 weights are multiplied by
+    their scales.
 
     Raises:
-        CheckpointError: listing all that is missing, unknown inside the prefix, or of another shape.
+        CheckpointError: tensors are missing, unknown inside the prefix, or of the wrong shape. The message
+            lists all of them.
     """
-    prefix = checkpoint["prefix"]
+    prefix = checkpoint.prefix
     tensors, scales, problems = {}, {}, []
     integers = set()
-    for file in checkpoint["files"]:
-        with safe_open(file["path"], framework="pt") as opened:
-            for full_name in opened.keys():  # noqa: SIM118  (a safetensors handle is no dict)
+    for file in checkpoint.files:
+        with safe_open(file.path, framework="pt") as opened:
+            for full_name in opened.keys():  # noqa: SIM118 (the handle of safetensors is not a dict)
                 name = full_name.removeprefix(prefix)
                 if not full_name.startswith(prefix):
                     continue
@@ -74,14 +75,15 @@ def read_tensors(
         if name in integers and scale is not None and tuple(scale.shape) == rows and tensors[name].ndim == 2:
             tensors[name] *= scale.to(dtype)[:, None]
         else:
-            problems.append(f"{name}: expected an int8 matrix beside {name}{SCALE_SUFFIX} {rows}, or neither")
+            problems.append(
+                f"{name}: expected an int8 matrix with scales {name}{SCALE_SUFFIX} {rows}, or neither"
+            )
     for name, shape in expected.items():
-        if shape.numel() == 0:  # no future tokens: their empty table need not be stored
+        if shape.numel() == 0:  # an empty table of future tokens need not be stored
             tensors.setdefault(name, torch.empty(shape, dtype=dtype))
     absent = expected.keys() - tensors.keys() - {problem.split(":")[0] for problem in problems}
     problems += [f"{name}: missing" for name in sorted(absent)]
     if problems:
         listed = "; ".join(sorted(problems))
-        source = checkpoint["source"]
-        raise CheckpointError(f"{source}: {len(problems)} tensors do not fit the config: {listed}")
+        raise CheckpointError(f"{checkpoint.source}: {len(problems)} tensors do not fit the config: {listed}")
     return tensors

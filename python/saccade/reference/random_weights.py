@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from saccade.config import HeadConfig
-from saccade.reference.model import ActionHead
+from saccade.reference.head import ActionHead
 
 N1_CONFIG: Mapping[str, Any] = {
     "action_dim": 32,

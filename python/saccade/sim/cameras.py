@@ -41,4 +41,5 @@ DEFAULT_CAMERAS = (
     Camera("right", CENTRE, 0.95, 35.0, -35.0),
     Camera("top", CENTRE, 0.8, 90.0, -75.0),
 )
+DEFAULT_IMAGE_SIZE = 64  # pixels along each side
 VIDEO_CAMERA = Camera("video", (0.0, 0.68, 0.15), 1.25, 140.0, -28.0)

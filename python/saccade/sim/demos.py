@@ -6,21 +6,25 @@ depends on its task, its seed and the settings only, so a recording can also be 
 task.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from saccade._files import write_atomically, write_json
 from saccade.errors import InputError
-from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
-from saccade.sim.environment import DEFAULT_IMAGE_SIZE, TaskEnvironment
+from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, Camera
 from saccade.sim.experts import Expert, NoiseBursts
-from saccade.sim.files import write_atomically, write_json
 from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
+
+if TYPE_CHECKING:
+    from saccade.sim.environment import TaskEnvironment
 
 MAX_STEPS = 250  # bursts make the expert's way longer
 STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to stay
@@ -55,7 +59,7 @@ class RecordingSettings:
         }
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "RecordingSettings":
+    def from_dict(cls, values: dict[str, Any]) -> RecordingSettings:
         """Reads what `to_dict` wrote."""
         cameras = tuple(Camera.from_dict(camera) for camera in values["cameras"])
         return cls(int(values["image_size"]), int(values["frame_stride"]), cameras)
@@ -138,6 +142,8 @@ def record_task(
     Raises:
         InputError: what is there was recorded with other settings, or the expert fails too often.
     """
+    from saccade.sim.environment import TaskEnvironment  # not at the top: reading needs no simulator
+
     directory = out / task
     directory.mkdir(parents=True, exist_ok=True)
     claim_directory(directory / "recording.json", settings)

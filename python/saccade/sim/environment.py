@@ -4,25 +4,21 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
 from saccade.errors import InputError, ShapeError
-from saccade.sim.cameras import DEFAULT_CAMERAS, VIDEO_CAMERA, Camera
+from saccade.sim import graphics
+from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, VIDEO_CAMERA, Camera
 from saccade.sim.rendering import Renderer, UInt8Array, prepare_model
 from saccade.sim.scenarios import StepOutcome
-from saccade.sim.tasks import find_task
+from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 
 Observation = dict[
     str, Any
 ]  # {"images": {camera: (H, W, 3) uint8}, "proprio": (4,) float32, "instruction": str}
 
-ACTION_DIM = 4  # hand velocity along x, y, z and gripper effort, each in [-1, 1]
-PROPRIO_DIM = 4  # hand position in metres and gripper opening in [0, 1]
-DEFAULT_IMAGE_SIZE = 64
 VIDEO_SIZE = 360
 SIMULATION_HZ = 80  # control steps in a second of simulated time
 
@@ -46,6 +42,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     Raises:
         InputError: no such task; image size or cameras that cannot be used; no camera with a blanked name.
+        GraphicsError: OpenGL cannot be loaded.
 
     Example:
         >>> env = TaskEnvironment("push")
@@ -85,7 +82,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.observation_space = observation_space(self.cameras, image_size)
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 
-        self._world = ALL_V3_ENVIRONMENTS[self.task.scene]()
+        self._world = make_world(self.task.scene)
         # Otherwise every seed gives the first layout again.
         self._world._freeze_rand_vec = False
         self._world.seeded_rand_vec = True
@@ -123,9 +120,9 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._world.seed(seed)
         self._full_state, _ = self._world.reset()
         self.scenario.start(seed)
-        # Meta-World moves the goal marker in the model only; without this the picture shows the last
-        # episode's.
-        mujoco.mj_forward(self._world.model, self._world.data)
+        # Meta-World moves the goal marker in the model only. Without this the picture shows the marker of the
+        # last episode.
+        graphics.load_mujoco().mj_forward(self._world.model, self._world.data)
         self._steps = 0
 
     def advance(self, action: npt.ArrayLike) -> StepOutcome:
@@ -186,6 +183,19 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
                 renderer.close()
         self._renderer = self._video_renderer = None
         self._world.close()
+
+
+def make_world(scene: str) -> Any:
+    """The Meta-World environment of that name.
+
+    Raises:
+        GraphicsError: OpenGL cannot be loaded.
+        ModuleNotFoundError: mujoco or metaworld is not installed.
+    """
+    graphics.load_mujoco()  # metaworld imports it too, with a less helpful error where OpenGL is missing
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+    return ALL_V3_ENVIRONMENTS[scene]()
 
 
 def observation_space(cameras: Sequence[Camera], image_size: int) -> spaces.Dict:

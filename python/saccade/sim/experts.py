@@ -1,11 +1,17 @@
 """Scripted experts, and how demonstrations are disturbed so that a learner sees how to recover."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from saccade.sim.environment import ACTION_DIM, TaskEnvironment
+from saccade.sim.tasks import ACTION_DIM
+
+if TYPE_CHECKING:
+    from saccade.sim.environment import TaskEnvironment
 
 Float32Array = npt.NDArray[np.float32]
 

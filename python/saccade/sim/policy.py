@@ -14,11 +14,11 @@ import numpy.typing as npt
 import threadpoolctl  # type: ignore[import-untyped]
 
 import saccade
+from saccade._files import sha256_of
 from saccade.checkpoints import read_tensors
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.intervention import Intervention
 from saccade.sim.backbone import Backbone, stack_images
-from saccade.sim.files import sha256_of
 from saccade.sim.instructions import Tokenizer
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 

@@ -1,16 +1,20 @@
 """Fast drawing: what the policy sees, and the larger picture for videos.
 
-All that makes drawing fast is set here, once, for demonstrations and evaluation alike. Measured with Mesa's
-software
-renderer on one core, milliseconds a picture at 128 px: as Meta-World ships it 200, without shadows,
-multisampling and reflections 5.1, with the arm above the wrist left out 3.5. Almost all of the rest is the
-vertices of hand and scene, so pictures are drawn at twice their size and averaged down, which costs little
-and places edges to a part of a pixel.
+The settings that make drawing fast are the same for demonstrations and evaluation. Milliseconds per picture
+at 128 px with Mesa's software renderer on one core: 200 as Meta-World configures it, 5.1 without shadows,
+multisampling and reflections, 3.5 without the arm above the wrist. Almost all of the remaining time is spent
+on the vertices of hand and scene. Pictures are therefore drawn at twice their size and averaged down, which
+costs little and places edges with subpixel precision.
 """
 
-from collections.abc import Iterable
+from __future__ import annotations
 
-import mujoco
+import atexit
+import functools
+import weakref
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -18,11 +22,14 @@ from saccade.sim import graphics
 from saccade.sim.cameras import Camera
 from saccade.sim.scenarios import Ball
 
+if TYPE_CHECKING:
+    import mujoco
+
 UInt8Array = npt.NDArray[np.uint8]
 
 SUPERSAMPLING = 2
 HIDDEN_GROUP = 5  # geoms of this group are not drawn for the policy
-# The arm above the wrist: 52 thousand of 67 thousand triangles, and it covers what the hand does.
+# The arm above the wrist: 52,000 of 67,000 triangles, and it hides what the hand does.
 ARM_BODIES = frozenset(
     (
         *("pedestal", "pedestal_feet", "torso", "head", "screen", "controller_box", "right_arm_base_link"),
@@ -35,11 +42,11 @@ GOAL_RGBA = (0.0, 1.0, 0.0, 1.0)
 
 
 def prepare_model(model: mujoco.MjModel, *, draws_goal: bool) -> None:
-    """Sets the scene up for fast drawing, in place.
+    """Configures the scene for fast drawing, in place.
 
     Args:
         model: a Meta-World model.
-        draws_goal: mark the goal with a green ball, or hide Meta-World's marker.
+        draws_goal: whether the goal is marked with a green ball; otherwise Meta-World's marker is hidden.
     """
     model.vis.quality.shadowsize = 0
     model.vis.quality.offsamples = 0
@@ -63,15 +70,16 @@ def average_down(picture: UInt8Array, factor: int) -> UInt8Array:
 
 
 def free_camera(camera: Camera) -> mujoco.MjvCamera:
-    """The camera as MuJoCo takes it."""
-    view = mujoco.MjvCamera()
+    """The camera in MuJoCo's form."""
+    view = graphics.load_mujoco().MjvCamera()
     view.lookat[:] = camera.lookat
     view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
     return view
 
 
 def add_ball(scene: mujoco.MjvScene, ball: Ball) -> None:
-    """Adds a ball to what is about to be drawn."""
+    """Adds a ball to the scene that is drawn next."""
+    mujoco = graphics.load_mujoco()
     mujoco.mjv_initGeom(
         scene.geoms[scene.ngeom],
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -86,26 +94,37 @@ def add_ball(scene: mujoco.MjvScene, ball: Ball) -> None:
 class Renderer:
     """Draws one simulation through several cameras.
 
-    Close it before the interpreter ends: with EGL, MuJoCo otherwise prints an exception at exit.
+    Call `close` to free the OpenGL context. Renderers that are still open when the interpreter ends are
+    closed then.
 
     Args:
         model: prepared by `prepare_model`.
         size: pixels along each side of the result.
         for_video: draw the whole robot, and without averaging, which takes three times as long.
+
+    Raises:
+        GraphicsError: OpenGL cannot be loaded.
     """
 
     def __init__(self, model: mujoco.MjModel, size: int, *, for_video: bool = False) -> None:
         graphics.load_triton_first()
+        mujoco = graphics.load_mujoco()
         self._supersampling = 1 if for_video else SUPERSAMPLING
         drawn = size * self._supersampling
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, drawn)
         model.vis.global_.offheight = max(model.vis.global_.offheight, drawn)
         self._options = mujoco.MjvOption()
         self._options.geomgroup[HIDDEN_GROUP] = 1 if for_video else 0
-        self._renderer: mujoco.Renderer | None = mujoco.Renderer(model, drawn, drawn)
+        self._renderer: Any = mujoco.Renderer(model, drawn, drawn)
+        open_renderers.add(self)
+        close_all_at_exit()
 
     def draw(self, data: mujoco.MjData, camera: Camera, balls: Iterable[Ball] = ()) -> UInt8Array:
-        """The picture `(size, size, 3)`, with balls that the simulation does not have."""
+        """The picture `(size, size, 3)`, with balls that the simulation does not have.
+
+        Raises:
+            RuntimeError: the renderer is closed.
+        """
         if self._renderer is None:
             raise RuntimeError("this renderer is closed")
         self._renderer.update_scene(data, free_camera(camera), self._options)
@@ -115,6 +134,27 @@ class Renderer:
 
     def close(self) -> None:
         """Frees the OpenGL context; may be called twice."""
+        open_renderers.discard(self)
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+open_renderers: weakref.WeakSet[Renderer] = weakref.WeakSet()
+
+
+@functools.cache
+def close_all_at_exit() -> None:
+    """Registers, once, that open renderers are closed before the interpreter ends.
+
+    Otherwise their contexts would be freed after EGL has been terminated, and each would print a traceback.
+    MuJoCo registers the end of EGL when it creates its first context, and functions registered later run
+    earlier: this must be called after that.
+    """
+    atexit.register(close_all)
+
+
+def close_all() -> None:
+    """Closes every open renderer."""
+    for renderer in list(open_renderers):
+        renderer.close()

@@ -1,6 +1,5 @@
 """Results of a rollout: intervals, summaries, the result file, the contact sheet."""
 
-import math
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,32 +11,17 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 import saccade
-from saccade.sim.files import write_atomically
+from saccade._files import write_atomically
+from saccade._intervals import wilson
+from saccade.environment import cpu_name
 from saccade.sim.policy import Policy
 from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import PARTS, Episode
 
-CONFIDENCE_95 = 1.959964  # quantile of the normal distribution, two-sided
 RECORDED_PACKAGES = ("numpy", "mujoco", "metaworld", "gymnasium")
 TILE = 160  # pixels along each side of a picture in the contact sheet
 LABEL_HEIGHT = 18
 GREEN, RED, INK, PAPER = (46, 160, 67), (207, 34, 46), (240, 240, 240), (24, 26, 30)
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % interval of a success rate (Wilson's score interval).
-
-    Example:
-        >>> [round(bound, 3) for bound in wilson_interval(18, 20)]
-        [0.699, 0.972]
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    z2 = CONFIDENCE_95**2
-    rate = successes / trials
-    centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = CONFIDENCE_95 / (1 + z2 / trials) * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials**2))
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 @dataclass(frozen=True)
@@ -72,7 +56,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Summary:
         task=task,
         episodes=len(episodes),
         successes=len(steps),
-        interval=wilson_interval(len(steps), len(episodes)),
+        interval=wilson(len(steps), len(episodes)),
         median_steps=median(steps) if steps else None,
         milliseconds={part: round(spent, 3) for part, spent in milliseconds.items()},
     )
@@ -121,16 +105,6 @@ def result_record(
         "summary": [asdict(summary) for summary in summarize_tasks(episodes)],
         "episodes": [asdict(episode) for episode in episodes],
     }
-
-
-def cpu_name() -> str:
-    """The processor's name as Linux gives it, or what Python knows."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def write_contact_sheet(pictures: Sequence[tuple[Episode, UInt8Array]], path: Path) -> None:

@@ -8,6 +8,10 @@ from typing import Any
 from saccade.errors import InputError
 from saccade.sim.scenarios import Fork, MetaWorldScenario, Scenario, StereoReach, TwoGoals, TwoStage
 
+# The robot is the same in every task.
+ACTION_DIM = 4  # hand velocity along x, y, z and gripper effort, each in [-1, 1]
+PROPRIO_DIM = 4  # hand position in metres and gripper opening in [0, 1]
+
 # A seed fixes where objects and goals lie. The three uses have ranges of their own, so that no policy is
 # judged on a layout it was trained or chosen on. `check_evaluation_seeds` and `demos.py` hold to them.
 EVALUATION_SEEDS = range(1_000_000)

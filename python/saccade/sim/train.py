@@ -10,6 +10,7 @@ resumed run gives what an uninterrupted one gives.
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
+import io
 import math
 import time
 from collections.abc import Callable
@@ -19,20 +20,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as serialize
 from torch import Tensor
 
+from saccade._files import sha256_of, write_atomically, write_json
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.sim import demos
 from saccade.sim.backbone import BackboneConfig
 from saccade.sim.dataset import Samples, describe, load_samples, statistics
-from saccade.sim.environment import ACTION_DIM, PROPRIO_DIM
-from saccade.sim.files import sha256_of, write_atomically, write_json
 from saccade.sim.instructions import Tokenizer, build_vocabulary, words
 from saccade.sim.learner import Learner
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
-from saccade.sim.tasks import TASKS, find_task
+from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
 
 STATE_FILE = "training.pt"
 CHECKPOINT_SECONDS = 60.0
@@ -309,8 +310,7 @@ def export(run: Run, out: Path) -> None:
     """
     tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
     with write_atomically(out / TENSOR_FILE) as temporary:
-        save_file(tensors, temporary, metadata={"format": "pt"})
-        temporary.chmod(0o644)  # safetensors lets only the owner read
+        temporary.write_bytes(serialize(tensors, metadata={"format": "pt"}))
     write_json(out / CONFIG_FILE, run.config.to_dict())
 
 
@@ -326,8 +326,10 @@ def save(run: Run, out: Path) -> None:
         "optimizer": run.optimizer.state_dict(),
         "average": run.average,
     }
+    serialized = io.BytesIO()  # writing to a full disk itself, torch raises a RuntimeError
+    torch.save(state, serialized)
     with write_atomically(out / STATE_FILE) as temporary:
-        torch.save(state, temporary)
+        temporary.write_bytes(serialized.getbuffer())
     export(run, out)
     write_json(out / "settings.json", {**asdict(run.settings), "demonstrations": run.demonstrations})
     write_json(out / "history.json", run.history)

@@ -1,5 +1,7 @@
-"""Videos of episodes: the robot from the side, what the policy saw at its last look, and what it was told."""
+"""Videos of episodes: the robot from the side, the policy's last camera images, and its instruction."""
 
+import contextlib
+import errno
 from pathlib import Path
 from types import TracebackType
 
@@ -14,18 +16,22 @@ from saccade.sim.rollout import Episode
 EVERY = 2  # control steps between pictures
 SPEED = 0.5  # of simulated time: an episode takes only about a second
 FRAMES_PER_SECOND = SIMULATION_HZ * SPEED / EVERY
-LINGER_FRAMES = 15  # the last picture stays a while
+LINGER_FRAMES = 15  # repeats of the last picture
 TITLE_HEIGHT = 40
-INSET = VIDEO_SIZE // 3  # the policy's pictures, in a column beside the large one
-WIDTH, HEIGHT = VIDEO_SIZE + INSET, VIDEO_SIZE + TITLE_HEIGHT  # multiples of 16, as H.264 likes them
+INSET = VIDEO_SIZE // 3  # the policy's images, in a column to the right of the large picture
+WIDTH, HEIGHT = VIDEO_SIZE + INSET, VIDEO_SIZE + TITLE_HEIGHT  # multiples of 16, which suit H.264
+INDEX = b"moov"  # the index of an MP4, which ffmpeg writes last
 GREEN, INK, PAPER = (63, 185, 80), (240, 240, 240), (24, 26, 30)
 
 
 class VideoWriter:
-    """Writes one episode as MP4, in a `with` block: the file appears when that ends without an error.
+    """Writes one episode as MP4, in a `with` block; the file appears when that ends without an error.
 
     Args:
         path: of the MP4.
+
+    Raises:
+        OSError: the video cannot be written; names `path`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,27 +42,50 @@ class VideoWriter:
 
     def __enter__(self) -> "VideoWriter":
         self._writer = imageio.get_writer(
-            self._temporary, fps=FRAMES_PER_SECOND, codec="libx264", quality=7, macro_block_size=16
+            self._temporary,
+            fps=FRAMES_PER_SECOND,
+            codec="libx264",
+            quality=7,
+            macro_block_size=16,
+            ffmpeg_log_level="quiet",
         )
         return self
 
     def add(self, environment: TaskEnvironment, episode: Episode) -> None:
-        """Shows the simulation as it is now; all but every second step is left out."""
+        """Adds a picture of the simulation at every second step."""
         if episode.steps % EVERY and not episode.success:
             return
         self._last = compose(environment, episode, self._font)
-        self._writer.append_data(self._last)
+        self._append(self._last)
+
+    def _append(self, picture: UInt8Array) -> None:
+        try:
+            self._writer.append_data(picture)
+        except OSError as error:  # ffmpeg has ended
+            raise self._failure() from error
+
+    def _failure(self) -> OSError:
+        return OSError(errno.EIO, "the video cannot be written; is the disk full?", str(self._path))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._last is not None and kind is None:
-            for _ in range(LINGER_FRAMES):
-                self._writer.append_data(self._last)
-        self._writer.close()
-        if kind is None:
+        try:
+            if kind is not None:
+                with contextlib.suppress(OSError):
+                    self._writer.close()
+                return
+            if self._last is not None:
+                for _ in range(LINGER_FRAMES):
+                    self._append(self._last)
+            self._writer.close()
+            # imageio does not say whether ffmpeg failed.
+            if self._last is not None and INDEX not in self._temporary.read_bytes():
+                raise self._failure()
             self._temporary.replace(self._path)
-        self._temporary.unlink(missing_ok=True)
+        finally:
+            with contextlib.suppress(OSError):
+                self._temporary.unlink(missing_ok=True)
 
 
 def compose(

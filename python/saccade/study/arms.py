@@ -1,16 +1,18 @@
-"""The arms of the study of cuts: what is changed inside the head, by name."""
+"""Studies of arms: the same observations and noise with something changed inside the head, arm by arm."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
-from saccade.intervention import ROW_GROUPS, Intervention
-
-Float32Array = npt.NDArray[np.float32]
+from saccade.errors import InputError
+from saccade.intervention import Intervention
+from saccade.study.cell import Cell, Rows
+from saccade.study.source import Float32Array, Source, changed, unchanged
+from saccade.study.study import Study
 
 NO_TOKENS = "the checkpoint has no future tokens"
 ROUNDING = 1e-3  # a change of an action that an exact identity may make
@@ -18,137 +20,146 @@ ROUNDING = 1e-3  # a change of an action that an exact identity may make
 
 @dataclass(frozen=True)
 class Arm:
-    """One change that is kept for a whole episode.
+    """One change inside the head, kept for a whole episode.
 
     Attributes:
-        name: For the command line and the table.
-        label: In figures.
-        about: What it is and what it asks, for the report.
-        intervention: From the learned future tokens `(N, width)` and the episode's random numbers.
+        name: In the table and on the command line.
+        label: In figures; default the name.
+        about: What it changes and what it asks, for the report.
+        intervention: From the learned future tokens `(N, width)` and the random numbers of the episode to the
+            change; None changes nothing.
         needs_future: Whether it means nothing for a head without future tokens.
+        settings: What else its results depend on, as JSON has it. Change it together with `intervention`, so
+            that cells measured before are measured again.
+
+    Example:
+        An arm of your own:
+
+        >>> doubled = Arm(
+        ...     "future-doubled", intervention=lambda tokens, rng: Intervention(future_tokens=2 * tokens)
+        ... )
     """
 
     name: str
-    label: str
-    about: str
-    intervention: Callable[[Float32Array, np.random.Generator], Intervention | None]
+    label: str = ""
+    about: str = ""
+    intervention: Callable[[Float32Array, np.random.Generator], Intervention | None] = lambda tokens, rng: (
+        None
+    )
     needs_future: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.label or self.name)
 
     def why_not(self, num_future_tokens: int) -> str | None:
-        """Why it cannot be measured on a head with so many future tokens, or None."""
+        """Why it cannot be measured on a head with N future tokens, or None."""
         if self.needs_future and num_future_tokens == 0:
             return NO_TOKENS
         return None
 
 
-def cut(*pairs: tuple[str, str]) -> Callable[[Float32Array, np.random.Generator], Intervention]:
-    """An intervention of an arm: `(reader, source)` pairs cut in every block."""
-    return lambda tokens, rng: Intervention(cut=pairs)
+@dataclass(frozen=True)
+class Metric:
+    """A number that says how the chunks of an arm differ from the unchanged ones.
+
+    Attributes:
+        name: Its column in the table.
+        function: From the unchanged chunks and those of the arm, both `(observations, draws, horizon,
+            action_dim)` float32 from equal noise, to a number.
+
+    Example:
+        How far the first action of a chunk moves:
+
+        >>> first = Metric("first_action", lambda before, after: np.abs(after - before)[:, :, 0].mean())
+    """
+
+    name: str
+    function: Callable[[Float32Array, Float32Array], Any]
 
 
-def shuffled(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """The learned tokens in another order."""
-    return Intervention(future_tokens=tokens[rng.permutation(len(tokens))])
-
-
-def averaged(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """As many copies of their mean."""
-    return Intervention(future_tokens=np.tile(tokens.mean(axis=0), (len(tokens), 1)))
-
-
-def zeroed(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """Zeros in their place."""
-    return Intervention(future_tokens=np.zeros_like(tokens))
-
-
-def redrawn(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """Random numbers with the mean and the standard deviation of theirs."""
-    drawn = rng.normal(tokens.mean(), tokens.std(), tokens.shape)
-    return Intervention(future_tokens=drawn.astype(np.float32))
-
-
-ALL_ARMS = (
-    Arm("none", "nothing changed", "The policy as it is.", lambda tokens, rng: None, needs_future=False),
-    Arm(
-        "future-unread",
-        "{state, action} <- future cut",
-        "State and action rows do not see the future rows. This removes every effect of the future tokens, "
-        "like N = 0 without training anew.",
-        cut(("state", "future"), ("action", "future")),
-    ),
-    Arm(
-        "future-blind",
-        "future <- vl cut",
-        "The future rows do not see the vision-language tokens: are they a summary of what is seen?",
-        cut(("future", "vl")),
-    ),
-    Arm(
-        "future-alone",
-        "future <- {state, action} cut",
-        "The future rows see neither state nor action rows: are they a scratchpad for them?",
-        cut(("future", "state"), ("future", "action")),
-    ),
-    Arm(
-        "action-blind",
-        "action <- vl cut",
-        "The action rows do not see the vision-language tokens. What is seen reaches them through the future "
-        "rows, and also through the state row.",
-        cut(("action", "vl")),
-        needs_future=False,
-    ),
-    Arm(
-        "rows-blind",
-        "{state, action} <- vl cut",
-        "Neither state nor action rows see the vision-language tokens: all that is seen must pass through "
-        "the future rows.",
-        cut(("state", "vl"), ("action", "vl")),
-    ),
-    Arm(
-        "all-blind",
-        "{state, future, action} <- vl cut",
-        "No row sees the vision-language tokens. A control that must fail: it shows what these tasks are "
-        "worth without sight.",
-        cut(*((row, "vl") for row in ROW_GROUPS)),
-        needs_future=False,
-    ),
-    Arm(
-        "future-shuffled",
-        "future tokens shuffled",
-        "The learned tokens in another order. A control: they have no positions, so nothing may change but "
-        "rounding.",
-        shuffled,
-    ),
-    Arm(
-        "future-averaged",
-        "future tokens averaged",
-        "N copies of the mean of the learned tokens: do they need to differ?",
-        averaged,
-    ),
-    Arm(
-        "future-zeroed",
-        "future tokens zeroed",
-        "Zeros in place of the learned tokens; the rows still read and are read.",
-        zeroed,
-    ),
-    Arm(
-        "future-redrawn",
-        "future tokens re-drawn",
-        "Random tokens with the mean and the standard deviation of the learned ones, others in every "
-        "episode: does it matter what was learned?",
-        redrawn,
-    ),
+METRICS = (
+    Metric("chunk_change", lambda before, after: np.abs(after - before).mean()),
+    Metric("chunk_change_max", lambda before, after: np.abs(after - before).max()),
 )
-ARMS = {arm.name: arm for arm in ALL_ARMS}
-BASELINE = "none"
-SHUFFLED = "future-shuffled"
 
 
-def episode_rng(task: str, seed: int) -> np.random.Generator:
-    """What an arm draws in an episode, apart from the noise of the chunks."""
-    return np.random.default_rng([seed, *task.encode()])
+@dataclass(frozen=True)
+class ArmStudy(Study):
+    """A study that measures every arm on every episode of a source.
+
+    Attributes:
+        source: Checkpoint and observations.
+        arms: What is changed; the baseline is always measured too.
+        metrics: Columns of the table.
+
+    Raises:
+        InputError: two arms or two metrics have the same name.
+    """
+
+    source: Source
+    arms: Sequence[Arm]
+    metrics: Sequence[Metric] = METRICS
+    baseline: ClassVar[Arm]
+    control: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        for what, given in (("arms", self.arms), ("metrics", self.metrics)):
+            names = [one.name for one in given]
+            if len(set(names)) != len(names):
+                raise InputError(f"{what}: given {', '.join(names)}, expected distinct names")
+
+    def settings(self) -> Mapping[str, Any]:
+        """See `Study`."""
+        own = [metric.name for metric in self.metrics if metric not in METRICS]
+        return {**self.source.describe(), **({"metrics": own} if own else {})}
+
+    @property
+    def all_arms(self) -> dict[str, Arm]:
+        """The baseline and the others, by name."""
+        return {arm.name: arm for arm in (self.baseline, *self.arms)}
+
+    def cells(self) -> Sequence[Cell]:
+        """An episode of one arm each; arms of one episode follow each other, to share what it recorded."""
+        return [
+            Cell((*unit, arm.name), arm.settings)
+            for unit in self.source.units
+            for arm in self.all_arms.values()
+        ]
+
+    def measure(self, cell: Cell) -> Rows:
+        """A row with the outcome and the metrics, or with a note why the arm cannot be measured."""
+        task, seed, name = str(cell.key[0]), int(cell.key[1]), str(cell.key[2])
+        source, arm = self.source, self.all_arms[name]
+        row: dict[str, Any] = {"task": task, "seed": seed, "arm": name, **source.labels(task, seed)}
+        tokens = source.future_tokens
+        note = arm.why_not(len(tokens))
+        if note is not None:
+            return [{**row, "success": None, "note": note}]
+        intervention = arm.intervention(tokens, source.rng(task, seed))
+        before = unchanged(source, task, seed).actions
+        after = changed(source, task, seed, intervention)
+        row |= source.outcome(task, seed, intervention)
+        row |= {metric.name: float(metric.function(before, after)) for metric in self.metrics}
+        if not source.closed_loop:
+            row["noise_change"] = between_draws(before)
+        return [{**row, "note": None}]
+
+
+def between_draws(chunks: Float32Array) -> float | None:
+    """The mean |difference| of an action between two chunks of one observation from different noise.
+
+    Args:
+        chunks: `(1, draws, horizon, action_dim)`.
+    """
+    drawn = chunks[0]
+    if len(drawn) < 2:
+        return None
+    one, two = np.triu_indices(len(drawn), k=1)
+    return float(np.abs(drawn[one] - drawn[two]).mean())
 
 
 def control_line(label: str, largest: float) -> str:
-    """Whether a control, which may change nothing but rounding, changed an action by more than that."""
+    """Whether a control, which may change actions by rounding only, did so."""
     verdict = "as it must be" if largest < ROUNDING else "WHICH IT MUST NOT: do not trust the other arms"
     return f"Control, {label}: the chunk changed by {largest:.1g} at most, {verdict}."

@@ -1,31 +1,58 @@
-"""Intervals for rates, paired differences and means over episodes, and what a number of them can detect."""
+"""Confidence intervals for rates, paired differences and means over episodes; verdicts; statistical power."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 from scipy.stats import binomtest, nct, norm, t
 
+from saccade import _intervals
+from saccade._intervals import CONFIDENCE as CONFIDENCE
 from saccade.errors import InputError
 
-CONFIDENCE = 0.95
 POWER = 0.8
-Statistic = Callable[..., float]
+LOSS_THAT_MATTERS = 0.05  # of the success rate: 5 percentage points
+Statistic: TypeAlias = Callable[..., float]
+Verdict: TypeAlias = Literal["better", "worse", "no worse", "undecided"]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its 95 % interval."""
+    """A number with its 95 % interval; the bounds are NaN where there is none."""
 
     value: float
     low: float
     high: float
+
+
+def verdict(difference: Estimate) -> Verdict:
+    """What the 95 % interval of a difference of success rates shows.
+
+    The first of these rules that holds decides:
+
+    1. `better`: the whole interval is above zero.
+    2. `worse`: the whole interval is below zero, even if it excludes a loss of `LOSS_THAT_MATTERS`.
+    3. `no worse`: the interval contains zero and excludes a loss of `LOSS_THAT_MATTERS`.
+    4. `undecided`: anything else, and a difference without an interval.
+
+    Example:
+        >>> [verdict(Estimate((low + high) / 2, low, high))
+        ...  for low, high in ((0.01, 0.03), (-0.04, -0.01), (-0.04, 0.02), (-0.06, 0.02))]
+        ['better', 'worse', 'no worse', 'undecided']
+    """
+    if difference.low > 0:
+        return "better"
+    if difference.high < 0:
+        return "worse"
+    if difference.low > -LOSS_THAT_MATTERS:
+        return "no worse"
+    return "undecided"
 
 
 @dataclass(frozen=True)
@@ -33,11 +60,11 @@ class PairedDifference:
     """Success of two arms on the same episodes.
 
     Attributes:
-        difference: Rate of the first less rate of the second, with Tango's score interval.
-        pairs: Episodes that both have.
-        both, only_first, only_second, neither: In how many of them which arm succeeded. Only the two middle
-            ones, the discordant pairs, tell the arms apart.
-        p_value: McNemar's exact test.
+        difference: Success rate of the first arm minus that of the second, with Tango's score interval.
+        pairs: Number of episodes that both arms ran.
+        both, only_first, only_second, neither: Number of episodes in which both arms succeeded, only one of
+            them, or none. Only the discordant pairs (`only_first`, `only_second`) distinguish the arms.
+        p_value: Of McNemar's exact test.
     """
 
     difference: Estimate
@@ -50,34 +77,37 @@ class PairedDifference:
 
 
 def scaled(value: Estimate) -> Estimate:
-    """A share in percent."""
+    """A fraction in percent."""
     return Estimate(100 * value.value, 100 * value.low, 100 * value.high)
 
 
 def wilson(successes: int, trials: int) -> Estimate:
-    """A success rate with Wilson's score interval; without a trial the rate is NaN and may be anything.
+    """A success rate with Wilson's score interval; without trials, NaN with the interval 0 to 1.
+
+    Raises:
+        InputError: `successes` is negative or larger than `trials`.
 
     Example:
         >>> rate = wilson(18, 20)
         >>> rate.value, round(rate.low, 3), round(rate.high, 3)
         (0.9, 0.699, 0.972)
     """
-    if not 0 <= successes <= trials:
-        raise InputError(f"successes: given {successes} of {trials}, expected between 0 and all of them")
-    if trials == 0:
-        return Estimate(math.nan, 0.0, 1.0)
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(successes / trials, float(interval.low), float(interval.high))
+    low, high = _intervals.wilson(successes, trials)
+    return Estimate(successes / trials if trials else math.nan, low, high)
 
 
 def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> PairedDifference:
-    """Compares two arms on the same episodes, in the same order.
+    """Compares the success of two arms on the same episodes.
 
-    The interval is Tango's score interval (Statistics in Medicine 17, 1998). Unlike those of Wald and
-    Newcombe it keeps its width where no pair is discordant, so equal results are not taken for equality.
+    The interval is Tango's score interval (Statistics in Medicine 17, 1998). Unlike the intervals of Wald
+    and Newcombe it has a positive width when no pair is discordant, so equal results do not look like proof
+    of equality.
+
+    Args:
+        first, second: Success of each arm, episode by episode in the same order.
 
     Raises:
-        InputError: lengths differ, or there is no pair.
+        InputError: The lengths differ, or there are no pairs.
 
     Example:
         >>> found = paired_difference([True] * 9 + [False], [True] * 5 + [False] * 5)
@@ -107,6 +137,10 @@ def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> PairedDi
 def tango(only_first: float, only_second: float, pairs: int) -> Estimate:
     """The difference of two paired rates with Tango's score interval, from the discordant pairs.
 
+    Args:
+        only_first, only_second: Number of pairs in which only the first, or only the second, succeeded.
+        pairs: Number of all pairs.
+
     Example:
         Response to a therapy, before and after (Cavo and others, Blood 120, 2012):
 
@@ -120,7 +154,7 @@ def tango(only_first: float, only_second: float, pairs: int) -> Estimate:
     def score(difference: float) -> float:
         return tango_score(only_first, only_second, pairs, difference)
 
-    # At -1 and 1 the variance may vanish; there the limit is the bound itself.
+    # At -1 and 1 the variance may be zero; the limit is then -1 or 1 itself.
     edge = 1 - 1e-12
     low, high = -1.0, 1.0
     if score(-edge) > quantile:
@@ -131,21 +165,21 @@ def tango(only_first: float, only_second: float, pairs: int) -> Estimate:
 
 
 def tango_score(only_first: float, only_second: float, pairs: int, difference: float) -> float:
-    """The observed difference of paired rates less a supposed one, in its standard deviations."""
-    # The likeliest share of pairs that only the second won, given the difference (a quadratic's root).
+    """Tango's test statistic: the observed difference minus the hypothesised one, in standard errors."""
+    # Maximum-likelihood share of pairs that only the second won, given the difference (root of a quadratic).
     linear = (2 * pairs - only_first + only_second) * difference - only_first - only_second
     constant = -only_second * difference * (1 - difference)
     share = (math.sqrt(max(linear**2 - 8 * pairs * constant, 0.0)) - linear) / (4 * pairs)
     variance = pairs * (2 * share + difference * (1 - difference))
     excess = only_first - only_second - pairs * difference
-    return excess / math.sqrt(variance) if excess else 0.0  # both vanish where no pair is discordant
+    return excess / math.sqrt(variance) if excess else 0.0  # both are zero where no pair is discordant
 
 
 def p_of_loss(pairs: PairedDifference, loss: float) -> float:
-    """The p value of "the first loses at least `loss` against the second", by Tango's score.
+    """One-sided p value of the hypothesis that the first arm is worse by at least `loss`, by Tango's score.
 
-    It is below 2.5 % just where the 95 % interval excludes such a loss; Holm's method corrects it where many
-    are compared with the same second.
+    It is below 2.5 % exactly where the 95 % interval excludes such a loss. Correct it with `holm` when
+    several arms are compared with the same second arm.
 
     Example:
         >>> close = paired_difference([True] * 297 + [False] * 3, [True] * 300)
@@ -156,7 +190,7 @@ def p_of_loss(pairs: PairedDifference, loss: float) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """P values corrected for their number by Holm's step-down method, in the order given.
+    """P values corrected for multiple comparisons by Holm's step-down method, in the given order.
 
     Example:
         >>> [round(p, 3) for p in holm([0.01, 0.04, 0.03])]
@@ -178,17 +212,21 @@ def bootstrap(
     draws: int = 2000,
     seed: int = 0,
 ) -> Estimate:
-    """A statistic with its percentile interval, drawing whole clusters with replacement.
+    """A statistic with its percentile interval from a cluster bootstrap.
 
-    Chunks of one episode are alike, so episodes are drawn and not chunks. With fewer than about ten clusters
-    the interval is too narrow; with one there is none (NaN). Where all values are equal it has no width,
-    which is no proof of equality: rates and their differences belong to `wilson` and `paired_difference`.
+    Whole clusters are drawn with replacement, because observations of one episode are correlated. With fewer
+    than about ten clusters the interval is too narrow; with one cluster its bounds are NaN. Where all values
+    are equal the interval has zero width, which does not prove equality: use `wilson` for rates and
+    `paired_difference` for their differences.
 
     Args:
-        values: `(observations, ...)`; the statistic gets the rows of the clusters drawn.
-        clusters: of each observation, such as its episode; text or numbers, or tuples of them.
-        statistic: a function of such rows; must not depend on their order.
-        draws, seed: of the bootstrap.
+        values: Array `(observations, ...)`. The statistic receives the rows of the drawn clusters.
+        clusters: The cluster of each observation, such as its episode: strings, numbers or tuples of them.
+        statistic: A function of such rows that does not depend on their order.
+        draws, seed: Number of bootstrap samples and seed of the random generator.
+
+    Raises:
+        InputError: `clusters` does not have one entry per observation, or there are no observations.
 
     Example:
         >>> mean = bootstrap([1.0, 1.0, 3.0, 3.0], ["a", "a", "b", "b"])
@@ -199,7 +237,7 @@ def bootstrap(
     names = [tuple(name) if isinstance(name, (tuple, list)) else name for name in clusters]
     if len(names) != len(rows) or not names:
         raise InputError(
-            f"clusters: given {len(names)} for {len(rows)} values, expected one for each, at least one"
+            f"clusters: given {len(names)} for {len(rows)} values, expected one for each value, at least one"
         )
     if statistic is np.mean and rows.ndim == 1:
         return bootstrap_ratio(rows, np.ones(len(rows)), names, draws=draws, seed=seed)
@@ -221,10 +259,15 @@ def bootstrap(
 def bootstrap_ratio(
     parts: npt.ArrayLike, wholes: npt.ArrayLike, clusters: Sequence[Any], *, draws: int = 2000, seed: int = 0
 ) -> Estimate:
-    """The sum of parts over the sum of wholes, with its percentile interval, drawing whole clusters.
+    """The ratio of two sums with its percentile interval from a cluster bootstrap.
 
-    `bootstrap` for what is made of two sums, and much faster. With wholes of 1 it is the mean. NaN where the
-    wholes add up to nothing.
+    Gives the same interval as `bootstrap` with that ratio as its statistic, and is much faster. With all
+    `wholes` equal to 1 it is the mean of `parts`. NaN if `wholes` sum to zero.
+
+    Args:
+        parts, wholes: Numerators and denominators, `(observations,)`.
+        clusters: The cluster of each observation.
+        draws, seed: Number of bootstrap samples and seed of the random generator.
 
     Example:
         >>> share = bootstrap_ratio([1.0, 1.0, 3.0, 3.0], [2.0, 2.0, 4.0, 4.0], ["a", "a", "b", "b"])
@@ -249,28 +292,30 @@ def bootstrap_ratio(
 
 
 def detectable_difference(pairs: int, discordant: float) -> float:
-    """The smallest difference of two paired rates that McNemar's test finds with 80 % power at the 5 % level.
+    """The smallest difference of two paired rates that McNemar's test detects: 80 % power, 5 % level.
 
-    From Connor's sample size (Biometrics 43, 1987), solved for the difference.
+    Connor's formula for the sample size (Biometrics 43, 1987), solved for the difference.
 
     Args:
-        pairs: episodes that both arms have.
-        discordant: share of pairs in which one succeeds and the other fails. Two arms that have nothing in
-            common but a rate p have 2 p (1 - p).
+        pairs: Number of episodes that both arms run.
+        discordant: Fraction of pairs in which exactly one arm succeeds. Two independent arms with the same
+            success rate p have 2 p (1 - p).
 
     Returns:
-        The difference of the rates; NaN if not even one as large as `discordant`, the largest there can be,
-        would be found.
+        The difference of the rates. NaN if even the largest possible one, `discordant`, is not detected.
+
+    Raises:
+        InputError: `pairs` is below 1, or `discordant` is outside (0, 1].
 
     Example:
-        75 episodes an arm, of which a quarter go one way in one arm and the other way in the other:
+        75 episodes per arm, a quarter of them with different outcomes:
 
         >>> round(detectable_difference(75, 0.25), 3)
         0.159
     """
     if pairs < 1 or not 0 < discordant <= 1:
         raise InputError(
-            f"pairs, discordant: given {pairs} and {discordant}, expected at least 1, and a share above 0"
+            f"pairs, discordant: given {pairs} and {discordant}, expected at least 1 and a fraction above 0"
         )
     level, power = norm.ppf((1 + CONFIDENCE) / 2), norm.ppf(POWER)
 
@@ -282,24 +327,27 @@ def detectable_difference(pairs: int, discordant: float) -> float:
 
 
 def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation: float) -> float:
-    """The smallest difference between two arms of trained policies found with 80 % power at the 5 % level.
+    """The smallest difference between two arms of trained policies that is detected: 80 % power, 5 % level.
 
-    For a t test between the runs of the two arms, with as many runs in each: a run's measured rate varies by
-    the episodes drawn and by the training itself, and that variance is told from the runs alone. Few runs
-    tell it badly, which costs more than the variance does.
+    For a t test between the runs of two arms with the same number of runs. A run's measured rate varies with
+    the sampled episodes and with the training itself, and the test estimates this variance from the runs
+    alone. With few runs the estimate is poor, which costs more power than the variance itself.
 
     Args:
-        rate: success expected of both arms.
-        episodes: of each run.
-        runs: trained policies of each arm.
-        run_deviation: standard deviation of the true rate between training seeds, a guess.
+        rate: Expected success rate of both arms.
+        episodes: Episodes of each run.
+        runs: Trained policies of each arm.
+        run_deviation: Assumed standard deviation of the true success rate between training seeds.
 
     Returns:
-        The difference of the rates; NaN if none that rates can have would be found, as with a single run.
+        The difference of the rates. NaN if no possible difference is detected, as with a single run.
+
+    Raises:
+        InputError: An argument is out of range.
 
     Example:
-        Two runs of 100 episodes each, at a rate of 50 % that varies by 4 points between training seeds, and
-        then ten runs:
+        Two runs, then ten runs, of 100 episodes each, at a rate of 50 % with a standard deviation of 4
+        points between training seeds:
 
         >>> round(detectable_between_runs(0.5, 100, 2, 0.04), 2)
         0.36
@@ -309,7 +357,7 @@ def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation
     if not 0 <= rate <= 1 or episodes < 1 or runs < 1 or run_deviation < 0:
         raise InputError(
             f"rate, episodes, runs, run_deviation: given {rate}, {episodes}, {runs}, {run_deviation}; "
-            "expected a share, two numbers of at least 1, and a number of at least 0"
+            "expected a fraction, two numbers of at least 1, and a number of at least 0"
         )
     if runs == 1:
         return math.nan

@@ -1,0 +1,164 @@
+"""Examines a checkpoint: sizes, parts, memory, expected time, embodiments, future tokens, what is odd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import saccade._saccade as _saccade
+from saccade._arrays import integer
+from saccade.bench.cost import PRECISIONS, Machine, predict
+from saccade.bench.work import Call
+from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
+from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
+from saccade.checkpoints.findings import Counts, Inspection, MachineRates, Memory
+from saccade.checkpoints.resemblance import Reference
+from saccade.checkpoints.survey import Piece, Survey
+from saccade.checkpoints.tokens import token_statistics
+from saccade.config import HeadConfig
+from saccade.errors import InputError, SaccadeError
+from saccade.robots import EMBODIMENTS, read_json
+
+#: Embodiments of N1.7, as lerobot and Isaac-GR00T number them.
+N17_EMBODIMENTS = {
+    "simpler_env_google": 0,
+    "simpler_env_widowx": 1,
+    "libero_sim": 2,
+    "new_embodiment": 10,
+    "oxe_droid_relative_eef_relative_joint": 24,
+    "real_g1_relative_eef_relative_joints": 25,
+    "real_r1_pro_sharpa_relative_eef": 26,
+    "xdof_relative_eef_relative_joint": 27,
+}
+
+
+def inspect(
+    source: Source,
+    *,
+    config: Config = None,
+    reference: Source | None = None,
+    num_vl_tokens: int = 296,
+    time: bool = True,
+    progress: Callable[[int, int], object] | None = None,
+) -> Inspection:
+    """Examines every tensor of a checkpoint's head. This is what ``saccade inspect`` prints.
+
+    One tensor, or the slice of one embodiment of it, is in memory at a time.
+
+    Args:
+        source, config: As for :meth:`saccade.ActionHead.load`.
+        reference: A checkpoint to compare with, tensor by tensor; for example the one that ``source`` was
+            trained from.
+        num_vl_tokens: T_vl of the expected times. 296 is what one camera produces in N1.5.
+        time: Whether to estimate times. This measures the CPU, which takes about a second.
+        progress: Called with the number of bytes that are done and the total number of bytes.
+
+    Returns:
+        The findings, see :class:`saccade.checkpoints.findings.Inspection`. ``dataclasses.asdict`` converts
+        them to JSON values.
+
+    Raises:
+        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.load`, except that values need not be
+            finite.
+        InputError: ``num_vl_tokens`` is not an integer of at least 1, or ``reference`` is of another version.
+    """
+    num_vl_tokens = integer("num_vl_tokens", num_vl_tokens)
+    published = open_published(source, config)
+    published.check()
+    description = description_of(published, source)
+    head = description.config
+    other = None if reference is None else Reference(reference)
+    if other is not None and other.version != head.version:
+        raise InputError(
+            f"reference: {other.source} is of GR00T {other.version.upper()}, expected "
+            f"{head.version.upper()}, the version of source"
+        )
+
+    def look(piece: Piece) -> None:
+        if other is not None:
+            other.compare(piece)
+
+    survey = Survey(published, head, look, progress)
+    parts = survey.parts()
+    embodiments = survey.embodiments(_embodiment_names(description))
+    tokens = None
+    if survey.tokens is not None and len(survey.tokens) > 0:
+        tokens = token_statistics(survey.tokens, head.future_key_bias)
+    resemblance = None if other is None else other.resemblance()
+    machine, seconds = expected_times(head, num_vl_tokens) if time else (None, None)
+    return Inspection(
+        **vars(description),
+        parts=parts,
+        parameters=sum(part.parameters for part in parts.values()),
+        outside=_outside(description),
+        memory={
+            precision: Memory(
+                all=published.nbytes(precision, head.num_embodiments), one=published.nbytes(precision, 1)
+            )
+            for precision in PRECISIONS
+        },
+        num_vl_tokens=num_vl_tokens,
+        machine=machine,
+        seconds=seconds,
+        embodiments=embodiments,
+        future_tokens=tokens,
+        reference=resemblance,
+        odd=survey.odd + odd_tokens(tokens, description) + odd_embodiments(embodiments),
+        from_noise=from_noise(head.version, parts, tokens, embodiments, resemblance),
+    )
+
+
+def expected_times(head: HeadConfig, num_vl_tokens: int) -> tuple[MachineRates, dict[str, dict[str, float]]]:
+    """The rates of this CPU, measured now, and the seconds that `saccade.bench.cost` expects of a chunk."""
+    machine = Machine.measured(_saccade.selected_isa(), _saccade.default_num_threads())
+    call = Call.of(head, num_vl_tokens)
+    seconds = {precision: predict(head, call, precision, machine) for precision in PRECISIONS}
+    rates = MachineRates(
+        isa=machine.isa,
+        num_threads=machine.num_threads,
+        macs_per_second=dict(machine.macs_per_second),
+        read_bytes_per_second=machine.read_bytes_per_second,
+    )
+    return rates, seconds
+
+
+def _outside(description: Description) -> dict[str, Counts]:
+    """Tensors outside the head by the first component of their names."""
+    counted: dict[str, Counts] = {}
+    for tensor in description.tensors:
+        if tensor.name.startswith(description.prefix):
+            continue
+        module = tensor.name.removeprefix("_groot_model.").partition(".")[0]
+        counts = counted.get(module, Counts(0, 0))
+        counted[module] = Counts(counts.tensors + 1, counts.nbytes + tensor.nbytes)
+    return counted
+
+
+def _embodiment_names(description: Description) -> dict[int, list[str]]:
+    """Names of each id from the checkpoint's files, or else from the released code."""
+    path = Path(description.source)
+    first = description.files[0].path if description.files else path
+    folder = path if path.is_dir() else Path(first).parent
+    known = {"n1.7": N17_EMBODIMENTS, "n1.6": {}}.get(description.version, EMBODIMENTS)
+    names: dict[int, list[str]] = {}
+    for name, index in (_mapping(folder) or known).items():
+        names.setdefault(index, []).append(name)
+    return names
+
+
+def _mapping(folder: Path) -> dict[str, int]:
+    """Ids by name in `embodiment_id.json` or in lerobot's processors; empty if there are none."""
+    for name in ("embodiment_id.json", "policy_preprocessor.json"):
+        try:
+            values: Any = read_json(folder / name)
+        except (OSError, SaccadeError):
+            continue
+        if name == "policy_preprocessor.json":
+            steps = values.get("steps")
+            configs = [step.get("config") for step in steps or () if isinstance(step, dict)]
+            mappings = [config.get("embodiment_mapping") for config in configs if isinstance(config, dict)]
+            values = next(filter(None, mappings), {})
+        if isinstance(values, dict):
+            return {tag: index for tag, index in values.items() if isinstance(index, int)}
+    return {}

@@ -1,0 +1,278 @@
+"""Changed copies of checkpoints: quantised, converted, or with another number of future tokens."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import saccade._saccade as _saccade
+from saccade._arrays import integer, optional_integers, text
+from saccade._files import sha256_of
+from saccade.checkpoints.description import Config, Source
+from saccade.config import to_json
+from saccade.errors import InputError
+from saccade.hub import resolve
+
+Progress = Callable[[int, int], object] | None
+
+
+@dataclass(frozen=True)
+class Written:
+    """What :func:`quantize`, :func:`convert` and :func:`resize` wrote."""
+
+    files: tuple[Path, ...]
+    """The files with tensors. ``config.json`` is in the same directory."""
+    carried: tuple[Path, ...]
+    """Other files that were copied, such as statistics; paths in the new directory."""
+    left: tuple[Path, ...]
+    """Files of the source's directory that were not copied: other weights, optimizer states, other
+    checkpoints."""
+    num_dropped: int
+    """Number of tensors outside the head that were left out."""
+
+
+@dataclass(frozen=True)
+class QuantizeReport(Written):
+    """What :func:`quantize` wrote."""
+
+    num_quantized: int
+    """Number of weights that were converted to int8."""
+    num_copied: int
+    """Number of tensors that were copied bit for bit."""
+    head_bytes_before: int
+    """Size of the head's tensors in the source, in bytes."""
+    head_bytes_after: int
+    """Size of the head's tensors in the copy, scales included, in bytes."""
+
+
+@dataclass(frozen=True)
+class ConvertReport(Written):
+    """What :func:`convert` wrote."""
+
+    num_converted: int
+    """Number of tensors whose dtype changed."""
+    num_rounded: int
+    """Number of values that changed, because the new dtype cannot represent them."""
+    largest_error: float
+    """The largest absolute difference of a value."""
+    largest_error_in: str | None
+    """The tensor with this value."""
+    largest_relative_error: float
+    """The largest relative difference of a value; 1 if a value became zero."""
+    embodiment_ids: tuple[int, ...] | None
+    """The embodiments that were kept, in ascending order; None for all."""
+    zeroed_bytes: int
+    """Size of the layers of the other embodiments, which are zero now. They are holes in the file, if the
+    file system supports holes."""
+    bytes_before: int
+    """Size of all tensors of the source, in bytes."""
+    bytes_after: int
+    """Size of all tensors of the copy, zeros included, in bytes."""
+
+
+@dataclass(frozen=True)
+class ResizeReport(Written):
+    """What :func:`resize` wrote."""
+
+    num_before: int
+    """Number of future tokens of the source."""
+    num_after: int
+    """Number of future tokens of the copy."""
+    sources: tuple[tuple[int, ...], ...]
+    """For each token of the copy, the tokens of the source that it represents: one if it is a copy, several
+    if they were merged."""
+    future_key_bias: tuple[float, ...] | None
+    """What saccade adds to the logits of the tokens' keys; None if nothing."""
+    is_exact: bool
+    """Whether the actions of the copy in saccade equal those of the source up to rounding."""
+    is_widened: bool
+    """Whether the tokens are float32 now, because their dtype cannot represent the new values."""
+    perturbation_rms: float
+    """Root mean square of the noise that was added to the copied tokens."""
+
+
+def quantize(
+    source: Source,
+    out: str | os.PathLike[str],
+    *,
+    config: Config = None,
+    head_only: bool = False,
+    force: bool = False,
+    progress: Progress = None,
+) -> QuantizeReport:
+    """Writes a copy of a checkpoint with int8 weights: a quarter of the size of float32, half of bfloat16.
+
+    The weights of the attention and feed-forward layers of all blocks become int8. These are the weights that
+    precision ``"int8"`` computes with in int8. Such a weight is stored as row-major int8 ``X.weight
+    (out_features, in_features)`` with values from -127 to 127, and float32 ``X.weight_scale
+    (out_features,)``. A row represents its integers times its scale, which is the largest magnitude of the
+    row / 127. The result does not depend on the instruction set. All other tensors are copied bit for bit,
+    those outside the head (of a backbone) included unless ``head_only`` is set, and so are the other files of
+    the directory: statistics, processors, tokenizers.
+
+    :meth:`saccade.ActionHead.load` reads the copy at every precision. At ``"int8"`` it gives the same bits as
+    the source at ``"int8"``. At the others, the weights are those that the integers represent. No other
+    program reads these weights.
+
+    One tensor at a time is in memory. The directory appears under its name when everything is written.
+
+    Args:
+        source: A directory (``config.json`` and one or more ``.safetensors`` files) or one ``.safetensors``
+            file. Other files are copied only from a directory.
+        out: The directory to write. Parent directories are created.
+        config: As for :meth:`saccade.ActionHead.load`. It becomes the ``config.json`` of the copy.
+        head_only: Whether to leave out tensors outside the head.
+        force: Whether to replace an existing checkpoint. A directory that contains other files is never
+            replaced.
+        progress: Called after each tensor with the number of bytes that are done and the total number of
+            bytes. If it raises an exception, nothing is written.
+
+    Raises:
+        FileNotFoundError: ``source`` or the config does not exist.
+        CheckpointError: The source is damaged, does not fit the config, is quantised already, or contains NaN
+            or infinity. Or ``out`` cannot be written.
+        InputError: ``out`` exists and ``force`` is not set, or it contains other files or the source.
+    """
+    rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
+    return QuantizeReport(**_paths(_saccade.quantize(rewrite)))
+
+
+def convert(
+    source: Source,
+    out: str | os.PathLike[str],
+    *,
+    config: Config = None,
+    embodiment_ids: Sequence[int] | None = None,
+    dtype: str | None = None,
+    max_shard_bytes: int | None = None,
+    head_only: bool = False,
+    force: bool = False,
+    progress: Progress = None,
+) -> ConvertReport:
+    """Writes a copy of a checkpoint with fewer embodiments, in another dtype, or split into other files.
+
+    Everything else is copied bit for bit: tensors, ``config.json``, and the other files of the directory
+    (statistics, processors, tokenizers). A part of one tensor at a time is in memory. The directory appears
+    under its name when everything is written.
+
+    Args:
+        source, config, out, head_only, force, progress: As in :func:`quantize`. Other programs need the
+            tensors outside the head.
+        embodiment_ids: The embodiments to keep. The layers of the others become zero. They keep their place,
+            so that ids keep their numbers and every program that reads the source reads the copy. A note in
+            the metadata of the files makes saccade refuse the ids that were removed. The zeros take no disk
+            space on file systems that support holes.
+        dtype: ``"float32"``, ``"bfloat16"`` or ``"float16"``, for all floating point tensors, those outside
+            the head included. Default: unchanged. Values are rounded to the nearest, and the report contains
+            the largest differences. int8 weights and their scales are kept.
+        max_shard_bytes: Largest size of a file in bytes. A tensor that is larger gets a file of its own.
+            Default: one file if the source has one, else 5 GB.
+
+    Raises:
+        FileNotFoundError: ``source`` or the config does not exist.
+        CheckpointError: The source is damaged, does not fit the config, or contains a finite value beyond the
+            range of the dtype. Or ``out`` cannot be written.
+        InputError: An option is out of range, ``out`` exists and ``force`` is not set, or ``out`` contains
+            other files or the source.
+    """
+    rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
+    if max_shard_bytes is not None:
+        rewrite["max_shard_bytes"] = integer("max_shard_bytes", max_shard_bytes)
+    ids = optional_integers("embodiment_ids", embodiment_ids)
+    found = _paths(_saccade.convert(rewrite, ids, None if dtype is None else text("dtype", dtype)))
+    kept = found["embodiment_ids"]
+    return ConvertReport(**{**found, "embodiment_ids": None if kept is None else tuple(kept)})
+
+
+def resize(
+    source: Source,
+    out: str | os.PathLike[str],
+    *,
+    num_future_tokens: int,
+    perturbation: float = 0.0,
+    seed: int = 0,
+    config: Config = None,
+    force: bool = False,
+    progress: Progress = None,
+) -> ResizeReport:
+    """Writes a copy of a checkpoint with another number of future tokens.
+
+    Everything else is copied bit for bit. ``config.json`` is updated wherever it contains the number.
+
+    From N to a larger number M, token i is copied to the rows i, i + N, i + 2 N, ... If a token has r copies,
+    ln r is subtracted from the logit of each copy's key in every self-attention block. Together the copies
+    have the effect of the original; the difference is floating-point rounding. From N to a smaller number,
+    the two tokens with the most similar directions are merged into their mean, repeatedly, and the logarithm
+    of the number of tokens that a merged token represents is added to its logit. This is exact for equal
+    tokens, and otherwise an approximation.
+
+    These numbers are stored under saccade's own key of the config, ``"saccade": {"future_key_bias": [...]}``.
+    The config of a lerobot policy accepts no other keys, so there they are in a separate ``saccade.json``.
+    Other programs do not read them. In those, r copies have r times the weight of the original.
+
+    Args:
+        source, config, out, force, progress: As in :func:`quantize`.
+        num_future_tokens: The new number. 0 removes all.
+        perturbation: Root mean square of noise that is added to the copied tokens (the rows from N on),
+            relative to the root mean square of all tokens, so that training can separate them. With noise,
+            the copies are not exact.
+        seed: Seed of the noise, at least 0.
+
+    Raises:
+        FileNotFoundError: ``source`` or the config does not exist.
+        CheckpointError: The source is damaged, does not fit the config, belongs to a version without future
+            tokens, or has none. Or ``out`` cannot be written.
+        InputError: An option is out of range, ``out`` exists and ``force`` is not set, or ``out`` contains
+            other files or the source.
+    """
+    count = integer("num_future_tokens", num_future_tokens, least=0)
+    drawn = integer("seed", seed, least=0)
+    try:
+        amount = float(perturbation)
+    except (TypeError, ValueError):
+        raise InputError(f"perturbation: expected a number, got {perturbation!r}") from None
+    rewrite = _rewrite(source, out, config, force=force, progress=progress)
+    found = _paths(_saccade.resize(rewrite, count, amount, drawn))
+    bias = found["future_key_bias"]
+    found["sources"] = tuple(tuple(group) for group in found["sources"])
+    return ResizeReport(**{**found, "future_key_bias": None if bias is None else tuple(bias)})
+
+
+def _rewrite(
+    source: Source,
+    out: str | os.PathLike[str],
+    config: Config,
+    *,
+    force: bool,
+    progress: Progress,
+    head_only: bool = False,
+) -> dict[str, Any]:
+    """The arguments that the three functions share, for the engine."""
+    path = resolve(source)
+    config_text = None if config is None else to_json(config)
+    published = _saccade.Published.open(os.fspath(path), config_text)
+    published.check()  # before the hash, which takes long
+    beside = (path if path.is_dir() else path.parent) / "config.json"
+    hashed = [beside] if beside.is_file() else []
+    return {
+        "source": os.fspath(path),
+        "out": os.fspath(out),
+        "config": config_text,
+        "head_only": head_only,
+        "force": force,
+        "metadata": {
+            "format": "pt",
+            "saccade": _saccade.__version__,
+            "source_sha256": sha256_of(*hashed, *published.files),
+        },
+        "max_shard_bytes": None,
+        "progress": progress,
+    }
+
+
+def _paths(written: dict[str, Any]) -> dict[str, Any]:
+    names = ("files", "carried", "left")
+    return {**written, **{name: tuple(Path(path) for path in written[name]) for name in names}}

@@ -1,0 +1,171 @@
+"""One pass over the tensors of a head: counts, norms, distributions.
+
+One tensor, or the slice of one embodiment of it, is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+import saccade._saccade as _saccade
+from saccade._arrays import Float32Array
+from saccade.checkpoints.findings import Embodiment, Part
+from saccade.checkpoints.initialisation import Draw, draw, is_as_drawn, is_norm, sample
+from saccade.checkpoints.parts import UNUSED, in_order, part_of
+from saccade.config import HeadConfig
+
+#: A median absolute deviation times this is the standard deviation of normally distributed numbers.
+MAD_TO_STD = 1.4826
+
+#: Number of elements that are widened to float64 at a time: about a megabyte.
+WIDENED = 1 << 17
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A tensor, or one embodiment's slice of it, while it is in memory."""
+
+    name: str
+    """Without the prefix of the head."""
+    embodiment: int | None
+    values: Float32Array
+    drawn: Draw | None
+    """The distribution at initialisation. None if it is not compared: int8, and what only training uses."""
+
+
+class Survey:
+    """Reads every tensor of a head once.
+
+    Args:
+        published: The open checkpoint.
+        head: Its config.
+        look: Called with each piece.
+        progress: Called with the number of bytes that are done and the total number of bytes.
+
+    Attributes:
+        odd: Sentences about unusual tensors.
+        tokens: The future tokens, ``(N, width)``, or None.
+    """
+
+    def __init__(
+        self,
+        published: _saccade.Published,
+        head: HeadConfig,
+        look: Callable[[Piece], object],
+        progress: Callable[[int, int], object] | None,
+    ) -> None:
+        self._published = published
+        self._head = head
+        self._prefix = published.prefix
+        self._parts: dict[str, Part] = {}
+        self._squares = np.zeros(head.num_embodiments)
+        self._biases_zero = np.ones(head.num_embodiments, bool)
+        self._weights_drawn = np.ones(head.num_embodiments, bool)
+        self.tokens: Float32Array | None = None
+        self.odd: list[str] = []
+        tensors = [tensor for tensor in published.tensors() if tensor[0].startswith(self._prefix)]
+        done, total = 0, sum(nbytes for *_, nbytes in tensors)
+        self._shapes = {name.removeprefix(self._prefix): tuple(shape) for name, _, shape, _ in tensors}
+        for full_name, dtype, shape, nbytes in tensors:
+            name = full_name.removeprefix(self._prefix)
+            part = self._parts.setdefault(part_of(name), Part())
+            part.tensors += 1
+            part.parameters += math.prod(shape)
+            part.nbytes += nbytes
+            part.dtypes[dtype] = part.dtypes.get(dtype, 0) + 1
+            judged = []
+            for piece in self._pieces(name, dtype, tuple(shape)):
+                look(piece)
+                judged.append(self._judge(piece))
+            if judged and None not in judged:
+                part.judged += 1
+                part.as_drawn += all(judged)
+            done += nbytes
+            if progress is not None:
+                progress(done, total)
+
+    def _pieces(self, name: str, dtype: str, shape: tuple[int, ...]) -> Iterator[Piece]:
+        drawn = None if dtype == "I8" or part_of(name) == UNUSED else draw(name, self._inputs(name, shape))
+        if name.endswith("_scale"):
+            drawn = None
+        is_category = name.endswith((".W", ".b"))
+        indices: list[int | None] = list(range(shape[0])) if is_category else [None]
+        for index in indices:
+            yield Piece(name, index, self._published.read(self._prefix + name, index), drawn)
+
+    def _inputs(self, name: str, shape: tuple[int, ...]) -> int:
+        """Number of inputs of the linear layer that a weight or bias belongs to."""
+        module, _, kind = name.rpartition(".")
+        if kind == "bias" and not is_norm(name):
+            return self._shapes[f"{module}.weight"][1]
+        return shape[1] if len(shape) == 2 else 1
+
+    def _judge(self, piece: Piece) -> bool | None:
+        """Counts a piece. Whether it is distributed as at initialisation; None if that is not compared."""
+        values, name = piece.values, piece.name
+        where = name if piece.embodiment is None else f"{name}[{piece.embodiment}]"
+        squares = dot(values, values)
+        if not math.isfinite(squares):
+            count = int(np.sum(~np.isfinite(values)))
+            self.odd.append(f"{where} contains {count} values that are NaN or infinite")
+            return False
+        is_weight = not name.endswith((".b", ".bias")) and piece.drawn is not None
+        if piece.embodiment is None and is_weight and values.size > 1 and not is_norm(name):
+            low, high = float(values.min()), float(values.max())
+            if low == high:
+                self.odd.append(f"every value of {where} is {low:g}")
+        if name == "future_tokens.weight":
+            self.tokens = values
+        as_drawn = None if piece.drawn is None else is_as_drawn(sample(values), piece.drawn)
+        if piece.embodiment is not None:
+            self._squares[piece.embodiment] += squares
+            if name.endswith(".b"):
+                self._biases_zero[piece.embodiment] &= squares == 0.0
+            else:
+                self._weights_drawn[piece.embodiment] &= as_drawn is not False
+        return as_drawn
+
+    def parts(self) -> dict[str, Part]:
+        """The parts of the head."""
+        return in_order(self._parts)
+
+    def embodiments(self, names: Mapping[int, list[str]]) -> list[Embodiment]:
+        """All embodiments in ascending order of their ids."""
+        norms = np.sqrt(self._squares)
+        scores = robust_z(norms)
+        return [
+            Embodiment(
+                id=index,
+                names=names.get(index, []),
+                norm=float(norms[index]),
+                robust_z=None if scores is None else float(scores[index]),
+                looks=self._looks(index, norms[index] == 0.0),
+            )
+            for index in range(self._head.num_embodiments)
+        ]
+
+    def _looks(self, index: int, is_zero: bool) -> str:
+        if is_zero:
+            return "zero"
+        return "as initialised" if self._biases_zero[index] and self._weights_drawn[index] else "trained"
+
+
+def robust_z(values: np.ndarray) -> np.ndarray | None:
+    """Distances from the median in units of 1.4826 median absolute deviations; None if the deviation is 0."""
+    centre = np.median(values)
+    spread = MAD_TO_STD * float(np.median(np.abs(values - centre)))
+    return None if spread == 0.0 else (values - centre) / spread
+
+
+def dot(a: Float32Array, b: Float32Array) -> float:
+    """The dot product of all elements in float64. One thread, because reading the file takes longer."""
+    a, b = a.reshape(-1), b.reshape(-1)
+    total = 0.0
+    for first in range(0, a.size, WIDENED):
+        piece = slice(first, first + WIDENED)
+        total += float(np.einsum("i,i->", a[piece].astype(np.float64), b[piece].astype(np.float64)))
+    return total

@@ -1,0 +1,174 @@
+"""What commands write to standard output and standard error: tables, progress bars, JSON."""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import functools
+import io
+import os
+import sys
+import unicodedata
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Protocol
+
+from saccade._json import dumps
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Characters of our texts, and what is written where the encoding of a stream lacks them.
+ASCII = {"–": "-", "—": "-", "×": "x", "·": "*", "…": "...", "“": '"', "”": '"', "→": "->", "±": "+-"}
+REPLACE = "saccade-ascii"  # name of the error handler
+
+
+class OutputError(Exception):
+    """Standard output cannot be written; the message says why."""
+
+
+def prepare_streams() -> None:
+    """Makes both streams accept any text, whatever their encoding is.
+
+    Raises:
+        OutputError: standard output is closed.
+    """
+    if sys.stdout is None:
+        raise OutputError("standard output is closed")
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
+    codecs.register_error(REPLACE, replace_with_ascii)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=REPLACE)
+
+
+def replace_with_ascii(error: UnicodeError) -> tuple[str, int]:
+    """Error handler of a codec: writes an ASCII replacement for what cannot be encoded.
+
+    Example:
+        >>> codecs.register_error(REPLACE, replace_with_ascii)
+        >>> "R² 0.3–0.4 é \\udcff".encode("ascii", REPLACE)
+        b'R2 0.3-0.4 e ?'
+    """
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    written = ""
+    for character in error.object[error.start : error.end]:
+        plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
+        written += ASCII.get(character) or plain or "?"
+    return written, error.end
+
+
+def flush() -> None:
+    """Flushes standard output.
+
+    Raises:
+        BrokenPipeError: whoever read it is gone.
+        OutputError: it cannot be written.
+    """
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"standard output: {error.strerror or error}") from error
+
+
+def discard_output() -> None:
+    """Sends the rest of standard output nowhere, so that no error follows when the interpreter ends."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
+
+
+def print_json(value: Any, *, indent: int | None = None, default: Callable[[Any], Any] | None = None) -> None:
+    """Prints one JSON document in ASCII; numbers that are not finite are ``null``."""
+    print(dumps(value, indent=indent, default=default))
+
+
+def note(command: str, message: str) -> None:
+    """Prints progress to standard error."""
+    print(f"{command}: {message} ...", file=sys.stderr, flush=True)
+
+
+@functools.cache
+def _console_class() -> type[Console]:
+    from rich.console import Console
+
+    class SaccadeConsole(Console):
+        """A console that leaves a closed pipe to `saccade.cli.main`; rich would exit with status 1."""
+
+        def on_broken_pipe(self) -> None:
+            raise  # rich calls this while it handles the error
+
+    return SaccadeConsole
+
+
+def console(*, stderr: bool = False, width: int | None = None) -> Console:
+    """A console of rich.
+
+    Args:
+        stderr: write to standard error.
+        width: characters in a line where the output is not a terminal; None for rich's 80.
+    """
+    made = _console_class()(stderr=stderr)
+    if width is not None and not made.is_terminal and "COLUMNS" not in os.environ:
+        made.width = width
+    return made
+
+
+class Update(Protocol):
+    """Moves a progress bar."""
+
+    def __call__(self, completed: int, total: int | None = None, description: str | None = None) -> None:
+        """Shows how much is done; None leaves total and description as they are."""
+
+
+@contextlib.contextmanager
+def progress_bar(
+    description: str, total: int | None = None, *, in_bytes: bool = False, transient: bool = False
+) -> Iterator[Update]:
+    """A progress bar on standard error, if that is a terminal and rich is installed.
+
+    Args:
+        description: of the work.
+        total: of its pieces; None if that is not known yet.
+        in_bytes: show megabytes instead of a count.
+        transient: remove the bar at the end.
+    """
+
+    def ignore(completed: int, total: int | None = None, description: str | None = None) -> None:
+        """There is no bar."""
+
+    try:
+        from rich.progress import (
+            BarColumn,
+            DownloadColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+    except ModuleNotFoundError:
+        yield ignore
+        return
+    shown = console(stderr=True)
+    counted = DownloadColumn() if in_bytes else MofNCompleteColumn()
+    text = TextColumn("{task.description}", markup=False)
+    # Elsewhere than in a terminal a bar that nobody sees would leave lines behind.
+    with Progress(
+        text,
+        BarColumn(),
+        counted,
+        TimeRemainingColumn(),
+        console=shown,
+        transient=transient,
+        disable=not shown.is_terminal,
+    ) as progress:
+        bar = progress.add_task(description, total=total)
+
+        def update(completed: int, total: int | None = None, description: str | None = None) -> None:
+            progress.update(bar, completed=completed, total=total, description=description)
+
+        yield update

@@ -1,0 +1,321 @@
+"""The flags that commands and studies share: each has one name, one meaning and one way to be read.
+
+A command that needs a checkpoint takes it as its first argument, one that has a default takes
+``--checkpoint``. A list takes commas, spaces or both. A number outside its range is refused while the
+arguments are parsed, before anything is imported, loaded or written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from saccade.cli import UsageError
+from saccade.errors import InputError
+
+#: A parser, or a group of its arguments.
+Arguments: TypeAlias = argparse._ActionsContainer
+
+PRECISIONS = ("float32", "bfloat16", "int8")
+
+
+class StoreNumber(argparse.Action):
+    """Stores a number and refuses one outside `minimum <= number < below`.
+
+    Raises:
+        UsageError: when the argument is parsed; names the flag, the number given and the range.
+    """
+
+    def __init__(
+        self, *args: Any, minimum: float = -math.inf, below: float = math.inf, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.minimum, self.below = minimum, below
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """See argparse."""
+        if not self.minimum <= values < self.below:  # not so either if it is NaN
+            if self.below < math.inf:
+                expected = f"{self.minimum:g} to below {self.below:g}"
+            elif values == math.inf:
+                expected = "a finite number"
+            else:
+                expected = f"at least {self.minimum:g}"
+            raise UsageError(f"{option_string}: given {values}, expected {expected}")
+        setattr(namespace, self.dest, values)
+
+
+class StoreList(argparse.Action):
+    """Stores the items of a list as a tuple, in the order given, each once.
+
+    Args:
+        item: makes an item of a word, and raises `ValueError` for one that is not a number.
+        minimum: of items that are numbers.
+
+    Raises:
+        UsageError: when the argument is parsed; the list is empty, or holds something else than numbers of at
+            least `minimum`.
+    """
+
+    def __init__(
+        self, *args: Any, item: Callable[[str], Any] = str, minimum: float | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.item, self.minimum = item, minimum
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """See argparse."""
+        items = []
+        for word in split_list(values):
+            try:
+                items.append(self.item(word))
+            except ValueError:
+                raise UsageError(f"{option_string}: given {word!r}, expected numbers") from None
+        if not items:
+            kind = "name" if self.item is str else "number"
+            raise UsageError(f"{option_string}: expected at least one {kind}")
+        if self.minimum is not None and not all(number >= self.minimum for number in items):
+            given = ", ".join(map(str, items))
+            raise UsageError(f"{option_string}: given {given}, expected numbers from {self.minimum:g} on")
+        setattr(namespace, self.dest, tuple(dict.fromkeys(items)))
+
+
+def split_list(words: Iterable[str]) -> list[str]:
+    """The items of a list that is separated by commas, spaces or both.
+
+    Example:
+        >>> split_list(["reach,push", "fork"]), split_list(["reach, push"])
+        (['reach', 'push', 'fork'], ['reach', 'push'])
+    """
+    return [item for word in words for item in re.split(r"[,\s]+", word) if item]
+
+
+def add_integer(
+    parser: Arguments, flag: str, *, minimum: int = 1, default: int | None = None, help: str
+) -> None:
+    """Declares a whole number of at least `minimum`; the help text ends with the default, if there is one."""
+    parser.add_argument(
+        flag,
+        type=int,
+        action=StoreNumber,
+        minimum=minimum,
+        default=default,
+        metavar="N",
+        help=help if default is None else f"{help} (default: {default})",
+    )
+
+
+def add_number(
+    parser: Arguments,
+    flag: str,
+    *,
+    minimum: float = -math.inf,
+    below: float = math.inf,
+    default: float | None = None,
+    help: str,
+) -> None:
+    """Declares a number with `minimum <= number < below`; the help text ends with the default, if any."""
+    parser.add_argument(
+        flag,
+        type=float,
+        action=StoreNumber,
+        minimum=minimum,
+        below=below,
+        default=default,
+        metavar="X",
+        help=help if default is None else f"{help} (default: {default:g})",
+    )
+
+
+def add_list(
+    parser: Arguments,
+    flag: str,
+    *,
+    item: Callable[[str], Any] = str,
+    metavar: str = "NAME",
+    minimum: float | None = None,
+    default: Sequence[Any] | None = None,
+    help: str,
+) -> None:
+    """Declares a list, see `StoreList`; `args` then holds a tuple, or `default` where the flag is absent.
+
+    Args:
+        parser: of the command.
+        flag: its name, in the plural.
+        item: makes an item of a word, such as `int`.
+        metavar: what an item is called.
+        minimum: of items that are numbers.
+        default: for `args`.
+        help: says what the default is.
+    """
+    parser.add_argument(
+        flag,
+        action=StoreList,
+        nargs="+",
+        item=item,
+        minimum=minimum,
+        metavar=metavar,
+        default=default,
+        help=help,
+    )
+
+
+def add_checkpoint_argument(parser: Arguments) -> None:
+    """Declares the checkpoint of a command that needs one."""
+    parser.add_argument(
+        "checkpoint",
+        type=Path,
+        metavar="CHECKPOINT",
+        help="directory, .safetensors file or published id (read from the local Hugging Face cache)",
+    )
+
+
+def add_checkpoint(
+    parser: Arguments,
+    help: str = "directory of a policy (default: the bundled policy)",
+) -> None:
+    """Declares the checkpoint of a command that has a default for it."""
+    parser.add_argument("--checkpoint", type=Path, metavar="PATH", help=help)
+
+
+def add_config(parser: Arguments) -> None:
+    """Declares the head's config."""
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="config of the head (default: config.json in the checkpoint's directory)",
+    )
+
+
+def add_features(parser: Arguments, help: str) -> None:
+    """Declares a file of recorded observations."""
+    parser.add_argument("--features", type=Path, metavar="FILE", help=help)
+
+
+def add_tasks(parser: Arguments, help: str = "tasks to run (default: all that the policy knows)") -> None:
+    """Declares the names of tasks; see `check_tasks`."""
+    add_list(parser, "--tasks", help=help)
+
+
+def add_episodes(parser: Arguments, default: int | None, help: str = "episodes per task") -> None:
+    """Declares the number of episodes of each task."""
+    add_integer(parser, "--episodes", default=default, help=help)
+
+
+def add_seed(parser: Arguments, help: str) -> None:
+    """Declares the seed."""
+    add_integer(parser, "--seed", minimum=0, default=0, help=help)
+
+
+def add_num_threads(
+    parser: Arguments,
+    help: str = "threads of the action head (default: the physical cores)",
+    default: int | None = None,
+) -> None:
+    """Declares the number of threads."""
+    add_integer(parser, "--num-threads", default=default, help=help)
+
+
+def add_num_steps(parser: Arguments) -> None:
+    """Declares the number of Euler steps."""
+    add_integer(parser, "--num-steps", help="Euler steps (default: those of the checkpoint)")
+
+
+def add_num_vl_tokens(parser: Arguments, default: int | None, help: str) -> None:
+    """Declares T_vl."""
+    add_integer(parser, "--num-vl-tokens", default=default, help=help)
+
+
+def add_out(parser: Arguments, default: str | None, help: str = "directory of the results") -> None:
+    """Declares the directory to write; without a default it must be given."""
+    text = help if default is None else f"{help} (default: {default})"
+    path = None if default is None else Path(default)
+    parser.add_argument("--out", type=Path, metavar="DIR", default=path, required=default is None, help=text)
+
+
+def add_json(parser: Arguments, help: str = "print JSON instead of text") -> None:
+    """Declares whether JSON is printed."""
+    parser.add_argument("--json", action="store_true", help=help)
+
+
+def add_rollout_arguments(parser: Arguments, episodes: int) -> None:
+    """Declares which episodes of which policy a study runs, or which recorded observations it reads.
+
+    Args:
+        parser: of the study.
+        episodes: default number per task. It is kept as `args.default_episodes`, and `args.episodes` is None
+            where the flag is absent, because with `--features` the flag may not be given.
+    """
+    add_checkpoint(
+        parser, "policy to study (default: the bundled policy); with --features any checkpoint of a head"
+    )
+    add_tasks(parser)
+    add_episodes(parser, None, f"episodes per task (default: {episodes})")
+    parser.set_defaults(default_episodes=episodes)
+    add_seed(parser, "seed of the first episode, the next ones count up; with --features: of random numbers")
+    file = parser.add_argument_group("recorded observations instead of the simulator")
+    add_features(file, ".npz or .safetensors as for `saccade attention`; an array `episode` groups its rows")
+    add_config(file)
+
+
+def check_known(flag: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Checks names.
+
+    Raises:
+        InputError: one is unknown; lists those that are known.
+    """
+    known = list(known)
+    for name in given:
+        if name not in known:
+            raise InputError(f"{flag}: unknown name {name!r}, expected one of {', '.join(known)}")
+
+
+def check_tasks(names: Iterable[str]) -> None:
+    """Checks the names of tasks; needs no simulator.
+
+    Raises:
+        InputError: one is unknown; lists those that are known.
+    """
+    check_known("--tasks", names, known_tasks())
+
+
+def known_tasks() -> tuple[str, ...]:
+    """The names of all tasks; needs no simulator."""
+    from saccade.sim.tasks import TASKS
+
+    return tuple(TASKS)
+
+
+def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:
+    """Distinct indices below `count` in increasing order; None gives all of them.
+
+    Raises:
+        InputError: one is out of range.
+
+    Example:
+        >>> indices("--blocks", (3, 0), 4), indices("--blocks", None, 4)
+        ((0, 3), (0, 1, 2, 3))
+    """
+    if given is None:
+        return tuple(range(count))
+    found = tuple(sorted(set(given)))
+    if found and (found[0] < 0 or found[-1] >= count):
+        raise InputError(f"{flag}: given {', '.join(map(str, found))}, expected 0 to {count - 1}")
+    return found

@@ -1,0 +1,108 @@
+"""Multi-head attention, written out.
+
+Shapes in comments: B is the batch, Q the queries, S the keys.
+"""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Attention(nn.Module):
+    """Multi-head attention written out; heads are contiguous slices of the width."""
+
+    def __init__(self, width: int, context_dim: int, num_heads: int, head_dim: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.head_dim = head_dim
+        inner = num_heads * head_dim
+        self.to_q = nn.Linear(width, inner)
+        self.to_k = nn.Linear(context_dim, inner)
+        self.to_v = nn.Linear(context_dim, inner)
+        self.to_out = nn.ModuleList([nn.Linear(inner, width)])
+
+    def forward(
+        self,
+        x: Tensor,
+        context: Tensor,
+        *,
+        logit_bias: Tensor | None = None,
+        stop_gradient: Tensor | None = None,
+        return_weights: bool = False,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Lets the rows of `x` read those of `context`.
+
+        Args:
+            x: `(B, Q, width)`.
+            context: `(B, S, context_dim)`.
+            logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a
+                key. A query with no key left gets zeros from the attention.
+            stop_gradient: `(Q, S)` bool; where true, the query takes this key and its value as constants in
+                the backward pass.
+            return_weights: also return the probabilities.
+
+        Returns:
+            `(B, Q, width)`, and the probabilities `(B, heads, Q, S)` or None.
+        """
+        q = self.split_heads(self.to_q(x))  # (B, heads, Q, head_dim)
+        k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
+        v = self.split_heads(self.to_v(context))  # (B, heads, S, head_dim)
+        if logit_bias is None and stop_gradient is None and not return_weights:
+            weights, values = None, F.scaled_dot_product_attention(q, k, v)  # the same sums, faster to train
+        else:
+            weights = attention_weights(q, k, logit_bias, stop_gradient)  # (B, heads, Q, S)
+            values = attention_values(weights, v, stop_gradient)  # (B, heads, Q, head_dim)
+        return self.to_out[0](values.transpose(1, 2).flatten(2)), weights  # (B, Q, width)
+
+    def split_heads(self, x: Tensor) -> Tensor:
+        """`(B, S, heads * head_dim)` to `(B, heads, S, head_dim)`."""
+        return x.unflatten(-1, (self.num_heads, self.head_dim)).transpose(1, 2)
+
+
+def attention_weights(
+    q: Tensor, k: Tensor, logit_bias: Tensor | None, stop_gradient: Tensor | None = None
+) -> Tensor:
+    """softmax(q k^T / sqrt(head_dim) + bias), and zeros where no key is left.
+
+    Args:
+        q: `(B, heads, Q, head_dim)`.
+        k: `(B, heads, S, head_dim)`.
+        logit_bias: broadcast to `(B, heads, Q, S)`, or None.
+        stop_gradient: `(Q, S)` bool, True where the key is a constant; or None.
+
+    Returns:
+        `(B, heads, Q, S)`.
+    """
+    logits = q @ k.transpose(-1, -2)  # (B, heads, Q, S)
+    if stop_gradient is not None:
+        logits = torch.where(stop_gradient, q @ k.detach().transpose(-1, -2), logits)
+    logits = logits / math.sqrt(q.shape[-1])
+    if logit_bias is None:
+        return torch.softmax(logits, dim=-1)
+    logits = logits + logit_bias.to(logits.dtype)
+    nothing_left = torch.isneginf(logits).all(dim=-1, keepdim=True)  # (B, heads, Q, 1)
+    # Filled before the softmax too: a row of nan would poison the gradient even where its value is replaced.
+    return torch.softmax(logits.masked_fill(nothing_left, 0.0), dim=-1).masked_fill(nothing_left, 0.0)
+
+
+def attention_values(weights: Tensor, v: Tensor, stop_gradient: Tensor | None) -> Tensor:
+    """The probabilities' mean of the values.
+
+    Args:
+        weights: `(B, heads, Q, S)`.
+        v: `(B, heads, S, head_dim)`.
+        stop_gradient: `(Q, S)` bool, True where the value is a constant; or None.
+
+    Returns:
+        `(B, heads, Q, head_dim)`.
+    """
+    if stop_gradient is None:
+        return weights @ v
+    constant = v.detach()
+    # The second product is zero. It carries the gradient to `v`, and the first one that to the weights.
+    return weights @ constant + weights.masked_fill(stop_gradient, 0.0) @ (v - constant)

@@ -1,0 +1,88 @@
+"""Reads the small files of statistics in a checkpoint's directory."""
+
+from __future__ import annotations
+
+import json
+import math
+import stat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade.errors import CheckpointError, printable
+
+#: A larger file is refused, since it is read at once. No robot's statistics are larger.
+MOST_BYTES = 1 << 26
+
+#: The types of safetensors that statistics may have, and those of NumPy.
+DTYPES = {
+    "F64": "<f8",
+    "F32": "<f4",
+    "F16": "<f2",
+    "I64": "<i8",
+    "I32": "<i4",
+    "I16": "<i2",
+    "I8": "i1",
+    "U8": "u1",
+    "BOOL": "?",
+}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON file that contains an object.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        CheckpointError: It contains something else.
+    """
+    try:
+        values = json.loads(_bytes(path))
+    except FileNotFoundError:
+        raise FileNotFoundError(printable(f"{path}: no such file")) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: cannot be read as JSON: {error}") from None
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path}: expected a JSON object, got {type(values).__name__}")
+    return values
+
+
+def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Reads a small ``.safetensors`` file with tensors of any dtype. lerobot stores counts as int64.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        CheckpointError: It is damaged.
+    """
+    try:
+        content = _bytes(path)
+        start = 8 + int.from_bytes(content[:8], "little")
+        if len(content) < 8 or start > len(content):
+            raise ValueError("the header is longer than the file")
+        tensors = {}
+        for name, about in json.loads(content[8:start]).items():
+            if name == "__metadata__":
+                continue
+            first, last = about["data_offsets"]
+            shape, kind = tuple(about["shape"]), np.dtype(DTYPES[about["dtype"]])
+            data = content[start + first : start + last]
+            if min(first, last, *shape, 0) < 0 or len(data) != math.prod(shape) * kind.itemsize:
+                raise ValueError(f"{name}: data_offsets {first} to {last} do not contain {shape} of {kind}")
+            tensors[name] = np.frombuffer(data, kind).reshape(shape)
+    except FileNotFoundError:
+        raise FileNotFoundError(printable(f"{path}: no such file")) from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: cannot be read as safetensors: {error}") from None
+    return tensors
+
+
+def _bytes(path: Path) -> bytes:
+    """The content of a small file."""
+    about = path.stat()
+    # Reading a pipe might wait forever, and a device might never end.
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError("not a regular file")
+    if about.st_size > MOST_BYTES:
+        raise ValueError(f"more than {MOST_BYTES} bytes")
+    return path.read_bytes()

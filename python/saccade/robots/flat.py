@@ -1,0 +1,40 @@
+"""Statistics of the whole state and the whole action: saccade's own policies, and plain mappings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from saccade._arrays import integer
+from saccade.robots.building import Builder, Dims, Options, finished
+from saccade.robots.groups import Robot
+from saccade.robots.isaac_metadata import EMBODIMENTS
+
+
+def flat_robot(
+    values: Any, options: Options, where: str, dims: Dims, embodiment_id: int | None = None
+) -> Robot:
+    """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well.
+
+    Raises:
+        CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
+    """
+    options.refuse_keys(where)
+    builder = Builder(where, np.float32)
+    groups = []
+    for kind, other in (("state", "observation.state"), ("action", "action")):
+        found = values.get(kind, values.get(other)) if isinstance(values, Mapping) else None
+        has_bounds = isinstance(found, Mapping) and {"min", "max"} <= set(found)
+        groups.append(builder.group(kind, found, "min_max" if has_bounds else "mean_std"))
+    state, action = builder.check(groups)
+    # The statistics do not name a robot, so the request does.
+    tag, asked = None, options.embodiment
+    if embodiment_id is None and asked is not None:
+        if isinstance(asked, str):
+            tag, embodiment_id = asked, EMBODIMENTS.get(asked)
+        else:
+            embodiment_id = integer("embodiment", asked, least=0)
+    options.check_only(tag, embodiment_id, where)
+    return finished(where, options, tag, embodiment_id, (state,), (action,), dims)

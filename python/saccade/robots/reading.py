@@ -1,0 +1,100 @@
+"""Finds the statistics of a checkpoint, and passes them to the file of their layout."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from saccade.errors import CheckpointError
+from saccade.hub import resolve
+from saccade.robots.building import Dims, Options, size_of
+from saccade.robots.files import read_json
+from saccade.robots.flat import flat_robot
+from saccade.robots.groups import Robot
+from saccade.robots.isaac_metadata import metadata_robot
+from saccade.robots.isaac_processor import processor_robot
+from saccade.robots.lerobot import lerobot_robot
+
+
+def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -> Robot:
+    """The robot that ``source`` describes; see :meth:`saccade.Normalizer.load`.
+
+    Raises:
+        FileNotFoundError, CheckpointError, InputError: As there.
+    """
+    where = "source" if isinstance(source, Mapping) else str(resolve(source))
+    try:
+        if isinstance(source, Mapping):
+            return _from_values(source, options, where)
+        return _from_path(Path(where), options)
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        # A file may contain anything in place of an object.
+        raise CheckpointError(f"{where}: statistics of an unknown form ({error!r})") from error
+
+
+def _from_path(path: Path, options: Options) -> Robot:
+    """The robot of one file, or of the first of `FILES` in a directory that has statistics."""
+    if not os.path.isdir(path):  # noqa: PTH112 (Path.is_dir raises OSError if a name is too long)
+        return _from_values(read_json(path), options, str(path))
+    for name, reader in FILES.items():
+        if (path / name).is_file():
+            found = reader(path, read_json(path / name), options)
+            if found is not None:
+                return found
+    raise CheckpointError(f"{path}: no statistics of states and actions; looked for {', '.join(FILES)}")
+
+
+def _processor(folder: Path, values: Mapping[str, Any], options: Options) -> Robot | None:
+    """Isaac-GR00T N1.6 and N1.7. The processor of another transformers model has no ``processor_kwargs``."""
+    if "processor_kwargs" not in values:
+        return None
+    where = str(folder / "processor_config.json")
+    ids = read_json(folder / "embodiment_id.json") if (folder / "embodiment_id.json").is_file() else {}
+    statistics = read_json(folder / "statistics.json")
+    return processor_robot(where, values["processor_kwargs"], statistics, ids, options)
+
+
+def _metadata(folder: Path, values: Mapping[str, Any], options: Options) -> Robot:
+    """Isaac-GR00T N1 and N1.5. The widths of the head are in the config."""
+    where = str(folder / "experiment_cfg" / "metadata.json")
+    config = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
+    return _from_values(values, options, where, _dims(config))
+
+
+def _own(folder: Path, values: Mapping[str, Any], options: Options) -> Robot | None:
+    """saccade's own policies, which have their statistics in the config."""
+    return _from_values(values, options, str(folder / "config.json")) if "policy_cfg" in values else None
+
+
+#: Files of a checkpoint that have statistics, in the order in which they are tried. A new layout is one more
+#: line.
+FILES: dict[str, Callable[[Path, Mapping[str, Any], Options], Robot | None]] = {
+    "policy_preprocessor.json": lerobot_robot,
+    "processor_config.json": _processor,
+    "experiment_cfg/metadata.json": _metadata,
+    "config.json": _own,
+}
+
+
+def _from_values(values: Mapping[str, Any], options: Options, where: str, dims: Dims = (None, None)) -> Robot:
+    """The robot of a mapping, or of the contents of a JSON file."""
+    if isinstance(values.get("policy_cfg"), Mapping):
+        statistics = values["policy_cfg"].get("statistics")
+        return flat_robot(statistics, options, where, _dims(values), embodiment_id=0)
+    entries = [entry for entry in values.values() if isinstance(entry, Mapping)]
+    if entries and all("statistics" in entry and "modalities" in entry for entry in entries):
+        return metadata_robot(values, options, where, dims)
+    if "statistics" in values and "modalities" in values:
+        tag = str(values.get("embodiment_tag", "new_embodiment"))
+        return metadata_robot({tag: values}, options, where, dims)
+    return flat_robot(values, options, where, dims)
+
+
+def _dims(config: Mapping[str, Any]) -> Dims:
+    """Widths of state and action of a head, from the config of a checkpoint."""
+    head = config.get("action_head_cfg")
+    if not isinstance(head, Mapping):
+        return None, None
+    return size_of(head.get("max_state_dim")), size_of(head.get("action_dim"))

@@ -1,0 +1,110 @@
+"""Reading runs of `saccade train` for the sweeps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from saccade._files import sha256_of
+from saccade.errors import InputError
+
+SETTINGS_FILE = "settings.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained policy, or one in training.
+
+    Attributes:
+        name: Of its directory.
+        directory: The run's directory.
+        settings: Contents of `settings.json`.
+        history: Contents of `history.json`.
+        point: Names and values of what the sweep varies.
+    """
+
+    name: str
+    directory: Path
+    settings: Mapping[str, Any]
+    history: Sequence[Mapping[str, float]]
+    point: Mapping[str, float]
+
+    @property
+    def seed(self) -> int:
+        """The training seed."""
+        return int(self.settings["seed"])
+
+    @property
+    def step(self) -> int:
+        """The last step of the training so far."""
+        return int(self.history[-1]["step"]) if self.history else 0
+
+    @property
+    def checkpoint_sha256(self) -> str:
+        """Hash of config and tensors, equal to `Policy.checkpoint_sha256`."""
+        from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE
+
+        return sha256_of(self.directory / CONFIG_FILE, self.directory / TENSOR_FILE)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the training is complete."""
+        return self.step == int(self.settings["steps"])
+
+
+def read_run(directory: Path, varied: Sequence[str]) -> Run:
+    """A run of `saccade train`.
+
+    Raises:
+        FileNotFoundError: There is none.
+        InputError: Its files are not what `saccade train` writes.
+    """
+    from saccade.sim.settings import CONFIG_FILE, PolicyConfig
+
+    if not (directory / SETTINGS_FILE).is_file():
+        raise FileNotFoundError(
+            f"{directory / SETTINGS_FILE}: no such file; expected a run of `saccade train`"
+        )
+    try:
+        settings = json.loads((directory / SETTINGS_FILE).read_text(encoding="utf-8"))
+        history_file = directory / "history.json"
+        history = json.loads(history_file.read_text(encoding="utf-8")) if history_file.exists() else []
+        backbone = PolicyConfig.from_file(directory / CONFIG_FILE).backbone
+        known = {**settings, **vars(backbone), "num_vl_tokens": backbone.num_tokens}
+        return Run(directory.name, directory, settings, history, {name: known[name] for name in varied})
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{directory}: not written by `saccade train`: {error}") from None
+
+
+def find_runs(directories: Iterable[Path], varied: Sequence[str]) -> list[Run]:
+    """All runs in directories of runs, sorted by what varies and then by seed.
+
+    A run that has not written its policy yet is skipped.
+
+    Raises:
+        FileNotFoundError: A directory does not exist, or none of them contains a run.
+    """
+    from saccade.sim.settings import TENSOR_FILE
+
+    found = []
+    for directory in directories:
+        if not directory.is_dir():
+            raise FileNotFoundError(f"{directory}: no such directory of policies")
+        written = sorted(path.parent for path in directory.glob(f"*/{SETTINGS_FILE}"))
+        found += [read_run(path, varied) for path in written if (path / TENSOR_FILE).is_file()]
+    if not found:
+        raise FileNotFoundError(f"{', '.join(map(str, directories))}: contain no runs of `saccade train`")
+    return sorted(found, key=lambda run: (*run.point.values(), run.seed))
+
+
+def describe_run(run: Run) -> dict[str, Any]:
+    """The columns of the table that identify a policy."""
+    return {
+        "policy": run.name,
+        **run.point,
+        "training_seed": run.seed,
+        "checkpoint_sha256": run.checkpoint_sha256,
+    }

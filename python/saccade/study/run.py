@@ -1,0 +1,324 @@
+"""Resumable work: a study is many small cells, each kept as soon as it is done, spread over processes."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import platform
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import joblib
+import pandas as pd
+
+import saccade
+from saccade._files import sha256_of, writable_directory, write_json
+from saccade.environment import cpu_name
+from saccade.errors import InputError, SaccadeError
+from saccade.study.cell import Cell, Rows, digest, plain, sortable
+from saccade.study.study import Study
+from saccade.study.table import (
+    Provenance,
+    provenance_path,
+    read_provenance,
+    read_table,
+    table_path,
+    write_provenance,
+    write_table,
+)
+
+BACKENDS = ("loky", "ray")
+ROUND = 4  # cells a worker between two looks at what Ray has done
+RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld", "scikit-learn")
+
+
+class StudyError(SaccadeError):
+    """Some cells of a study failed; those that are done are kept, and the next run tries the others again."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What came of a cell: rows, or an error and no rows."""
+
+    cell: Cell
+    rows: Rows
+    seconds: float
+    error: str | None = None
+
+
+#: Called after each cell with what came of it, the number of cells done or failed so far, and of all.
+OnDone: TypeAlias = Callable[[Finished, int, int], None]
+
+
+def silent(finished: Finished, done: int, total: int) -> None:
+    """An `OnDone` that says nothing."""
+
+
+def run(
+    study: Study, out: Path, *, backend: str = "loky", jobs: int = 1, on_done: OnDone = silent
+) -> pd.DataFrame:
+    """Works through all stages of a study.
+
+    Args:
+        study: what is measured.
+        out, backend, jobs, on_done: as in `run_cells`.
+
+    Returns:
+        The table.
+
+    Raises:
+        InputError, StudyError: as `run_cells`.
+    """
+    stage: Study | None = study.begin(out)
+    while stage is not None:
+        table = run_cells(
+            stage.name,
+            stage.cells(),
+            stage.measure,
+            out,
+            settings=stage.settings(),
+            backend=backend,
+            jobs=jobs,
+            on_done=on_done,
+            expected=stage.num_cells,
+        )
+        stage = stage.then(table)
+    return table
+
+
+def run_cells(
+    study: str,
+    cells: Sequence[Cell],
+    work: Callable[[Cell], Rows],
+    out: Path,
+    *,
+    settings: Mapping[str, Any],
+    backend: str = "loky",
+    jobs: int = 1,
+    on_done: OnDone = silent,
+    expected: int = 0,
+) -> pd.DataFrame:
+    """Works through the cells that are not done yet; a run that was killed goes on where it was.
+
+    A finished cell is a file in `OUT/<study>/cells`. After each, `OUT/<study>.csv` (rows of all finished
+    cells, sorted by key, with the columns that `work` returned and `settings_sha256`, `saccade` and `cpu`)
+    and `OUT/<study>.json` are written anew. Cells that lie there from an earlier run with the same settings
+    stay in the table, so a study can be widened by running it again with more cells.
+
+    Args:
+        study: names the table.
+        cells: all of them, done or not, with distinct keys.
+        work: a cell to its rows; values are text, numbers, booleans or None. Runs in other processes, so it
+            must be picklable: a function of a module, or a frozen dataclass with `__call__`.
+        out: directory of the tables.
+        settings: what all rows depend on, for JSON: hashes of checkpoints, engine, and so on. Not what only
+            says which cells there are.
+        backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
+        jobs: how many at once; with loky -1 takes all cores.
+        on_done: progress.
+        expected: how many cells there will be, where later calls bring more: until then the table is not
+            complete.
+
+    Returns:
+        The table, as `tables.read_table` gives it.
+
+    Raises:
+        InputError: an unknown backend, `jobs` out of range, keys that are not distinct, or `out` holds this
+            study with other settings.
+        StudyError: cells failed, each named with its error; or a worker process died. What is done is kept.
+    """
+    check_workers(backend, jobs)
+    if len({cell.key for cell in cells}) != len(cells):
+        raise InputError(f"cells: {study} has keys that occur twice")
+    store = Store(study, out, settings, cells, expected)
+    todo = [cell for cell in cells if cell.digest not in store.finished]
+    store.write()
+    marks = {"settings_sha256": digest(settings), "saccade": saccade.__version__}
+    for finished in spread(Guarded(work, marks), todo, backend, jobs):
+        store.add(finished)
+        on_done(finished, len(cells) - len(todo) + store.added, max(len(cells), expected))
+    if store.failed:
+        lines = [f"{finished.cell.name}: {finished.error}" for finished in store.failed[:3]]
+        more = f"; and {len(store.failed) - 3} more" if len(store.failed) > 3 else ""
+        raise StudyError(
+            f"{study}: {len(store.failed)} of {len(cells)} cells failed: {'; '.join(lines)}{more}"
+        )
+    return read_table(table_path(out, study))
+
+
+def check_workers(backend: str, jobs: int) -> None:
+    """Raises `InputError` for an unknown backend or a number of jobs that makes no sense."""
+    if backend not in BACKENDS:
+        raise InputError(f"backend: unknown name {backend!r}, expected one of {', '.join(BACKENDS)}")
+    if jobs < 1 and (backend, jobs) != ("loky", -1):
+        raise InputError(f"jobs: given {jobs}, expected at least 1, or with loky -1 for all cores")
+
+
+class Store:
+    """The files of one study.
+
+    Args:
+        study, out, settings, cells, expected: as in `run_cells`.
+
+    Raises:
+        InputError: `out` holds this study with other settings.
+    """
+
+    def __init__(
+        self, study: str, out: Path, settings: Mapping[str, Any], cells: Sequence[Cell], expected: int
+    ) -> None:
+        self.study = study
+        self.out = out
+        self.settings = plain(settings)
+        self.finished: dict[str, dict[str, Any]] = {}
+        self.failed: list[Finished] = []
+        self.added = 0
+        self._check_settings()
+        self.directory = writable_directory(out / study / "cells")
+        asked = {cell.key: cell.digest for cell in cells}
+        for path in self.directory.glob("*.json"):
+            if path.name.startswith("."):
+                continue  # half a file, of a run that was killed
+            record = read_record(path)
+            # One whose settings, or those of the study, have changed must not stand beside its successor.
+            if record is None or any(
+                row.get("settings_sha256") != digest(settings) for row in record["rows"]
+            ):
+                continue
+            kept = Cell(tuple(record["key"]), record["settings"])
+            if asked.get(kept.key, kept.digest) == kept.digest:
+                self.finished[kept.digest] = record
+        self.total = max(len({*self.finished, *asked.values()}), expected)
+
+    def _check_settings(self) -> None:
+        path = provenance_path(self.out, self.study)
+        if not path.exists():
+            return
+        before = read_provenance(path).settings
+        names = [name for name in {**before, **self.settings} if before.get(name) != self.settings.get(name)]
+        if names:
+            changes = [f"{name} {before.get(name)!r}, now {self.settings.get(name)!r}" for name in names]
+            raise InputError(
+                f"out: {self.out} holds the study {self.study} with other settings ({'; '.join(changes)}); "
+                "expected the same ones or another directory"
+            )
+
+    def add(self, finished: Finished) -> None:
+        """Keeps what came of a cell."""
+        self.added += 1
+        if finished.error is not None:
+            self.failed.append(finished)
+        else:
+            cell = finished.cell
+            record = plain(
+                {
+                    "key": list(cell.key),
+                    "settings": cell.settings,
+                    "seconds": round(finished.seconds, 3),
+                    "rows": finished.rows,
+                }
+            )
+            write_json(self.directory / f"{cell.digest}.json", record)
+            self.finished[cell.digest] = record
+        self.write()
+
+    def write(self) -> None:
+        """Writes table and provenance from the finished cells."""
+        records = sorted(self.finished.values(), key=lambda record: sortable(record["key"]))
+        write_table([row for record in records for row in record["rows"]], table_path(self.out, self.study))
+        provenance = Provenance(
+            study=self.study,
+            table_sha256=sha256_of(table_path(self.out, self.study)),
+            settings=self.settings,
+            done=len(records),
+            total=self.total,
+            failed=[{"key": list(one.cell.key), "error": one.error} for one in self.failed],
+            cell_seconds=round(sum(record["seconds"] for record in records), 1),
+            packages=packages(),
+            machine={
+                "cpu": cpu_name(),
+                "system": platform.platform(),
+                "python": platform.python_version(),
+            },
+        )
+        write_provenance(provenance, provenance_path(self.out, self.study))
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """A cell's file; None if it holds something else, so that the cell is done anew."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        hash(tuple(record["key"]))
+        settings, rows, seconds = (record[name] for name in ("settings", "rows", "seconds"))
+    except (ValueError, KeyError, TypeError):
+        return None
+    fits = isinstance(settings, dict) and isinstance(rows, list) and isinstance(seconds, (int, float))
+    return dict(record) if fits and all(isinstance(row, dict) for row in rows) else None
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """`work` that returns its exceptions, with what is written into every row."""
+
+    work: Callable[[Cell], Rows]
+    marks: Mapping[str, str]
+
+    def __call__(self, cell: Cell) -> Finished:
+        """What came of the cell."""
+        start = time.perf_counter()
+        try:
+            rows = plain(self.work(cell))  # what has no form in JSON is this cell's error
+        except Exception as error:  # one bad cell must not end the others; it is raised when they are done
+            spent = time.perf_counter() - start
+            return Finished(cell, [], spent, f"{type(error).__name__}: {error}")
+        marks = {**self.marks, "cpu": cpu_name()}
+        return Finished(cell, [{**row, **marks} for row in rows], time.perf_counter() - start)
+
+
+def spread(
+    work: Callable[[Cell], Finished], cells: Sequence[Cell], backend: str, jobs: int
+) -> Iterable[Finished]:
+    """Works through cells in processes, in any order; one job works in this process.
+
+    Raises:
+        StudyError: a worker process died.
+    """
+    todo = [joblib.delayed(work)(cell) for cell in cells]
+    if backend == "ray":
+        from ray.exceptions import RayError
+        from ray.util.joblib import register_ray
+
+        register_ray()
+        # Through joblib, Ray gives no result before the last one, so it gets a few cells a worker at a time.
+        size = ROUND * jobs
+        rounds = [todo[start : start + size] for start in range(0, len(todo), size)]
+        for several in rounds:
+            try:
+                yield from joblib.Parallel(n_jobs=jobs, backend=backend, batch_size=1)(several)
+            except RayError as error:
+                reason = str(error).strip().splitlines()[-1]
+                raise StudyError(f"ray could not go on: {reason}; what is done is kept") from None
+        return
+    parallel = joblib.Parallel(n_jobs=jobs, backend=backend, return_as="generator_unordered", batch_size=1)
+    try:
+        yield from parallel(todo)
+    except BrokenProcessPool:
+        raise StudyError(
+            "a worker process died, perhaps for want of memory; what is done is kept, run again to go on"
+        ) from None
+
+
+@functools.cache
+def packages() -> dict[str, str]:
+    """Versions of saccade and of what computes beside it, as far as it is installed."""
+    found = {"saccade": saccade.__version__}
+    for name in RECORDED_PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

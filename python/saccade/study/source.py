@@ -1,0 +1,186 @@
+"""Where a study's observations come from: the simulator or a recording, behind one interface."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade.cli.arguments import check_tasks
+from saccade.config import HeadConfig
+from saccade.errors import InputError
+from saccade.head import ActionHead
+from saccade.intervention import Intervention
+from saccade.observation import Observation
+
+Float32Array = npt.NDArray[np.float32]
+
+
+class Source(ABC):
+    """Observations for a checkpoint.
+
+    A source is a frozen dataclass: it is pickled, and results are cached by its value. A unit is an episode,
+    named by task and seed, or a row of a file, named by `recording.TASK` and its number.
+
+    Attributes:
+        closed_loop: Whether episodes can be run, so that success is known.
+        checkpoint: Path of the checkpoint.
+    """
+
+    closed_loop: ClassVar[bool]
+    checkpoint: str
+
+    @property
+    def engine_name(self) -> str:
+        """What computes the head."""
+        return "rust"
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """What a study's settings say of checkpoint and observations, as JSON has it."""
+
+    @property
+    @abstractmethod
+    def units(self) -> list[tuple[str, int]]:
+        """All that there are."""
+
+    @property
+    @abstractmethod
+    def config(self) -> HeadConfig:
+        """Of the head."""
+
+    @abstractmethod
+    def head(self, precision: str = "float32") -> ActionHead:
+        """The head; loaded once in a process for each precision."""
+
+    @property
+    def future_tokens(self) -> Float32Array:
+        """The learned future tokens, `(N, width)`; N is 0 where the checkpoint has none."""
+        return self.head().future_tokens
+
+    @abstractmethod
+    def observed(self, task: str, seed: int) -> Observation:
+        """What the unchanged head is given: all observations of an episode, or one row of the file.
+
+        Returns:
+            At least one row, with noise.
+        """
+
+    @abstractmethod
+    def rng(self, task: str, seed: int) -> np.random.Generator:
+        """The random numbers of an episode, apart from the noise of its chunks: the same for every arm."""
+
+    @abstractmethod
+    def actions(
+        self, observation: Observation, intervention: Intervention | None, context: Any = None
+    ) -> Float32Array:
+        """Chunks as they are compared, `(batch, draws, horizon, action_dim)`.
+
+        Args:
+            observation: one row, with noise.
+            intervention: what is changed inside the head.
+            context: of the observation, from `encode`; None computes it.
+        """
+
+    @abstractmethod
+    def encode(self, observation: Observation) -> Any:
+        """What `actions` takes as `context`."""
+
+    @abstractmethod
+    def comparable(self, chunk: Float32Array) -> Float32Array:
+        """Actions of the head as they are compared: those of the robot, or the head's own."""
+
+    @abstractmethod
+    def outcome(self, task: str, seed: int, intervention: Intervention | None) -> dict[str, Any]:
+        """Columns of the table: success and length of an episode under an intervention; success is None in an
+        open loop.
+        """
+
+    @abstractmethod
+    def labels(self, task: str, seed: int) -> dict[str, Any]:
+        """Columns that say more of a unit than task and seed."""
+
+
+def episode_rng(task: str, seed: int) -> np.random.Generator:
+    """The random numbers of an episode, apart from the noise of its chunks."""
+    return np.random.default_rng([seed, *task.encode()])
+
+
+@dataclass(frozen=True, eq=False)
+class Unchanged:
+    """What the unchanged head does on the observations of a unit.
+
+    Attributes:
+        observations: One row each.
+        contexts: Of the observations.
+        actions: `(observations, draws, horizon, action_dim)`, as they are compared.
+    """
+
+    observations: Sequence[Observation]
+    contexts: Sequence[Any]
+    actions: Float32Array
+
+
+@functools.lru_cache(maxsize=1)
+def unchanged(source: Source, task: str, seed: int) -> Unchanged:
+    """The unchanged head on a unit; kept for the next arm."""
+    rows = list(source.observed(task, seed).rows())
+    contexts = [source.encode(one) for one in rows]
+    chunks = [source.actions(one, None, context) for one, context in zip(rows, contexts, strict=True)]
+    return Unchanged(rows, contexts, np.concatenate(chunks))
+
+
+def changed(source: Source, task: str, seed: int, intervention: Intervention | None) -> Float32Array:
+    """`Unchanged.actions` with something changed inside the head, from equal noise."""
+    before = unchanged(source, task, seed)
+    if intervention is None:
+        return before.actions
+    pairs = zip(before.observations, before.contexts, strict=True)
+    return np.concatenate([source.actions(one, intervention, context) for one, context in pairs])
+
+
+def source_of(args: argparse.Namespace, *refused: str) -> Source:
+    """The source that the arguments ask for, checked.
+
+    Args:
+        args: as `saccade.cli.arguments.add_rollout_arguments` declares them.
+        refused: options of the study that cannot be used with a file of features.
+
+    Raises:
+        InputError: an argument is wrong, or cannot be combined with another one.
+        FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
+        GraphicsError: the simulator is needed and cannot draw here.
+    """
+    # Each needs packages that the other does not.
+    if args.features is not None:
+        from saccade.study.recording import recording_of
+
+        return recording_of(args, *refused)
+    if args.config is not None:
+        raise InputError("--config: only with --features; a policy of the simulator has its own")
+    return simulator_of(args)
+
+
+def simulator_of(args: argparse.Namespace) -> Any:
+    """The simulator, for studies that need what only it knows; raises as `source_of`."""
+    if args.features is not None:
+        raise InputError(
+            "--features: this study needs what only the simulator knows; cuts, patching, gradients, "
+            "n-runtime and fast take a file of features"
+        )
+    from saccade.sim import graphics
+    from saccade.sim.tasks import check_evaluation_seeds
+
+    episodes = args.default_episodes if args.episodes is None else args.episodes
+    seeds = check_evaluation_seeds(args.seed, episodes)
+    check_tasks(args.tasks or ())
+    graphics.check()  # before MuJoCo is imported, which ends in a traceback without OpenGL
+    from saccade.study.simulator import simulator
+
+    return simulator(args.checkpoint, args.tasks, seeds, getattr(args, "engine", None) or "rust")
