@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def test_weights_that_are_not_finite_are_refused(
     tensors = tensors_of(tiny)
     tensors[name] = tensors[name].copy()
     tensors[name][index] = bad
-    shown = f"({index[0]},)" if len(index) == 1 else str(index)
+    shown = re.escape(f"({index[0]},)" if len(index) == 1 else str(index))
     message = f"{name}: expected finite weights, got .* at index {shown}".replace("(", r"\(").replace(
         ")", r"\)"
     )
@@ -109,7 +110,7 @@ def test_inputs_too_large_for_the_arithmetic_are_an_error(head: saccade.ActionHe
 
 def test_a_cross_attention_that_is_not_finite_is_an_error() -> None:
     weights = {name: np.full((8, 8), 1e30, np.float32) for name in ("to_q", "to_k", "to_v", "to_out.0")}
-    tensors = {f"{name}.weight": weight for name, weight in weights.items()}
+    tensors: dict[str, Any] = {f"{name}.weight": weight for name, weight in weights.items()}
     tensors |= {f"{name}.bias": np.zeros(8, np.float32) for name in weights}
     layer = saccade.CrossAttention(tensors, 2)
     keys = layer.project(np.ones((1, 3, 8), np.float32))

@@ -1,7 +1,4 @@
-"""A signal ends a call that is under way, whatever its size, and the head can be used afterwards.
-
-How soon is counted in the work that was done since, not in time: the handler asks how far the call has come.
-"""
+"""A signal ends a call that is under way, whatever its size, and the head can be used afterwards."""
 
 from __future__ import annotations
 
@@ -17,10 +14,10 @@ import pytest
 
 import saccade
 
-DEMO = importlib.resources.files("saccade") / "sim" / "demo"
+DEMO = str(importlib.resources.files("saccade") / "sim" / "demo")
 
 
-class Stopped(Exception):  # noqa: N818 - what a handler raises is not an error
+class Stopped(Exception):
     """What the signal's handler raises."""
 
 
@@ -104,11 +101,15 @@ def test_what_was_stopped_is_not_remembered(state: Any) -> None:
     fresh = saccade.ActionHead.load(DEMO, num_threads=1)
     context = encoded(fresh)
     actions = np.zeros((1, 16, 4), np.float32)
+
+    def all_buckets() -> None:
+        for bucket in range(1000):
+            fresh.velocity(context, state, 0, actions, bucket)
+        threading.Event().wait()
+
     for delay in np.geomspace(1e-4, 2e-2, 20):
         with pytest.raises(Stopped), stopped_after(float(delay)):
-            for bucket in range(1000):
-                fresh.velocity(context, state, 0, actions, bucket)
-            threading.Event().wait()
+            all_buckets()
     other = saccade.ActionHead.load(DEMO, num_threads=1)
     theirs = encoded(other)
     for bucket in range(200):

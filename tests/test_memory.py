@@ -1,4 +1,4 @@
-"""Memory that the system refuses: each call ends in an error that says how much was asked for, never in an abort.
+"""Memory that the system refuses: each call ends in an error that says how much was asked for.
 
 Each case runs in a process of its own, with little more address space than it has taken already.
 """
@@ -47,14 +47,15 @@ def refused(call):
     try:
         call()
     except MemoryError as error:
-        assert any(word in str(error) for word in ("bytes", "does not fit in memory", "Unable to allocate")), error
+        expected = ("bytes", "does not fit in memory", "Unable to allocate")
+        assert any(words in str(error) for words in expected), error
     except saccade.InputError as error:
         assert "memory" in str(error) or "bytes" in str(error), error
     else:
         raise AssertionError("it was not refused")
 """
 
-# What is prepared before memory is limited, the limit in MB above what is in use, and the call that is refused.
+# What is prepared before memory is limited, the limit in MB above what is in use, the call that is refused.
 CASES = {
     "encode a large batch": (
         "features = np.zeros((2000, 64, config.context_dim), np.float32)",
@@ -130,7 +131,7 @@ CASES = {
         "head.trace(kept, state, 0, seed=0, num_steps=200, record=('attention', 'hidden'))",
     ),
     "copies of vl_embs": (
-        "kept = head.encode(np.zeros((4, 30_000, config.context_dim), np.float32))",
+        "kept = head.encode(np.zeros((4000, 30, config.context_dim), np.float32))",
         2,
         "[kept.vl_embs for _ in range(20)]",
     ),
