@@ -87,7 +87,7 @@ def test_all_extras_that_are_needed_are_named(checkout: Path) -> None:
     with pytest.raises(MissingExtraError, match=re.escape("--editable '.[sim]'")):
         _extras.require("rich", "mujoco")  # sim includes cli
     with pytest.raises(MissingExtraError, match=re.escape("--editable '.[study]'")):
-        _extras.require("rich", "mujoco", "jinja2")
+        _extras.require("rich", "mujoco", "pandas")
 
 
 def test_the_path_of_the_checkout_is_relative_to_the_working_directory(

@@ -33,7 +33,7 @@ from saccade.study.study import Study
 from saccade.study.table import Provenance
 
 if TYPE_CHECKING:
-    from saccade.sim.train import TrainingSettings
+    from saccade.sim.training_settings import TrainingSettings
 
 EPILOG = """\
 Reads finished runs of `saccade train` (--policies), which must differ in nothing else, or trains them
@@ -178,7 +178,7 @@ class Sweep(Study):
     @classmethod
     def plan(cls, args: argparse.Namespace) -> list[Planned]:
         """The runs to be trained, checked before anything is trained."""
-        from saccade.sim.train import TrainingSettings
+        from saccade.sim.training_settings import TrainingSettings
 
         steps = TrainingSettings.steps if args.training_steps is None else args.training_steps
         weights = getattr(args, "alignment_weights", (0.0,))
