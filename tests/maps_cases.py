@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 
 import saccade
-from saccade.maps.inputs import Inputs
 from saccade.maps.layout import parse_layout
 from saccade.maps.occlusion import DroppedPositions, Occlusion
 from saccade.maps.record import Maps, Selection
+from saccade.maps.view import View
+from saccade.observation import Observation
 from saccade.sim.policy import DEMO_CHECKPOINT
 
 FUTURE = 3
@@ -62,22 +63,20 @@ def one_hot_maps(
         np.zeros((1, config.state_dim), np.float32),
     )
     noise = np.zeros((1, ACTIONS, config.encoder_action_dim), np.float32)
+    observation = Observation(features, state, np.array([0]), noise)
     gradient = np.arange(16 * 16 * 3, dtype=np.uint32).reshape(16, 16, 3) % 251
     pictures = {"left": gradient.astype(np.uint8), "top": np.full((8, 24, 3), 200, np.uint8)}
     change = {"left": np.array([[0, 1], [0, 0]], np.float32), "top": np.array([[0, 0, 0.25]], np.float32)}
     return Maps(
         checkpoint={"name": "by-hand", "sha256": "0" * 64},
         config=config,
-        inputs=Inputs(
+        view=View(
             title="maps by hand <&>",
             source={"kind": "test"},
-            features=features,
-            state=state,
-            embodiment_id=0,
-            noise=noise,
+            observation=observation,
             layout=layout,
             images=pictures if images else {},
-            occluder=DroppedPositions(features, state, 0, noise),
+            occluder=DroppedPositions(observation),
         ),
         selection=Selection(blocks=(0, 1), steps=steps, heads=(0, 1), shown_heads=(0, 1)),
         rows=rows,

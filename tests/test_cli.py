@@ -204,7 +204,9 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
     arguments = {"demos": ["--out", "out"], "train": ["--demos", str(tmp_path), "--out", "out"]}
     (tmp_path / "reach").mkdir()
     (tmp_path / "reach" / "recording.json").write_text("{}")
-    done = saccade_command(name, *arguments.get(name, ["report", "."] if name == "study" else []), code=BARE)
+    arguments |= {"study": ["cuts"], "study report": ["."], "study --features": ["--features", "looks.npz"]}
+    words = ["study", "cuts"] if name == "study --features" else name.split()
+    done = saccade_command(*words, *arguments.get(name, []), code=BARE)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1
     extras = {extra for extra, modules in _extras.EXTRAS.items() if set(modules) & set(cli.NEEDS[name])}

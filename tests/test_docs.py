@@ -115,6 +115,34 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), target
 
 
+def tree_of_architecture() -> set[Path]:
+    """The files and folders that the tree in ARCHITECTURE.md names; an entry lies in the last folder above it
+    that is indented less.
+    """
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    block = text.split("```")[1]
+    found: set[Path] = set()
+    above: list[tuple[int, Path]] = []
+    for line in filter(str.strip, block.splitlines()):
+        indent = len(line) - len(line.lstrip())
+        above = [(depth, folder) for depth, folder in above if depth < indent]
+        base = above[-1][1] if above else Path()
+        names = [base / name for name in re.split(r"\s{2,}", line.strip())[0].split()]
+        found |= set(names)
+        above.append((indent, names[0]))
+    return found
+
+
+def test_architecture_names_every_folder_and_nothing_that_is_not_there() -> None:
+    named = tree_of_architecture()
+    assert [str(path) for path in sorted(named) if not (ROOT / path).exists()] == []
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    files = [Path(name) for name in listed.stdout.split("\0") if name]
+    # The folders of a study hold what its commands wrote.
+    folders = {file.parent for file in files if file.parts[0] != "studies"} - {Path()}
+    assert [str(folder) for folder in sorted(folders - named)] == []
+
+
 def test_pictures_of_the_readme_are_made_from_what_commands_write(tmp_path: Path) -> None:
     shades = np.linspace(0, 255, 9).astype(np.uint8)
     frames = [np.full((64, 96, 3), shade, np.uint8) for shade in shades]

@@ -29,11 +29,14 @@ from saccade.cli import main
 from saccade.cli.attention import show
 from saccade.errors import InputError, ShapeError
 from saccade.maps import occlusion, record
-from saccade.maps.inputs import Inputs, LayoutOptions, from_file, from_simulator
+from saccade.maps.drawing import ranges
 from saccade.maps.layout import Camera, parse_layout
+from saccade.maps.notes import NO_FUTURE, NO_IMAGES
 from saccade.maps.occlusion import BlankedPixels, DroppedPositions, cell_for, measure, places_of
-from saccade.maps.sheet import DOTS_PER_INCH, NO_FUTURE, NO_IMAGES, WIDTH, Sheet, ranges, write_sheet
+from saccade.maps.sheet import DOTS_PER_INCH, WIDTH, Sheet, write_sheet
 from saccade.maps.summary import Overlap, entropy, overlap, shuffle, summarize
+from saccade.maps.view import LayoutOptions, View, from_file, from_simulator
+from saccade.observation import Observation
 from saccade.reference import ActionHead as ReferenceHead
 from saccade.sim import graphics
 from saccade.sim.environment import TaskEnvironment
@@ -123,7 +126,7 @@ TINY_LAYOUT = parse_layout("text:2,image:2x3=left,image:1x2=top,text:1", 11)
 def tiny_occluder() -> DroppedPositions:
     given = load_released("n15_tiny")
     return DroppedPositions(
-        given.backbone_features[:1], given.state[:1], int(given.embodiment_id[0]), given.noise[:1]
+        Observation(given.backbone_features[:1], given.state[:1], given.embodiment_id[:1], given.noise[:1])
     )
 
 
@@ -134,8 +137,11 @@ class Blind:
         self.head = head
         self.cut = Intervention(cut=[(group, "vl") for group in ("state", "future", "action")])
 
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        return self.head(*args, **options, intervention=self.cut)
+    def encode(self, *args: Any, **options: Any) -> Any:
+        return self.head.encode(*args, **options)
+
+    def sample(self, *args: Any, **options: Any) -> Any:
+        return self.head.sample(*args, **options, intervention=self.cut)
 
 
 def no_noise(count: int) -> Any:
@@ -217,7 +223,7 @@ def head() -> saccade.ActionHead:
 
 
 @pytest.fixture(scope="module")
-def pushed(policy: Policy) -> Inputs:
+def pushed(policy: Policy) -> View:
     return from_simulator(policy, "push", 3, 0)
 
 
@@ -241,15 +247,15 @@ def test_the_observation_is_that_of_the_rollout(policy: Policy) -> None:
 
 
 def test_blanking_a_picture_of_one_colour_changes_nothing(
-    policy: Policy, head: saccade.ActionHead, pushed: Inputs
+    policy: Policy, head: saccade.ActionHead, pushed: View
 ) -> None:
     grey = np.full_like(pushed.images["top"], 90)
     observation = {
         "images": {**pushed.images, "top": grey},
-        "proprio": policy.config.state.restore(pushed.state[0]),
+        "proprio": policy.config.state.restore(pushed.observation.state[0]),
         "instruction": pushed.source["instruction"],
     }
-    occluder = BlankedPixels(policy, observation, pushed.noise)
+    occluder = BlankedPixels(policy, observation, pushed.observation)
     found = measure(head, pushed.layout, occluder, lambda count: np.zeros((count, 16, 4), np.float32), cell=2)
     assert not found.change["top"].any()
     assert found.change["left"].max() > 0.01
@@ -257,7 +263,12 @@ def test_blanking_a_picture_of_one_colour_changes_nothing(
     blanked = pushed.images["left"].copy()
     blanked[32:, 32:] = np.rint(blanked.mean(axis=(0, 1)))
     chunks = [
-        head(policy.features({**observation, "images": images}), pushed.state, 0, noise=pushed.noise)
+        head(
+            policy.features({**observation, "images": images}),
+            pushed.observation.state,
+            0,
+            noise=pushed.observation.noise,
+        )
         for images in (observation["images"], {**observation["images"], "left": blanked})
     ]
     expected = float(np.abs(np.asarray(chunks[1]) - np.asarray(chunks[0])).mean())
@@ -283,7 +294,7 @@ def written(path: Path, arrays: dict[str, Any]) -> Path:
     return path
 
 
-def taken(path: Path, **options: Any) -> Inputs:
+def taken(path: Path, **options: Any) -> View:
     config = saccade.HeadConfig.from_dict(load_released("n15_single_view").config)
     return from_file(path, config, row=0, options=LayoutOptions(**options), seed=5)
 
@@ -291,9 +302,9 @@ def taken(path: Path, **options: Any) -> Inputs:
 def test_a_file_of_features(tmp_path: Path) -> None:
     arrays = feature_arrays()
     found = taken(written(tmp_path / "f.npz", arrays))
-    np.testing.assert_array_equal(found.features, arrays["backbone_features"])
-    np.testing.assert_array_equal(found.noise, arrays["noise"])
-    assert found.embodiment_id == arrays["embodiment_id"][0]
+    np.testing.assert_array_equal(found.observation.backbone_features, arrays["backbone_features"])
+    np.testing.assert_array_equal(found.observation.noise, arrays["noise"])
+    assert found.observation.embodiment_id == arrays["embodiment_id"][0]
     assert found.layout.cameras == (Camera("camera 1", 20, 16, 16),)
     assert found.images["camera 1"].shape == (32, 32, 3)
     by_hand = taken(tmp_path / "f.npz", text="text:20,image:16x16=left,text:*")
@@ -302,7 +313,8 @@ def test_a_file_of_features(tmp_path: Path) -> None:
     drawn = taken(written(tmp_path / "g.npz", {f"_in.{name}": array for name, array in arrays.items()}))
     assert drawn.images == {}
     expected = np.random.default_rng(5).standard_normal((16, 32), dtype=np.float32)
-    np.testing.assert_array_equal(drawn.noise[0], expected)
+    assert drawn.observation.noise is not None
+    np.testing.assert_array_equal(drawn.observation.noise[0], expected)
 
 
 def test_safetensors_with_bfloat16_and_token_strings(tmp_path: Path) -> None:
@@ -312,7 +324,9 @@ def test_safetensors_with_bfloat16_and_token_strings(tmp_path: Path) -> None:
     names = [f"<{place}>" for place in range(296)]
     save_torch_file(tensors, tmp_path / "f.safetensors", metadata={"tokens": json.dumps(names)})
     found = taken(tmp_path / "f.safetensors")
-    np.testing.assert_array_equal(found.features, tensors["backbone_features"].float().numpy())
+    np.testing.assert_array_equal(
+        found.observation.backbone_features, tensors["backbone_features"].float().numpy()
+    )
     assert found.layout.tokens[0].name == "<0>"
 
 
@@ -330,9 +344,9 @@ def test_a_row_of_a_batch(tmp_path: Path) -> None:
     config = saccade.HeadConfig.from_dict(given.config)
     path = written(tmp_path / "f.npz", arrays)
     found = from_file(path, config, row=1, options=LayoutOptions(), seed=0)
-    np.testing.assert_array_equal(found.features, given.backbone_features[1:])
-    np.testing.assert_array_equal(found.state, given.state[1:])
-    assert found.embodiment_id == given.embodiment_id[1]
+    np.testing.assert_array_equal(found.observation.backbone_features, given.backbone_features[1:])
+    np.testing.assert_array_equal(found.observation.state, given.state[1:])
+    assert found.observation.embodiment_id == given.embodiment_id[1]
     assert found.layout.cameras == (Camera("camera 1", 2, 2, 2),)
     assert found.layout.parts()["pad"].tolist() == [0]
     with pytest.raises(InputError, match="--row: given 2"):
@@ -350,7 +364,7 @@ FILES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"backbone_features": np.zeros((296, 128), np.float32)}, ShapeError, "backbone_features: shape"),
     ({"backbone_features": np.zeros((0, 296, 128), np.float32)}, InputError, "expected no empty axis"),
     ({"backbone_features": np.zeros((1, 296, 128), np.int64)}, InputError, "floating point"),
-    ({"input_ids": None}, InputError, "neither input_ids nor image_mask; --layout"),
+    ({"input_ids": None}, InputError, "neither input_ids nor image_mask; give the positions"),
     ({"input_ids": np.zeros((1, 295), np.int64)}, ShapeError, r"input_ids: shape .* expected \(1, 296\)"),
     ({"input_ids": np.zeros((1, 296))}, InputError, "input_ids: expected integers"),
     ({"image_mask": np.full((1, 296), 2)}, InputError, "image_mask: expected booleans"),
@@ -387,21 +401,22 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 # What is recorded.
 
 
-def test_maps_are_those_of_the_reference(head: saccade.ActionHead, pushed: Inputs) -> None:
+def test_maps_are_those_of_the_reference(head: saccade.ActionHead, pushed: View) -> None:
     selection = record.Selection(blocks=(0, 3), steps=(1,), heads=(0, 2), shown_heads=())
     rows, attention = record.look(head, pushed, selection)
     assert rows == {"state": slice(0, 1), "future": slice(1, 33), "action": slice(33, 49)}
     assert list(attention) == [(1, 0), (1, 3)]
+    assert pushed.observation.noise is not None
     reference = ReferenceHead.load(DEMO_CHECKPOINT, dtype=torch.float64)
-    tokens = record.random_tokens(DEMO_CHECKPOINT, seed=4)
+    tokens = record.random_tokens(head.future_tokens, seed=4)
     other = record.look_redrawn(head, pushed, selection, tokens)
     for intervention, found in ((None, attention), (Intervention(future_tokens=tokens), other)):
         with torch.no_grad():
             expected = reference.trace(
-                reference.encode(torch.from_numpy(pushed.features.astype(np.float64))),
-                torch.from_numpy(pushed.state.astype(np.float64)),
+                reference.encode(torch.from_numpy(pushed.observation.backbone_features.astype(np.float64))),
+                torch.from_numpy(pushed.observation.state.astype(np.float64)),
                 torch.tensor([0]),
-                noise=torch.from_numpy(pushed.noise.astype(np.float64)),
+                noise=torch.from_numpy(pushed.observation.noise.astype(np.float64)),
                 intervention=intervention,
             ).attention
         for place, maps in found.items():
@@ -412,10 +427,10 @@ def test_maps_are_those_of_the_reference(head: saccade.ActionHead, pushed: Input
 
 def test_random_tokens_have_the_lengths_of_the_learned_ones() -> None:
     learned = read_tensors(DEMO_CHECKPOINT, "action_head.future_tokens.")["weight"]
-    drawn = record.random_tokens(DEMO_CHECKPOINT, seed=0)
+    drawn = record.random_tokens(learned, seed=0)
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), np.linalg.norm(learned, axis=1), rtol=1e-5)
     assert np.abs((drawn * learned).sum(axis=1)).max() < 0.6 * np.square(learned).sum(axis=1).min()
-    np.testing.assert_array_equal(drawn, record.random_tokens(DEMO_CHECKPOINT, seed=0))
+    np.testing.assert_array_equal(drawn, record.random_tokens(learned, seed=0))
 
 
 def test_summaries_of_maps_made_by_hand() -> None:
@@ -500,7 +515,7 @@ def texts(figure: Figure) -> str:
 def test_the_sheet_says_what_is_missing() -> None:
     without = texts(Sheet(one_hot_maps(future_tokens=0, images=False)).draw())
     assert record.CAVEAT in without
-    assert record.BESIDE in without
+    assert record.OCCLUSION in without
     assert NO_FUTURE in without
     assert "one by one" not in without
     assert "maps are drawn on white" in without
@@ -533,7 +548,7 @@ def test_without_image_tokens_there_is_no_occlusion_map(
     assert {entry["rank_correlation"] for entry in found["agreement"]} == {None}
     page = (tmp_path / "out/page.html").read_text()
     assert NO_IMAGES in page
-    assert record.BESIDE not in page
+    assert record.OCCLUSION not in page
 
 
 def test_ranges() -> None:
@@ -566,7 +581,7 @@ def test_the_command_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[st
     }
     assert found["checkpoint"]["sha256"] == Policy.load().checkpoint_sha256()
     assert found["selection"]["blocks"] == [1, 2]
-    assert found["caveat"] == f"{record.CAVEAT} {record.BESIDE}"
+    assert found["caveat"] == f"{record.CAVEAT} {record.OCCLUSION}"
     assert {(entry["step"], entry["block"]) for entry in found["summaries"]} == {
         (0, 1),
         (0, 2),
@@ -623,7 +638,7 @@ def test_the_table_keeps_the_names_of_cameras(tmp_path: Path, capsys: pytest.Cap
     names = ("the camera at the left wrist [bold]", "the camera that looks down from above the table")
     layout = parse_layout(f"text:1,image:2x2={names[0]},image:1x3={names[1]},special:1", 9)
     maps = one_hot_maps()
-    maps = dataclasses.replace(maps, inputs=dataclasses.replace(maps.inputs, layout=layout))
+    maps = dataclasses.replace(maps, view=dataclasses.replace(maps.view, layout=layout))
     show(maps, {"summaries": maps.summaries}, tmp_path)
     shown = capsys.readouterr().out
     assert all(name in shown for name in names)  # more than 80 letters, and no markup

@@ -20,8 +20,10 @@ from saccade.reference import ActionHead
 from saccade.sim import graphics
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.study.questions import cuts, patching
+from saccade.study.questions import cuts
 from saccade.study.questions.cuts import ALL_ARMS, ARMS
+from saccade.study.questions.cuts_section import arm_results
+from saccade.study.questions.patching_section import GROUPS, KINDS
 from saccade.study.simulator import Simulator, head_of
 from saccade.study.source import changed, episode_rng, unchanged
 from saccade.study.table import read_provenance, read_table
@@ -184,13 +186,13 @@ def test_without_future_tokens_their_arms_are_not_measured(
 def test_patching_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--tasks", "push,drawer-open", "--episodes", "2", "--out", str(tmp_path)]
     assert study("patching", *arguments) == 0
-    assert "Control, all rows in all blocks: a share of 1.0000, as it must be." in capsys.readouterr().out
+    assert "Control, all rows in all blocks: a share of 1.0000, as expected." in capsys.readouterr().out
     table = read_table(tmp_path / "patching.csv")
     blocks = head_of(CHECKPOINT).config.num_layers
     counts = table[table["note"].isna()].groupby(["kind", "task"]).size().to_dict()
     # Every group, in each block and in all; no other task has the drawer.
-    each = 2 * len(patching.GROUPS) * (blocks + 1)
-    assert counts == {(kind, "push"): each for kind in patching.KINDS} | {
+    each = 2 * len(GROUPS) * (blocks + 1)
+    assert counts == {(kind, "push"): each for kind in KINDS} | {
         ("layout", "drawer-open"): each,
         ("task", "drawer-open"): each,
     }
@@ -276,7 +278,7 @@ def test_arm_results_pair_by_task_and_seed() -> None:
     table = pd.DataFrame(rows, columns=["task", "seed", "success", "arm"])
     table["chunk_change"] = 0.1
     table["note"] = math.nan
-    baseline, blind = cuts.arm_results(table)
+    baseline, blind = arm_results(table, [*cuts.ARMS])
     assert (baseline.rate.value, baseline.episodes, baseline.pairs) == (0.75, 4, None)
     assert (blind.rate.value, blind.episodes) == (0.75, 4)
     assert blind.pairs is not None

@@ -201,7 +201,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
         "2",
     ]
     assert main([*arguments, "--demos", str(recording), "--out", str(tmp_path)]) == 0
-    assert "runs by state and action rows alone" in capsys.readouterr().out
+    assert "runs through state and action rows only" in capsys.readouterr().out
     table = read_table(tmp_path / "gradients.csv")
     provenance = read_provenance(tmp_path / "gradients.json")
     assert provenance.complete
@@ -210,7 +210,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose(shares, 1.0, rtol=1e-5)
     tokens = table[(table["of"] == "actions") & (table["seed"] == 0) & table["token"].notna()]
     assert tokens["token"].tolist() == list(range(32))
-    section = gradients.section(table, provenance)
+    section = gradients.Gradients.summarise(table, provenance)
     assert [figure.name for figure in section.figures] == [
         "paths",
         "rows-of-actions",
@@ -238,7 +238,7 @@ def test_a_policy_without_future_tokens(recording: Path, tmp_path: Path) -> None
     assert main([*arguments, "--projections", "1", "--out", str(tmp_path)]) == 0
     table = read_table(tmp_path / "gradients.csv")
     assert NO_TOKENS in set(table["note"])
-    section = gradients.section(table, read_provenance(tmp_path / "gradients.json"))
+    section = gradients.Gradients.summarise(table, read_provenance(tmp_path / "gradients.json"))
     assert section.concluded == ["Paths: not measured, the checkpoint has no future tokens."]
 
 

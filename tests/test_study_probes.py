@@ -169,7 +169,7 @@ def test_frames_are_the_rows_of_the_reference(tmp_path: Path) -> None:
 def test_the_study_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["study", "probes", "--tasks", TASK, "--episodes", "5", "--dimensions", "8"]
     assert main([*arguments, "--out", str(tmp_path)]) == 0
-    assert "Where the goal is:" in capsys.readouterr().out
+    assert "Position of the goal:" in capsys.readouterr().out
     table = read_table(tmp_path / "probes.csv")
     provenance = read_provenance(tmp_path / "probes.json")
     assert provenance.complete
@@ -177,12 +177,12 @@ def test_the_study_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     found = table[table["kind"] == "probe"]
     own = found[(found["rows"] == PROPRIO[0]) & (found["target"] == "hand")]
     assert own["r2"].item() > 0.99  # it is one of the inputs
-    section = probes.section(table, provenance)
+    section = probes.Probes.summarise(table, provenance)
     assert {figure.name for figure in section.figures} == set(found["target"])
     assert len(section.grids) == 2
-    unfinished = probes.section(table[table["kind"] == "episode"], provenance)
+    unfinished = probes.Probes.summarise(table[table["kind"] == "episode"], provenance)
     assert unfinished.concluded == ["Not measured: episodes were run, no probe is done yet."]
-    without = probes.section(table[table["rows"] != "future"], provenance)
+    without = probes.Probes.summarise(table[table["rows"] != "future"], provenance)
     assert without.concluded == ["Future rows: not measured, the checkpoint has no future tokens."]
 
     # What was traced is kept; without it, only that is done again.

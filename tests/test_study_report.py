@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from html import escape, unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,11 @@ from PIL import Image
 from saccade._files import sha256_of
 from saccade.cli import main
 from saccade.errors import InputError
-from saccade.study.questions import cuts, patching
+from saccade.study.questions import cuts
 from saccade.study.questions.cuts import ARMS
+from saccade.study.questions.patching_section import shares
 from saccade.study.report import write_report
+from saccade.study.section import Prose
 from saccade.study.study import STUDIES
 from saccade.study.table import (
     Provenance,
@@ -155,18 +158,18 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
     # Equal results in 20 pairs do not exclude a difference of 16 points, so equality is not claimed.
     label = ARMS["future-blind"].label
     assert f"{label}: success: undecided, 0.0 points (-16.1 to 16.1)" in parsed.text
-    assert "as it must be" in parsed.text
+    assert "future tokens shuffled: the chunk changed by at most 3e-07, as expected." in parsed.text
     assert f"{ARMS['rows-blind'].label}: not measured, the checkpoint has no future tokens." in parsed.text
     # The change of the chunk: mean of 0.10 ... 0.19 by hand.
     assert "0.1450 (" in parsed.text
     assert "actions change by 0.020 (0.020 to 0.020) on average" in parsed.text
 
     assert "future rows in all blocks: the chunk goes 20.0 %" in parsed.text
-    assert "state rows in all blocks: the chunk was not found to follow" in parsed.text
-    assert "Control, all rows in all blocks: a share of 1.0000, as it must be." in parsed.text
+    assert "state rows in all blocks: no effect was found" in parsed.text
+    assert "Control, all rows in all blocks: a share of 1.0000, as expected." in parsed.text
     assert "words: not measured, the policy knows no task for it (8 receivers: push)." in parsed.text
-    assert "Donors of the kind words (0 pairs)" in parsed.text
-    assert "Donors of the kind layout (8 pairs, ways of a mean length of 2.04)" in parsed.text
+    assert "Donors of kind words (0 pairs)" in parsed.text
+    assert "Donors of kind layout (8 pairs, mean distance between the chunks 2.04)" in parsed.text
     for name in set(STUDIES) - {"cuts", "patching"}:
         assert f"{STUDIES[name][1][1:]} (not measured)" in parsed.text
 
@@ -180,6 +183,23 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
         assert line.count("|") - 2 * line.count("\\|") in (len(line.split(" | ")) + 1,)
 
 
+def test_page_and_markdown_are_the_same_text(tmp_path: Path) -> None:
+    write_cuts(tmp_path)
+    write_patching(tmp_path)
+    page, markdown = write_report(tmp_path)
+    html, text = page.read_text(encoding="utf-8"), markdown.read_text(encoding="utf-8")
+    linked = re.findall(r"^- \[.*\]\(#(.*?)\)", text, re.MULTILINE)
+    assert len(linked) == len(STUDIES)
+    assert linked == re.findall(r'<h2 id="(.*?)"', html) == re.findall(r'href="#(.*?)"', html)
+    rows = [line for line in text.splitlines() if line.startswith("| ") and "| --- |" not in line]
+    cells = [cell.replace("\\|", "|").strip() for row in rows for cell in re.split(r"(?<!\\)\|", row)[1:-1]]
+    shown = [unescape(cell) for cell in re.findall(r"<t[dh]>(.*?)</t[dh]>", html)]
+    assert shown == cells
+    for line in text.splitlines():
+        if line.startswith("- ") and "](#" not in line:
+            assert f"<li>{escape(line[2:], quote=False)}</li>" in html
+
+
 def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = []
     for seed in range(75):
@@ -191,7 +211,7 @@ def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_p
     line = next(line for line in section.concluded if line.startswith(ARMS["future-blind"].label))
     # McNemar: 2 / 2**6 = 0.031; of three arms, 0.094.
     assert "success: worse, -8.0 points" in line
-    assert "(Holm, p = 0.094)" in line
+    assert ", not significant after Holm's correction (p = 0.094);" in line
 
 
 def test_report_is_made_from_the_tables_alone_and_always_alike(tmp_path: Path) -> None:
@@ -208,11 +228,11 @@ def test_report_is_made_from_the_tables_alone_and_always_alike(tmp_path: Path) -
 def test_a_failed_control_is_said(tmp_path: Path) -> None:
     write_patching(tmp_path, control=0.9)
     page, _ = write_report(tmp_path)
-    assert "a share of 0.9000, WHICH IT MUST NOT BE" in parse(page).text
+    assert "a share of 0.9000, WHICH SHOULD BE 1: do not trust the other rows." in parse(page).text
     rows = [cut_row("push", 0, "none", True, 0.0), cut_row("push", 0, "future-shuffled", True, 0.2)]
     write_study(tmp_path, "cuts", rows, {"engine": "rust"})
     page, _ = write_report(tmp_path)
-    assert "WHICH IT MUST NOT: do not trust the other arms" in parse(page).text
+    assert "MORE THAN ROUNDING: do not trust the other arms" in parse(page).text
 
 
 def test_half_finished_and_empty_studies_say_so(tmp_path: Path) -> None:
@@ -231,7 +251,7 @@ def test_arms_without_a_partner_are_not_compared(tmp_path: Path) -> None:
     rows = [cut_row("push", 0, "none", True, 0.0), cut_row("push", 1, "future-blind", False, 0.1)]
     write_study(tmp_path, "cuts", rows, {"engine": "rust"}, done=2, total=4)
     section = cuts.Cuts.summarise(read_table(tmp_path / "cuts.csv"), read_provenance(tmp_path / "cuts.json"))
-    assert all("lower" not in line and "no effect" not in line for line in section.concluded)
+    assert all("success" not in line for line in section.concluded)
     write_report(tmp_path)
 
 
@@ -274,6 +294,39 @@ def test_the_report_of_every_study_needs_no_simulator(tmp_path: Path) -> None:
     assert (tmp_path / "report.md").read_text(encoding="utf-8").count("(not measured)") == 2  # tvl, vlsa
 
 
+BARE = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in sys.argv[2].split(","):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+import importlib.util
+find_spec = importlib.util.find_spec
+importlib.util.find_spec = lambda name, package=None: (
+    None if name in sys.argv[2].split(",") else find_spec(name, package)
+)
+from saccade.cli import main
+sys.exit(main(["study", "report", sys.argv[1]]))
+"""
+
+
+def test_without_packages_the_report_asks_for_the_extra_that_it_needs(tmp_path: Path) -> None:
+    write_cuts(tmp_path)
+    missing = (
+        "jinja2,markdown_it,matplotlib,pandas,scipy,sklearn,joblib,torch,mujoco,gymnasium,metaworld,rich"
+    )
+    command = [sys.executable, "-c", BARE, str(tmp_path), missing]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "[study]" in done.stderr
+    assert done.stderr.count("\n") == 1
+    for name in ("mujoco", "torch", "rich"):
+        assert name not in done.stderr
+
+
 def test_names_are_escaped(tmp_path: Path) -> None:
     write_study(
         tmp_path, "cuts", [cut_row("<script>alert(1)</script>", 0, "none", True, 0.0)], {"engine": "rust"}
@@ -294,11 +347,12 @@ def test_shares_pool_pairs_and_keep_what_cannot_be_told() -> None:
             "squared_change": [0.25, 0.5, 0.75, 1.0],
         }
     )
-    share, size = patching.shares(rows)
+    share, size = shares(rows)
     assert (share.value, share.low, share.high, size) == (0.5, 0.5, 0.5, 0.5)
-    share, size = patching.shares(rows.assign(squared_way=0.0))
+    share, size = shares(rows.assign(squared_way=0.0))
     assert np.isnan([share.value, size]).all()
-    assert "act alike" in patching.following(share)
+    following = Prose("patching").line("following", share)
+    assert following == "donors and receivers have the same chunks, so there is nothing to follow"
 
 
 def test_bad_directories_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,17 +69,37 @@ _SUBMODULES = (
 
 if TYPE_CHECKING:
     from saccade import (
-        bench,
-        checkpoints,
-        comparison,
-        integrations,
-        maps,
-        observation,
-        reference,
-        robots,
-        sim,
-        study,
-        torch,
+        bench as bench,
+    )
+    from saccade import (
+        checkpoints as checkpoints,
+    )
+    from saccade import (
+        comparison as comparison,
+    )
+    from saccade import (
+        integrations as integrations,
+    )
+    from saccade import (
+        maps as maps,
+    )
+    from saccade import (
+        observation as observation,
+    )
+    from saccade import (
+        reference as reference,
+    )
+    from saccade import (
+        robots as robots,
+    )
+    from saccade import (
+        sim as sim,
+    )
+    from saccade import (
+        study as study,
+    )
+    from saccade import (
+        torch as torch,
     )
 else:  # so that a type checker still reports names that do not exist
 

@@ -18,7 +18,8 @@ from saccade.errors import CheckpointError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from saccade.config import HeadConfig
-    from saccade.head import ActionHead, Context
+    from saccade.context import Context
+    from saccade.head import ActionHead
     from saccade.trace import Trace
 
 Float32Array = npt.NDArray[np.float32]
@@ -81,7 +82,7 @@ class Observation:
         def float32(array: npt.NDArray[Any]) -> Float32Array:
             return np.ascontiguousarray(array[chosen], np.float32)
 
-        def kept(array: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
+        def kept(array: npt.NDArray[Any] | None) -> Any:
             return None if array is None else array[chosen]
 
         return Observation(
@@ -89,13 +90,26 @@ class Observation:
             float32(self.state),
             self.embodiment_id[chosen],
             None if self.noise is None else float32(self.noise),
-            *(kept(getattr(self, name)) for name in MASKS),
+            kept(self.attention_mask),
+            kept(self.image_mask),
+            kept(self.drop_vl),
             kept(self.episode),
         )
 
     def rows(self) -> Iterator[Observation]:
         """Every row as a batch of one."""
         return (self.row(row) for row in range(len(self)))
+
+    def repeated(self, count: int) -> Observation:
+        """One row, `count` times."""
+
+        def repeat(array: npt.NDArray[Any] | None) -> Any:
+            return None if array is None else np.repeat(array, count, axis=0)
+
+        fields = dataclasses.fields(self)
+        return dataclasses.replace(
+            self, **{field.name: repeat(getattr(self, field.name)) for field in fields}
+        )
 
     def with_noise(
         self, rng: np.random.Generator, config: HeadConfig, draws: int | None = None
@@ -202,8 +216,8 @@ def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig, wher
         _state(arrays["state"], batch, config, where),
         _embodiments(arrays["embodiment_id"], batch, config, where),
         _noise(arrays.get("noise"), batch, config, where),
-        *(_mask(arrays.get(name), name, (batch, num_tokens), where) for name in MASKS),
-        _episodes(arrays.get("episode"), batch, where),
+        **{name: _mask(arrays.get(name), name, (batch, num_tokens), where) for name in MASKS},
+        episode=_episodes(arrays.get("episode"), batch, where),
     )
     _check_finite(found, where)
     return _check_masks(found, config, where)

@@ -37,10 +37,10 @@ class Trace(Generic[ArrayT]):
         >>> head = saccade.ActionHead.load(importlib.resources.files("saccade") / "sim" / "demo")
         >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
         >>> head.trace(context, np.zeros((1, head.config.state_dim)), 0, seed=7, blocks=[0, 2])
-        <saccade.Trace 0.3 MB
-          attention[step, block]: steps 0-3, blocks 0, 2: (1, 4, 33, 60)
+        <saccade.Trace 0.4 MB
+          attention[step, block]: steps 0-3, blocks 0, 2: (1, 4, 49, 60)
           hidden: not recorded
-          rows: state 0, future 1-16, action 17-32
+          rows: state 0, future 1-32, action 33-48
           actions: (1, 16, 4)>
     """
 

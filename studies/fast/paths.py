@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.patches import Circle
 
-from saccade.sim.environment import TaskEnvironment
 from saccade._files import write_atomically
+from saccade.sim.environment import TaskEnvironment
 from saccade.sim.rollout import Episode, run_episode
 from saccade.sim.scenarios import TOUCH, Fork
 from saccade.study import figures
-from saccade.study.fast import policy_in
-from saccade.study.fast_modes import Calibration, Mode
-from saccade.study.loaded import close_environments, environment_of
+from saccade.study.questions.fast_engine import policy_in
+from saccade.study.questions.fast_modes import Calibration, Mode
+from saccade.study.simulator import environment_of
 
 EPISODES = 40
 MODES = {"one Euler step": "float32-euler-1", "four Euler steps": "float32-euler-4"}
@@ -52,7 +52,6 @@ def main(checkpoint: str, out: Path) -> None:
         axes.set_xlabel("aside, cm")
         axes.set_ylabel("ahead, cm")
         axes.set_aspect("equal")
-    close_environments()
     with write_atomically(out) as temporary:
         picture.savefig(temporary, format="png", dpi=130, metadata={"Software": None})
 

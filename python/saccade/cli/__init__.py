@@ -34,18 +34,18 @@ COMMANDS: dict[str, str] = {
 }
 
 _PICTURES = ("matplotlib", "PIL")
+_TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn")
 _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
 # The optional packages that each command needs, checked once its arguments have been: a message then names
 # all that are missing. Commands without an entry need NumPy only. See `saccade._extras` for the extras.
 NEEDS: dict[str, tuple[str, ...]] = {
-    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg"),
+    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
-    "study": (
-        *("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors"),
-        *("jinja2", "joblib", "pandas", "scipy", "sklearn"),
-    ),
+    "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib"),
+    "study --features": ("rich", *_PICTURES, *_TABLES, "joblib"),
+    "study report": (*_PICTURES, *_TABLES),
     "parity": ("torch", "safetensors"),
 }
 

@@ -13,9 +13,9 @@ from saccade.cli import EXIT_OK, UsageError, _output, arguments, require
 if TYPE_CHECKING:
     from saccade.config import HeadConfig
     from saccade.head import ActionHead
-    from saccade.maps.inputs import Inputs
     from saccade.maps.occlusion import Occlusion
     from saccade.maps.record import Maps
+    from saccade.maps.view import View
 
 HELP = "show what the rows of the action head attend to"
 
@@ -130,6 +130,7 @@ def run(args: argparse.Namespace) -> int:
 
 def look(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
+    from saccade._files import checkpoint_identity
     from saccade.head import ActionHead
     from saccade.maps import record
     from saccade.maps.occlusion import cell_for
@@ -141,25 +142,25 @@ def look(args: argparse.Namespace) -> Maps:
     steps = record.choose("steps", args.steps, head.config.num_steps)
     named = args.heads not in (None, ("mean",))
     heads = record.choose("heads", args.heads if named else None, head.config.num_heads)
-    inputs = take(args, checkpoint, head.config)
-    few = probabilities(head.config, inputs, len(blocks), len(steps)) <= MAX_PROBABILITIES
+    view = take(args, checkpoint, head.config)
+    few = probabilities(head.config, view, len(blocks), len(steps)) <= MAX_PROBABILITIES
     shown = heads if named or (args.heads is None and few) else ()
     selection = record.Selection(blocks, steps, heads, shown)
-    cell = cell_for(inputs.layout, args.cell)
-    rows, attention = record.look(head, inputs, selection)
+    cell = cell_for(view.layout, args.cell)
+    rows, attention = record.look(head, view, selection)
     redrawn = None
     if head.config.num_future_tokens:
-        tokens = record.random_tokens(checkpoint, seed=0)
-        redrawn = record.look_redrawn(head, inputs, selection, tokens)
+        tokens = record.random_tokens(head.future_tokens, seed=0)
+        redrawn = record.look_redrawn(head, view, selection, tokens)
     return record.Maps(
-        checkpoint=record.describe_checkpoint(checkpoint),
+        checkpoint=checkpoint_identity(checkpoint),
         config=head.config,
-        inputs=inputs,
+        view=view,
         selection=selection,
         rows=rows,
         attention=attention,
         redrawn=redrawn,
-        occlusion=occlude(head, inputs, cell) if inputs.layout.cameras else None,
+        occlusion=occlude(head, view, cell) if view.layout.cameras else None,
     )
 
 
@@ -183,26 +184,26 @@ def check(args: argparse.Namespace) -> None:
             raise UsageError(f"{', '.join(wrong)}: only with --features")
 
 
-def probabilities(config: HeadConfig, inputs: Inputs, blocks: int, steps: int) -> int:
+def probabilities(config: HeadConfig, view: View, blocks: int, steps: int) -> int:
     """About how many probabilities the maps of all heads contain."""
     rows = 1 + config.num_future_tokens + config.action_horizon
-    return blocks * steps * config.num_heads * rows * inputs.layout.num_tokens
+    return blocks * steps * config.num_heads * rows * view.layout.num_tokens
 
 
-def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> Inputs:
+def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> View:
     """The observation that the arguments ask for."""
     from saccade.errors import CheckpointError
-    from saccade.maps import inputs, layout
+    from saccade.maps import layout, view
 
     if args.features is not None:
-        options = inputs.LayoutOptions(
+        options = view.LayoutOptions(
             text=args.layout,
             grid=None if args.grid is None else layout.parse_grid(args.grid),
             image_token_index=layout.IMAGE_TOKEN_INDEX
             if args.image_token_index is None
             else args.image_token_index,
         )
-        return inputs.from_file(args.features, config, row=args.row, options=options, seed=args.seed)
+        return view.from_file(args.features, config, row=args.row, options=options, seed=args.seed)
     from saccade.sim import graphics
     from saccade.sim.policy import Policy, check_trained_on
 
@@ -214,24 +215,25 @@ def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> Inpu
     task = args.task or ("push" if "push" in known else known[0])
     check_trained_on(policy, [task])
     graphics.check()
-    return inputs.from_simulator(policy, task, args.seed, args.after)
+    return view.from_simulator(policy, task, args.seed, args.after)
 
 
-def occlude(head: ActionHead, inputs: Inputs, cell: int) -> Occlusion:
+def occlude(head: ActionHead, view: View, cell: int) -> Occlusion:
     """The occlusion map, with a progress bar."""
     import numpy as np
 
     from saccade.maps.occlusion import measure, places_of
 
-    context = head.encode(inputs.features)
+    observation = view.observation
+    context = observation.encode(head)
 
     def whole(count: int) -> Any:
-        chunks = head.sample(context, inputs.state, inputs.embodiment_id, seed=0, num_samples=count)
+        chunks = head.sample(context, observation.state, observation.embodiment_id, seed=0, num_samples=count)
         return np.asarray(chunks)[0]
 
-    total = len(places_of(inputs.layout, cell))
+    total = len(places_of(view.layout, cell))
     with _output.progress_bar("occlusion", total, transient=True) as update:
-        return measure(head, inputs.layout, inputs.occluder, whole, cell=cell, on_done=update)
+        return measure(head, view.layout, view.occluder, whole, cell=cell, on_done=update)
 
 
 def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
@@ -240,10 +242,10 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from saccade.maps.sheet import NO_FUTURE, NO_IMAGES
+    from saccade.maps.notes import NO_FUTURE, NO_IMAGES
 
     console = _output.console(width=WIDTH)
-    console.print(maps.inputs.title, style="bold", markup=False, soft_wrap=True)
+    console.print(maps.view.title, style="bold", markup=False, soft_wrap=True)
     entries = [entry for entry in record["summaries"] if entry["head"] == "mean"]
     for reads, blocks in (("vl", maps.cross_blocks()), ("rows", maps.self_blocks())):
         if not blocks:
@@ -267,7 +269,7 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
     )
     for missing, message in (
         (not maps.num_future_tokens, NO_FUTURE),
-        (not maps.inputs.layout.cameras, NO_IMAGES),
+        (not maps.view.layout.cameras, NO_IMAGES),
     ):
         if missing:
             console.print(message, soft_wrap=True)

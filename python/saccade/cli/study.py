@@ -41,7 +41,7 @@ class StudyParser(Parser):
     ) -> tuple[argparse.Namespace, list[str]]:
         """See argparse, which calls this for the chosen study only."""
         if self.study is not None:
-            require("study")
+            require("study --features")  # what declaring the arguments imports
             load_study(self.study).add_arguments(self)
             add_common_arguments(self)
             self.study = None
@@ -88,8 +88,11 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the study, or makes the report."""
-    require("study")
-    return run_report(args) if args.study == "report" else measure(args)
+    if args.study == "report":
+        require("study report")
+        return run_report(args)
+    require("study" if getattr(args, "features", None) is None else "study --features")
+    return measure(args)
 
 
 def measure(args: argparse.Namespace) -> int:

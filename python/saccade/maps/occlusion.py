@@ -1,15 +1,14 @@
-"""What moves the actions: take one patch away, sample again from the same noise, measure the change.
+"""Occlusion: remove one patch, sample again from the same noise, measure the change of the actions.
 
-A map of attention says where a row reads; it does not say what it reads there, since after the VL
-self-attention every position holds something of all others. Taking the patch away answers the other question,
-what the actions depend on.
+An attention map shows which positions a row reads, but not what it reads there: after the VL self-attention
+every position contains information of all others. Occlusion shows what the actions depend on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,19 +16,22 @@ import numpy.typing as npt
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.maps.layout import Camera, Layout
-from saccade.sim.policy import EMBODIMENT_ID, Policy
+from saccade.observation import Observation
+
+if TYPE_CHECKING:
+    from saccade.sim.policy import Policy
 
 Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
 
 BATCH = 16  # one observation of N1.5 holds 32 MB of keys and values
-MAX_CELLS = 8  # along each side of a picture, unless asked for: each costs a pass through the head
-NOISES = 8  # draws that `other_noise` is the mean of
+MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the head
+NOISES = 8  # draws that `other_noise` is computed from
 
 
 @dataclass(frozen=True)
 class Place:
-    """Patches of one camera that are taken away together."""
+    """Patches of one camera that are removed together."""
 
     camera: Camera
     rows: slice
@@ -37,22 +39,22 @@ class Place:
 
 
 class Occluder(Protocol):
-    """Samples chunks with patches taken away."""
+    """Samples chunks with patches removed."""
 
     method: str  # one sentence: how
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
-        """One chunk for each place, `(places, horizon, action_dim)`, normalised; None takes nothing away."""
+        """One chunk for each place, `(places, horizon, action_dim)`, normalised; None removes nothing."""
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """What taking away each patch changes.
+    """How the actions change without each patch.
 
     Attributes:
-        method: How patches were taken away.
-        cell: Patches along each side of what was taken away at once.
-        change: By camera, `(rows, columns)`: mean |change| of the chunk's normalised actions, the same noise.
+        method: How patches were removed.
+        cell: Patches along each side of what was removed at once.
+        change: By camera, `(rows, columns)`: mean |change| of the normalised actions, from equal noise.
         other_noise: Mean |change| between chunks of the whole observation from different noise, to compare.
     """
 
@@ -68,50 +70,45 @@ class Occlusion:
 
 
 class BlankedPixels:
-    """Takes patches away in the picture: their pixels get the picture's mean colour.
+    """Removes patches from the picture: their pixels get the mean colour of the picture.
 
     Args:
         policy: has the backbone.
-        observation: of the simulator.
-        noise: `(1, horizon, action_dim)`, for all chunks.
+        seen: observation of the simulator.
+        observation: the same as the head takes it; its state and noise are used for all chunks.
     """
 
     method = "the patch's pixels are replaced by the picture's mean colour, before the backbone"
 
-    def __init__(self, policy: Policy, observation: Mapping[str, Any], noise: Float32Array) -> None:
+    def __init__(self, policy: Policy, seen: Mapping[str, Any], observation: Observation) -> None:
         self._policy = policy
+        self._seen = seen
         self._observation = observation
-        self._noise = noise
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
         """See `Occluder`."""
         features = np.concatenate([self._policy.features(self._without(place)) for place in places])
-        count = len(places)
-        state = np.repeat(self._policy.state(self._observation), count, axis=0)
-        noise = np.repeat(self._noise, count, axis=0)
-        return np.asarray(head(features, state, EMBODIMENT_ID, noise=noise))
+        repeated = self._observation.repeated(len(places))
+        return replace(repeated, backbone_features=features).sample(head)
 
     def _without(self, place: Place | None) -> Mapping[str, Any]:
         if place is None:
-            return self._observation
-        picture: UInt8Array = self._observation["images"][place.camera.name].copy()
+            return self._seen
+        picture: UInt8Array = self._seen["images"][place.camera.name].copy()
         size = picture.shape[0] // place.camera.rows
         blanked = (
             slice(place.rows.start * size, place.rows.stop * size),
             slice(place.columns.start * size, place.columns.stop * size),
         )
         picture[blanked] = np.rint(picture.mean(axis=(0, 1))).astype(np.uint8)
-        return {**self._observation, "images": {**self._observation["images"], place.camera.name: picture}}
+        return {**self._seen, "images": {**self._seen["images"], place.camera.name: picture}}
 
 
 class DroppedPositions:
-    """Takes patches away in T_vl: their positions are removed by `drop_vl`, as if they had not been there.
+    """Removes patches from T_vl: `drop_vl` removes their positions, as if they had not been there.
 
     Args:
-        features: `(1, T_vl, context_dim)`.
-        state: `(1, state_dim)` or `(1, history, state_dim)`.
-        embodiment_id: of the robot.
-        noise: `(1, horizon, encoder_action_dim)`, for all chunks.
+        observation: one row, with noise.
     """
 
     method = (
@@ -119,33 +116,27 @@ class DroppedPositions:
         "already mixed into other positions stays"
     )
 
-    def __init__(
-        self, features: Float32Array, state: Float32Array, embodiment_id: int, noise: Float32Array
-    ) -> None:
-        self._features, self._state, self._embodiment_id, self._noise = features, state, embodiment_id, noise
+    def __init__(self, observation: Observation) -> None:
+        self._observation = observation
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
         """See `Occluder`."""
-        count = len(places)
-        dropped = np.zeros((count, self._features.shape[1]), dtype=np.bool_)
+        repeated = self._observation.repeated(len(places))
+        dropped = np.zeros((len(places), repeated.num_vl_tokens), dtype=np.bool_)
         for row, place in zip(dropped, places, strict=True):
             if place is not None:
                 grid = row[place.camera.positions].reshape(place.camera.rows, place.camera.columns)
                 grid[place.rows, place.columns] = True
-        return np.asarray(
-            head(
-                np.repeat(self._features, count, axis=0),
-                np.repeat(self._state, count, axis=0),
-                np.full(count, self._embodiment_id),
-                noise=np.repeat(self._noise, count, axis=0),
-                drop_vl=dropped,
-            )
-        )
+        return replace(repeated, drop_vl=dropped).sample(head)
 
 
 def cell_for(layout: Layout, cell: int | None) -> int:
-    """Patches along each side of what is taken away at once: as asked for, or so many that no picture has
-    more than `MAX_CELLS` x `MAX_CELLS` of them.
+    """Patches along each side of what is removed at once.
+
+    Args:
+        layout: Has the cameras.
+        cell: The number given by the user; None chooses the smallest with which no picture has more than
+            `MAX_CELLS` x `MAX_CELLS` cells.
 
     Raises:
         InputError: it is below 1.
@@ -159,7 +150,7 @@ def cell_for(layout: Layout, cell: int | None) -> int:
 
 
 def places_of(layout: Layout, cell: int) -> list[Place]:
-    """All that is taken away, one after the other; at the far edges a place may be smaller."""
+    """All places in turn; at the right and lower edges a place may be smaller."""
     return [
         Place(
             camera,
@@ -182,16 +173,16 @@ def measure(
     batch: int = BATCH,
     on_done: Callable[[int], None] = lambda done: None,
 ) -> Occlusion:
-    """Takes away every patch of every camera in turn.
+    """Removes every patch of every camera in turn.
 
     Args:
         head: computes the chunks.
         layout: where the patches are.
-        occluder: takes them away.
-        whole: so many chunks of the whole observation from different noise, `(count, horizon, action_dim)`.
-        cell: patches along each side of what is taken away at once.
+        occluder: removes them.
+        whole: from a number of draws to chunks of the whole observation, `(draws, horizon, action_dim)`.
+        cell: patches along each side of what is removed at once.
         batch: places at once.
-        on_done: told how many places are done.
+        on_done: called with the number of places done.
     """
     places = places_of(layout, cell)
     untouched = occluder(head, [None])[0]

@@ -1,4 +1,4 @@
-"""The HTML page: one file that holds all it needs; a person picks block, step, head, token and camera."""
+"""The HTML page: one file that needs no network, to choose block, step, head, token and camera."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import numpy.typing as npt
 from PIL import Image
 
 from saccade._files import write_atomically
+from saccade.maps.notes import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES, NO_PICTURES
 from saccade.maps.record import MEAN, Maps
-from saccade.maps.sheet import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES
 
 TEMPLATE = "page.html.j2"
-LEVELS = 65535  # probabilities are stored as shares of their row's largest, in 16 bits
+LEVELS = 65535  # probabilities are stored relative to the largest of their row, in 16 bits
 
 
 def write_page(maps: Maps, path: Path) -> None:
@@ -34,34 +34,34 @@ def render_page(maps: Maps) -> str:
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # groups keep their order
     # `tojson` escapes what would end the script element; token strings such as </img> are common here.
     return environment.from_string(source).render(
-        title=maps.inputs.title, caveat=maps.caveat, notes=notes(maps), data=page_data(maps)
+        title=maps.view.title, caveat=maps.caveat, notes=notes(maps), data=page_data(maps)
     )
 
 
 def notes(maps: Maps) -> list[str]:
-    """What is not there and why."""
+    """Notes on what is missing, and why."""
     found = []
     if not maps.num_future_tokens:
         found.append(NO_FUTURE)
-    if not maps.inputs.layout.cameras:
+    if not maps.view.layout.cameras:
         found.append(NO_IMAGES)
-    elif not maps.inputs.images:
-        found.append("The file has no pictures: maps are drawn on white.")
+    elif not maps.view.images:
+        found.append(NO_PICTURES)
     if not maps.selection.shown_heads:
         found.append(
-            f"This page has only the mean over {len(maps.selection.heads)} heads; --heads N,... shows them "
-            "one by one."
+            f"This page shows only the mean over {len(maps.selection.heads)} heads; choose single heads with "
+            "--heads."
         )
     return found
 
 
 def page_data(maps: Maps) -> dict[str, Any]:
-    """What the page's script works with."""
+    """The data of the page's script."""
     selection = maps.selection
     return {
         "checkpoint": maps.checkpoint,
         "numFuture": maps.num_future_tokens,
-        "layout": maps.inputs.layout.to_dict(),
+        "layout": maps.view.layout.to_dict(),
         "rows": {name: [rows.start, rows.stop] for name, rows in maps.rows.items()},
         "blocks": [{"block": block, "readsVl": maps.reads_vl(block)} for block in selection.blocks],
         "steps": list(selection.steps),
@@ -70,7 +70,7 @@ def page_data(maps: Maps) -> dict[str, Any]:
             f"{step},{block}": _packed(_shown(maps, attention))
             for (step, block), attention in maps.attention.items()
         },
-        "images": {name: _data_url(picture) for name, picture in maps.inputs.images.items()},
+        "images": {name: _data_url(picture) for name, picture in maps.view.images.items()},
         "occlusion": None if maps.occlusion is None else maps.occlusion.to_dict(),
         "summaries": [
             {
@@ -106,7 +106,7 @@ def _base64(array: npt.NDArray[Any]) -> str:
 
 
 def _data_url(picture: npt.NDArray[np.uint8]) -> str:
-    """The picture as a PNG inside an address."""
+    """The picture as a PNG in a data URL."""
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

@@ -1,11 +1,10 @@
-"""All that is known about one observation: traces, summaries, occlusion; what the sheet and the page show."""
+"""The maps of one observation: traces, summaries and occlusion, as the sheet and the page show them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,15 +12,13 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 import saccade
-from saccade._files import sha256_of
-from saccade.checkpoints import read_tensors
 from saccade.config import HeadConfig
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention
-from saccade.maps.inputs import Inputs
 from saccade.maps.occlusion import Occlusion
 from saccade.maps.summary import Overlap, overlap, summarize
+from saccade.maps.view import View
 
 Float32Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
@@ -29,23 +26,22 @@ Indices = npt.NDArray[np.int64]
 Attention = Mapping[tuple[int, int], Float32Array]
 
 CAVEAT = (
-    "A bright patch is a position that is read, not a cause. After the backbone and the VL self-attention a "
-    "position holds more than its patch, so what is read there need not come from that patch of the picture."
+    "A bright patch shows where a row reads, not what causes an action. After the backbone and the VL "
+    "self-attention a position contains more than its patch, so what is read there need not come from that "
+    "patch of the picture."
 )
-BESIDE = "The occlusion map beside it shows what the actions depend on."
-FUTURE_TOKENS = "future_tokens."
-PREFIXES = ("action_head.", "_groot_model.action_head.", "")  # those that ActionHead.load knows
+OCCLUSION = "The occlusion map shows what the actions depend on."
 MEAN = "mean"
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which maps are wanted.
+    """Which maps are computed and shown.
 
     Attributes:
         blocks, steps: Of the DiT and of the Euler loop.
-        heads: Those that the mean is taken over.
-        shown_heads: Those of them that are shown one by one as well.
+        heads: Heads over which the mean is taken.
+        shown_heads: Those of them that are also shown one by one.
     """
 
     blocks: tuple[int, ...]
@@ -56,23 +52,22 @@ class Selection:
 
 @dataclass(frozen=True)
 class Maps:
-    """One observation and what the head's rows look at.
+    """One observation and what the rows of the head attend to.
 
     Attributes:
         checkpoint: Where the head was loaded from, and its hash.
         config: Of the head.
-        inputs: The observation.
+        view: The observation.
         selection: Which maps.
-        rows: Where the groups lie; a group without rows is left out.
+        rows: Slices of the groups; a group without rows is left out.
         attention: By step and block, `(heads, rows, keys)`, heads in the selection's order.
-        redrawn: The same with future tokens drawn at random, only the future rows; None without future
-            tokens.
+        redrawn: The same with random future tokens, only of the future rows; None without future tokens.
         occlusion: None if there are no image tokens.
     """
 
     checkpoint: dict[str, str]
     config: HeadConfig
-    inputs: Inputs
+    view: View
     selection: Selection
     rows: dict[str, slice]
     attention: Attention
@@ -81,8 +76,8 @@ class Maps:
 
     @property
     def caveat(self) -> str:
-        """What has to be said with every map."""
-        return CAVEAT if self.occlusion is None else f"{CAVEAT} {BESIDE}"
+        """What a reader of any map must know."""
+        return CAVEAT if self.occlusion is None else f"{CAVEAT} {OCCLUSION}"
 
     @property
     def num_future_tokens(self) -> int:
@@ -110,17 +105,17 @@ class Maps:
         return mean
 
     def parts(self, block: int) -> dict[str, Indices]:
-        """The block's keys by what they are: cameras and kinds of tokens, or groups of rows."""
-        return self.inputs.layout.parts() if self.reads_vl(block) else self._row_parts()
+        """The keys of a block by camera and kind of token, or by group of rows."""
+        return self.view.layout.parts() if self.reads_vl(block) else self._row_parts()
 
     def agreement(self, keys: Float32Array) -> float | None:
         """Spearman's rank correlation over all patches between a map `(T_vl,)` and the occlusion map.
 
-        None where there are no image tokens, or where one of the two is the same everywhere.
+        None without image tokens, or if one of the two maps is constant.
         """
         if self.occlusion is None:
             return None
-        cameras = self.inputs.layout.cameras
+        cameras = self.view.layout.cameras
         read = np.concatenate([keys[camera.positions] for camera in cameras])
         change = np.concatenate([self.occlusion.change[camera.name].ravel() for camera in cameras])
         if np.ptp(read) == 0 or np.ptp(change) == 0:
@@ -128,7 +123,7 @@ class Maps:
         return float(np.corrcoef(rankdata(read), rankdata(change))[0, 1])
 
     def agreements(self) -> list[dict[str, Any]]:
-        """`agreement` of each group's mean map over heads and Euler steps, in the blocks that read vision."""
+        """`agreement` of the mean map of each group over heads and Euler steps, in cross-attention blocks."""
         return [
             {
                 "block": block,
@@ -146,14 +141,14 @@ class Maps:
     def summaries(self) -> list[dict[str, Any]]:
         """One entry for each step, block, group and head, the mean map of all heads first.
 
-        The entry of the mean map has `per_head`: entropy and overlap of each head's own maps, averaged over
-        the heads. Heads that look at different places make a wide mean map though each of them is narrow.
+        The entry of the mean map has `per_head`: entropy and overlap of the maps of each head, averaged over
+        the heads. If heads attend to different keys, the mean map is wide although each head's is narrow.
         """
         rng = np.random.default_rng(0)
         entries = []
         for (step, block), attention in self.attention.items():
             parts = self.parts(block)
-            within = self.inputs.layout.kinds() if self.reads_vl(block) else parts
+            within = self.view.layout.kinds() if self.reads_vl(block) else parts
             for group, rows in self.rows.items():
                 redrawn = (
                     self.redrawn[step, block] if group == "future" and self.redrawn is not None else None
@@ -184,11 +179,11 @@ class Maps:
         return {
             "saccade": saccade.__version__,
             "checkpoint": self.checkpoint,
-            "source": self.inputs.source,
+            "source": self.view.source,
             "num_future_tokens": self.num_future_tokens,
             "rows": {name: [rows.start, rows.stop] for name, rows in self.rows.items()},
             "selection": asdict(self.selection),
-            "layout": self.inputs.layout.to_dict(),
+            "layout": self.view.layout.to_dict(),
             "caveat": self.caveat,
             "baselines": BASELINES,
             "occlusion": None if self.occlusion is None else self.occlusion.to_dict(),
@@ -199,9 +194,8 @@ class Maps:
 
 BASELINES = {
     "identical": "tokens with the same map: divergence 0, cosine 1, 1 distinct map",
-    "shuffled": "each token's map shuffled on its own among the keys of one kind: the same spread, unrelated "
-    "places",
-    "redrawn": "future tokens replaced by random directions of the learned tokens' lengths",
+    "shuffled": "each map shuffled by itself among the keys of one kind: equal entropy, unrelated keys",
+    "redrawn": "future tokens replaced by random directions with the lengths of the learned tokens",
 }
 
 
@@ -210,7 +204,7 @@ def _asdict(found: Overlap | None) -> dict[str, float] | None:
 
 
 def _per_head(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the heads of what each head's own maps give."""
+    """Means over the heads of entropy and overlap of their maps."""
     means: dict[str, Any] = {"entropy": float(np.mean([entry["entropy"]["mean"] for entry in entries]))}
     for name in ("overlap", "shuffled", "redrawn"):
         values = [entry[name] for entry in entries if entry.get(name) is not None]
@@ -243,28 +237,25 @@ def choose(name: str, given: Sequence[int] | None, count: int) -> tuple[int, ...
 
 
 def look(
-    head: ActionHead, inputs: Inputs, selection: Selection
+    head: ActionHead, view: View, selection: Selection
 ) -> tuple[dict[str, slice], dict[tuple[int, int], Float32Array]]:
-    """Where the groups of rows lie, and the chosen maps, for the learned future tokens."""
-    return _trace(head, inputs, selection, None)
+    """The slices of the groups of rows, and the chosen maps with the learned future tokens."""
+    return _trace(head, view, selection, None)
 
 
 def look_redrawn(
-    head: ActionHead, inputs: Inputs, selection: Selection, tokens: Float32Array
+    head: ActionHead, view: View, selection: Selection, tokens: Float32Array
 ) -> dict[tuple[int, int], Float32Array]:
     """The chosen maps of the future rows, with other future tokens."""
-    rows, attention = _trace(head, inputs, selection, Intervention(future_tokens=tokens))
+    rows, attention = _trace(head, view, selection, Intervention(future_tokens=tokens))
     return {place: maps[:, rows["future"]] for place, maps in attention.items()}
 
 
 def _trace(
-    head: ActionHead, inputs: Inputs, selection: Selection, intervention: Intervention | None
+    head: ActionHead, view: View, selection: Selection, intervention: Intervention | None
 ) -> tuple[dict[str, slice], dict[tuple[int, int], Float32Array]]:
-    trace = head.trace(
-        head.encode(inputs.features),
-        inputs.state,
-        inputs.embodiment_id,
-        noise=inputs.noise,
+    trace = view.observation.trace(
+        head,
         intervention=intervention,
         record=("attention",),
         blocks=selection.blocks,
@@ -277,24 +268,9 @@ def _trace(
     return {name: where for name, where in rows.items() if where.stop > where.start}, attention
 
 
-def learned_tokens(checkpoint: Path) -> Float32Array:
-    """The checkpoint's future tokens, `(N, width)`; it must have some."""
-    tables = [read_tensors(checkpoint, prefix + FUTURE_TOKENS) for prefix in PREFIXES]
-    return next(table["weight"] for table in tables if "weight" in table)
-
-
-def random_tokens(checkpoint: Path, seed: int) -> Float32Array:
-    """Random directions with the lengths of the checkpoint's future tokens, `(N, width)`."""
-    learned = learned_tokens(checkpoint)
+def random_tokens(learned: Float32Array, seed: int) -> Float32Array:
+    """Random directions with the lengths of the learned future tokens; both `(N, width)`."""
     drawn = np.random.default_rng(seed).standard_normal(learned.shape, dtype=np.float32)
     lengths = np.linalg.norm(learned, axis=-1, keepdims=True)
     random: Float32Array = drawn * (lengths / np.linalg.norm(drawn, axis=-1, keepdims=True))
     return random
-
-
-def describe_checkpoint(checkpoint: Path) -> dict[str, str]:
-    """Name and hash of a checkpoint; the hash is over the config beside it, if any, and then the tensors."""
-    directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
-    config = [directory / "config.json"] if (directory / "config.json").is_file() else []
-    tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
-    return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}

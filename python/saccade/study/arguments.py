@@ -1,48 +1,79 @@
-"""Lists with commas on the command line."""
+"""The source that the arguments of a study ask for, checked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import argparse
+from typing import TYPE_CHECKING
 
+from saccade.cli.arguments import check_tasks
 from saccade.errors import InputError
+from saccade.study.recording import Recording
+from saccade.study.source import Source
 
-UNLIMITED = 1 << 31  # for `numbers` that have no bound of their own
+if TYPE_CHECKING:
+    from saccade.study.simulator import Simulator
 
 
-def names(option: str, text: str) -> tuple[str, ...]:
-    """Names out of a list with commas, each once.
+def source_of(args: argparse.Namespace, *refused: str) -> Source:
+    """The source that the arguments ask for, checked.
 
-    Example:
-        >>> names("--arms", "none, future-zeroed,none")
-        ('none', 'future-zeroed')
+    Args:
+        args: as `saccade.cli.arguments.add_rollout_arguments` declares them.
+        refused: options of the study that cannot be used with a file of features.
+
+    Raises:
+        InputError: an argument is wrong, or cannot be combined with another one.
+        FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
+        GraphicsError: the simulator is needed and cannot draw here.
     """
-    found = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-    if not found:
-        raise InputError(f"{option}: expected at least one name")
-    return found
+    if args.features is not None:
+        return recording_of(args, *refused)
+    if args.config is not None:
+        raise InputError("--config: only with --features; a policy of the simulator has its own")
+    return simulator_of(args)
 
 
-def check_known(what: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Raises `InputError` for the first name that is not known; lists those that are."""
-    known = list(known)
-    for name in given:
-        if name not in known:
-            raise InputError(f"{what}: unknown name {name!r}, expected one of {', '.join(known)}")
+def simulator_of(args: argparse.Namespace) -> Simulator:
+    """The simulator, for studies that need what only it knows; raises as `source_of`."""
+    if args.features is not None:
+        raise InputError(
+            "--features: this study needs what only the simulator knows; cuts, patching, gradients, "
+            "n-runtime and fast take a file of features"
+        )
+    from saccade.sim import graphics
+    from saccade.sim.tasks import check_evaluation_seeds
+
+    episodes = args.default_episodes if args.episodes is None else args.episodes
+    seeds = check_evaluation_seeds(args.seed, episodes)
+    check_tasks(args.tasks or ())
+    graphics.check()  # before MuJoCo is imported, which ends in a traceback without OpenGL
+    from saccade.study.simulator import simulator
+
+    return simulator(args.checkpoint, args.tasks, seeds, getattr(args, "engine", None) or "rust")
 
 
-def numbers(option: str, text: str | None, count: int) -> tuple[int, ...]:
-    """Distinct numbers below `count` out of a list with commas, in order; None gives all of them.
-
-    Example:
-        >>> numbers("--blocks", "3,0", 4), numbers("--blocks", None, 4)
-        ((0, 3), (0, 1, 2, 3))
-    """
-    if text is None:
-        return tuple(range(count))
-    try:
-        found = tuple(sorted({int(word) for word in names(option, text)}))
-    except ValueError:
-        raise InputError(f"{option}: given {text!r}, expected numbers separated by commas") from None
-    if found[0] < 0 or found[-1] >= count:
-        raise InputError(f"{option}: given {text}, expected 0 to {count - 1}")
+def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
+    """The recording that the arguments ask for, read and checked; arguments and errors as `source_of`."""
+    given = [name for name in ("tasks", "episodes", *refused) if getattr(args, name) is not None]
+    if given:
+        raise InputError(
+            f"{', '.join(f'--{name}' for name in given)}: not with --features, whose observations are all "
+            "measured as they are, without a simulator"
+        )
+    if args.seed < 0:
+        raise InputError(f"--seed: given {args.seed}, expected at least 0")
+    if args.checkpoint is None:
+        from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
+    else:
+        checkpoint = args.checkpoint
+    found = Recording(
+        checkpoint=str(checkpoint),
+        file=str(args.features),
+        config_file=None if args.config is None else str(args.config),
+        seed=args.seed,
+        # The bits do not depend on it. One process may use all cores; several share them.
+        num_threads=None if args.jobs == 1 else 1,
+    )
+    found.head()
+    _ = found.all
     return found

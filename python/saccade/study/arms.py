@@ -138,7 +138,12 @@ class ArmStudy(Study):
             return [{**row, "success": None, "note": note}]
         intervention = arm.intervention(tokens, source.rng(task, seed))
         before = unchanged(source, task, seed).actions
-        after = changed(source, task, seed, intervention)
+        try:
+            after = changed(source, task, seed, intervention)
+        except (
+            InputError
+        ) as error:  # a change that this head cannot have, such as one in blocks that it lacks
+            return [{**row, "success": None, "note": str(error)}]
         row |= source.outcome(task, seed, intervention)
         row |= {metric.name: float(metric.function(before, after)) for metric in self.metrics}
         if not source.closed_loop:
@@ -157,9 +162,3 @@ def between_draws(chunks: Float32Array) -> float | None:
         return None
     one, two = np.triu_indices(len(drawn), k=1)
     return float(np.abs(drawn[one] - drawn[two]).mean())
-
-
-def control_line(label: str, largest: float) -> str:
-    """Whether a control, which may change actions by rounding only, did so."""
-    verdict = "as it must be" if largest < ROUNDING else "WHICH IT MUST NOT: do not trust the other arms"
-    return f"Control, {label}: the chunk changed by {largest:.1g} at most, {verdict}."

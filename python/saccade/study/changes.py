@@ -1,35 +1,29 @@
-"""What a table says of arms that were measured on a recording: by how much the chunks change."""
+"""What a table shows about arms that were measured on a recording: by how much the chunks change."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from saccade.study import figures
-from saccade.study.arms import ArmStudy, control_line
-from saccade.study.section import Figure, Grid, Section, not_measured, number, too_few
+from saccade.study.arms import ROUNDING, ArmStudy
+from saccade.study.section import Figure, Grid, Prose, Section, not_measured, number
 from saccade.study.statistics import Estimate, bootstrap_ratio
 from saccade.study.table import Provenance, clusters_of
-
-NO_LOOP = f"Success: {not_measured('a file of features has no closed loop')}."
-NOT_SHOWN = (
-    "A changed chunk is not a failed task: whether it matters can be seen in closed loop only. The next look "
-    "may correct what this chunk got wrong.",
-    "Intervals are for observations like those of the file, with one set of weights.",
-)
 
 
 @dataclass(frozen=True)
 class ArmChange:
-    """What the table says of one arm.
+    """What the table shows about one arm.
 
     Attributes:
-        observations: So many.
-        change: Of the chunk; None if it was not measured.
-        ratio: The same over what another noise changes; None where noise was not drawn.
+        observations: Number of observations.
+        change: Mean |change| of an action; None if it was not measured.
+        ratio: `change` divided by the change that another noise makes; None where noise was not drawn.
         largest: The largest change of one action.
         note: Why it was not measured.
     """
@@ -42,7 +36,7 @@ class ArmChange:
 
 
 def arm_changes(table: pd.DataFrame, arms: Sequence[str]) -> dict[str, ArmChange]:
-    """Of those arms that the table has, in that order."""
+    """The arms that are in the table, in the given order."""
     found = {}
     for arm in arms:
         rows = table[table["arm"] == arm]
@@ -66,87 +60,63 @@ def arm_changes(table: pd.DataFrame, arms: Sequence[str]) -> dict[str, ArmChange
 
 def change_section(
     study: type[ArmStudy],
-    title: str,
+    prose: Prose,
     labels: Mapping[str, str],
-    about: Sequence[str],
-    not_shown: Sequence[str],
     table: pd.DataFrame,
     provenance: Provenance,
 ) -> Section:
-    """The section of a study of changes.
+    """The section of a study of arms on a recording.
 
     Args:
-        study: whose baseline and control the arms are compared with.
-        title: of the section.
-        labels: of the arms, in their order; those that the table has not are passed over.
-        about: paragraphs on the arms.
-        not_shown: what the study cannot show besides `NOT_SHOWN`.
-        table, provenance: of the study.
+        study: Its baseline is compared with the other arms, and its control must change nothing.
+        prose: Text of the study: `recorded_title`, `about` and `not_shown_of_arms`.
+        labels: Of the arms, in their order; those that are not in the table are skipped.
+        table, provenance: Of the study.
     """
     found = arm_changes(table, [arm for arm in labels if arm != study.baseline.name])
+    text = Prose(
+        "changes",
+        heading=prose.line("recorded_title"),
+        about=prose.paragraphs("about"),
+        not_shown_of_arms=prose.points("not_shown_of_arms"),
+        arms=[
+            {"label": labels[arm], "is_control": arm == study.control, **vars(one)}
+            for arm, one in found.items()
+        ],
+        recorded=recorded(table, table[table["chunk_change"].notna()], provenance),
+        rounding=ROUNDING,
+    )
     measured = {labels[arm]: one.change for arm, one in found.items() if one.change is not None}
     pictures = []
     if measured:
         picture = figures.estimates(
             list(measured), list(measured.values()), "mean |change of an action|", reference=0.0
         )
-        caption = "Change of the chunk on equal observations and noise, with a 95 % bootstrap interval."
-        pictures.append(Figure("change", caption, picture))
-    rows, concluded = [], []
+        pictures.append(Figure("change", text.line("caption_change"), picture))
+    rows = []
     for arm, one in found.items():
         if one.change is None:
             rows.append([labels[arm], not_measured(str(one.note)), "", ""])
-            concluded.append(f"{labels[arm]}: {not_measured(str(one.note))}.")
-            continue
-        ratio = "" if one.ratio is None else number(one.ratio, digits=2)
-        rows.append([labels[arm], str(one.observations), number(one.change, digits=4), ratio])
-        if arm == study.control:
-            concluded.append(control_line(labels[arm], one.largest))
-            continue
-        beside = f", {ratio} times what another noise changes" if ratio else ""
-        concluded.append(
-            f"{labels[arm]}: actions change by {number(one.change, digits=3)} on average{beside}."
-        )
-    columns = ("arm", "observations", "change of the chunk", "over another noise's")
-    return Section(
-        title=f"{title}, from a file of features",
-        summary=[
-            *summary(table, provenance),
-            "Change of the chunk: mean over its actions of |change|, with equal noise in every arm, and "
-            "beside it the same over what another noise changes (not known where the file brings its noise).",
-            *about,
-        ],
-        figures=pictures,
-        grids=[Grid("By arm, with 95 % intervals.", columns, rows)] if rows else [],
-        concluded=[*concluded, NO_LOOP, *cautions(table[table["chunk_change"].notna()], provenance)],
-        not_shown=(*not_shown, *NOT_SHOWN),
-    )
+        else:
+            ratio = "" if one.ratio is None else number(one.ratio, digits=2)
+            rows.append([labels[arm], str(one.observations), number(one.change, digits=4), ratio])
+    columns = ("arm", "observations", "change of the chunk", "relative to another noise")
+    return text.section(pictures, [Grid(text.line("caption_arms"), columns, rows)] if rows else [])
 
 
-def summary(table: pd.DataFrame, provenance: Provenance) -> list[str]:
-    """On what it was measured."""
-    checkpoint, features = provenance.settings["checkpoint"], provenance.settings["features"]
-    observations = table["seed"].nunique()
-    episodes = f" of {table['episode'].nunique()} episodes" if features["episodes"] is not None else ""
-    return [
-        f"From a file of features, {features['name']} (SHA-256 {features['sha256'][:12]}): {observations} "
-        f"observations{episodes}, {checkpoint['num_vl_tokens']} vision-language tokens each; noise: "
-        f"{features['noise']}. Checkpoint {checkpoint['name']} (SHA-256 {checkpoint['sha256'][:12]}), N = "
-        f"{checkpoint['num_future_tokens']} future tokens, {checkpoint['num_layers']} blocks, "
-        f"{checkpoint['num_steps']} Euler steps. Actions are the head's own, normalised; all of the config's "
-        "action dimensions count, also those that a robot leaves unused. Intervals are drawn by "
-        f"{'episode' if episodes else 'observation'}.",
-    ]
+def recorded(table: pd.DataFrame, measured: pd.DataFrame, provenance: Provenance) -> dict[str, Any]:
+    """What the template `recording` says of a recording.
 
-
-def cautions(table: pd.DataFrame, provenance: Provenance) -> list[str]:
-    """What is to be known of the intervals; nothing where nothing was measured."""
-    if table.empty:
-        return []
-    lines = []
-    if provenance.settings["features"]["episodes"] is None:
-        lines.append(
-            "The file does not say of which episode an observation is, so each counts by itself. If several "
-            "are of one episode, the intervals are too narrow; an array named episode mends that."
-        )
-    return lines + too_few(table["episode"].nunique(), "independent observations or episodes")
+    Args:
+        table, provenance: Of the study.
+        measured: The rows that intervals are computed from.
+    """
+    settings = provenance.settings
+    known = settings["features"]["episodes"] is not None
+    return {
+        "features": settings["features"],
+        "checkpoint": settings["checkpoint"],
+        "observations": table["seed"].nunique(),
+        "episodes": table["episode"].nunique() if known else None,
+        "clusters": measured["episode"].nunique() if len(measured) else 0,
+    }

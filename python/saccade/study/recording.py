@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 from saccade import observation
 from saccade._files import checkpoint_identity, sha256_of
 from saccade.config import HeadConfig
-from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
@@ -120,33 +118,6 @@ class Recording(Source):
     def labels(self, task: str, seed: int) -> dict[str, Any]:
         """See `Source`."""
         return {"episode": self.episode_of(seed)}
-
-
-def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
-    """The recording that the arguments ask for, read and checked; arguments and errors as `source_of`."""
-    given = [name for name in ("tasks", "episodes", *refused) if getattr(args, name) is not None]
-    if given:
-        raise InputError(
-            f"{', '.join(f'--{name}' for name in given)}: not with --features, whose observations are all "
-            "measured as they are, without a simulator"
-        )
-    if args.seed < 0:
-        raise InputError(f"--seed: given {args.seed}, expected at least 0")
-    if args.checkpoint is None:
-        from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
-    else:
-        checkpoint = args.checkpoint
-    found = Recording(
-        checkpoint=str(checkpoint),
-        file=str(args.features),
-        config_file=None if args.config is None else str(args.config),
-        seed=args.seed,
-        # The bits do not depend on it. One process may use all cores; several share them.
-        num_threads=None if args.jobs == 1 else 1,
-    )
-    found.head()
-    _ = found.all
-    return found
 
 
 @functools.lru_cache(maxsize=3)

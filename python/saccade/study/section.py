@@ -117,7 +117,7 @@ def templates() -> Environment:
         "row": markdown_row,
         "verdict": verdict,
     }
-    environment.globals["margin"] = f"{100 * LOSS_THAT_MATTERS:.0f}"
+    environment.globals |= {"margin": f"{100 * LOSS_THAT_MATTERS:.0f}", "fewest": FEWEST}
     return environment
 
 
@@ -184,16 +184,6 @@ def effect(what: str, difference: Estimate) -> str:
 def not_measured(reason: str) -> str:
     """What is written where there is no number."""
     return Prose("words").line("not_measured", reason)
-
-
-def too_few(count: int, what: str) -> list[str]:
-    """A warning if a bootstrap interval is computed from too few clusters, else nothing.
-
-    Example:
-        >>> too_few(3, "episodes")
-        ['Only 3 episodes: bootstrap intervals are too narrow with fewer than about 10.']
-    """
-    return [] if count >= FEWEST else [Prose("words").line("too_few", count, what, FEWEST)]
 
 
 def markdown_row(cells: Sequence[str]) -> str:

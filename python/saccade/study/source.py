@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,9 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from saccade.cli.arguments import check_tasks
 from saccade.config import HeadConfig
-from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
@@ -143,44 +140,3 @@ def changed(source: Source, task: str, seed: int, intervention: Intervention | N
         return before.actions
     pairs = zip(before.observations, before.contexts, strict=True)
     return np.concatenate([source.actions(one, intervention, context) for one, context in pairs])
-
-
-def source_of(args: argparse.Namespace, *refused: str) -> Source:
-    """The source that the arguments ask for, checked.
-
-    Args:
-        args: as `saccade.cli.arguments.add_rollout_arguments` declares them.
-        refused: options of the study that cannot be used with a file of features.
-
-    Raises:
-        InputError: an argument is wrong, or cannot be combined with another one.
-        FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
-        GraphicsError: the simulator is needed and cannot draw here.
-    """
-    # Each needs packages that the other does not.
-    if args.features is not None:
-        from saccade.study.recording import recording_of
-
-        return recording_of(args, *refused)
-    if args.config is not None:
-        raise InputError("--config: only with --features; a policy of the simulator has its own")
-    return simulator_of(args)
-
-
-def simulator_of(args: argparse.Namespace) -> Any:
-    """The simulator, for studies that need what only it knows; raises as `source_of`."""
-    if args.features is not None:
-        raise InputError(
-            "--features: this study needs what only the simulator knows; cuts, patching, gradients, "
-            "n-runtime and fast take a file of features"
-        )
-    from saccade.sim import graphics
-    from saccade.sim.tasks import check_evaluation_seeds
-
-    episodes = args.default_episodes if args.episodes is None else args.episodes
-    seeds = check_evaluation_seeds(args.seed, episodes)
-    check_tasks(args.tasks or ())
-    graphics.check()  # before MuJoCo is imported, which ends in a traceback without OpenGL
-    from saccade.study.simulator import simulator
-
-    return simulator(args.checkpoint, args.tasks, seeds, getattr(args, "engine", None) or "rust")

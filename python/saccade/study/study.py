@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from saccade.study.section import Section
     from saccade.study.table import Provenance
 
-#: Every study by name: where its class is, `module:class`, and one line of help. A module is imported when its
-#: study is chosen. The report has its sections in this order.
+#: Every study by name: where its class is, `module:class`, and one line of help. A module is imported when
+#: its study is chosen. The report has its sections in this order.
 STUDIES: dict[str, tuple[str, str]] = {
     "cuts": (
         "saccade.study.questions.cuts:Cuts",

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from saccade.context import Context
 from saccade.errors import InputError
-from saccade.head import Context
 from saccade.observation import Observation
 from saccade.sim.policy import EMBODIMENT_ID, Float32Array, Interventions, Policy
 from saccade.study.questions.fast_modes import Calibration, Mode, encode, sample

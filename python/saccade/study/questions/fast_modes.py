@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade.context import Context
 from saccade.errors import InputError
-from saccade.head import ActionHead, Context
+from saccade.head import ActionHead
 from saccade.observation import Observation
 from saccade.study.cell import digest
 from saccade.study.source import Float32Array

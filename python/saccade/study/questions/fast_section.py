@@ -24,7 +24,7 @@ from saccade.study.questions.fast_results import (
     separations,
     timed_sizes,
 )
-from saccade.study.section import Figure, Grid, Prose, Section, number, points, rate, too_few
+from saccade.study.section import Figure, Grid, Prose, Section, number, points, rate
 from saccade.study.statistics import Estimate, PairedDifference, scaled
 from saccade.study.table import Provenance, from_file, truths
 
@@ -50,9 +50,8 @@ def values(table: pd.DataFrame, provenance: Provenance, results: Mapping[str, Mo
     return {
         "baseline": BASELINE,
         "one_step": ONE_STEP,
-        "closed_loop": not recorded,
         "checkpoint": provenance.settings["checkpoint"],
-        "recorded": changes.summary(of_baseline, provenance) if recorded and len(of_baseline) else [],
+        "recorded": changes.recorded(of_baseline, of_baseline, provenance) if recorded else None,
         "looks": 0 if chunks.empty else int(of_baseline["looks"].sum()),
         "episodes": not episodes.empty,
         "sizes": [
@@ -65,14 +64,12 @@ def values(table: pd.DataFrame, provenance: Provenance, results: Mapping[str, Mo
         "doubtful": [
             judgement(results, one) for one in judged if one.verdict != "undecided" and not one.significant
         ],
-        "warnings": too_few(min(pairs), "paired episodes") if pairs else [],
+        "pairs": min(pairs, default=0),
         "recommended": recommended(results) if judged else [],
         "screened": [
             {"name": one.name, "change": one.change, "ratio": one.ratio, "times": saved(results, one.name)}
             for one in screened
         ],
-        "cautions": [changes.NO_LOOP, *changes.cautions(of_baseline, provenance)] if recorded else [],
-        "not_shown_of_recordings": changes.NOT_SHOWN if recorded else [],
     }
 
 
@@ -220,7 +217,7 @@ def pictures(prose: Prose, results: Mapping[str, ModeResult]) -> list[Figure]:
         }
         if success:
             caption = prose.line("caption_frontier", SIZES[size])
-            picture = scattered(success, "milliseconds a chunk", "success, %")
+            picture = scattered(success, "milliseconds per chunk", "success, %")
             found.append(Figure(f"frontier-{size.replace('.', '')}", caption, picture))
     for size in timed_sizes(results)[:1]:
         errors = {
@@ -230,7 +227,7 @@ def pictures(prose: Prose, results: Mapping[str, ModeResult]) -> list[Figure]:
         }
         if errors:
             caption = prose.line("caption_errors", SIZES[size])
-            picture = scattered(errors, "milliseconds a chunk", "|difference| of an action", falling=True)
+            picture = scattered(errors, "milliseconds per chunk", "|difference| of an action", falling=True)
             found.append(Figure("errors", caption, picture))
     return found
 

@@ -22,17 +22,16 @@ from saccade.cli.arguments import add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS
 from saccade.observation import MASKS, Observation
-from saccade.study import figures
+from saccade.study.arguments import source_of
 from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
-from saccade.study.changes import cautions
-from saccade.study.changes import summary as file_summary
-from saccade.study.paths import DETOUR, DIRECT, PATHS, READ
-from saccade.study.section import Figure, Grid, Section, not_measured, number
-from saccade.study.source import Source, source_of
-from saccade.study.statistics import Estimate, bootstrap
+from saccade.study.paths import PATHS
+from saccade.study.questions.gradients_section import section
+from saccade.study.recording import Recording
+from saccade.study.section import Section
+from saccade.study.source import Source
 from saccade.study.study import Study
-from saccade.study.table import Provenance, clusters_of, from_file
+from saccade.study.table import Provenance
 
 if TYPE_CHECKING:
     import torch
@@ -163,6 +162,7 @@ class Gradients(Study):
 
         from saccade.study import derivatives
 
+        assert observation.noise is not None
         masks = {name: getattr(observation, name) for name in MASKS}
         masks = {name: torch.from_numpy(mask) for name, mask in masks.items() if mask is not None}
         inputs = (
@@ -175,7 +175,7 @@ class Gradients(Study):
         # In a head of full size, which a file may be for, the graph takes a gigabyte for each projection.
         size = self.projections if self.source.closed_loop else 1
         sensitivities, paths = [], []
-        for some in cotangents.split(size):
+        for some in torch.split(cotangents, size):
             given = (head, *inputs, some, int(observation.embodiment_id[0]), masks)
             sensitivities.append(derivatives.action_sensitivity(*given))
             if head.config.num_future_tokens:
@@ -188,8 +188,6 @@ class Gradients(Study):
     def generator(self, task: str, seed: int) -> torch.Generator:
         """Of the random projections of a cell."""
         import torch
-
-        from saccade.study.recording import Recording
 
         given = (self.source.seed, seed) if isinstance(self.source, Recording) else (seed, *map(ord, task))
         return torch.Generator().manual_seed(int(np.random.default_rng(given).integers(2**31)))
@@ -261,14 +259,13 @@ def reference_of(source: Source) -> ActionHead:
     import torch
 
     from saccade.reference import ActionHead
-    from saccade.study.recording import Recording
 
-    checkpoint, config, num_threads = source.checkpoint, None, 1
-    if isinstance(source, Recording):
-        config, num_threads = source.config_file, source.num_threads
+    recording = source if isinstance(source, Recording) else None
+    num_threads = 1 if recording is None else recording.num_threads
     if num_threads is not None:
         torch.set_num_threads(num_threads)
-    head = ActionHead.load(checkpoint, config=config)
+    config = None if recording is None else recording.config_file
+    head = ActionHead.load(source.checkpoint, config=config)
     head.requires_grad_(False)
     return head
 
@@ -319,189 +316,3 @@ def spaced(count: int, wanted: int) -> list[int]:
         ([0, 3, 6], [0, 1])
     """
     return [place * count // wanted for place in range(wanted)] if count > wanted else list(range(count))
-
-
-def mean_of(table: pd.DataFrame, column: str) -> Estimate:
-    """The mean over episodes, drawing episodes."""
-    return bootstrap(table[column].to_numpy(), clusters_of(table))
-
-
-def section(table: pd.DataFrame, provenance: Provenance) -> Section:
-    """The study's part of the report."""
-    settings = provenance.settings
-    episodes = {kind: len(rows.groupby(["task", "seed"])) for kind, rows in table.groupby("of")}
-    how = (
-        "derivatives of the sampled chunk (all Euler steps, normalised actions) in torch, Frobenius norms "
-        f"from {settings['projections']} random projections. {loss_summary(episodes.get('loss', 0))}"
-    )
-    title, warned = "Gradients", []
-    if from_file(provenance):
-        title, warned = "Gradients, from a file of features", cautions(table, provenance)
-        summary = [*file_summary(table, provenance), f"{how[0].upper()}{how[1:]}"]
-    else:
-        summary = [
-            f"{episodes.get('actions', 0)} episodes of {settings['checkpoint']['name']} in closed loop, up "
-            f"to {settings['looks']} looks of each; {how} Intervals are over episodes."
-        ]
-    summary.append(
-        "The change for a row is the norm of the derivative times the row's length: to first order, how much "
-        "the chunk moves if the row changes by its own length, at every Euler step. Norms alone are in the "
-        "table; blocks normalise what they read, so those say as much about how long a row is.",
-    )
-    pictures = [
-        Figure(f"rows-of-{kind}", caption, sensitivity_picture(table[table["of"] == kind], label))
-        for kind, caption, label in (
-            (
-                "actions",
-                "Change of the chunk for a change of one row by its own length, before the first block (-1) "
-                "and after each; root mean square over the rows of a group, 95 % intervals.",
-                "change of the chunk (norm)",
-            ),
-            (
-                "loss",
-                "The same for the flow-matching loss on demonstrations.",
-                "change of the loss",
-            ),
-        )
-        if kind in episodes
-    ]
-    if "token" in table:
-        pictures.append(
-            Figure(
-                "tokens",
-                "Change of the chunk for a change of one learned future token by its own length, the largest "
-                "first; 95 % intervals.",
-                token_picture(table),
-            )
-        )
-    if "path" not in table:
-        return Section(
-            title,
-            summary,
-            pictures,
-            concluded=[f"Paths: {not_measured(NO_TOKENS)}.", *warned],
-            not_shown=NOT_SHOWN,
-        )
-    paths = table[table["path"].notna()]
-    share = {path: mean_of(shares_of(paths, path), "share") for path in PATHS}
-    pictures.insert(
-        0,
-        Figure(
-            "paths",
-            "Share of each path in the derivative of the chunk by the vision-language tokens, along the "
-            "whole; shares add up to 1. Means over episodes, 95 % intervals.",
-            figures.estimates(PATHS, list(share.values()), "share of the derivative", reference=0),
-        ),
-    )
-    return Section(
-        title,
-        summary,
-        pictures,
-        [path_grid(paths), cosine_grid(paths)],
-        [*conclusions(paths, share), *warned],
-        NOT_SHOWN,
-    )
-
-
-def loss_summary(demonstrations: int) -> str:
-    """What was done about the loss."""
-    if not demonstrations:
-        return f"The loss: {not_measured('no demonstrations were given')}."
-    return f"The loss: on {demonstrations} demonstrations, which the policy may have been trained on."
-
-
-def sensitivity_picture(table: pd.DataFrame, label: str) -> Any:
-    """A line for each group of rows over the blocks."""
-    groups = table[table["group"].notna() & (table["token"].isna() if "token" in table else True)]
-    blocks = sorted(int(block) for block in groups["block"].unique())
-    series = {
-        str(group): [mean_of(rows[rows["block"] == block], "relative") for block in blocks]
-        for group, rows in groups.groupby("group")
-    }
-    return figures.lines(blocks, series, "after block", label)
-
-
-def token_picture(table: pd.DataFrame) -> Any:
-    """An estimate for each learned token, the largest first."""
-    tokens = table[(table["of"] == "actions") & table["token"].notna()]
-    found = {
-        int(token): mean_of(tokens[tokens["token"] == token], "relative")
-        for token in tokens["token"].unique()
-    }
-    order = sorted(found, key=lambda token: -found[token].value)
-    picture, (axes,) = figures.new_picture()
-    for place, token in enumerate(order):
-        axes.plot([place, place], [found[token].low, found[token].high], color=figures.COLOURS[0])
-        axes.plot([place], [found[token].value], "o", color=figures.COLOURS[0], markersize=4)
-    axes.set_xticks(range(len(order)), [str(token) for token in order], fontsize="x-small")
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel("future token")
-    axes.set_ylabel("change of the chunk (norm)")
-    return picture
-
-
-def shares_of(paths: pd.DataFrame, path: str) -> pd.DataFrame:
-    """The rows with a path's length and share."""
-    return paths[(paths["path"] == path) & paths["share"].notna()]
-
-
-def path_grid(paths: pd.DataFrame) -> Grid:
-    """Lengths and shares of the paths, over all and by task."""
-    rows = []
-    for path in PATHS:
-        of_path = shares_of(paths, path)
-        by_task = [
-            number(mean_of(values, "share"), digits=2) for _, values in of_path.groupby("task", sort=False)
-        ]
-        rows.append(
-            [
-                path,
-                number(mean_of(of_path, "length"), digits=2),
-                number(mean_of(of_path, "share"), digits=2),
-                *by_task,
-            ]
-        )
-    tasks = list(dict.fromkeys(paths["task"]))
-    caption = (
-        "Paths from the vision-language tokens to the chunk. Length: Frobenius norm over that of the whole; "
-        "lengths need not add up. Share: the part along the whole; adds up to 1. Then the share by task."
-    )
-    return Grid(caption, ("path", "length", "share", *tasks), rows)
-
-
-def cosine_grid(paths: pd.DataFrame) -> Grid:
-    """Cosines between paths."""
-    pairs = paths[paths["cosine"].notna()]
-    rows = [
-        [str(one), str(other), number(mean_of(values, "cosine"), digits=2)]
-        for (one, other), values in pairs.groupby(["path", "other_path"], sort=False)
-    ]
-    return Grid("Cosine between the derivatives along two paths.", ("path", "other path", "cosine"), rows)
-
-
-def conclusions(paths: pd.DataFrame, share: Mapping[str, Estimate]) -> list[str]:
-    """What the numbers say."""
-    through = paths[paths["path"].isin((READ, DETOUR)) & paths["share"].notna()]
-    sums = through.groupby(["task", "seed"])["share"].sum()  # sorted, as are the clusters
-    observed = through.sort_values(["task", "seed"]).drop_duplicates(["task", "seed"])
-    by_future = bootstrap(sums.to_numpy(), clusters_of(observed))
-    length = {path: number(mean_of(shares_of(paths, path), "length"), digits=2) for path in PATHS}
-    return [
-        "Of the derivative of the chunk by the vision-language tokens, a share of "
-        f"{number(share[DIRECT], digits=2)} runs by state and action rows alone and one of "
-        f"{number(by_future, digits=2)} through future rows. Of the latter, {number(share[READ], digits=2)} "
-        f"is read by future rows from the tokens; {number(share[DETOUR], digits=2)} was read by state or "
-        "action rows and passes future rows later. Shares are no proportions: one above 1 is taken back by a "
-        "negative one.",
-        f"By itself, what future rows read has a length of {length[READ]} times the whole, and what runs by "
-        f"state and action rows alone one of {length[DIRECT]}. Where lengths are larger than shares, paths "
-        "point in other directions than the whole, or against each other.",
-    ]
-
-
-NOT_SHOWN = (
-    "A derivative is what a small change does. A path that carries much of it may still be one that the "
-    "policy can do without: cuts and success in closed loop say that.",
-    "Shares depend on the coordinates: actions are normalised, and the vision-language tokens are taken as "
-    "they are, all directions alike, also those in which no picture ever moves them.",
-)

@@ -1,0 +1,77 @@
+"""A study with an arm and a metric of your own: what happens without the two longest future tokens?
+
+python examples/own_study.py                                              the bundled policy, in the simulator
+python examples/own_study.py --checkpoint CHECKPOINT --features LOOKS.npz   any checkpoint, on a recording
+
+The arm is compared with the unchanged head on equal episodes and noise. Results are kept in --out: run again
+with more episodes, the script measures only those. `saccade study report OUT` makes a page of them.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade.intervention import Intervention
+from saccade.study.arms import METRICS, Arm, Metric
+from saccade.study.questions.cuts import Cuts
+from saccade.study.recording import Recording
+from saccade.study.run import run
+from saccade.study.source import Source
+from saccade.study.table import provenance_path, read_provenance
+
+Float32Array = npt.NDArray[np.float32]
+REMOVED = 2
+
+
+def without_longest(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+    """The learned future tokens `(N, width)` without the longest ones."""
+    kept = np.sort(np.argsort(np.linalg.norm(tokens, axis=1))[:-REMOVED])
+    return Intervention(future_tokens=tokens[kept])
+
+
+def first_action(before: Float32Array, after: Float32Array) -> float:
+    """How far the first action of a chunk moves; both are `(observations, draws, horizon, action_dim)`."""
+    return float(np.abs(after - before)[:, :, 0].mean())
+
+
+ARM = Arm(
+    "without-longest",
+    label=f"without the {REMOVED} longest future tokens",
+    about="The future tokens with the largest norm are removed; the others stay as they are.",
+    intervention=without_longest,
+    settings={"removed": REMOVED},  # part of the cell's name: another number is measured again
+)
+
+
+def source_of(args: argparse.Namespace) -> Source:
+    """A recording if there is one, else episodes of a policy in the simulator."""
+    if args.features is not None:
+        return Recording(str(args.checkpoint), str(args.features))
+    from saccade.study.simulator import simulator  # needs the extra `sim` and OpenGL
+
+    return simulator(args.checkpoint, ["button-press-topdown"], range(args.episodes))
+
+
+def main() -> None:
+    """Measures the arm and prints what can be concluded."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--checkpoint", type=Path, help="default: the bundled policy")
+    parser.add_argument("--features", type=Path, help="recorded observations for the checkpoint")
+    parser.add_argument("--episodes", type=int, default=3, help="in the simulator (default: 3)")
+    parser.add_argument("--out", type=Path, default=Path("out/own-study"))
+    args = parser.parse_args()
+    if args.features is not None and args.checkpoint is None:
+        parser.error("--features needs a --checkpoint")
+
+    study = Cuts(source_of(args), arms=(ARM,), metrics=(*METRICS, Metric("first_action", first_action)))
+    table = run(study, args.out)
+    for line in Cuts.summarise(table, read_provenance(provenance_path(args.out, Cuts.name))).concluded:
+        print(f"- {line}")
+    moved = table[table["arm"] == ARM.name]["first_action"]
+    print(f"The first action moves by {moved.mean():.4f} on average (per episode up to {moved.max():.4f}).")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,215 @@
+"""One observation with what a map of it needs: title, pictures, layout of its tokens, occluder."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade.config import HeadConfig
+from saccade.errors import InputError, ShapeError
+from saccade.maps import layout as layouts
+from saccade.maps.layout import Layout
+from saccade.maps.occlusion import BlankedPixels, DroppedPositions, Occluder
+from saccade.observation import Observation, as_mask, from_arrays, read_arrays
+from saccade.sim.policy import EMBODIMENT_ID, Policy
+
+UInt8Array = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class View:
+    """One observation to be mapped.
+
+    Attributes:
+        title: What it is, on one line.
+        source: The same for JSON.
+        observation: One row, with noise.
+        layout: What the positions of T_vl are.
+        images: By camera name, `(H, W, 3)`; empty if there are no pictures to draw on.
+        occluder: Removes patches.
+    """
+
+    title: str
+    source: dict[str, Any]
+    observation: Observation
+    layout: Layout
+    images: dict[str, UInt8Array]
+    occluder: Occluder
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """How to find the image tokens in a file of features.
+
+    Attributes:
+        text: A layout written by hand, see `layout.parse_layout`; it overrides what the file says.
+        grid: Rows and columns of a picture.
+        image_token_index: The id of the token that stands for one patch.
+    """
+
+    text: str | None = None
+    grid: tuple[int, int] | None = None
+    image_token_index: int = layouts.IMAGE_TOKEN_INDEX
+
+
+def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> View:
+    """What the policy sees after a number of control steps of a rollout, with the noise of that rollout.
+
+    Raises:
+        InputError: the episode ends before that.
+    """
+    from saccade.sim.rollout import environment_for
+    from saccade.sim.tasks import TASKS
+
+    rng = np.random.default_rng((list(TASKS).index(task), seed))
+    with contextlib.closing(environment_for(policy, task)) as environment:
+        environment.restart(seed)
+        steps = 0
+        while True:
+            observation = environment.observe()
+            noise = policy.noise(rng)
+            if steps == control_steps:
+                break
+            chunk = policy.act(observation, noise=noise)
+            for action in chunk.actions[: min(policy.config.execute_steps, control_steps - steps)]:
+                success = environment.advance(action).success
+                steps += 1
+                if steps < control_steps and (success or steps == environment.task.max_steps):
+                    raise InputError(
+                        f"--after: given {control_steps}, but the episode {task} {seed} ends after "
+                        f"{steps} steps"
+                    )
+    instruction = observation["instruction"]
+    cameras = [camera.name for camera in policy.config.cameras]
+    given = Observation(
+        policy.features(observation), policy.state(observation), np.array([EMBODIMENT_ID]), noise
+    )
+    return View(
+        title=f'{task}, seed {seed}, after {control_steps} control steps: "{instruction}"',
+        source={
+            "kind": "simulator",
+            "task": task,
+            "seed": seed,
+            "control_steps": control_steps,
+            "instruction": instruction,
+        },
+        observation=given,
+        layout=layouts.of_policy(policy.config.backbone, cameras, policy.config.vocabulary, instruction),
+        images={name: observation["images"][name] for name in cameras},
+        occluder=BlankedPixels(policy, observation, given),
+    )
+
+
+def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOptions, seed: int) -> View:
+    """One observation of a file of backbone features.
+
+    Args:
+        path: `.npz` or `.safetensors`, see `saccade.observation.read_arrays`.
+        config: of the head that will take them.
+        row: which of the observations of the file.
+        options: where its image tokens are.
+        seed: of the noise, if the file has none.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: arrays are missing or not finite, or nothing says where the image tokens are.
+        ShapeError: sizes that do not fit the head or each other.
+    """
+    arrays = read_arrays(path)
+    # Heads that ignore padding show it: there these masks say what the positions are, and nothing else.
+    shown = () if config.mask_mode == "alternate" else ("attention_mask", "image_mask")
+    given = from_arrays(
+        {name: array for name, array in arrays.items() if name not in shown}, config, str(path)
+    )
+    batch, num_tokens = len(given), given.num_vl_tokens
+    if not 0 <= row < batch:
+        raise InputError(f"--row: given {row}, {path} has rows 0 to {batch - 1}")
+
+    def of_row(name: str, shape: tuple[int, ...]) -> npt.NDArray[Any] | None:
+        """The row of an array `(batch, *shape)`; -1 is any size. One row may leave out the batch axis."""
+        if name not in arrays:
+            return None
+        array = np.asarray(arrays[name])
+        if batch == 1 and array.ndim == len(shape):
+            array = array[None]
+        sizes = (batch, *shape)
+        if array.ndim != len(sizes) or any(
+            size not in (-1, given) for given, size in zip(array.shape, sizes, strict=True)
+        ):
+            shown = ", ".join("any" if size < 0 else str(size) for size in sizes)
+            raise ShapeError(f"{path}: {name}: shape {array.shape}, expected ({shown})")
+        chosen: npt.NDArray[Any] = array[row]
+        return chosen
+
+    names = of_row("tokens", (num_tokens,))
+    layout = _layout(
+        num_tokens,
+        options,
+        input_ids=of_row("input_ids", (num_tokens,)),
+        image_mask=as_mask(str(path), "image_mask", of_row("image_mask", (num_tokens,))),
+        attention_mask=as_mask(str(path), "attention_mask", of_row("attention_mask", (num_tokens,))),
+        names=None if names is None else [str(name) for name in names],
+        path=path,
+    )
+    pictures = of_row("images", (len(layout.cameras), -1, -1, 3))
+    if pictures is not None and pictures.dtype != np.uint8:
+        raise InputError(f"{path}: images: expected uint8, got {pictures.dtype}")
+    dropped = as_mask(str(path), "drop_vl", of_row("drop_vl", (num_tokens,)))
+    if dropped is not None and dropped.any():
+        raise InputError(f"{path}: drop_vl: maps show all positions, expected none dropped in row {row}")
+    observation = given.row(row).with_noise(np.random.default_rng(seed), config)
+    embodiment_id = int(observation.embodiment_id[0])
+    return View(
+        title=f"{path.name}, row {row} of {batch}, embodiment {embodiment_id}",
+        source={
+            "kind": "features",
+            "file": path.name,
+            "row": row,
+            "embodiment_id": embodiment_id,
+            "noise": "from the file" if "noise" in arrays else f"seed {seed}",
+        },
+        observation=observation,
+        layout=layout,
+        images={}
+        if pictures is None
+        else {camera.name: picture for camera, picture in zip(layout.cameras, pictures, strict=True)},
+        occluder=DroppedPositions(observation),
+    )
+
+
+def _layout(
+    num_tokens: int,
+    options: LayoutOptions,
+    *,
+    input_ids: npt.NDArray[Any] | None,
+    image_mask: npt.NDArray[np.bool_] | None,
+    attention_mask: npt.NDArray[np.bool_] | None,
+    names: Sequence[str] | None,
+    path: Path,
+) -> Layout:
+    if options.text is not None:
+        return layouts.parse_layout(options.text, num_tokens, names)
+    if input_ids is not None:
+        if input_ids.dtype.kind not in "iu":
+            raise InputError(f"{path}: input_ids: expected integers, got {input_ids.dtype}")
+        return layouts.from_input_ids(
+            input_ids,
+            image_token_index=options.image_token_index,
+            grid=options.grid or layouts.DEFAULT_GRID,
+            names=names,
+            attention_mask=attention_mask,
+        )
+    if image_mask is not None:
+        return layouts.from_image_mask(
+            image_mask, grid=options.grid, names=names, attention_mask=attention_mask
+        )
+    raise InputError(
+        f"{path}: neither input_ids nor image_mask; give the positions of image tokens with --layout "
+        f"({layouts.GRAMMAR})"
+    )
