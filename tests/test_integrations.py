@@ -222,7 +222,7 @@ def test_inference_mode() -> None:
 
 
 def test_the_benchmark_runs() -> None:
-    options = ["--size", "small", "--num-vl-tokens", "9", "--rounds", "1", "--threads", "1"]
+    options = ["--size", "small", "--num-vl-tokens", "9", "--rounds", "1", "--num-threads", "1"]
     command = [sys.executable, "-m", "benches.accelerate", *options, "--precisions", "int8"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.count("| int8 | float32") == 2

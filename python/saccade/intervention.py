@@ -83,8 +83,8 @@ class Intervention:
     """
 
     cut: Sequence[tuple[Tokens, Tokens]] = ()
-    key_bias: Mapping[str, float | ArrayLike] | Mapping[Tokens, float | ArrayLike] | None = None
-    patch: Mapping[tuple[int, int], Mapping[str, ArrayLike] | Mapping[Tokens, ArrayLike]] | None = None
+    key_bias: Mapping[Tokens, float | ArrayLike] | None = None
+    patch: Mapping[tuple[int, int], Mapping[Tokens, ArrayLike]] | None = None
     future_tokens: ArrayLike | None = None
     blocks: Sequence[int] | int | None = None
     steps: Sequence[int] | int | None = None
