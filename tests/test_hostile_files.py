@@ -10,7 +10,6 @@ import functools
 import json
 import math
 import os
-import re
 import resource
 import shutil
 import signal
@@ -576,42 +575,6 @@ def test_a_killed_writer_leaves_no_checkpoint(entry: str, good: Path, tmp_path: 
     assert left.startswith(".out.")
     WRITERS[entry](good, tmp_path / "out")
     saccade.ActionHead.load(tmp_path / "out")
-
-
-CAN_MOUNT = shutil.which("unshare") and not subprocess.run(
-    ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True, check=False
-).returncode
-
-
-@pytest.mark.skipif(not CAN_MOUNT, reason="mounting a disk needs a namespace of its own")
-@pytest.mark.parametrize("entry", WRITERS)
-@pytest.mark.parametrize(
-    ("options", "problem"), [("size=20k", "No space left on device"), ("ro", "Read-only file system")]
-)
-def test_a_disk_that_is_full_or_read_only(
-    options: str, problem: str, entry: str, good: Path, tmp_path: Path
-) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    code = (
-        "import os, sys; sys.path.insert(0, os.environ['TESTS'])\n"
-        "import test_hostile_files as t; from pathlib import Path; from saccade.errors import CheckpointError\n"
-        "try: t.WRITERS[sys.argv[1]](Path('good'), Path('disk/out'))\n"
-        "except CheckpointError as error: print(error)\n"
-        "print(os.listdir('disk'))\n"
-    )
-    script = f'mount -t tmpfs -o {options} none disk && exec "$@"'
-    done = subprocess.run(
-        ["unshare", "-rm", "sh", "-c", script, "sh", sys.executable, "-c", code, entry],
-        cwd=tmp_path,
-        env=os.environ | {"TESTS": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    message, left = done.stdout.splitlines()
-    assert re.match(rf"out: disk/\S+ cannot be written: {problem}", message), message
-    assert left == "[]"
 
 
 def of_holes(folder: Path, shapes: Iterable[tuple[str, list[int]]], dtype: str) -> None:

@@ -315,7 +315,7 @@ impl Reader {
         let cross = "diffusion_model_cfg.cross_attention_dim";
         match number(dit, "cross_attention_dim") {
             Some(given) => equal(cross, given, "backbone_embedding_dim", config.context_dim),
-            // What stands for null is the width; the later versions give their class `backbone_embedding_dim` instead.
+            // Null means the width; the later versions give their class `backbone_embedding_dim` instead.
             None if version == Version::N15 => equal(
                 &format!("{cross} (null, so input_embedding_dim)"),
                 config.width,

@@ -42,13 +42,13 @@ pub struct Published {
 }
 
 impl Published {
-    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` beside the weights.
+    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights.
     ///
     /// The names and shapes of single tensors are checked where they are read.
     ///
     /// # Errors
-    /// [`Error::NotFound`] for a path or a config that is not there; [`Error::Checkpoint`] for files that are broken, a config that is
-    /// none, and for whatever config and tensors disagree on: all of it is listed.
+    /// [`Error::File`] for a path or a config that is not there and for broken files; [`Error::Checkpoint`] for a config that is not one, and
+    /// for everything that config and tensors disagree on, in one list.
     pub fn open(source: &Path, config: Option<&str>) -> Result<Self> {
         let checkpoint = Checkpoint::open(source)?;
         let directory = match source.is_dir() {
@@ -94,7 +94,7 @@ impl Published {
         })
     }
 
-    /// All tensors of the checkpoint, sorted by name; without those that stand in two files, which [`Published::check`] refuses in a head.
+    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which [`Published::check`] refuses in a head.
     pub fn tensors(&self) -> impl Iterator<Item = TensorFacts> {
         let checkpoint = &self.checkpoint;
         checkpoint.names().filter_map(|name| {
@@ -107,7 +107,7 @@ impl Published {
         })
     }
 
-    /// That exactly the head's tensors stand under the prefix, each of the right shape and a readable type.
+    /// Checks that exactly the head's tensors are under the prefix, each of the right shape and a readable type.
     ///
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.

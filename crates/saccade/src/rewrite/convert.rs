@@ -64,13 +64,13 @@ pub struct ConvertReport {
 
 /// Writes the checkpoint `source` to the directory `out`, changed as the options say. Everything else is copied bit for bit.
 ///
-/// NaN and infinity stay what they are: a head with such weights is as unusable as it was. One piece of a tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; where it returns
-/// false, nothing is written.
+/// NaN and infinity are copied too; [`ActionHead::load`](crate::ActionHead::load) refuses them in the copy as in the source. One piece of a
+/// tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
 /// # Errors
-/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a finite number that the type cannot hold; [`Error::Input`]
-/// for ids out of range, and if `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source;
-/// [`Error::Output`] if it cannot be written.
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, and for a finite number that the
+/// type cannot hold; [`Input`](crate::ErrorKind::Input) for ids out of range, and if `out` exists and `force` is not set, holds anything but
+/// such a checkpoint, or is the source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn convert(
     source: &Path,
     out: &Path,
@@ -136,9 +136,7 @@ pub fn convert(
                         Some((from, to)) => rounding.write(name, bytes, from, to, writer),
                     })?;
             } else {
-                let nbytes = change.map_or(nbytes, |(from, to)| {
-                    nbytes / from.dtype().bitsize() as u64 * to.dtype().bitsize() as u64
-                });
+                let nbytes = change.map_or(nbytes, |(from, to)| nbytes / from.size() * to.size());
                 writer.zeros(name, nbytes);
                 zeroed_bytes += nbytes;
             }

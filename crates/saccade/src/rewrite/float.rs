@@ -51,6 +51,14 @@ impl Float {
         }
     }
 
+    /// Bytes of a number.
+    pub(crate) fn size(self) -> u64 {
+        match self {
+            Self::F32 => 4,
+            Self::Bf16 | Self::F16 => 2,
+        }
+    }
+
     /// The numbers with these bytes.
     pub(crate) fn read(self, bytes: &[u8], values: &mut Vec<f32>) {
         let pairs = || {

@@ -32,13 +32,13 @@ pub struct QuantizeReport {
 /// and float32 `X.weight_scale (out)`, by [`quantize_rows`]: what [`Precision::Int8`](crate::Precision::Int8) computes with, so that
 /// loading the result at that precision gives the same bits as loading `source` at it. All other tensors are copied bit for bit.
 ///
-/// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; where it returns false, nothing
-/// is written.
+/// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is
+/// written.
 ///
 /// # Errors
-/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a source that is quantised already or whose weights are not
-/// finite; [`Error::Input`] if `out` is there and `force` is not given, holds anything but a checkpoint, or is the source;
-/// [`Error::Output`] if it cannot be written.
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken, does not fit its config or is quantised already, and for
+/// weights of the head that are not finite; [`Input`](crate::ErrorKind::Input) if `out` exists and `force` is not set, holds anything but a
+/// checkpoint, or is the source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn quantize(
     source: &Path,
     out: &Path,

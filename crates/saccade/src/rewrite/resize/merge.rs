@@ -12,16 +12,16 @@ const NO_BIAS: f64 = 1e-6;
 /// Biases up to this size are exponentiated as they are: products and sums of 4096 such weights stay within float64.
 const MAX_PLAIN_BIAS: f64 = 300.0;
 
-/// Future tokens that stand for those of a head.
+/// Future tokens that represent a head's.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MergedTokens {
     /// The rows, `(num_future_tokens, width)`.
     pub tokens: Vec<f32>,
-    /// For each row, the indices of the source's tokens that it stands for.
+    /// For each row, the indices of the given tokens that it represents.
     pub sources: Vec<Vec<usize>>,
     /// What is added to the logit of each row's key in self-attention, `(num_future_tokens)`; none if it is zero everywhere.
     pub key_bias: Option<Vec<f32>>,
-    /// Whether every row stands for equal tokens only, so that attention gives the same output but for rounding.
+    /// Whether every row represents equal tokens only, so that attention gives the same output but for rounding.
     pub is_exact: bool,
 }
 
@@ -133,14 +133,14 @@ fn shift(biases: impl Iterator<Item = f32>) -> f64 {
 }
 
 /// Tokens that are merged.
-struct Group {
+struct Cluster {
     members: Vec<usize>,
     weight: f64,
     /// The weighted sum of the members' directions.
     sum: Vec<f64>,
 }
 
-impl Group {
+impl Cluster {
     /// What merging with `other` adds to the weighted squared distances of directions from their group's mean.
     fn cost(&self, other: &Self) -> f64 {
         let both = self.sum.iter().zip(&other.sum);
@@ -201,7 +201,7 @@ fn merged(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Vec<Vec<u
 }
 
 /// A group for each token.
-fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Group>> {
+fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Cluster>> {
     let shift = shift(bias.iter().copied());
     let group = |(index, (row, &bias)): (usize, (&[f32], &f32))| {
         let row = row.iter().map(|&value| f64::from(value));
@@ -209,7 +209,7 @@ fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Group
         let norm = if norm > 0.0 { norm } else { 1.0 };
         // Lighter tokens than this all cost nothing to merge.
         let weight = (f64::from(bias) - shift).max(-MAX_PLAIN_BIAS).exp();
-        Some(Group {
+        Some(Cluster {
             members: vec![index],
             weight,
             sum: row.map(|value| weight * (value / norm)).collect(),
@@ -220,7 +220,7 @@ fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Group
 }
 
 /// The cheapest group after number `index` to merge it with, and its cost.
-fn cheapest(groups: &[Option<Group>], index: usize) -> Option<(f64, usize)> {
+fn cheapest(groups: &[Option<Cluster>], index: usize) -> Option<(f64, usize)> {
     let group = groups[index].as_ref()?;
     let mut best: Option<(f64, usize)> = None;
     for (other, candidate) in groups.iter().enumerate().skip(index + 1) {

@@ -60,7 +60,7 @@ pub struct ResizeReport {
     pub num_before: usize,
     /// Future tokens of the copy.
     pub num_after: usize,
-    /// For each token of the copy, the indices of the source's tokens that it stands for: one for a copy, several for merged ones.
+    /// For each token of the copy, the indices of the source's tokens that it represents: one for a copy, several for merged ones.
     pub sources: Vec<Vec<usize>>,
     /// What saccade adds to the logits of the tokens' keys; none if it is zero everywhere.
     pub future_key_bias: Option<Vec<f32>>,
@@ -73,15 +73,15 @@ pub struct ResizeReport {
 }
 
 /// Writes the checkpoint `source` to the directory `out` with another number of future tokens. Going up, tokens are copied in turn; going
-/// down, the most similar are merged. All other tensors are copied bit for bit, and the number is changed wherever the config says it.
+/// down, the most similar are merged. All other tensors are copied bit for bit, and the number is changed wherever the config has it.
 ///
-/// `progress(done, total)`, in bytes read, is called after each tensor; where it returns false, nothing is written.
+/// `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
 /// # Errors
-/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a version without future tokens, a source that has none, one
-/// whose config says different numbers, and tokens that are not finite; [`Error::Input`] for a number or a perturbation out of range, and if
-/// `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source; [`Error::Output`] if it cannot be
-/// written.
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, a version without future
+/// tokens, a source that has none, a config with different numbers of them, and tokens that are not finite; [`Input`](crate::ErrorKind::Input)
+/// for a number or a perturbation out of range, and if `out` exists and `force` is not set, holds anything but such a checkpoint, or is the
+/// source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn resize(
     source: &Path,
     out: &Path,
