@@ -4,6 +4,10 @@ use std::fmt;
 use std::str::FromStr;
 
 use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
+#[allow(
+    unused_imports,
+    reason = "not every architecture has an instruction set with such products"
+)]
 use crate::gemm::dot_bf16::DotBf16;
 use crate::gemm::dot_int8::DotInt8;
 use crate::gemm::{Gemm, Product, available};

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use half::bf16;
 
-use crate::rows::Matrix;
+use crate::matrix::Matrix;
 
 /// How a [`PackedLinear`](crate::PackedLinear) multiplies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]

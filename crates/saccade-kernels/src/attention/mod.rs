@@ -7,6 +7,7 @@
 mod arithmetic;
 mod keys_values;
 mod mask;
+mod pack;
 mod product;
 mod softmax;
 mod tile;

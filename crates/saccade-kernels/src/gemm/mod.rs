@@ -2,6 +2,10 @@
 
 pub(crate) mod broadcast;
 mod chains;
+#[allow(
+    dead_code,
+    reason = "not every architecture has an instruction set with such products"
+)]
 pub(crate) mod dot_bf16;
 pub(crate) mod dot_int8;
 mod panel;

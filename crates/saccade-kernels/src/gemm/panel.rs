@@ -1,7 +1,7 @@
 //! Panels that are words of consecutive `k` of one column: `[k / STEP][column]`, the first `k` lowest, zeros where there are no more.
 
 use super::PanelMut;
-use crate::rows::Matrix;
+use crate::matrix::Matrix;
 use crate::weights::{WeightRef, quantize, row_scale};
 
 /// Writes float32 columns from `first` on, one for each row of `weight`.
