@@ -46,17 +46,17 @@ def shuffled(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
 
 
 def averaged(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """As many copies of their mean."""
+    """Copies of the mean of the learned tokens."""
     return Intervention(future_tokens=np.tile(tokens.mean(axis=0), (len(tokens), 1)))
 
 
 def zeroed(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """Zeros in their place."""
+    """Zeros instead of the learned tokens."""
     return Intervention(future_tokens=np.zeros_like(tokens))
 
 
 def redrawn(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """Random numbers with the mean and the standard deviation of theirs."""
+    """Random tokens with the mean and the standard deviation of the learned ones."""
     drawn = rng.normal(tokens.mean(), tokens.std(), tokens.shape)
     return Intervention(future_tokens=drawn.astype(np.float32))
 
