@@ -560,7 +560,11 @@ def test_gradient_without_future_rows_is_that_of_a_head_that_reads_constants() -
             Intervention(patch={(0, 0): {"state": np.ones((3, 1, 12))}}),
         ),
         (saccade.ShapeError, "future_tokens: ", Intervention(future_tokens=np.ones((4, 11)))),
-        (saccade.InputError, "future_tokens: expected in at most one intervention, got 2", [Intervention(future_tokens=np.ones((4, 12)))] * 2),
+        (
+            saccade.InputError,
+            "future_tokens: expected in at most one intervention, got 2",
+            [Intervention(future_tokens=np.ones((4, 12)))] * 2,
+        ),
         (
             saccade.InputError,
             "cut: future: 2, expected 0 to 1",

@@ -357,6 +357,26 @@ def test_actions_on_recorded_features(source: Path, tmp_path: Path) -> None:
     assert found.in_saccade.mean == pytest.approx(moved.mean(), rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "mask", "message"),
+    [
+        ("drop_vl", np.ones((3, 9), bool), "drop_vl: row 0 drops every position"),
+        ("attention_mask", np.zeros((3, 9), bool), "attention_mask: false entries"),
+    ],
+)
+def test_masks_that_the_head_would_refuse_are_refused_before_anything_is_written(
+    name: str, mask: Any, message: str, source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = features(tmp_path, **{name: mask}), tmp_path / "out"
+    options = ["--num-future-tokens", "8", "--out", str(out), "--features", str(file)]
+    assert cli.main(["resize", str(source), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+    resize(source, out, num_future_tokens=8)
+    with pytest.raises(InputError, match=message):
+        action_changes(source, out, features=file)
+
+
 def test_the_command(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(tmp_path / "out")
     assert cli.main(["resize", str(source), "--num-future-tokens", "64", "--out", out]) == 0

@@ -67,41 +67,8 @@ _SUBMODULES = (
     "torch",
 )
 
-if TYPE_CHECKING:
-    from saccade import (
-        bench as bench,
-    )
-    from saccade import (
-        checkpoints as checkpoints,
-    )
-    from saccade import (
-        comparison as comparison,
-    )
-    from saccade import (
-        integrations as integrations,
-    )
-    from saccade import (
-        maps as maps,
-    )
-    from saccade import (
-        observation as observation,
-    )
-    from saccade import (
-        reference as reference,
-    )
-    from saccade import (
-        robots as robots,
-    )
-    from saccade import (
-        sim as sim,
-    )
-    from saccade import (
-        study as study,
-    )
-    from saccade import (
-        torch as torch,
-    )
-else:  # so that a type checker still reports names that do not exist
+# Hidden from type checkers, so that they report names that do not exist; they need `import saccade.sim`.
+if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
         if name in _SUBMODULES:
