@@ -4,13 +4,11 @@ use std::ops::RangeInclusive;
 
 use serde_json::{Map, Value};
 
-use super::HeadConfig;
+use super::agreement::disagreements;
+use super::head_config::{HeadConfig, MAX_SIZE};
 use super::versions::{FEATURE_KEYS, Feature, Version};
 use super::whole::{OWN_KEY, Object, WholeConfig};
 use crate::error::{Error, Result};
-
-/// No size in a config is larger: products of three of them stay far below `u64::MAX`.
-const MAX_SIZE: u64 = 1 << 20;
 
 /// No head has more blocks; the names of their tensors are written out.
 const MAX_LAYERS: u64 = 1024;
@@ -23,21 +21,26 @@ fn has_layers(cfg: &Value) -> bool {
     }
 }
 
-/// The head's config in a whole one.
-///
-/// # Errors
-/// [`Error::Checkpoint`] with everything that is missing, of the wrong type or contradictory.
-pub(super) fn read(config: &WholeConfig) -> Result<HeadConfig> {
-    let mut reader = Reader { problems: Vec::new() };
-    let version = reader.version(config);
-    let head = reader.head(version, config.head());
-    if reader.problems.is_empty() {
-        return Ok(head);
+impl HeadConfig {
+    /// Reads a whole checkpoint config (with `action_head_cfg`, or flat as those of N1.6 and N1.7 are) or the head's own.
+    ///
+    /// `model_type` says the version; without it the keys do.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] with everything that is missing, of the wrong type or contradictory.
+    pub fn from_json(text: &str) -> Result<Self> {
+        let config = WholeConfig::parse(text)?;
+        let mut reader = Reader { problems: Vec::new() };
+        let version = reader.version(&config);
+        let head = reader.head(version, config.head());
+        if reader.problems.is_empty() {
+            return Ok(head);
+        }
+        Err(Error::Checkpoint(format!(
+            "config: {}",
+            reader.problems.join("; ")
+        )))
     }
-    Err(Error::Checkpoint(format!(
-        "config: {}",
-        reader.problems.join("; ")
-    )))
 }
 
 /// Whether a key that only some versions have asks for something.
@@ -165,7 +168,7 @@ impl Reader {
             add_pos_embed: self.flag(head, "", "add_pos_embed", Some(true)),
         };
         if self.problems.is_empty() {
-            self.check_agreement(version, &config, head, dit);
+            self.problems = disagreements(version, &config, head, dit);
         }
         config
     }
@@ -284,111 +287,6 @@ impl Reader {
                     .push("saccade.future_key_bias: expected a list of finite numbers".to_owned());
                 None
             }
-        }
-    }
-
-    fn check_agreement(&mut self, version: Version, config: &HeadConfig, head: &Object, dit: &Object) {
-        let mut equal = |what: &str, given: usize, other: &str, expected: usize| {
-            if given != expected {
-                self.problems
-                    .push(format!("{what} is {given}, but {other} is {expected}"));
-            }
-        };
-        equal(
-            "input_embedding_dim",
-            config.width,
-            "diffusion_model_cfg.num_attention_heads x attention_head_dim",
-            config.num_heads * config.head_dim,
-        );
-        if config.vl_num_layers > 0 {
-            equal(
-                "backbone_embedding_dim",
-                config.context_dim,
-                "vl_self_attention_cfg.num_attention_heads x attention_head_dim",
-                config.vl_num_heads * config.vl_head_dim,
-            );
-        }
-        let number = |map: &Object, key: &str| {
-            let number = map.get(key).and_then(Value::as_u64);
-            number.map(|number| usize::try_from(number).unwrap_or(usize::MAX))
-        };
-        let cross = "diffusion_model_cfg.cross_attention_dim";
-        match number(dit, "cross_attention_dim") {
-            Some(given) => equal(cross, given, "backbone_embedding_dim", config.context_dim),
-            // Null means the width; the later versions give their class `backbone_embedding_dim` instead.
-            None if version == Version::N15 => equal(
-                &format!("{cross} (null, so input_embedding_dim)"),
-                config.width,
-                "backbone_embedding_dim",
-                config.context_dim,
-            ),
-            None => {}
-        }
-        if let Some(output) = number(dit, "output_dim") {
-            equal(
-                "diffusion_model_cfg.output_dim",
-                output,
-                "hidden_size",
-                config.hidden_dim,
-            );
-        }
-        if version.is_flat()
-            && let Some(action_dim) = number(head, "action_dim")
-        {
-            equal("action_dim", action_dim, "max_action_dim", config.action_dim);
-        }
-        if let Some(bias) = &config.future_key_bias {
-            equal(
-                "the length of saccade.future_key_bias",
-                bias.len(),
-                "num_target_vision_tokens",
-                config.num_future_tokens,
-            );
-        }
-        if config.encoder_action_dim < config.action_dim {
-            self.problems.push(format!(
-                "pretrained_action_dim is {}, expected at least the {} of the actions that are decoded",
-                config.encoder_action_dim, config.action_dim
-            ));
-        }
-        if config.attend_text_every_n_blocks > 0 && !config.interleave_self_attention {
-            self.problems.push(
-                "diffusion_model_cfg.interleave_self_attention is false, expected true with use_alternate_vl_dit"
-                    .to_owned(),
-            );
-        }
-        for (what, size) in [
-            (
-                "diffusion_model_cfg.num_attention_heads x attention_head_dim",
-                config.width,
-            ),
-            (
-                "max_state_dim x state_history_length",
-                config.state_dim * config.state_history,
-            ),
-        ] {
-            if size as u64 > MAX_SIZE {
-                self.problems
-                    .push(format!("{what} is {size}, expected at most {MAX_SIZE}"));
-            }
-        }
-        if !config.width.is_multiple_of(2) {
-            self.problems.push(format!(
-                "input_embedding_dim is {}, expected an even number (half sines, half cosines)",
-                config.width
-            ));
-        }
-        if config.add_pos_embed && config.action_horizon > config.max_positions {
-            self.problems.push(format!(
-                "action_horizon is {}, more than the {} rows of the position table (max_seq_len)",
-                config.action_horizon, config.max_positions
-            ));
-        }
-        if config.num_steps > config.num_timestep_buckets {
-            self.problems.push(format!(
-                "num_inference_timesteps is {}, more than num_timestep_buckets {}",
-                config.num_steps, config.num_timestep_buckets
-            ));
         }
     }
 

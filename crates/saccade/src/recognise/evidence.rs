@@ -2,17 +2,11 @@
 
 use serde_json::Value;
 
-use super::layouts::{CheckpointLayout, Clues};
+use super::layout::{CheckpointLayout, Clues, Evidence};
 use super::sizes::DECODERS;
 use crate::config::{Feature, Version};
 use crate::error::{Error, Result};
 use crate::head::plan::FUTURE_TOKENS;
-
-/// Something that only some versions have.
-pub(super) struct Evidence {
-    pub versions: Vec<Version>,
-    pub what: String,
-}
 
 /// The one version that all evidence fits, and the evidence, a sentence each.
 ///

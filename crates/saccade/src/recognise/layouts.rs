@@ -1,59 +1,15 @@
-//! The layouts of checkpoints: who writes them, where the head is in them, and where its sizes come from.
-
-use std::path::Path;
+//! The table of layouts: a new one is a file with its [`CheckpointLayout`] and a line here.
 
 use saccade_checkpoint::Checkpoint;
 
-use super::evidence::Evidence;
+use super::layout::{CheckpointLayout, Clues};
 use super::lerobot::{Fork, Lerobot};
 use super::nvidia::{IsaacFineTune, Nvidia, Own};
-use super::sizes::{self, HeadShapes};
-use crate::config::{Object, Version, WholeConfig};
+use crate::config::WholeConfig;
 use crate::error::{Error, Result};
 
 /// Every layout. The first one that a checkpoint has is its own; the last one fits all.
 static LAYOUTS: [&dyn CheckpointLayout; 5] = [&Fork, &Lerobot, &Own, &IsaacFineTune, &Nvidia];
-
-/// What is known of a checkpoint before its version is.
-pub(super) struct Clues<'a> {
-    pub config: &'a WholeConfig,
-    /// Whether the config holds the head's.
-    pub has_head_config: bool,
-    pub tensors: HeadShapes<'a>,
-    /// The directory of the weights.
-    pub directory: &'a Path,
-}
-
-/// How one program writes checkpoints.
-pub(super) trait CheckpointLayout: Sync {
-    /// Its name in [`Published::layout`](super::Published::layout).
-    fn name(&self) -> &'static str;
-
-    /// What the names of the head's tensors begin with, if it is always the same.
-    fn prefix(&self) -> Option<&'static str>;
-
-    /// Whether a checkpoint is written so.
-    fn matches(&self, clues: &Clues<'_>) -> bool;
-
-    /// Whether a config is written so and holds no head, whose sizes must then come from elsewhere.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`] for a config of another kind of policy.
-    fn is_without_head(&self, _config: &WholeConfig) -> Result<bool> {
-        Ok(false)
-    }
-
-    /// Adds what the layout says about the version.
-    fn add_evidence(&self, _clues: &Clues<'_>, _found: &mut Vec<Evidence>) {}
-
-    /// The head's config in the released keys, and everything that it and the tensors disagree on.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`] if there is no head's config, and the tensors do not make one.
-    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        Ok(sizes::complete(clues.config.head(), version, &clues.tensors))
-    }
-}
 
 /// The layout of a checkpoint.
 pub(super) fn layout_of(clues: &Clues<'_>) -> &'static dyn CheckpointLayout {

@@ -6,8 +6,7 @@ use std::path::Path;
 use saccade_checkpoint::{OWN_CONFIG, read_text};
 use serde_json::{Map, Value, json};
 
-use super::evidence::Evidence;
-use super::layouts::{CheckpointLayout, Clues};
+use super::layout::{CheckpointLayout, Clues, Evidence};
 use super::sizes::{self, BLOCKS, HeadShapes, add_decoders, proved};
 use crate::config::{Feature, OWN_KEY, Object, Version, WholeConfig};
 use crate::error::{Error, Result};

@@ -5,6 +5,7 @@
 
 pub(crate) mod contents;
 mod evidence;
+mod layout;
 mod layouts;
 mod lerobot;
 mod nvidia;
@@ -19,7 +20,8 @@ use crate::config::{HeadConfig, WholeConfig};
 use crate::error::{Error, Result};
 use contents::{check, kept_embodiments};
 use evidence::recognise_version;
-use layouts::{Clues, has_head_config, head_prefix, layout_of};
+use layout::Clues;
+use layouts::{has_head_config, head_prefix, layout_of};
 use sizes::HeadShapes;
 
 /// A checkpoint, open, and what it is.

@@ -1,6 +1,6 @@
 //! NVIDIA's checkpoints, as published and as Isaac-GR00T's trainer writes them, and heads alone, as saccade writes them.
 
-use super::layouts::{CheckpointLayout, Clues};
+use super::layout::{CheckpointLayout, Clues};
 
 /// NVIDIA's: `action_head.*` and `backbone.*`.
 pub(super) struct Nvidia;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use saccade_checkpoint::spec::SCALE_SUFFIX;
-use saccade_checkpoint::{CheckpointWriter, Dtype};
+use saccade_checkpoint::{CheckpointWriter, Dtype, PlannedTensor};
 
 use crate::error::{Error, Result};
 use crate::head::embodiments::chosen_embodiments;
@@ -97,21 +97,7 @@ pub fn convert(
         .filter(|spec| spec.per_embodiment)
         .map(|spec| format!("{}{}", source.prefix, spec.name))
         .collect();
-    for name in source.checkpoint.names() {
-        report.bytes_before = report
-            .bytes_before
-            .saturating_add(source.checkpoint.nbytes(name)?);
-    }
-    let mut planned = Vec::new();
-    for name in source.names(&options.rewrite) {
-        let mut tensor = source.as_it_is(name)?;
-        if let Some((_, to)) = change(&source, name, options)? {
-            tensor.dtype = to.dtype();
-            report.num_converted += 1;
-        }
-        report.bytes_after = report.bytes_after.saturating_add(tensor.nbytes() as u64);
-        planned.push(tensor);
-    }
+    let planned = plan(&source, options, &mut report)?;
     let config = [("config.json", Some(source.given_config.as_str()))];
     let mut rounding = Rounding::default();
     let mut zeroed_bytes = 0;
@@ -152,6 +138,29 @@ pub fn convert(
         zeroed_bytes,
         ..report
     })
+}
+
+/// The tensors of the copy; their sizes are added to `report`.
+fn plan(
+    source: &SourceCheckpoint,
+    options: &ConvertOptions,
+    report: &mut ConvertReport,
+) -> Result<Vec<PlannedTensor>> {
+    for name in source.checkpoint.names() {
+        let nbytes = source.checkpoint.nbytes(name)?;
+        report.bytes_before = report.bytes_before.saturating_add(nbytes);
+    }
+    let mut planned = Vec::new();
+    for name in source.names(&options.rewrite) {
+        let mut tensor = source.as_it_is(name)?;
+        if let Some((_, to)) = change(source, name, options)? {
+            tensor.dtype = to.dtype();
+            report.num_converted += 1;
+        }
+        report.bytes_after = report.bytes_after.saturating_add(tensor.nbytes() as u64);
+        planned.push(tensor);
+    }
+    Ok(planned)
 }
 
 /// The types of tensor `name` before and after, if they differ.
