@@ -49,12 +49,10 @@ fn an_out_of_the_wrong_shape_is_an_error_and_stays_as_it_is() {
             message.starts_with("out: expected (batch, num_samples, action_horizon, action_dim) = (2, 3, "),
             "{message}"
         );
+        let actions_shape = [2, horizon, config.encoder_action_dim];
+        let actions = &noise[..actions_shape.iter().product()];
         let noisy = NoisyActions {
-            actions: Array::new(
-                &noise[..2 * horizon * config.encoder_action_dim],
-                &[2, horizon, config.encoder_action_dim],
-            )
-            .unwrap(),
+            actions: Array::new(actions, &actions_shape).unwrap(),
             timestep: Array::new(&[5], &[]).unwrap(),
         };
         if wrong != [2, horizon, width] {
