@@ -10,8 +10,9 @@ are therefore in the past when it arrives, and the robot jumps from one chunk in
 There are two arms, with the same layouts, instructions and noise:
 
 plain     the new chunk is sampled independently of the last one
-chunked   the head gets the last chunk as `previous_chunk=`. Its next `delay` actions will be executed, so they
-          are frozen; the influence of the actions after them decreases along the overlap (`saccade.Chunking`)
+chunked   the head gets the last chunk as `previous_chunk=`. Its next `delay` actions will be executed, so
+          they are frozen; the influence of the actions after them decreases along the overlap
+          (`saccade.Chunking`)
 
 The delay is counted in ticks, not in seconds, so a seed gives the same run on any machine.
 Needs the extra `study`.

@@ -10,8 +10,8 @@ from released import NAMES, Released, load_released
 
 from saccade import _saccade
 
-# No deadline: the machine may be shared. On CI every run draws the same examples, so a failure is caused by the
-# change and not by the draw.
+# No deadline: the machine may be shared. On CI every run draws the same examples, so a failure is caused by
+# the change and not by the draw.
 hypothesis.settings.register_profile(
     "saccade",
     deadline=None,

@@ -19,6 +19,7 @@ from PIL import Image, ImageSequence
 
 import saccade
 from saccade import cli
+from saccade._extras import EXTRAS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -77,6 +78,17 @@ def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
             [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md"])
+def test_the_first_pages_need_numpy_only(page: str, tmp_path: Path) -> None:
+    modules = sorted({module for extra in EXTRAS.values() for module in extra})
+    hidden = f"import sys; sys.modules.update(dict.fromkeys({modules}))\n"
+    code = hidden + "\n".join(code_blocks(ROOT / page, "python"))
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)

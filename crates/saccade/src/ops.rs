@@ -1,7 +1,7 @@
 //! The kernels' calls: each counted for the profile of the thread that makes it, its refusals and interruptions made errors.
 
 use saccade_kernels::{
-    AllocError, Epilogue, KernelError, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, Rows, RowsMut,
+    AllocError, Epilogue, KernelError, LinearScratch, Mask, PackedKeyValues, PackedLinear, Rows, RowsMut,
 };
 
 use crate::engine::Engine;
@@ -86,13 +86,13 @@ pub(crate) fn attention(
     queries: Rows<'_>,
     kv: &PackedKeyValues,
     scale: f32,
-    bias: Option<LogitBias<'_>>,
+    mask: Mask<'_>,
     weights: Option<&mut [f32]>,
     out: RowsMut<'_>,
 ) -> Result<()> {
     let multiply_adds = 2 * queries.num_rows() * kv.len() * queries.num_columns();
     counted(Some(Part::Attention), (multiply_adds, kv.nbytes()), || {
-        saccade_kernels::attention(threads, queries, kv, scale, bias.into(), weights, out);
+        saccade_kernels::attention(threads, queries, kv, scale, mask, weights, out);
     });
     check_interrupted()
 }
@@ -109,6 +109,42 @@ pub(crate) fn layer_norm(
     let (x, out) = (rows(x, width), rows_mut(out, width));
     counted(Some(Part::Norm), (0, 0), || {
         saccade_kernels::layer_norm(engine.isa, engine.threads, x, eps, scale_shift, out);
+    });
+    check_interrupted()
+}
+
+/// [`saccade_kernels::rms_norm`].
+pub(crate) fn rms_norm(
+    engine: Engine,
+    eps: f32,
+    weight: &[f32],
+    x: Rows<'_>,
+    out: RowsMut<'_>,
+) -> Result<()> {
+    counted(Some(Part::Norm), (0, 0), || {
+        saccade_kernels::rms_norm(engine.isa, engine.threads, x, eps, weight, out);
+    });
+    check_interrupted()
+}
+
+/// [`saccade_kernels::rms_norm_in_place`].
+pub(crate) fn rms_norm_in_place(engine: Engine, eps: f32, weight: &[f32], x: RowsMut<'_>) -> Result<()> {
+    counted(Some(Part::Norm), (0, 0), || {
+        saccade_kernels::rms_norm_in_place(engine.isa, engine.threads, x, eps, weight);
+    });
+    check_interrupted()
+}
+
+/// [`saccade_kernels::rotary_embedding`].
+pub(crate) fn rotary_embedding(
+    engine: Engine,
+    x: RowsMut<'_>,
+    head_dim: usize,
+    cos: Rows<'_>,
+    sin: Rows<'_>,
+) -> Result<()> {
+    counted(Some(Part::Pack), (0, 0), || {
+        saccade_kernels::rotary_embedding(engine.isa, engine.threads, x, head_dim, cos, sin);
     });
     check_interrupted()
 }

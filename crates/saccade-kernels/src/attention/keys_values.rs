@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::pack::{Head, Pack, PairHead, WordHead};
-use crate::aligned::{AlignedBuffer, AllocError};
+use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::rows::Rows;
@@ -76,12 +76,9 @@ impl PackedKeyValues {
     pub fn pack(&mut self, threads: usize, keys: Rows<'_>, values: Rows<'_>) -> Result<(), AllocError> {
         (self.len, self.capacity) = (0, 0);
         self.finite = true;
-        let needed = (
-            self.num_kv_heads * self.keys_of_head(keys.num_rows()),
-            self.num_kv_heads * self.values_of_head(keys.num_rows()),
-        );
-        grow(&mut self.keys, needed.0)?;
-        grow(&mut self.values, needed.1)?;
+        let (keys_size, values_size) = self.sizes_of_head(keys.num_rows())?;
+        grow(&mut self.keys, elements(self.num_kv_heads, keys_size)?)?;
+        grow(&mut self.values, elements(self.num_kv_heads, values_size)?)?;
         (self.len, self.capacity) = (keys.num_rows(), keys.num_rows());
         self.pack_from(threads, 0, keys, values);
         Ok(())
@@ -174,7 +171,9 @@ impl PackedKeyValues {
         Ok(())
     }
 
-    /// Makes room for `capacity` keys, so that [`Self::append`] allocates nothing up to there. [`Self::pack`] gives it up.
+    /// Makes room for `capacity` keys, so that [`Self::append`] allocates nothing up to there.
+    ///
+    /// [`Self::pack`] keeps the memory, but not the room: reserving again then allocates nothing.
     ///
     /// # Errors
     /// [`AllocError`] if there is not enough memory; what was held then stays.
@@ -182,16 +181,20 @@ impl PackedKeyValues {
         if capacity <= self.capacity {
             return Ok(());
         }
-        let keys = (self.keys_of_head(self.capacity), self.keys_of_head(capacity));
-        let values = (self.values_of_head(self.capacity), self.values_of_head(capacity));
-        let [keys, values] = [(&self.keys, keys), (&self.values, values)].map(|(from, (old, new))| {
-            let mut to = AlignedBuffer::zeroed(self.num_kv_heads * new)?;
-            for head in 0..self.num_kv_heads {
-                to[head * new..][..old].copy_from_slice(&from[head * old..][..old]);
-            }
-            Ok(to)
-        });
-        (self.keys, self.values) = (keys?, values?);
+        let (old_keys, old_values) = self.sizes_of_head(self.capacity)?;
+        let (keys, values) = self.sizes_of_head(capacity)?;
+        let num_kv_heads = self.num_kv_heads;
+        // Both before either is changed.
+        let larger_keys = larger(&self.keys, elements(num_kv_heads, keys)?)?;
+        let larger_values = larger(&self.values, elements(num_kv_heads, values)?)?;
+        if let Some(larger) = larger_keys {
+            self.keys = larger;
+        }
+        if let Some(larger) = larger_values {
+            self.values = larger;
+        }
+        spread(&mut self.keys, num_kv_heads, old_keys, keys);
+        spread(&mut self.values, num_kv_heads, old_values, values);
         self.capacity = capacity;
         Ok(())
     }
@@ -268,6 +271,13 @@ impl PackedKeyValues {
         capacity.div_ceil(self.step()) * self.value_width()
     }
 
+    /// Words of one head's keys and of its values, where there is room for `capacity` of them.
+    fn sizes_of_head(&self, capacity: usize) -> Result<(usize, usize), AllocError> {
+        // More than padding adds.
+        elements(capacity, self.value_width().saturating_mul(4))?;
+        Ok((self.keys_of_head(capacity), self.values_of_head(capacity)))
+    }
+
     /// Words from one step of keys to the next in the values.
     pub(super) fn value_width(&self) -> usize {
         self.head_dim.next_multiple_of(self.isa.vectors().lanes)
@@ -291,9 +301,28 @@ impl PackedKeyValues {
     }
 }
 
-fn grow(buffer: &mut AlignedBuffer<u32>, elements: usize) -> Result<(), AllocError> {
-    if buffer.len() < elements {
-        *buffer = AlignedBuffer::zeroed(elements)?;
+fn grow(buffer: &mut AlignedBuffer<u32>, len: usize) -> Result<(), AllocError> {
+    if buffer.len() < len {
+        // The old one goes first: both need not fit.
+        *buffer = AlignedBuffer::empty();
+        *buffer = AlignedBuffer::zeroed(len)?;
     }
     Ok(())
+}
+
+/// A copy of at least `len` words, where `buffer` has fewer.
+fn larger(buffer: &AlignedBuffer<u32>, len: usize) -> Result<Option<AlignedBuffer<u32>>, AllocError> {
+    if buffer.len() >= len {
+        return Ok(None);
+    }
+    let mut copy = AlignedBuffer::zeroed(len)?;
+    copy[..buffer.len()].copy_from_slice(buffer);
+    Ok(Some(copy))
+}
+
+/// Moves `count` parts of `old` words each to multiples of `new`, which is more.
+fn spread(buffer: &mut [u32], count: usize, old: usize, new: usize) {
+    for index in (1..count).rev() {
+        buffer.copy_within(index * old..(index + 1) * old, index * new);
+    }
 }

@@ -79,7 +79,7 @@ impl PackedLinear {
     ) -> Result<Self, KernelError> {
         isa.check();
         let in_features = parts.first().ok_or(KernelError::NoParts)?.0.shape().1;
-        let mut out_features = 0;
+        let mut out_features = 0_usize;
         for (weight, bias) in parts {
             let (outputs, inputs) = weight.shape();
             if inputs != in_features {
@@ -104,7 +104,10 @@ impl PackedLinear {
                     given: scales.len(),
                 });
             }
-            out_features += outputs;
+            out_features = out_features
+                .checked_add(outputs)
+                .filter(|&sum| sum <= isize::MAX as usize)
+                .ok_or(AllocError { bytes: usize::MAX })?;
         }
         if arithmetic == Arithmetic::Int8 && in_features > MAX_INT8_INPUTS {
             return Err(KernelError::TooManyInputs { given: in_features });
@@ -210,7 +213,9 @@ impl PackedLinear {
         if rows == 0 || self.out_features == 0 {
             return Ok(());
         }
-        let macs = rows * self.in_features * self.out_features;
+        let macs = rows
+            .saturating_mul(self.in_features)
+            .saturating_mul(self.out_features);
         let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
         let shape = self.gemm.shape();
         let columns = shape.columns;

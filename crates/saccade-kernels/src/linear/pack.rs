@@ -1,7 +1,7 @@
 //! From weights as they are stored to panels, on several threads.
 
 use super::error::KernelError;
-use crate::aligned::AlignedBuffer;
+use crate::aligned::{AlignedBuffer, elements};
 use crate::gemm::{Gemm, PanelMut};
 use crate::pool::{Interrupted, is_stopped, parallel_for};
 use crate::weights::WeightRef;
@@ -30,7 +30,7 @@ pub(super) fn pack_panels(
     let size = gemm.panel_words(in_features);
     let int8 = if is_int8 { columns } else { 0 };
     // SAFETY: the tasks below write all of it; where they were stopped, it is dropped.
-    let mut words = unsafe { AlignedBuffer::unwritten(num_panels * size)? };
+    let mut words = unsafe { AlignedBuffer::unwritten(elements(num_panels, size)?)? };
     let mut scales = AlignedBuffer::zeroed(num_panels * int8)?;
     let mut sums = AlignedBuffer::zeroed(num_panels * int8)?;
     let to = To {

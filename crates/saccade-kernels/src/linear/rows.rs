@@ -1,6 +1,6 @@
 //! Activations as a product reads them: rounded or quantised row by row, on several threads.
 
-use crate::aligned::{AlignedBuffer, AllocError};
+use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::gemm::{Gemm, Quantized, Source};
 use crate::pool::parallel_for;
 use crate::rows::Rows;
@@ -53,8 +53,9 @@ impl LinearScratch {
         let (rows, width, shape) = (x.num_rows(), x.num_columns(), gemm.shape());
         let groups = rows.div_ceil(shape.row_group);
         let held = groups * shape.row_group + shape.rows_beyond;
-        if self.words.len() < held * stride {
-            self.words = AlignedBuffer::zeroed(held * stride)?;
+        let words = elements(held, stride)?;
+        if self.words.len() < words {
+            self.words = AlignedBuffer::zeroed(words)?;
         }
         if is_int8 && self.quantized.len() < rows {
             self.quantized = AlignedBuffer::zeroed(rows)?;

@@ -77,7 +77,7 @@ impl ActionHead {
     /// Loads a head from `source`: one `.safetensors` file, or a directory of one or more of them with a `config.json`.
     ///
     /// # Errors
-    /// [`Error::NotFound`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;

@@ -257,7 +257,7 @@ impl Attention {
             let Some(Subset { positions, all }) = subset else {
                 let bias = bias.of(group, logits, &mut buffers.bias)?;
                 let weights = weights_of(&mut weights, call, logits);
-                ops::attention(engine.threads, q, kv, self.scale(), bias, weights, mix)?;
+                ops::attention(engine.threads, q, kv, self.scale(), bias.into(), weights, mix)?;
                 continue;
             };
             let positions = &positions[group];
@@ -267,7 +267,7 @@ impl Attention {
                 None => None,
             };
             let seen = chosen.as_deref_mut();
-            ops::attention(engine.threads, q, kv, self.scale(), bias, seen, mix)?;
+            ops::attention(engine.threads, q, kv, self.scale(), bias.into(), seen, mix)?;
             let all_weights = weights_of(&mut weights, call, [self.num_heads, count, all]);
             if let (Some(all_weights), Some(chosen)) = (all_weights, chosen) {
                 spread(chosen, positions, all_weights, all);
@@ -319,7 +319,7 @@ impl Attention {
                 rows(&buffers.q[range.clone()], width),
                 packed,
                 self.scale(),
-                bias.of(sequence, logits, &mut buffers.bias)?,
+                bias.of(sequence, logits, &mut buffers.bias)?.into(),
                 weights_of(&mut weights, sequence, logits),
                 rows_mut(&mut mix[range], width),
             )?;
