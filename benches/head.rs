@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use half::bf16;
-use saccade::{ActionHead, Array, Features, LoadOptions, Sampling};
+use saccade::{ActionHead, Array, ArrayMut, Features, LoadOptions, Sampling};
 use saccade_benches::random::Random;
 use serde_json::{Map, Value, json};
 
@@ -77,10 +77,7 @@ fn load() -> ActionHead {
     let path: PathBuf =
         std::env::temp_dir().join(format!("saccade-bench-{}.safetensors", std::process::id()));
     write_checkpoint(&path).expect("1.5 GB of room for temporary files");
-    let options = LoadOptions {
-        config: Some(config().to_string()),
-        ..LoadOptions::default()
-    };
+    let options = LoadOptions::default().with_config(config().to_string());
     let head = ActionHead::load(&path, &options);
     std::fs::remove_file(&path).expect("the file was just written");
     head.expect("the checkpoint that was just written")
@@ -91,7 +88,8 @@ fn head(criterion: &mut Criterion) {
     let mut random = Random::new(1);
     let mut numbers = |len: usize| random.vec(len, 1.0);
     let (features, state, noise) = (numbers(NUM_VL_TOKENS * 2048), numbers(64), numbers(8 * CHUNK));
-    let features = Features::new(Array::new(&features, &[1, NUM_VL_TOKENS, 2048]));
+    let features = Array::new(&features, &[1, NUM_VL_TOKENS, 2048]).expect("a shape that fits");
+    let features = Features::new(features);
     let context = head.encode(&features).expect("features that fit");
     let mut group =
         criterion.benchmark_group(format!("N1.5, {}, {} threads", head.isa(), head.num_threads()));
@@ -105,14 +103,11 @@ fn head(criterion: &mut Criterion) {
             bencher.iter(|| {
                 head.sample(
                     &context,
-                    Array::new(&state, &[1, 64]),
-                    Array::new(&[0], &[]),
-                    Array::new(&noise[..samples * CHUNK], &[1, samples, 16, 32]),
-                    &Sampling {
-                        num_samples: Some(samples),
-                        ..Sampling::default()
-                    },
-                    &mut out,
+                    Array::new(&state, &[1, 64])?,
+                    Array::new(&[0], &[])?,
+                    Array::new(&noise[..samples * CHUNK], &[1, samples, 16, 32])?,
+                    &Sampling::default().with_num_samples(samples),
+                    ArrayMut::new(&mut out, &[1, samples, 16, 32])?,
                 )
             });
         });

@@ -400,7 +400,7 @@ def check_refusals(case: Case) -> None:
     activation = type(block.ff.net[0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(activation, "gelu", lambda self, gate: torch.relu(gate))
-        refused("other actions")
+        refused("its actions differ")
     drawn = type(head).process_backbone_output
 
     def drawing(self: nn.Module, backbone_output: Any) -> Any:

@@ -41,4 +41,3 @@ def test_readers_and_getters_of_one_checkpoint_do_not_wait_for_each_other() -> N
         thread.join(timeout=60)
     assert not any(thread.is_alive() for thread in threads)
     assert len(failed) == 600
-

@@ -223,7 +223,7 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
         (["attention", "--grid", "3x3"], "--grid: only with --features"),
         (["rollout", "--tasks", "reach,fly"], "unknown name 'fly'"),
         (["demos", "--tasks", "fly", "--out", "out"], "unknown name 'fly'"),
-        (["train", "--demos", "nowhere", "--out", "out"], "nowhere: no demonstrations there"),
+        (["train", "--demos", "nowhere", "--out", "out"], "nowhere: no demonstrations found"),
         (["parity", "--checkpoint", "nowhere"], "nowhere"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -116,7 +117,7 @@ OTHER_CONTEXT = saccade.ActionHead.load(TINY.path, config=TINY.config).encode(FE
         (Input, "num_steps: ", {"num_steps": 2**64}),
         (Input, "num_samples: expected at least 1, got 0", {"num_samples": 0}),
         (Input, "num_samples: expected an integer, got True", {"num_samples": True}),
-        (Input, "does not fit in memory", {"num_samples": 2**61, "noise": None}),
+        (MemoryError, r"GB\) does not fit in memory", {"num_samples": 2**61, "noise": None}),
         (Input, "num_steps: expected a number below", {"num_steps": 2**70}),
         (Input, "embodiment_id: ", {"embodiment_id": [[0], [0, 1]]}),
         (Shape, r"out: expected \(2, 6, 5\), got \(2, 6, 4\)", {"out": np.empty((2, 6, 4), np.float32)}),
@@ -171,7 +172,7 @@ def test_velocity(error: type[Exception], message: str, options: dict[str, Any])
         ("embodiment_ids: expected at least one", {"embodiment_ids": np.zeros(0, int)}),
         ("embodiment_ids: expected an integer", {"embodiment_ids": ["gr1"]}),
         ("source: expected a path, got int", {"source": 3}),
-        ("source: .*null character", {"source": "a\0b"}),
+        ("source: .*null characters", {"source": "a\0b"}),
     ],
 )
 def test_load_options(message: str, options: dict[str, Any]) -> None:
@@ -488,3 +489,27 @@ def test_keys_and_values_of_another_layer() -> None:
     other = saccade.CrossAttention(cross_tensors(), 4)
     with pytest.raises(Input, match="kv: expected keys and values of 4 heads and width 12, got 3 and 12"):
         other(np.ones((2, 3, 12), np.float32), KEYS_VALUES)
+
+
+@pytest.mark.parametrize("ids", [0, 1.5, object()])
+def test_embodiment_ids_are_a_sequence(ids: Any) -> None:
+    with pytest.raises(Input, match=r"embodiment_ids: expected a sequence of integers, such as \[0\], got"):
+        saccade.ActionHead.load(TINY.path, config=TINY.config, embodiment_ids=ids)
+
+
+def test_names_that_are_not_valid_unicode() -> None:
+    tensors = {"\udcff": np.zeros(3, np.float32)}
+    with pytest.raises(Input, match="tensors: expected valid Unicode"):
+        saccade.ActionHead.from_tensors(tensors, config=TINY.config)
+    with pytest.raises(Input, match="tensors: expected valid Unicode"):
+        saccade.CrossAttention(tensors, 2)
+    with pytest.raises(Input, match="precision: expected valid Unicode"):
+        saccade.ActionHead.load(TINY.path, config=TINY.config, precision="\udcff")
+
+
+def test_a_head_of_tensors_cannot_be_pickled() -> None:
+    tensors = {name.removeprefix("action_head."): value for name, value in load_file(TINY.path).items()}
+    tensors = {name: value for name, value in tensors.items() if not name.startswith("_")}
+    head = saccade.ActionHead.from_tensors(tensors, config=TINY.config)
+    with pytest.raises(Dtype, match=r"use ActionHead\.load"):
+        pickle.dumps(head)

@@ -123,7 +123,8 @@ def test_which_embodiments_look_trained(base: Path) -> None:
     np.testing.assert_allclose([entry.norm for entry in entries], norms, rtol=1e-12)
     median = norms.quantile(0.5)
     expected = (norms - median) / (1.4826 * (norms - median).abs().quantile(0.5))
-    np.testing.assert_allclose([entry.robust_z for entry in entries], expected, rtol=1e-9, atol=1e-9)
+    scores = np.array([entry.robust_z for entry in entries], np.float64)
+    np.testing.assert_allclose(scores, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:

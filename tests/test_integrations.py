@@ -222,7 +222,7 @@ def test_inference_mode() -> None:
 
 
 def test_the_benchmark_runs() -> None:
-    options = ["--size", "small", "--num-vl-tokens", "9", "--rounds", "1", "--threads", "1"]
+    options = ["--size", "small", "--num-vl-tokens", "9", "--rounds", "1", "--num-threads", "1"]
     command = [sys.executable, "-m", "benches.accelerate", *options, "--precisions", "int8"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.count("| int8 | float32") == 2
@@ -250,3 +250,15 @@ def test_embodiments_that_were_never_trained(untrained: str) -> None:
                 parameter[chosen] = 0.0
     accelerate(case.head.to(torch.bfloat16)).restore()
     accelerate(case.head.float(), precision="int8").restore()
+
+
+def test_the_meta_device_is_refused_and_other_default_devices_do_not_matter() -> None:
+    case = n15()
+    with (
+        torch.device("meta"),
+        pytest.raises(saccade.DtypeError, match="default device with memory, got meta"),
+    ):
+        accelerate(case.head)
+    assert "get_action" not in vars(case.head)
+    with torch.device("cpu"), accelerate(case.head):
+        pass

@@ -177,8 +177,13 @@ def random_interventions(seed: int, *, batch: int, num_steps: int) -> tuple[Inte
     def edge() -> tuple[Any, Any]:
         return tokens(str(rng.choice(EVERY_READER)))[0], tokens(str(rng.choice(list(sizes))))[0]
 
+    def acts(keys: Any, blocks: list[int] | None) -> bool:
+        group = keys if isinstance(keys, str) else keys[0]
+        return any((block % 2 == 0) == (group == "vl") for block in blocks or range(4))
+
     made = []
     for number in range(rng.integers(1, 4)):
+        blocks = some(4)
         key_bias: dict[Any, Any] = {}
         for group in rng.choice(list(sizes), size=rng.integers(0, 3)):
             chosen, size = tokens(str(group))
@@ -190,11 +195,11 @@ def random_interventions(seed: int, *, batch: int, num_steps: int) -> tuple[Inte
         place = (int(rng.integers(num_steps)), int(rng.integers(4)))
         made.append(
             Intervention(
-                cut=[edge() for _ in range(rng.integers(0, 4))],
-                key_bias=key_bias,
+                cut=[pair for pair in (edge() for _ in range(rng.integers(0, 4))) if acts(pair[1], blocks)],
+                key_bias={keys: bias for keys, bias in key_bias.items() if acts(keys, blocks)},
                 patch={place: {chosen: rows}} if rng.random() < 0.5 else None,
                 future_tokens=rng.standard_normal((3, 12)) if replaced and number == 0 else None,
-                blocks=some(4),
+                blocks=blocks,
                 steps=some(num_steps),
                 heads=some(3),
             )
@@ -300,30 +305,64 @@ def test_removing_all_tokens_leaves_the_same() -> None:
         assert_close(dropped, head.sample(**inputs, intervention=blind))
 
 
-def test_a_cut_acts_where_its_keys_are() -> None:
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"cut": [("action", "vl")], "blocks": [1, 3]},
+            r"cut: action reads vl in cross-attention blocks only, which are \[0, 2\]; .*got \[1, 3\]",
+        ),
+        (
+            {"cut": [("future", "action")], "blocks": [0, 2]},
+            r"cut: future reads action in self-attention blocks only, which are \[1, 3\]",
+        ),
+        (
+            {"cut": [("action", "vl"), ("action", "future")], "blocks": 0},
+            "cut: action reads future in self-attention blocks only",
+        ),
+        ({"key_bias": {"vl": 3.0}, "blocks": [1]}, "key_bias: vl is read in cross-attention blocks only"),
+        ({"key_bias": {"state": 3.0}, "blocks": 2}, "key_bias: state is read in self-attention blocks only"),
+        ({"cut": [("action", ("vl", ()))]}, "cut: expected at least one vl token, got an empty list"),
+    ],
+)
+def test_what_can_act_nowhere_is_refused(change: dict[str, Any], message: str) -> None:
+    head, inputs = head_and_inputs()
+    one = Intervention(**change)
+    for intervention in (one, [Intervention(), one]):
+        with pytest.raises(saccade.InputError, match=message):
+            head.sample(**inputs, intervention=intervention)
+        with pytest.raises(saccade.InputError, match=message):
+            head.trace(**inputs, intervention=intervention)
+
+
+def test_what_acts_in_some_of_its_blocks_is_fine() -> None:
     head, inputs = head_and_inputs()
     with torch.no_grad():
-        plain = head.sample(**inputs)
-        nowhere = (
-            Intervention(cut=[("action", "vl")], key_bias={"vl": 3.0}, blocks=[1, 3]),
-            Intervention(cut=[("action", "future")], key_bias={"state": 3.0}, blocks=[0, 2]),
-            Intervention(cut=[("action", "vl")], heads=()),
-            Intervention(cut=[("action", "vl")], steps=()),
-            Intervention(cut=[("action", ("vl", ()))], key_bias={"future": 0.0}),
-        )
-        for one in (*nowhere, nowhere, ()):
-            assert torch.equal(head.sample(**inputs, intervention=one), plain)
+        some = head.sample(**inputs, intervention=Intervention(cut=[("action", "vl")], blocks=[0, 1, 3]))
+        cross = head.sample(**inputs, intervention=Intervention(cut=[("action", "vl")], blocks=[0]))
+        assert torch.equal(some, cross)
+        assert not torch.equal(some, head.sample(**inputs))
+        nothing = [Intervention(), Intervention(key_bias={"future": 0.0})]
+        assert torch.equal(head.sample(**inputs, intervention=nothing), head.sample(**inputs))
 
 
-def test_empty_groups_can_be_cut_and_biased() -> None:
+@pytest.mark.parametrize("name", ["blocks", "steps", "heads"])
+@pytest.mark.parametrize("empty", [(), [], range(0), set(), np.empty(0, np.int64)])
+def test_empty_limits_are_refused(name: str, empty: Any) -> None:
+    with pytest.raises(saccade.InputError, match=f"{name}: expected at least one"):
+        Intervention(cut=[("action", "vl")], **{name: empty})
+
+
+def test_groups_without_tokens_cannot_be_changed() -> None:
     head, inputs = head_and_inputs(num_future_tokens=0)
-    one = Intervention(
-        cut=[("future", "vl"), ("action", "future")],
-        key_bias={"future": -1.0},
-        patch={(0, 0): {"future": np.empty((0, 12), np.float32)}},
-    )
-    with torch.no_grad():
-        assert torch.equal(head.sample(**inputs, intervention=one), head.sample(**inputs))
+    for change in (
+        Intervention(cut=[("future", "vl")]),
+        Intervention(cut=[("action", "future")]),
+        Intervention(key_bias={"future": -1.0}),
+        Intervention(patch={(0, 0): {"future": np.empty((0, 12), np.float32)}}),
+    ):
+        with pytest.raises(saccade.InputError, match="this call has no future tokens"):
+            head.sample(**inputs, intervention=change)
 
 
 def test_steps_limit_cuts_and_biases() -> None:
@@ -521,7 +560,11 @@ def test_gradient_without_future_rows_is_that_of_a_head_that_reads_constants() -
             Intervention(patch={(0, 0): {"state": np.ones((3, 1, 12))}}),
         ),
         (saccade.ShapeError, "future_tokens: ", Intervention(future_tokens=np.ones((4, 11)))),
-        (saccade.InputError, "future_tokens: in 2 ", [Intervention(future_tokens=np.ones((4, 12)))] * 2),
+        (
+            saccade.InputError,
+            "future_tokens: expected in at most one intervention, got 2",
+            [Intervention(future_tokens=np.ones((4, 12)))] * 2,
+        ),
         (
             saccade.InputError,
             "cut: future: 2, expected 0 to 1",

@@ -206,7 +206,7 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Json], object], Callable[[Json], 
         "nvidia",
         lambda config: config.update(model_type="gr00t_n2"),
         lambda tensors: None,
-        ['the model is "gr00t_n2", expected one of gr00t_n1, gr00t_n1_5, Gr00tN1d6, Gr00tN1d7'],
+        ['model_type is "gr00t_n2", expected one of gr00t_n1, gr00t_n1_5, Gr00tN1d6, Gr00tN1d7'],
     ),
     "another model": (
         "nvidia",
@@ -224,7 +224,7 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Json], object], Callable[[Json], 
         "nvidia",
         lambda config: config.update(saccade={"future_key_bias": [0.0] * 32}),
         lambda tensors: None,
-        ["saccade stands beside action_head_cfg, expected inside"],
+        ["saccade is next to action_head_cfg, expected inside it"],
     ),
     "another policy of lerobot's": (
         "lerobot",
@@ -255,6 +255,15 @@ def test_contradictions_are_one_error_with_all_that_was_found(tmp_path: Path, ca
         assert re.search(message, str(caught.value)), caught.value
 
 
+def test_an_encoder_without_inputs(tmp_path: Path) -> None:
+    """Its width is a multiple of every state's, none of which it holds."""
+    folder = layouts.write(tmp_path / "checkpoint", "lerobot-n17")
+    name = f"{EXPECTED['lerobot'][2]}state_encoder.layer1.W"
+    change_tensors(folder, lambda tensors: tensors.update({name: torch.zeros(1, 0, 4)}))
+    with pytest.raises(CheckpointError, match="max_state_dim is"):
+        saccade.ActionHead.load(folder)
+
+
 def test_contradictions_of_a_config_alone() -> None:
     config = {"model_type": "gr00t_n1_5", "action_head_cfg": layouts.n15_head()}
     saccade.HeadConfig.from_dict(config)
@@ -262,7 +271,7 @@ def test_contradictions_of_a_config_alone() -> None:
         saccade.HeadConfig.from_dict(
             config | {"action_head_cfg": layouts.n15_head() | {"model_type": "Gr00tN1d7"}}
         )
-    with pytest.raises(CheckpointError, match="saccade stands beside action_head_cfg"):
+    with pytest.raises(CheckpointError, match="saccade is next to action_head_cfg"):
         saccade.HeadConfig.from_dict(config | {"saccade": {"future_key_bias": [0.0] * 32}})
 
 

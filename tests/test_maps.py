@@ -29,9 +29,11 @@ from saccade.cli import main
 from saccade.cli.attention import show
 from saccade.errors import InputError, ShapeError
 from saccade.maps import occlusion, record
+from saccade.maps.drawing import ranges
 from saccade.maps.layout import Camera, parse_layout
+from saccade.maps.notes import NO_FUTURE, NO_IMAGES
 from saccade.maps.occlusion import BlankedPixels, DroppedPositions, cell_for, measure, places_of
-from saccade.maps.sheet import DOTS_PER_INCH, NO_FUTURE, NO_IMAGES, WIDTH, Sheet, ranges, write_sheet
+from saccade.maps.sheet import DOTS_PER_INCH, WIDTH, Sheet, write_sheet
 from saccade.maps.summary import Overlap, entropy, overlap, shuffle, summarize
 from saccade.maps.view import LayoutOptions, View, from_file, from_simulator
 from saccade.observation import Observation
@@ -362,7 +364,7 @@ FILES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"backbone_features": np.zeros((296, 128), np.float32)}, ShapeError, "backbone_features: shape"),
     ({"backbone_features": np.zeros((0, 296, 128), np.float32)}, InputError, "expected no empty axis"),
     ({"backbone_features": np.zeros((1, 296, 128), np.int64)}, InputError, "floating point"),
-    ({"input_ids": None}, InputError, "neither input_ids nor image_mask; --layout"),
+    ({"input_ids": None}, InputError, "neither input_ids nor image_mask; give the positions"),
     ({"input_ids": np.zeros((1, 295), np.int64)}, ShapeError, r"input_ids: shape .* expected \(1, 296\)"),
     ({"input_ids": np.zeros((1, 296))}, InputError, "input_ids: expected integers"),
     ({"image_mask": np.full((1, 296), 2)}, InputError, "image_mask: expected booleans"),
@@ -513,7 +515,7 @@ def texts(figure: Figure) -> str:
 def test_the_sheet_says_what_is_missing() -> None:
     without = texts(Sheet(one_hot_maps(future_tokens=0, images=False)).draw())
     assert record.CAVEAT in without
-    assert record.BESIDE in without
+    assert record.OCCLUSION in without
     assert NO_FUTURE in without
     assert "one by one" not in without
     assert "maps are drawn on white" in without
@@ -546,7 +548,7 @@ def test_without_image_tokens_there_is_no_occlusion_map(
     assert {entry["rank_correlation"] for entry in found["agreement"]} == {None}
     page = (tmp_path / "out/page.html").read_text()
     assert NO_IMAGES in page
-    assert record.BESIDE not in page
+    assert record.OCCLUSION not in page
 
 
 def test_ranges() -> None:
@@ -579,7 +581,7 @@ def test_the_command_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[st
     }
     assert found["checkpoint"]["sha256"] == Policy.load().checkpoint_sha256()
     assert found["selection"]["blocks"] == [1, 2]
-    assert found["caveat"] == f"{record.CAVEAT} {record.BESIDE}"
+    assert found["caveat"] == f"{record.CAVEAT} {record.OCCLUSION}"
     assert {(entry["step"], entry["block"]) for entry in found["summaries"]} == {
         (0, 1),
         (0, 2),

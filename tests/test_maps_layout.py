@@ -106,7 +106,7 @@ def test_an_image_mask() -> None:
     assert from_image_mask(mask, names=names).parts()["special"].tolist() == [5]
     with pytest.raises(InputError, match=r"4 image tokens at position 1, expected a multiple of 9"):
         from_image_mask(mask, grid=(3, 3))
-    with pytest.raises(InputError, match=r"3 image tokens are no square"):
+    with pytest.raises(InputError, match=r"3 image tokens are not a square"):
         from_image_mask(np.array([True, True, True]))
 
 
@@ -131,16 +131,16 @@ def test_a_layout_written_by_hand() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not understood"),
-        ("text", "is not understood"),
-        ("text:2,", "is not understood"),
-        ("text:-1", "is not understood"),
+        ("", "cannot be read"),
+        ("text", "cannot be read"),
+        ("text:2,", "cannot be read"),
+        ("text:-1", "cannot be read"),
         ("words:3", "unknown kind 'words'"),
-        ("image:*", "is not understood, expected ROWSxCOLUMNS|grid: given"),
-        ("image:5", "5 image tokens are no square"),
+        ("image:*", "cannot be read, expected ROWSxCOLUMNS|grid: given"),
+        ("image:5", "5 image tokens are not a square"),
         ("image:0x4", "at least 1 row"),
         ("image:2x2x2", "expected ROWSxCOLUMNS"),
-        ("text:2x2", "is not understood"),
+        ("text:2x2", "cannot be read"),
         ("text:*,pad:*", r"\* more than once"),
     ],
 )

@@ -22,7 +22,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from saccade.maps.page import render_page, write_page
-from saccade.maps.record import BESIDE, CAVEAT, Maps
+from saccade.maps.record import CAVEAT, OCCLUSION, Maps
 
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
@@ -109,7 +109,7 @@ def test_the_first_view(page: Page) -> None:
         page.text("legend")
         == "block 0 (reads vision and language), Euler step 0, mean over heads: future rows, mean of 3"
     )
-    assert page.text("caveat") == f"{CAVEAT} {BESIDE}"
+    assert page.text("caveat") == f"{CAVEAT} {OCCLUSION}"
     assert "by hand" in page.text("change-text")
     assert page.driver.get_log("browser") == []  # type: ignore[no-untyped-call]
 
@@ -192,7 +192,7 @@ def test_a_map_is_painted_where_its_patches_are(page: Page) -> None:
 @needs_browser
 def test_every_choice_changes_what_is_drawn(page: Page) -> None:
     page.driver.find_element(By.CSS_SELECTOR, "#tokens button[data-token='1']").click()
-    one_scale = "one scale for block and head"
+    one_scale = "one scale per block and head"
     for name, text, told in (
         ("head", "1", "legend"),
         ("group", "action", "legend"),

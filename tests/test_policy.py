@@ -167,19 +167,19 @@ def statistics(state: int, action: int) -> dict[str, Any]:
 
 def test_which_embodiment_is_meant() -> None:
     head = load("nvidia")
-    with pytest.raises(saccade.InputError, match="embodiment: given None"):
+    with pytest.raises(saccade.InputError, match=r"embodiment: expected one of those in .*got None"):
         Policy(head)
     assert Policy(head, embodiment=24).normalizer.embodiment == "gr1"
     assert Policy(head, statistics(7, 6), 9).embodiment_id == 9
     assert Policy(head, Normalizer.load(statistics(7, 6), state_dim=12), 9).embodiment_id == 9
-    with pytest.raises(saccade.InputError, match="got nothing that says which"):
+    with pytest.raises(saccade.InputError, match="got None"):
         Policy(head, statistics(7, 6))
     with pytest.raises(saccade.InputError, match="got 40"):
         Policy(head, statistics(7, 6), 40)
     read = Normalizer.load(published("nvidia"), "gr1")
     assert Policy(head, read, "gr1").embodiment_id == 24
     for other in ("oxe_droid", 17):
-        with pytest.raises(saccade.InputError, match="embodiment: given"):
+        with pytest.raises(saccade.InputError, match="embodiment: expected that of the normalizer"):
             Policy(head, read, other)
     one = ActionHead.load(published("isaac"), embodiment_ids=[3])
     assert Policy(one, statistics(7, 6)).embodiment_id == 3
@@ -189,21 +189,22 @@ def test_which_embodiment_is_meant() -> None:
 
 def test_statistics_of_another_head() -> None:
     head = load("nvidia")
-    with pytest.raises(saccade.InputError, match="normalizer: gives states of 7"):
+    with pytest.raises(saccade.InputError, match=r"normalizer: .*got states of width 7"):
         Policy(head, Normalizer.load(statistics(7, 6)), 3)
-    with pytest.raises(saccade.InputError, match="gives 8 numbers an action"):
+    with pytest.raises(saccade.InputError, match=r"actions of at most width 8, .* actions of width 9"):
         Policy(head, Normalizer.load(statistics(7, 9), state_dim=12), 3)
     with pytest.raises(saccade.CheckpointError, match="9 numbers, the head's only 8"):
         Policy(head, statistics(7, 9), 3)
 
 
 def test_arguments_that_do_not_fit() -> None:
-    policy = Policy(load("lerobot"))
-    given = features(policy.head)
+    head = load("lerobot")
+    policy = Policy(head)
+    given = features(head)
     with pytest.raises(saccade.ShapeError, match="the Normalizer of 'new_embodiment' expected"):
         policy(given, draw(2, 12))
     with pytest.raises(saccade.ShapeError, match=r"(?s)state: .*Normalizer turns a robot's state into that"):
-        policy.head(given, draw(2, 7), 31)
+        head(given, draw(2, 7), 31)
     with pytest.raises(saccade.InputError, match="out: expected none"):
         policy(given, draw(2, 7), out=np.empty((2, 16, 8), np.float32))
     chunk: Any = {"overlap": 2, "frozen": 1}

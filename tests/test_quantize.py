@@ -222,6 +222,17 @@ def test_weights_that_are_not_finite_are_refused(value: float, source: Path, tmp
     assert not (tmp_path / "int8").exists()
 
 
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf])
+@pytest.mark.parametrize("name", ["model.proj_out_2.bias", "state_encoder.layer1.W", "vlln.weight"])
+def test_other_weights_that_are_not_finite_are_refused(
+    name: str, value: float, source: Path, tmp_path: Path
+) -> None:
+    rewrite(source, lambda tensors: tensors["action_head." + name].view(-1)[-1].fill_(value))
+    with pytest.raises(CheckpointError, match=rf"{re.escape(name)} holds (NaN|-inf), expected finite"):
+        quantize(source, tmp_path / "int8")
+    assert [path.name for path in tmp_path.iterdir()] == [source.name]
+
+
 def test_sources_that_are_not_there_or_do_not_fit(source: Path, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         quantize(tmp_path / "nowhere", tmp_path / "int8")

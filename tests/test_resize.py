@@ -199,7 +199,7 @@ def test_perturbation(source: Path, tmp_path: Path) -> None:
         assert torch.equal(tokens_of(again), after) == is_same
     with pytest.raises(InputError, match="perturbation: copies are perturbed"):
         resize(source, tmp_path / "less", num_future_tokens=5, perturbation=0.25)
-    for amount in (-1.0, math.nan, math.inf, 1e300):
+    for amount in (-1.0, math.nan, math.inf, 1e300, 1e38, 1e20):
         with pytest.raises(InputError, match="perturbation"):
             resize(source, tmp_path / "more", num_future_tokens=64, perturbation=amount)
 
@@ -272,6 +272,33 @@ def test_mismatches_are_fatal_and_all_listed(source: Path, tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("bias", [-1000.0, 800.0, -3e38, 3e38])
+@pytest.mark.parametrize("count", [5, N, 40])
+def test_large_biases_stay_finite(bias: float, count: int, source: Path, tmp_path: Path) -> None:
+    config = config_of(source)
+    config["action_head_cfg"]["saccade"] = {"future_key_bias": [bias] * N}
+    (source / "config.json").write_text(json.dumps(config))
+    report = resize(source, tmp_path / "out", num_future_tokens=count)
+    assert report.future_key_bias is not None
+    copies = [sum(index % N == one for index in range(count)) for one in range(N)]
+    for group, found in zip(report.sources, report.future_key_bias, strict=True):
+        weight = len(group) if count < N else 1 / copies[group[0]]
+        assert found == pytest.approx(bias + math.log(weight), rel=1e-6)
+    written = config_of(tmp_path / "out")["action_head_cfg"]["saccade"]["future_key_bias"]
+    assert written == pytest.approx(list(report.future_key_bias))
+    assert torch.isfinite(tokens_of(tmp_path / "out")).all()
+
+
+def test_the_heaviest_token_is_what_merging_leaves(source: Path, tmp_path: Path) -> None:
+    """Weights whose exponentials float64 does not hold."""
+    config = config_of(source)
+    config["action_head_cfg"]["saccade"] = {"future_key_bias": [-1000.0] * (N - 1) + [1000.0]}
+    (source / "config.json").write_text(json.dumps(config))
+    report = resize(source, tmp_path / "out", num_future_tokens=1)
+    assert report.future_key_bias == (1000.0,)
+    assert torch.equal(tokens_of(tmp_path / "out")[0], tokens_of(source)[-1])
+
+
 def test_tokens_that_are_not_finite(source: Path, tmp_path: Path) -> None:
     tensors = tensors_of(source)
     tensors[TOKENS][3, 4] = torch.nan
@@ -328,6 +355,26 @@ def test_actions_on_recorded_features(source: Path, tmp_path: Path) -> None:
     moved = np.abs(after.astype(float) - before)
     assert found.in_saccade.largest == pytest.approx(moved.max(), rel=1e-6)
     assert found.in_saccade.mean == pytest.approx(moved.mean(), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "mask", "message"),
+    [
+        ("drop_vl", np.ones((3, 9), bool), "drop_vl: row 0 drops every position"),
+        ("attention_mask", np.zeros((3, 9), bool), "attention_mask: false entries"),
+    ],
+)
+def test_masks_that_the_head_would_refuse_are_refused_before_anything_is_written(
+    name: str, mask: Any, message: str, source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = features(tmp_path, **{name: mask}), tmp_path / "out"
+    options = ["--num-future-tokens", "8", "--out", str(out), "--features", str(file)]
+    assert cli.main(["resize", str(source), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+    resize(source, out, num_future_tokens=8)
+    with pytest.raises(InputError, match=message):
+        action_changes(source, out, features=file)
 
 
 def test_the_command(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -161,7 +161,7 @@ CASES: list[tuple[Sequence[str], str]] = [
     (["demos", "--episodes", "0"], "--episodes: given 0"),
     (["demos", "--image-size", "2"], "--image-size: given 2"),
     (["demos", "--frame-stride", "0"], "--frame-stride: given 0"),
-    (["train", "--demos", "nowhere"], "nowhere: no demonstrations there"),
+    (["train", "--demos", "nowhere"], "nowhere: no demonstrations found"),
     (["train", "--demos", "nowhere", "--training-steps", "0"], "--training-steps: given 0"),
     (["train", "--demos", "nowhere", "--num-future-tokens", "-1"], "--num-future-tokens: given -1"),
     (["train", "--demos", "nowhere", "--learning-rate", "nan"], "--learning-rate: given nan"),

@@ -210,7 +210,7 @@ def test_observations_of_the_wrong_form_are_refused(demo: Policy) -> None:
     images = {camera.name: np.zeros((64, 64, 3), np.uint8) for camera in demo.config.cameras}
     good = {"images": images, "proprio": np.zeros(4), "instruction": ""}
     noise = demo.noise(np.random.default_rng(0))
-    with pytest.raises(ShapeError, match="no picture of left"):
+    with pytest.raises(ShapeError, match="none of camera left"):
         demo.act({**good, "images": {"top": images["top"]}}, noise=noise)
     with pytest.raises(ShapeError, match="proprio"):
         demo.act({**good, "proprio": np.zeros(3)}, noise=noise)

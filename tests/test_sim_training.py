@@ -26,9 +26,10 @@ from saccade.sim.dataset import chunks, describe, later_frames, load_samples, st
 from saccade.sim.learner import Learner, pool_tokens
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.tasks import DEMONSTRATION_SEEDS
+from saccade.sim.training_settings import TrainingSettings
 
 RECORDING = demos.RecordingSettings(image_size=16, frame_stride=6, cameras=DEFAULT_CAMERAS[:2])
-TINY = train.TrainingSettings(
+TINY = TrainingSettings(
     steps=6,
     batch_size=2,
     width=16,
@@ -132,7 +133,7 @@ def test_held_out_samples_come_from_demonstrations_of_their_own(
 
 @pytest.mark.parametrize("settings", [TINY, ALIGNED], ids=["plain", "aligned"])
 def test_training_resumes_to_the_same_weights(
-    recording: Path, tmp_path: Path, settings: train.TrainingSettings
+    recording: Path, tmp_path: Path, settings: TrainingSettings
 ) -> None:
     def interrupt(progress: train.Progress) -> None:
         if progress.step == 3:
@@ -170,7 +171,7 @@ def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Pa
     assert history[-1]["step"] == TINY.steps
     settings = json.loads((tmp_path / "settings.json").read_text())
     assert settings.pop("demonstrations")["tasks"] == dict.fromkeys(TASKS, 2)
-    assert train.TrainingSettings(**settings) == TINY
+    assert TrainingSettings(**settings) == TINY
     rust, other = (Policy.load(tmp_path, engine=engine, num_threads=1) for engine in ("rust", "torch"))
     assert rust.config.tasks == tuple(TASKS)
     images = {
@@ -187,7 +188,7 @@ def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Pa
 def test_a_run_with_other_settings_is_refused(recording: Path, tmp_path: Path) -> None:
     train.train(recording, tmp_path, TINY, ignore)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    other = train.TrainingSettings(**{**vars(TINY), "seed": 1, "batch_size": 3})
+    other = TrainingSettings(**{**vars(TINY), "seed": 1, "batch_size": 3})
     with pytest.raises(InputError, match=r"other settings \(batch_size, seed\)"):
         train.train(recording, tmp_path, other, ignore)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
@@ -195,12 +196,12 @@ def test_a_run_with_other_settings_is_refused(recording: Path, tmp_path: Path) -
 
 def test_settings_that_do_not_fit_the_pictures_are_refused(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="image_size 16 is not a multiple of patch_size 32"):
-        train.train(recording, tmp_path, train.TrainingSettings(patch_size=32), ignore)
+        train.train(recording, tmp_path, TrainingSettings(patch_size=32), ignore)
     assert not list(tmp_path.iterdir())
 
 
 def test_learning_rate_warms_up_and_falls_to_zero() -> None:
-    settings = train.TrainingSettings(steps=1000)
+    settings = TrainingSettings(steps=1000)
     rates = [train.learning_rate(settings, step) for step in range(1000)]
     assert rates[0] < 0.01 * settings.learning_rate
     assert max(rates) <= settings.learning_rate
@@ -211,9 +212,7 @@ def test_learning_rate_warms_up_and_falls_to_zero() -> None:
 def test_training_starts_from_a_policy(recording: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     train.train(recording, first, TINY, ignore)
-    settings = train.TrainingSettings(
-        **{**vars(TINY), "steps": 2, "learning_rate": 1e-9, "absent_share": 0.5}
-    )
+    settings = TrainingSettings(**{**vars(TINY), "steps": 2, "learning_rate": 1e-9, "absent_share": 0.5})
     train.train(recording, second, settings, ignore, start=first)
     tensors = load_file(second / "model.safetensors")
     for name, tensor in load_file(first / "model.safetensors").items():
@@ -231,7 +230,7 @@ def test_a_policy_of_other_sizes_cannot_be_started_from(recording: Path, tmp_pat
 
 
 def make_batches(
-    recording: Path, settings: train.TrainingSettings, *, with_later: bool = True
+    recording: Path, settings: TrainingSettings, *, with_later: bool = True
 ) -> tuple[train.Run, train.Batches]:
     """A run before its first step, and what it draws from."""
     samples, _ = load_samples(recording, TASKS, settings.horizon)
@@ -350,10 +349,10 @@ def test_alignment_loss_falls_and_is_reported(recording: Path, tmp_path: Path) -
 
 
 def test_alignment_block_is_the_middle_one_or_as_said() -> None:
-    found = [train.TrainingSettings(num_layers=n, alignment_weight=1).aligned_block for n in (1, 2, 4, 16)]
+    found = [TrainingSettings(num_layers=n, alignment_weight=1).aligned_block for n in (1, 2, 4, 16)]
     assert found == [0, 0, 1, 7]
-    assert train.TrainingSettings(alignment_weight=1, alignment_block=3).aligned_block == 3
-    assert train.TrainingSettings(alignment_block=3).aligned_block is None
+    assert TrainingSettings(alignment_weight=1, alignment_block=3).aligned_block == 3
+    assert TrainingSettings(alignment_block=3).aligned_block is None
 
 
 @pytest.mark.parametrize(
@@ -367,7 +366,7 @@ def test_alignment_block_is_the_middle_one_or_as_said() -> None:
 )
 def test_alignment_that_cannot_be_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        train.TrainingSettings(**wrong)
+        TrainingSettings(**wrong)
 
 
 def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) -> None:

@@ -189,7 +189,7 @@ def test_a_cell_with_other_settings_takes_the_place_of_its_predecessor(tmp_path:
     [
         ({"backend": "dask"}, "backend: unknown name 'dask', expected one of loky, ray"),
         ({"jobs": 0}, "jobs: given 0"),
-        ({"cells": cells(1, 1)}, "keys that occur twice"),
+        ({"cells": cells(1, 1)}, "duplicate keys"),
     ],
 )
 def test_bad_input(tmp_path: Path, arguments: dict[str, object], message: str) -> None:

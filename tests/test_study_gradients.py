@@ -14,6 +14,7 @@ from saccade.cli import main
 from saccade.reference import ActionHead, random_weights
 from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
+from saccade.sim.training_settings import TrainingSettings
 from saccade.study import derivatives
 from saccade.study.arms import NO_TOKENS
 from saccade.study.paths import ALL_PATHS, DETOUR, DIRECT, PATHS, READ
@@ -200,7 +201,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
         "2",
     ]
     assert main([*arguments, "--demos", str(recording), "--out", str(tmp_path)]) == 0
-    assert "runs by state and action rows alone" in capsys.readouterr().out
+    assert "runs through state and action rows only" in capsys.readouterr().out
     table = read_table(tmp_path / "gradients.csv")
     provenance = read_provenance(tmp_path / "gradients.json")
     assert provenance.complete
@@ -220,7 +221,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_a_policy_without_future_tokens(recording: Path, tmp_path: Path) -> None:
-    settings = train.TrainingSettings(
+    settings = TrainingSettings(
         steps=1, batch_size=1, width=8, num_layers=2, num_heads=1, backbone_layers=1, num_future_tokens=0
     )
     train.train(recording, tmp_path / "policy", settings, lambda progress: None)

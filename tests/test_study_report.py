@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from html import escape, unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -180,6 +181,23 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
             assert np.asarray(image.convert("L")).std() > 5  # something is drawn
     for line in (line for line in text.splitlines() if line.startswith("|")):
         assert line.count("|") - 2 * line.count("\\|") in (len(line.split(" | ")) + 1,)
+
+
+def test_page_and_markdown_are_the_same_text(tmp_path: Path) -> None:
+    write_cuts(tmp_path)
+    write_patching(tmp_path)
+    page, markdown = write_report(tmp_path)
+    html, text = page.read_text(encoding="utf-8"), markdown.read_text(encoding="utf-8")
+    linked = re.findall(r"^- \[.*\]\(#(.*?)\)", text, re.MULTILINE)
+    assert len(linked) == len(STUDIES)
+    assert linked == re.findall(r'<h2 id="(.*?)"', html) == re.findall(r'href="#(.*?)"', html)
+    rows = [line for line in text.splitlines() if line.startswith("| ") and "| --- |" not in line]
+    cells = [cell.replace("\\|", "|").strip() for row in rows for cell in re.split(r"(?<!\\)\|", row)[1:-1]]
+    shown = [unescape(cell) for cell in re.findall(r"<t[dh]>(.*?)</t[dh]>", html)]
+    assert shown == cells
+    for line in text.splitlines():
+        if line.startswith("- ") and "](#" not in line:
+            assert f"<li>{escape(line[2:], quote=False)}</li>" in html
 
 
 def test_an_interval_that_just_excludes_zero_is_no_finding_among_many_arms(tmp_path: Path) -> None:

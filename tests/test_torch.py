@@ -61,7 +61,7 @@ def packings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         counted.append(len(counted))
         return engine(*args, **options)
 
-    monkeypatch.setattr(saccade, "CrossAttention", count)
+    monkeypatch.setattr("saccade.torch.PackedAttention", count)
     return counted
 
 

@@ -1,4 +1,4 @@
-//! The text of a `config.json`; behind a line of `====` maybe the header of the weights beside it.
+//! The text of a `config.json`; optionally, after a line of `====`, the header of the weights next to it.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! A whole safetensors file: opened, checked against a head's names, every tensor read in every way.
+//! A whole safetensors file: opened, compared with expected tensors, every tensor read in every way.
 
 #![no_main]
 

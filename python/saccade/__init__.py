@@ -67,21 +67,8 @@ _SUBMODULES = (
     "torch",
 )
 
-if TYPE_CHECKING:
-    from saccade import (
-        bench,
-        checkpoints,
-        comparison,
-        integrations,
-        maps,
-        observation,
-        reference,
-        robots,
-        sim,
-        study,
-        torch,
-    )
-else:  # so that a type checker still reports names that do not exist
+# Hidden from type checkers, so that they report names that do not exist; they need `import saccade.sim`.
+if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
         if name in _SUBMODULES:

@@ -45,7 +45,7 @@ INCLUDES: dict[str, tuple[str, ...]] = {
     "ray": ("study", "sim", "cli", "torch"),
 }
 
-#: A message lists so many missing modules by name.
+#: Number of missing modules that a message names.
 SHOWN = 3
 
 
@@ -136,7 +136,8 @@ def install_command(extras: Iterable[str], modules: Iterable[str]) -> str:
 def _missing(modules: list[str], extras: list[str]) -> MissingExtraError:
     """The error for these missing modules of these extras."""
     more = len(modules) - SHOWN
-    listed = ", ".join(modules[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+    names = [*modules[:SHOWN], f"{more} more"] if more > 0 else modules
+    listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
     verb = "is" if len(modules) == 1 else "are"
     command = install_command(extras, modules)
     return MissingExtraError(f"{listed} {verb} not installed. Install with: {command}", name=modules[0])

@@ -37,9 +37,9 @@ class Intervention:
     Cross-attention blocks have ``vl`` keys, and self-attention blocks have ``state``, ``future`` and
     ``action`` keys. Therefore an edge (reader, source) exists in cross-attention blocks if the source is
     ``vl``, and otherwise in self-attention blocks. A cut or bias has no effect in the other kind of block. If
-    none of the cuts and biases of an intervention exists in any of its ``blocks``, the call raises an
-    ``InputError``, because a result without effect would be misleading. With interleaved self-attention, the
-    even blocks are cross-attention and the odd blocks are self-attention.
+    it exists in none of the ``blocks``, the call raises an ``InputError``, because a result without effect
+    would be misleading. The same holds for a choice of no tokens. With interleaved self-attention, the even
+    blocks are cross-attention and the odd blocks are self-attention.
 
     Indices of ``vl`` count all positions, also in blocks that attend only to text or only to images. Tokens
     that such a block does not attend to are not affected there.

@@ -1,8 +1,8 @@
-"""The cross-attention as a torch module: takes the place of diffusers' ``Attention`` in GR00T's blocks.
+"""Cross-attention as a torch module, a replacement for diffusers' ``Attention`` in the blocks of GR00T.
 
-The module holds its weights as torch parameters and gives them to a custom operator, so that
-``torch.compile`` and ``torch.export`` see tensors and nothing else. What the engine packs from them is kept
-beside, for as long as the weights live. Needs torch 2.4 or newer.
+The module has its weights as torch parameters and passes them to a custom operator, so that ``torch.compile``
+and ``torch.export`` see only tensors. The packed copy of the weights is cached for as long as the weights
+live. Needs torch 2.4 or newer.
 """
 
 from __future__ import annotations
@@ -14,19 +14,23 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import nn
 
-import saccade
+from saccade._extras import require
+from saccade.attention import CrossAttention as PackedAttention
 from saccade.errors import DtypeError, InputError, ShapeError
+
+require("torch")
+
+import torch  # noqa: E402
+from torch import nn  # noqa: E402
 
 __all__ = ["CrossAttention"]
 
-#: The weights as the operator takes them.
+#: The weights in the order in which the operator takes them.
 NAMES = tuple(
     f"{layer}.{kind}" for layer in ("to_q", "to_k", "to_v", "to_out.0") for kind in ("weight", "bias")
 )
-#: What diffusers' Attention can do beside and GR00T does not use: attribute and the value that turns it off.
+#: Features of diffusers' Attention that GR00T does not use: attribute and the value that turns it off.
 UNUSED: dict[str, Any] = {
     "group_norm": None,
     "spatial_norm": None,
@@ -43,36 +47,36 @@ UNUSED: dict[str, Any] = {
 }
 #: The processors that compute the plain softmax(q k^T / sqrt(head_dim)) v.
 PROCESSORS = ("AttnProcessor", "AttnProcessor2_0")
-#: Elements that are compared in every row and every column of a weight, at the least.
+#: At least this many elements of every row and every column of a weight are compared.
 SAMPLES = 4
 
 
 class CrossAttention(nn.Module):
     """Multi-head attention with its projections: ``to_out(softmax(q k^T / sqrt(head_dim)) v)``.
 
-    Drop-in for diffusers' ``Attention`` as GR00T uses it: the same parameter names, the same call. Computes
-    in float32 (or ``precision``) whatever the dtype of the inputs, on the CPU, without gradients or dropout.
-    Keys and values are projected at every call, as diffusers does; :class:`saccade.CrossAttention` holds them
-    over many calls.
+    A drop-in replacement for diffusers' ``Attention`` as GR00T uses it, with the same parameter names and the
+    same call. It computes on the CPU in float32 (or ``precision``) for inputs of any dtype, without gradients
+    and without dropout. Keys and values are projected in every call, as in diffusers.
+    :class:`saccade.CrossAttention` shares them between calls.
 
-    The parameters are ordinary torch memory, shared with ``state_dict``; the engine has a packed copy.
-    Every call compares the weights with what was packed, and packs them anew if they have changed, be it in
-    a way that torch does not count (through ``.data`` or NumPy). This reads the weights once, which was 6 to
-    26 % of a call at N1.5's sizes.
+    The parameters are ordinary torch memory, shared with ``state_dict``. The engine has a packed copy. Every
+    call compares the weights with the packed ones and packs them again if they have changed, also if torch
+    does not count the change (through ``.data`` or NumPy). This reads the weights once, which was 6 to 26 %
+    of a call at N1.5's sizes.
 
     Args:
         state_dict: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
             ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
             ``to_out.0.bias (width,)``; floating point, on the CPU.
-        heads: Attention heads, a divisor of the width.
+        heads: Number of attention heads, a divisor of the width.
         precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in :meth:`saccade.ActionHead.load`.
-        dropout: Probability after ``to_out.0`` in training. It is not applied: a module in training mode with
-            a dropout other than 0 refuses the call.
+        dropout: Probability of the dropout after ``to_out.0`` in training. It is not implemented: a call in
+            training mode with a dropout other than 0 raises an error.
 
     Raises:
-        CheckpointError: tensors are missing, unknown or misshaped; all of them are listed.
-        DtypeError: a tensor is not floating point or not on the CPU.
-        InputError: ``heads`` does not divide the width, the precision is unknown, a weight is not finite.
+        CheckpointError: Tensors are missing, unknown or of the wrong shape. The message lists all of them.
+        DtypeError: A tensor is not floating point or not on the CPU.
+        InputError: ``heads`` does not divide the width, the precision is unknown, or a weight is not finite.
 
     Example:
         >>> import torch
@@ -94,8 +98,8 @@ class CrossAttention(nn.Module):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        # The engine says what is wrong with the tensors, and what it packs serves the first call.
-        engine = saccade.CrossAttention(state_dict, heads, precision=precision)
+        # The engine checks the tensors, and the first call uses what it packs here.
+        engine = PackedAttention(state_dict, heads, precision=precision)
         self.heads, self.precision = engine.num_heads, engine.precision
         width, context_dim = engine.width, engine.context_dim
         self.to_q = nn.Linear(width, width, device="meta")
@@ -103,18 +107,18 @@ class CrossAttention(nn.Module):
         self.to_v = nn.Linear(context_dim, width, device="meta")
         self.to_out = nn.ModuleList([nn.Linear(width, width, device="meta"), nn.Dropout(dropout)])
         self.requires_grad_(False)
-        # Detached tensors share memory and the count of changes with the caller's.
+        # Detached tensors share memory and the version counter with the caller's.
         self.load_state_dict({name: state_dict[name].detach() for name in NAMES}, assign=True)
         weights = self._weights()
         _PACKED.put(weights, self.heads, self.precision, engine, _fingerprint(weights))
 
     @classmethod
     def from_attention(cls, attention: nn.Module, *, precision: str = "float32") -> CrossAttention:
-        """Takes the place of a diffusers ``Attention``: shares its weights, and is in its training mode.
+        """A replacement for a diffusers ``Attention``, with shared weights and the same training mode.
 
         Raises:
-            InputError: ``attention`` does something that GR00T's does not; all of it is listed.
-            CheckpointError, DtypeError: its weights do not fit, as for the class.
+            InputError: ``attention`` uses features that GR00T does not. The message lists them.
+            CheckpointError, DtypeError: Its weights do not fit, as for the class.
         """
         state_dict = attention.state_dict()
         wrong = [
@@ -126,7 +130,7 @@ class CrossAttention(nn.Module):
         if processor not in PROCESSORS:
             wrong.append(f"processor {processor}")
         if wrong:
-            raise InputError(f"attention: expected what GR00T uses of Attention, got {', '.join(wrong)}")
+            raise InputError(f"attention: expected only features that GR00T uses, got {', '.join(wrong)}")
         dropout = attention.to_out[1].p  # type: ignore[index,union-attr]
         module = cls(state_dict, attention.heads, precision=precision, dropout=dropout)  # type: ignore[arg-type]
         return module.train(attention.training)
@@ -141,26 +145,29 @@ class CrossAttention(nn.Module):
 
         Args:
             hidden_states: ``(batch, queries, width)``, any floating dtype.
-            encoder_hidden_states: ``(batch, T_vl, context_dim)``; None for self-attention.
-            attention_mask: ``(batch, T_vl)``, or with axes of 1 between: bool, True = attended, or floating
-                point, added to the logits (minus infinity removes a key). A query with no key left gets
-                ``to_out``'s bias.
+            encoder_hidden_states: ``(batch, T_vl, context_dim)``. None means self-attention.
+            attention_mask: ``(batch, T_vl)``, optionally with axes of size 1 in between. Either bool, True
+                for attended keys, or floating point, added to the logits (minus infinity removes a key). If
+                no key is left, the output of a query is the bias of ``to_out``.
 
         Returns:
-            ``(batch, queries, width)`` in the dtype of ``hidden_states``, or in autocast's where that is on.
+            ``(batch, queries, width)`` in the dtype of ``hidden_states``, or in that of autocast if it is on.
 
         Raises:
-            ShapeError, DtypeError: an argument does not fit, or is not on the CPU.
-            InputError: an input is NaN or infinite; a gradient is asked for; training mode with dropout.
+            ShapeError, DtypeError: An argument does not fit, or is not on the CPU.
+            InputError: An input is not finite, a gradient is requested, or the module is in training mode
+                with dropout.
         """
         encoder = hidden_states if encoder_hidden_states is None else encoder_hidden_states
         weights = self._weights()
         if torch.is_grad_enabled() and any(t.requires_grad for t in (hidden_states, encoder, *weights)):
             raise InputError(
-                "CrossAttention has no gradient: call it under torch.no_grad(), or use saccade.reference"
+                "CrossAttention computes no gradient: call it under torch.no_grad(), or use saccade.reference"
             )
         if self.training and self.to_out[1].p > 0:  # type: ignore[operator]
-            raise InputError("CrossAttention has no dropout: expected evaluation mode, call eval()")
+            raise InputError(
+                "CrossAttention has no dropout: expected evaluation mode (call eval()), got training"
+            )
         for name, value in (("hidden_states", hidden_states), ("encoder_hidden_states", encoder)):
             if value.device.type != "cpu":
                 raise DtypeError(f"{name}: expected a tensor on the CPU, got one on {value.device}")
@@ -168,11 +175,11 @@ class CrossAttention(nn.Module):
         output: torch.Tensor = cross_attention(
             hidden_states, encoder, mask, weights, self.heads, self.precision
         )
-        # As diffusers' linear layers give it; nothing is computed in less than `precision` for it.
+        # The dtype of diffusers' linear layers. Nothing is computed in less than `precision`.
         return output.to(torch.get_autocast_dtype("cpu")) if torch.is_autocast_enabled("cpu") else output
 
     def extra_repr(self) -> str:
-        """Heads and precision, for ``print(module)``."""
+        """Number of heads and precision, for ``print(module)``."""
         return f"heads={self.heads}, precision={self.precision!r}"
 
     def _weights(self) -> list[torch.Tensor]:
@@ -180,15 +187,15 @@ class CrossAttention(nn.Module):
         return [tensor for layer in layers for tensor in (layer.weight, layer.bias)]  # type: ignore[misc]
 
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> CrossAttention:
-        # What .to() and its kind go through; refused before anything has moved.
+        # .to() and similar methods call this. It refuses before anything has moved.
         device = fn(self.to_q.bias.detach()[:0]).device
         if device.type != "cpu":
-            raise DtypeError(f"CrossAttention runs on the CPU, it cannot be moved to {device}")
+            raise DtypeError(f"CrossAttention: expected the CPU, got a move to {device}")
         return super()._apply(fn, recurse)  # type: ignore[no-any-return,no-untyped-call]
 
 
 def _key_mask(mask: torch.Tensor | None, encoder: torch.Tensor) -> torch.Tensor | None:
-    """A mask in the forms that diffusers takes for all queries alike, as ``(batch, T_vl)``."""
+    """A mask that is the same for all queries, in any form that diffusers accepts, as ``(batch, T_vl)``."""
     if mask is None:
         return None
     if mask.dtype != torch.bool and not mask.dtype.is_floating_point:
@@ -196,8 +203,8 @@ def _key_mask(mask: torch.Tensor | None, encoder: torch.Tensor) -> torch.Tensor 
     batch, keys = encoder.shape[0], encoder.shape[1]
     if mask.ndim not in (2, 3, 4) or mask.shape != (batch, *[1] * (mask.ndim - 2), keys):
         raise ShapeError(
-            f"attention_mask: expected (batch, T_vl) = ({batch}, {keys}), perhaps with axes of 1 between ("
-            f"one mask for all queries and heads), got {tuple(mask.shape)}"
+            f"attention_mask: expected (batch, T_vl) = ({batch}, {keys}), optionally with axes of size 1 in "
+            f"between (one mask for all queries and heads), got {tuple(mask.shape)}"
         )
     return mask.reshape(batch, keys)
 
@@ -210,7 +217,7 @@ def _new_output(
     heads: int,
     precision: str,
 ) -> torch.Tensor:
-    """Where the result goes; all that a tracing compiler needs to know of the operator."""
+    """An empty result, after checking shapes. Tracing compilers call it in place of the operator."""
     inputs = (
         ("hidden_states", hidden_states, "batch, queries", weights[0].shape[1]),
         ("encoder_hidden_states", encoder_hidden_states, "batch, T_vl", weights[2].shape[1]),
@@ -243,12 +250,12 @@ def cross_attention(
     heads: int,
     precision: str,
 ) -> torch.Tensor:
-    """The operator ``saccade::cross_attention``: what :class:`CrossAttention` calls, without its checks.
+    """The operator ``saccade::cross_attention``, which :class:`CrossAttention` calls after its checks.
 
     Args:
         hidden_states: ``(batch, queries, width)``.
         encoder_hidden_states: ``(batch, T_vl, context_dim)``.
-        attention_mask: ``(batch, T_vl)``, bool or added to the logits.
+        attention_mask: ``(batch, T_vl)``, bool or floating point, which is added to the logits.
         weights: Weight and bias of ``to_q``, ``to_k``, ``to_v`` and ``to_out.0``.
         heads: A divisor of the width.
         precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``.
@@ -261,7 +268,7 @@ def cross_attention(
     if output.numel() == 0:
         pass
     elif encoder_hidden_states.shape[1] == 0:
-        output.copy_(weights[-1])  # no key: attention is zero, and to_out adds its bias
+        output.copy_(weights[-1])  # without keys, attention is zero, and to_out adds its bias
     else:
         engine = _PACKED.get(weights, heads, precision)
         is_bool = attention_mask is not None and attention_mask.dtype == torch.bool
@@ -275,19 +282,19 @@ cross_attention.register_fake(_new_output)
 
 
 class _Packed:
-    """What the engine made of weights, kept until the memory of one of them is gone."""
+    """Packed weights, cached until the memory of one of the weights is freed."""
 
     def __init__(self) -> None:
-        self._held: dict[tuple[Any, ...], tuple[bytes, saccade.CrossAttention]] = {}
+        self._held: dict[tuple[Any, ...], tuple[bytes, PackedAttention]] = {}
 
-    def get(self, weights: Sequence[torch.Tensor], heads: int, precision: str) -> saccade.CrossAttention:
-        """The weights packed; anew if they have changed."""
+    def get(self, weights: Sequence[torch.Tensor], heads: int, precision: str) -> PackedAttention:
+        """The packed weights. They are packed again if they have changed."""
         key = _place(weights, heads, precision)
         fingerprint = _fingerprint(weights)
         held, engine = self._held.get(key, (None, None))
         if engine is None or held != fingerprint:
             tensors = {name: weight.detach() for name, weight in zip(NAMES, weights, strict=True)}
-            engine = saccade.CrossAttention(tensors, heads, precision=precision)
+            engine = PackedAttention(tensors, heads, precision=precision)
             self.put(weights, heads, precision, engine, fingerprint)
         return engine
 
@@ -296,10 +303,10 @@ class _Packed:
         weights: Sequence[torch.Tensor],
         heads: int,
         precision: str,
-        engine: saccade.CrossAttention,
+        engine: PackedAttention,
         fingerprint: bytes,
     ) -> None:
-        """Keeps what was made of weights that had this fingerprint."""
+        """Caches packed weights under the place and fingerprint of the weights."""
         key = _place(weights, heads, precision)
         if key not in self._held:
             for weight in weights:
@@ -311,21 +318,22 @@ _PACKED = _Packed()
 
 
 def _place(weights: Sequence[torch.Tensor], heads: int, precision: str) -> tuple[Any, ...]:
-    """Where in memory the weights lie, and how they are used."""
+    """A key for the memory of the weights and for how they are used."""
     places = ((w.untyped_storage()._cdata, w.storage_offset(), w.shape, w.stride(), w.dtype) for w in weights)
     return heads, precision, *places
 
 
 def _fingerprint(weights: Sequence[torch.Tensor]) -> bytes:
-    """Differs where the weights do: torch's count of changes, the xor of each column's bits, and samples.
+    """A fingerprint of the weights: torch's version counters, the xor of the bits of each column, and
+    samples.
 
-    A change that torch does not count shows in the xor, unless changes in one column cancel there (two rows
-    swapped, an even number of signs turned). Samples in every row and every column see those, too, if they
-    touch a row, a column or a larger block.
+    The xor shows changes that torch does not count, unless changes in a column cancel (two rows swapped, an
+    even number of signs flipped). Samples in every row and every column detect those as well, if they affect
+    a whole row, a whole column or a larger block.
     """
     parts = []
     for weight in weights:
-        # A tensor made under torch.inference_mode has no count.
+        # A tensor created under torch.inference_mode has no version counter.
         parts.append(b"" if weight.is_inference() else weight._version.to_bytes(8, "little"))
         bits = weight.detach().view(_INTEGERS[weight.element_size()]).numpy()
         bits = bits.reshape(len(bits), -1)
@@ -339,7 +347,7 @@ _INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 @cache
 def _samples(shape: tuple[int, int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Rows and columns of some elements of a matrix: `SAMPLES` or more in every row and every column."""
+    """Rows and columns of sampled elements: at least `SAMPLES` in every row and every column."""
     rng = np.random.default_rng(0)
     k = np.arange(max(shape))
     columns = [rng.permutation(shape[1])[k % shape[1]] for _ in range(SAMPLES)]

@@ -22,7 +22,7 @@ pub struct Wanted {
 }
 
 /// A tensor that was read ahead, and what came of it.
-struct Read {
+struct TensorRead {
     wanted: Wanted,
     elements: Result<Elements>,
 }
@@ -31,9 +31,9 @@ struct Read {
 pub struct ReadAhead<'a> {
     checkpoint: &'a Checkpoint,
     /// What the thread has read, in the order that it was given; none where the system grants no thread.
-    ahead: Option<Receiver<Read>>,
+    ahead: Option<Receiver<TensorRead>>,
     /// The next one, if something else was asked for before it.
-    next: Cell<Option<Box<Read>>>,
+    next: Cell<Option<Box<TensorRead>>>,
     /// Memory of tensors that were used, for the thread.
     spare: Sender<Elements>,
 }
@@ -88,13 +88,13 @@ impl ReadAhead<'_> {
 fn read_all(
     checkpoint: &Checkpoint,
     wanted: Vec<Wanted>,
-    sender: &SyncSender<Read>,
+    sender: &SyncSender<TensorRead>,
     used: &Receiver<Elements>,
 ) {
     for wanted in wanted {
         let spare = wanted.is_given_back.then(|| used.try_recv().ok()).flatten();
         let elements = checkpoint.read_into(&wanted.name, wanted.slices.clone(), spare);
-        if sender.send(Read { wanted, elements }).is_err() {
+        if sender.send(TensorRead { wanted, elements }).is_err() {
             return;
         }
     }

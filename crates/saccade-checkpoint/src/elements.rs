@@ -53,3 +53,33 @@ impl Elements {
         Ok(wide)
     }
 }
+
+/// What is wrong with the int8 tensor `name` of these `values`, whose rows are multiplied by `scales`, the tensor `scale`.
+pub(crate) fn check_int8(
+    name: &str,
+    values: &[i8],
+    scale: &str,
+    scales: &[f32],
+) -> std::result::Result<(), String> {
+    let is_good = |scale: &f32| (127.0 * scale).is_finite() && *scale >= 0.0;
+    if let Some(row) = scales.iter().position(|scale| !is_good(scale)) {
+        return Err(format!(
+            "{scale} is {} at index {row}, expected finite scales that are not negative, and 127 times them finite",
+            scales[row]
+        ));
+    }
+    if values.contains(&i8::MIN) {
+        return Err(format!("{name} holds -128, expected -127 to 127"));
+    }
+    let width = values.len() / scales.len().max(1);
+    let is_zero = |row: usize| {
+        let row = &values[row * width..(row + 1) * width];
+        row.iter().all(|&value| value == 0)
+    };
+    match (0..scales.len()).find(|&row| scales[row] == 0.0 && !is_zero(row)) {
+        Some(row) => Err(format!(
+            "{scale} is 0 at index {row}, whose row of {name} is not zero"
+        )),
+        None => Ok(()),
+    }
+}

@@ -114,7 +114,7 @@ impl Error {
 ///
 /// # Errors
 /// [`Error::Memory`] if the system refuses it: a file with holes is as long as it likes, and an allocation that fails ends the process.
-pub(crate) fn reserve<T>(what: &'static str, values: &mut Vec<T>, len: usize) -> Result<()> {
+pub fn reserve<T>(what: &'static str, values: &mut Vec<T>, len: usize) -> Result<()> {
     let more = len.saturating_sub(values.len());
     values.try_reserve_exact(more).map_err(|_| Error::Memory {
         what,

@@ -23,7 +23,7 @@ mod writer;
 pub use ahead::{ReadAhead, Wanted};
 pub use companions::{Companions, OWN_CONFIG};
 pub use elements::Elements;
-pub use error::{Error, Result, granted, printable, show_bytes, show_shape};
+pub use error::{Error, Result, granted, printable, reserve, show_bytes, show_shape};
 pub use reader::Checkpoint;
 /// The types that tensors are stored in.
 pub use safetensors::Dtype;

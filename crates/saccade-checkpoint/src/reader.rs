@@ -9,7 +9,7 @@ use half::{bf16, f16};
 use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 
-use crate::elements::Elements;
+use crate::elements::{Elements, check_int8};
 use crate::error::{Error, Result, granted, reserve, show_shape};
 use crate::header::Header;
 use crate::index::WeightFiles;
@@ -22,7 +22,7 @@ const PIECE: usize = 1 << 24;
 struct Entry {
     file: usize,
     info: TensorInfo,
-    /// Where the tensor's first byte lies in the file.
+    /// The position of the tensor's first byte in the file.
     start: u64,
 }
 
@@ -154,7 +154,9 @@ impl Checkpoint {
         };
         match entry.info.shape.split_first() {
             Some((&size, rest)) if wanted.start <= wanted.end && wanted.end <= size => {
-                let elements: usize = rest.iter().product();
+                let elements = rest
+                    .iter()
+                    .fold(1, |product, &size| usize::saturating_mul(product, size));
                 let (first, count) = (wanted.start * elements, wanted.len() * elements);
                 self.read_elements(name, entry, first, count, spare)
             }
@@ -286,30 +288,8 @@ impl Checkpoint {
         let scales = self
             .read_elements(&scale, self.entry(&scale)?, 0, rows, None)?
             .into_f32();
-        let bad = |problem: String| Err(Error::Checkpoint(format!("source: {problem}")));
-        if let Some(row) = scales
-            .iter()
-            .position(|scale| !((127.0 * scale).is_finite() && *scale >= 0.0))
-        {
-            return bad(format!(
-                "{scale} is {} at index {row}, expected finite scales that are not negative, and 127 times them finite",
-                scales[row]
-            ));
-        }
-        if values.contains(&i8::MIN) {
-            return bad(format!("{name} holds -128, expected -127 to 127"));
-        }
-        let width = values.len() / rows.max(1);
-        let unscaled = |row: usize| {
-            values[row * width..(row + 1) * width]
-                .iter()
-                .any(|&value| value != 0)
-        };
-        if let Some(row) = (0..rows).find(|&row| scales[row] == 0.0 && unscaled(row)) {
-            return bad(format!(
-                "{scale} is 0 at index {row}, whose row of {name} is not zero"
-            ));
-        }
+        check_int8(name, &values, &scale, &scales)
+            .map_err(|problem| Error::Checkpoint(format!("source: {problem}")))?;
         Ok(Elements::Int8 { values, scales })
     }
 

@@ -1,148 +1,39 @@
-//! Exponential and activations: vector forms for the epilogues of other kernels, and slices in place.
+//! The exponential and the activations of slices, in place.
+
+use std::marker::PhantomData;
 
 use crate::isa::Isa;
-use crate::simd::{Kernel, Vector, dispatch};
-
-/// `exp(x)`, within 2 ULP of the exact value where that is a normal number, and within one smallest denormal below.
-///
-/// Exactly 0 at `-inf` and below -104, infinity above 88.73, NaN at NaN.
-///
-/// # Safety
-/// The CPU has the instruction set of `V`.
-#[inline(always)]
-pub(crate) unsafe fn exp_vector<V: Vector>(x: V) -> V {
-    // SAFETY: the caller's promise.
-    unsafe {
-        // Beyond these the result is 0 or infinity, and the whole part stays small. The second operand wins if it is NaN.
-        let x = V::splat(-105.0).max(V::splat(89.0).min(x));
-        // x = n ln 2 + r, |r| <= ln 2 / 2; ln 2 in two parts, of which n times the first is exact (Cody and Waite).
-        let n = x.mul(V::splat(std::f32::consts::LOG2_E)).round();
-        let r = n.fma(V::splat(-0.693_359_4), x);
-        let r = n.fma(V::splat(2.121_944_4e-4), r);
-        // exp(r) = 1 + r + r^2 p(r), the polynomial of Cephes' expf.
-        let p = V::splat(1.987_569_1e-4);
-        let p = p.fma(r, V::splat(1.398_199_9e-3));
-        let p = p.fma(r, V::splat(8.333_452e-3));
-        let p = p.fma(r, V::splat(4.166_579_6e-2));
-        let p = p.fma(r, V::splat(1.666_666_5e-1));
-        let p = p.fma(r, V::splat(0.5));
-        let p = p.fma(r.mul(r), r).add(V::splat(1.0));
-        p.scale_by_power_of_two(n)
-    }
-}
-
-/// `x / (1 + exp(-x))`.
-///
-/// # Safety
-/// The CPU has the instruction set of `V`.
-#[inline(always)]
-pub(crate) unsafe fn silu_vector<V: Vector>(x: V) -> V {
-    // SAFETY: the caller's promise.
-    unsafe {
-        // Below, the result is -0, as it is in the limit; -inf would give inf / inf.
-        let x = V::splat(-200.0).max(x);
-        let e = exp_vector(V::splat(0.0).sub(x));
-        x.div(V::splat(1.0).add(e))
-    }
-}
-
-/// `0.5 x (1 + tanh(u)) = x / (1 + exp(-2 u))` with `u = sqrt(2 / pi) (x + 0.044715 x^3)`.
-///
-/// The right form needs no difference of nearly equal numbers, so that it is exact to rounding for negative `x` too.
-///
-/// # Safety
-/// The CPU has the instruction set of `V`.
-#[inline(always)]
-pub(crate) unsafe fn gelu_tanh_vector<V: Vector>(x: V) -> V {
-    // -2 sqrt(2 / pi), and the same times 0.044715.
-    const LINEAR: f32 = -1.595_769_2;
-    const CUBIC: f32 = -0.071_354_82;
-    // SAFETY: the caller's promise.
-    unsafe {
-        // Below, the result is -0, as it is in the limit; -inf would give inf / inf.
-        let x = V::splat(-30.0).max(x);
-        let factor = x.mul(x).fma(V::splat(CUBIC), V::splat(LINEAR));
-        let e = exp_vector(x.mul(factor));
-        x.div(V::splat(1.0).add(e))
-    }
-}
-
-/// A function of one vector, for [`Map`].
-trait Activation {
-    /// # Safety
-    /// The CPU has the instruction set of `V`.
-    unsafe fn of<V: Vector>(x: V) -> V;
-}
-
-struct GeluTanh;
-struct Silu;
-struct Relu;
-struct Exp;
-
-impl Activation for GeluTanh {
-    #[inline(always)]
-    unsafe fn of<V: Vector>(x: V) -> V {
-        // SAFETY: the caller's promise.
-        unsafe { gelu_tanh_vector(x) }
-    }
-}
-
-impl Activation for Silu {
-    #[inline(always)]
-    unsafe fn of<V: Vector>(x: V) -> V {
-        // SAFETY: the caller's promise.
-        unsafe { silu_vector(x) }
-    }
-}
-
-impl Activation for Relu {
-    #[inline(always)]
-    unsafe fn of<V: Vector>(x: V) -> V {
-        // SAFETY: the caller's promise. The second operand wins if it is NaN.
-        unsafe { V::splat(0.0).max(x) }
-    }
-}
-
-impl Activation for Exp {
-    #[inline(always)]
-    unsafe fn of<V: Vector>(x: V) -> V {
-        // SAFETY: the caller's promise.
-        unsafe { exp_vector(x) }
-    }
-}
+use crate::simd::math::{Activation, Exp, GeluErf, GeluTanh, Relu, Silu};
+use crate::simd::{Kernel, Simd, Vector};
 
 /// An activation over a slice, in place.
 struct Map<'a, A> {
     x: &'a mut [f32],
-    activation: std::marker::PhantomData<A>,
+    activation: PhantomData<A>,
 }
 
 impl<A: Activation> Kernel for Map<'_, A> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<V: Vector>(self) {
-        let mut chunks = self.x.chunks_exact_mut(V::LANES);
+    unsafe fn run<S: Simd>(self, _: S) {
+        let mut chunks = self.x.chunks_exact_mut(S::Vector::LANES);
         for chunk in &mut chunks {
             // SAFETY: a chunk has LANES elements; the caller has the instruction set.
-            unsafe { A::of(V::load(chunk.as_ptr())).store(chunk.as_mut_ptr()) }
+            unsafe { A::of(S::Vector::load(chunk.as_ptr())).store(chunk.as_mut_ptr()) }
         }
         let rest = chunks.into_remainder();
         // SAFETY: as many lanes as there are elements.
         unsafe {
-            A::of(V::load_partial(rest.as_ptr(), rest.len())).store_partial(rest.as_mut_ptr(), rest.len())
+            let last = S::Vector::load_partial(rest.as_ptr(), rest.len());
+            A::of(last).store_partial(rest.as_mut_ptr(), rest.len());
         }
     }
 }
 
 fn map<A: Activation>(isa: Isa, x: &mut [f32]) {
-    dispatch(
-        isa,
-        Map::<A> {
-            x,
-            activation: std::marker::PhantomData,
-        },
-    );
+    let activation = PhantomData::<A>;
+    isa.run(Map { x, activation });
 }
 
 /// GELU in its tanh form, `0.5 x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3)))`, in place.
@@ -159,6 +50,22 @@ fn map<A: Activation>(isa: Isa, x: &mut [f32]) {
 /// If this CPU lacks `isa`.
 pub fn gelu_tanh(isa: Isa, x: &mut [f32]) {
     map::<GeluTanh>(isa, x);
+}
+
+/// GELU by its definition, `x Phi(x) = 0.5 x (1 + erf(x / sqrt(2)))`, in place.
+///
+/// Within 8 ULP for `x >= -1`, and within `1e-7` of the exact value below; NaN stays, `-inf` gives 0.
+///
+/// ```
+/// let mut x = [0.0, 1.0, f32::NEG_INFINITY];
+/// saccade_kernels::gelu_erf(saccade_kernels::Isa::best(), &mut x);
+/// assert!((x[1] - 0.841_344_7).abs() < 1e-6 && x[0] == 0.0 && x[2] == 0.0);
+/// ```
+///
+/// # Panics
+/// If this CPU lacks `isa`.
+pub fn gelu_erf(isa: Isa, x: &mut [f32]) {
+    map::<GeluErf>(isa, x);
 }
 
 /// `x / (1 + exp(-x))`, in place.
@@ -258,6 +165,23 @@ mod tests {
         x / (1.0 + (-2.0 * u).exp())
     }
 
+    /// By `erfc(z) = (2 / sqrt(pi)) exp(-z^2) (z + z^3 2/3 + ...)` from 1 for small `z`, and its continued fraction for large ones.
+    fn exact_gelu_erf(x: f64) -> f64 {
+        let z = x.abs() / std::f64::consts::SQRT_2;
+        let erfc = if z < 2.0 {
+            let (mut term, mut sum) = (z, z);
+            for n in 1..80 {
+                term *= 2.0 * z * z / f64::from(2 * n + 1);
+                sum += term;
+            }
+            1.0 - std::f64::consts::FRAC_2_SQRT_PI * (-z * z).exp() * sum
+        } else {
+            let fraction = (1..200).rev().fold(z, |rest, n| z + f64::from(n) / 2.0 / rest);
+            std::f64::consts::FRAC_2_SQRT_PI / 2.0 * (-z * z).exp() / fraction
+        };
+        x.max(0.0) - x.abs() * 0.5 * erfc
+    }
+
     fn exact_silu(x: f64) -> f64 {
         x / (1.0 + (-x).exp())
     }
@@ -303,6 +227,33 @@ mod tests {
     }
 
     #[test]
+    fn accuracy_of_gelu_by_erf() {
+        // From scipy.stats.norm.cdf.
+        for (x, exact) in [
+            (-4.0, -1.266_849_673_4e-4),
+            (-1.0, -0.158_655_253_931_457),
+            (0.5, 0.345_731_230_637_006_5),
+            (3.0, 2.995_950_305_905_110_5),
+        ] {
+            assert!((exact_gelu_erf(x) - exact).abs() < 1e-13, "{x}");
+        }
+        for isa in Isa::available() {
+            bound(
+                "GELU by erf, ULP",
+                isa,
+                worst(gelu_erf, isa, exact_gelu_erf, ulps, |x| x >= -1.0),
+                8.0,
+            );
+            bound(
+                "GELU by erf, absolute",
+                isa,
+                worst(gelu_erf, isa, exact_gelu_erf, absolute, |x| x < -1.0),
+                1e-7,
+            );
+        }
+    }
+
+    #[test]
     fn accuracy_of_silu() {
         for isa in Isa::available() {
             bound(
@@ -341,6 +292,7 @@ mod tests {
             let inf = f32::INFINITY;
             assert_eq!(of(exp, isa)[..6], [0.0, 0.0, 0.0, inf, inf, inf]);
             assert_eq!(of(gelu_tanh, isa)[..6], [0.0, 0.0, 0.0, 89.0, f32::MAX, inf]);
+            assert_eq!(of(gelu_erf, isa)[..6], [0.0, 0.0, 0.0, 89.0, f32::MAX, inf]);
             assert_eq!(of(silu, isa)[..6], [0.0, 0.0, 0.0, 89.0, f32::MAX, inf]);
             assert_eq!(of(relu, isa)[..6], [0.0, 0.0, 0.0, 89.0, f32::MAX, inf]);
         }
@@ -349,7 +301,7 @@ mod tests {
     #[test]
     fn a_value_does_not_depend_on_its_lane() {
         for isa in Isa::available() {
-            for f in [exp, gelu_tanh, silu, relu] {
+            for f in [exp, gelu_tanh, gelu_erf, silu, relu] {
                 let x: Vec<f32> = (0..67).map(|i| i as f32 * 0.37 - 12.0).collect();
                 let mut all = x.clone();
                 f(isa, &mut all);

@@ -18,6 +18,11 @@ pub struct AllocError {
     pub bytes: usize,
 }
 
+/// `count * size`, where that fits into the address space.
+pub(crate) fn elements(count: usize, size: usize) -> Result<usize, AllocError> {
+    count.checked_mul(size).ok_or(AllocError { bytes: usize::MAX })
+}
+
 /// Types for which all bytes zero is a value.
 ///
 /// # Safety

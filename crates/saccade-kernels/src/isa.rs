@@ -1,31 +1,200 @@
-//! Instruction sets: which ones this CPU has, and which one is used.
+//! Instruction sets: the table of what each one uses, which ones this CPU has, and which one is chosen.
 
 use std::fmt;
 use std::str::FromStr;
 
+use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
+#[allow(
+    unused_imports,
+    reason = "not every architecture has an instruction set with such products"
+)]
+use crate::gemm::dot_bf16::DotBf16;
+use crate::gemm::dot_int8::DotInt8;
+use crate::gemm::{Gemm, Product, available};
+use crate::simd::portable::Portable;
+#[cfg(target_arch = "x86_64")]
+use crate::simd::x86_64::{
+    avx2::{Avx2, Avx2EvexVnni, Avx2VexVnni},
+    avx512::{Avx512, Avx512Bf16, Avx512Vnni},
+};
+use crate::simd::{Dot, Kernel, Simd, Vector};
+
 /// Environment variable that forces an instruction set, so that every path can be tested on one machine.
 pub const ISA_VARIABLE: &str = "SACCADE_ISA";
 
-/// An instruction set that the kernels are written for.
-///
-/// ```
-/// use saccade_kernels::Isa;
-/// assert!(Isa::available().contains(&Isa::best()));
-/// assert_eq!("portable".parse::<Isa>().unwrap(), Isa::Portable);
-/// ```
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum Isa {
+/// A line is an instruction set by the name that users give it, slowest first: `Name = "name" if CONDITION { ... }`, and in the braces
+/// - `vectors`: what every kernel runs on;
+/// - `bf16`, `int8`: instruction sets with the same vectors and an instruction for dot products of these elements, of which a kernel for
+///   such products uses the first that the CPU has, and else `vectors`;
+/// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last one listed are made of
+///   `vectors` alone;
+/// - `needs`: of these types, the CPU must have at least one.
+macro_rules! instruction_sets {
+    ($(
+        $(#[$doc:meta])*
+        $isa:ident = $name:literal if $condition:meta {
+            vectors: $vectors:ty,
+            bf16: [$($bf16:ty),*],
+            int8: [$($int8:ty),*],
+            gemm_bf16: [$($gemm_bf16:ty),*],
+            gemm_int8: [$($gemm_int8:ty),*],
+            needs: [$($needed:ty),+],
+        }
+    )+) => {
+        /// An instruction set that the kernels are written for.
+        ///
+        /// ```
+        /// use saccade_kernels::Isa;
+        /// assert!(Isa::available().contains(&Isa::best()));
+        /// assert_eq!("portable".parse::<Isa>().unwrap(), Isa::Portable);
+        /// ```
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+        #[non_exhaustive]
+        pub enum Isa {
+            $($(#[$doc])* $isa,)+
+        }
+
+        const ALL: &[Isa] = &[$(Isa::$isa),+];
+
+        impl Isa {
+            fn name(self) -> &'static str {
+                match self {
+                    $(Self::$isa => $name,)+
+                }
+            }
+
+            /// Whether this CPU has it.
+            #[must_use]
+            #[inline]
+            pub fn is_available(self) -> bool {
+                match self {
+                    $(#[cfg($condition)] Self::$isa => $(<$needed as Simd>::new().is_some())||+,)+
+                    #[allow(unreachable_patterns, reason = "on some architectures all of them are there")]
+                    _ => false,
+                }
+            }
+
+            /// Whether this CPU has an instruction for `dot` that this instruction set uses.
+            fn has(self, dot: Dot) -> bool {
+                self.is_available() && match self {
+                    $(#[cfg($condition)] Self::$isa => match dot {
+                        Dot::Bf16 => false $(|| <$bf16 as Simd>::new().is_some())*,
+                        Dot::Int8 => false $(|| <$int8 as Simd>::new().is_some())*,
+                    },)+
+                    #[allow(unreachable_patterns, reason = "as above")]
+                    _ => false,
+                }
+            }
+
+            /// Sizes of its vectors.
+            ///
+            /// # Panics
+            /// If this CPU lacks it.
+            pub(crate) fn vectors(self) -> Vectors {
+                match self {
+                    $(#[cfg($condition)] Self::$isa => Vectors::of::<<$vectors as Simd>::Vector>(),)+
+                    #[allow(unreachable_patterns, reason = "as above")]
+                    _ => self.is_missing(),
+                }
+            }
+
+            /// Runs a kernel on it, with the dot products that the kernel wants where there are any.
+            ///
+            /// # Panics
+            /// If this CPU lacks it: looking is a few loads, and makes every kernel sound.
+            #[inline]
+            pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
+                match self {
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => {
+                        match K::DOTS {
+                            None => {}
+                            Some(Dot::Bf16) => {
+                                $(if let Some(simd) = <$bf16 as Simd>::new() { return simd.run(kernel); })*
+                            }
+                            Some(Dot::Int8) => {
+                                $(if let Some(simd) = <$int8 as Simd>::new() { return simd.run(kernel); })*
+                            }
+                        }
+                        match <$vectors as Simd>::new() {
+                            Some(simd) => simd.run(kernel),
+                            None => self.is_missing(),
+                        }
+                    })+
+                    _ => self.is_missing(),
+                }
+            }
+
+            /// What multiplies rows by packed weights.
+            ///
+            /// # Panics
+            /// If this CPU lacks it.
+            pub(crate) fn gemm(self, product: Product) -> Box<dyn Gemm> {
+                let found: Option<Box<dyn Gemm>> = match self {
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => match product {
+                        Product::Float32 => available::<Plain<$vectors>>(),
+                        Product::WidenedBf16 => available::<Widened<$vectors>>(),
+                        Product::Bf16 => None $(.or_else(available::<$gemm_bf16>))*
+                            .or_else(available::<RoundedRows<$vectors>>),
+                        Product::Int8 => None $(.or_else(available::<$gemm_int8>))*
+                            .or_else(available::<DotInt8<$vectors>>),
+                    },)+
+                    _ => None,
+                };
+                found.unwrap_or_else(|| self.is_missing())
+            }
+        }
+    };
+}
+
+instruction_sets! {
     /// Plain loops that any compiler vectorises for its baseline; runs everywhere.
-    Portable,
+    Portable = "portable" if all() {
+        vectors: Portable, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Portable],
+    }
     /// AVX2 with FMA.
-    Avx2,
+    Avx2 = "avx2" if target_arch = "x86_64" {
+        vectors: Avx2, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx2],
+    }
     /// AVX2 with 256-bit int8 dot products: AVX-VNNI, or AVX512-VNNI with VL.
-    Avx2Vnni,
+    Avx2Vnni = "avx2vnni" if target_arch = "x86_64" {
+        vectors: Avx2,
+        bf16: [],
+        int8: [Avx2VexVnni, Avx2EvexVnni],
+        gemm_bf16: [],
+        gemm_int8: [DotInt8<Avx2VexVnni>, DotInt8<Avx2EvexVnni>],
+        needs: [Avx2VexVnni, Avx2EvexVnni],
+    }
     /// AVX-512 F, VL, BW and DQ, without dot products.
-    Avx512f,
+    Avx512f = "avx512f" if target_arch = "x86_64" {
+        vectors: Avx512, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx512],
+    }
     /// AVX-512 with whichever of the dot products AVX512-BF16 and AVX512-VNNI this CPU has; [`Isa::Avx512f`] where it has neither.
-    Avx512,
+    Avx512 = "avx512" if target_arch = "x86_64" {
+        vectors: Avx512,
+        bf16: [Avx512Bf16],
+        int8: [Avx512Vnni],
+        gemm_bf16: [DotBf16<Avx512Bf16>],
+        gemm_int8: [DotInt8<Avx512Vnni>],
+        needs: [Avx512],
+    }
+}
+
+/// Sizes that data are laid out by.
+#[derive(Clone, Copy)]
+pub(crate) struct Vectors {
+    /// f32 in a vector.
+    pub lanes: usize,
+    /// Rows of the largest tile of sums in registers.
+    pub tile_rows: usize,
+}
+
+impl Vectors {
+    fn of<V: Vector>() -> Self {
+        Self {
+            lanes: V::LANES,
+            tile_rows: V::TILE_ROWS,
+        }
+    }
 }
 
 /// `SACCADE_ISA` holds a name that is unknown, or of an instruction set that this CPU lacks.
@@ -35,8 +204,6 @@ pub struct IsaError {
     given: String,
     known: bool,
 }
-
-const ALL: [Isa; 5] = [Isa::Portable, Isa::Avx2, Isa::Avx2Vnni, Isa::Avx512f, Isa::Avx512];
 
 impl Isa {
     /// The fastest one that this CPU has.
@@ -48,33 +215,7 @@ impl Isa {
     /// All that this CPU has, slowest first.
     #[must_use]
     pub fn available() -> Vec<Self> {
-        ALL.into_iter().filter(|isa| isa.is_available()).collect()
-    }
-
-    /// Whether this CPU has it.
-    #[must_use]
-    pub fn is_available(self) -> bool {
-        match self {
-            Self::Portable => true,
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2Vnni => {
-                Self::Avx2.is_available()
-                    && (is_x86_feature_detected!("avxvnni")
-                        || (is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512vl")))
-            }
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512f | Self::Avx512 => {
-                is_x86_feature_detected!("avx512f")
-                    && is_x86_feature_detected!("avx512vl")
-                    && is_x86_feature_detected!("avx512bw")
-                    && is_x86_feature_detected!("avx512dq")
-                    && Self::Avx2.is_available()
-            }
-            #[cfg(not(target_arch = "x86_64"))]
-            _ => false,
-        }
+        ALL.iter().copied().filter(|isa| isa.is_available()).collect()
     }
 
     /// The dot products that it uses on this CPU: `bf16` (pairs of bfloat16), `vnni` (quads of int8).
@@ -84,30 +225,10 @@ impl Isa {
     /// ```
     #[must_use]
     pub fn dot_products(self) -> Vec<&'static str> {
-        [("bf16", self.has_bf16_dot()), ("vnni", self.has_vnni())]
+        [("bf16", Dot::Bf16), ("vnni", Dot::Int8)]
             .into_iter()
-            .filter_map(|(name, has)| has.then_some(name))
+            .filter_map(|(name, dot)| self.has(dot).then_some(name))
             .collect()
-    }
-
-    /// Whether pairs of bf16 are multiplied and summed in one instruction.
-    pub(crate) fn has_bf16_dot(self) -> bool {
-        #[cfg(target_arch = "x86_64")]
-        return self == Self::Avx512 && self.is_available() && is_x86_feature_detected!("avx512bf16");
-        #[cfg(not(target_arch = "x86_64"))]
-        false
-    }
-
-    /// Whether quads of int8 are multiplied and summed in one instruction.
-    pub(crate) fn has_vnni(self) -> bool {
-        #[cfg(target_arch = "x86_64")]
-        return match self {
-            Self::Avx2Vnni => self.is_available(),
-            Self::Avx512 => self.is_available() && is_x86_feature_detected!("avx512vnni"),
-            _ => false,
-        };
-        #[cfg(not(target_arch = "x86_64"))]
-        false
     }
 
     /// The one that `SACCADE_ISA` names; the best where it is unset or empty.
@@ -131,17 +252,23 @@ impl Isa {
             _ => Ok(Self::best()),
         }
     }
+
+    /// Panics unless this CPU has it.
+    pub(crate) fn check(self) {
+        if !self.is_available() {
+            self.is_missing();
+        }
+    }
+
+    #[cold]
+    fn is_missing(self) -> ! {
+        panic!("this CPU lacks {self}")
+    }
 }
 
 impl fmt::Display for Isa {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(match self {
-            Self::Portable => "portable",
-            Self::Avx2 => "avx2",
-            Self::Avx2Vnni => "avx2vnni",
-            Self::Avx512f => "avx512f",
-            Self::Avx512 => "avx512",
-        })
+        formatter.write_str(self.name())
     }
 }
 
@@ -149,7 +276,7 @@ impl FromStr for Isa {
     type Err = IsaError;
 
     fn from_str(name: &str) -> Result<Self, IsaError> {
-        let known = ALL.into_iter().find(|isa| isa.to_string() == name);
+        let known = ALL.iter().copied().find(|isa| isa.name() == name);
         known.ok_or_else(|| IsaError {
             given: name.to_owned(),
             known: false,
@@ -159,4 +286,30 @@ impl FromStr for Isa {
 
 fn names(isas: &[Isa]) -> String {
     isas.iter().map(Isa::to_string).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_name_is_that_of_one_instruction_set() {
+        for &isa in ALL {
+            assert_eq!(isa.to_string().parse::<Isa>().unwrap(), isa);
+        }
+        let error = "avx1024".parse::<Isa>().unwrap_err().to_string();
+        assert!(
+            error.starts_with("SACCADE_ISA: expected one of portable"),
+            "{error}"
+        );
+        assert!(error.ends_with("got `avx1024`"), "{error}");
+    }
+
+    #[test]
+    fn tiles_are_as_large_as_kernels_take_them() {
+        for isa in Isa::available() {
+            let Vectors { lanes, tile_rows } = isa.vectors();
+            assert!(lanes <= crate::simd::MAX_LANES && (1..=crate::simd::MAX_TILE_ROWS).contains(&tile_rows));
+        }
+    }
 }

@@ -7,24 +7,30 @@
 mod activation;
 mod aligned;
 mod attention;
+mod gemm;
 mod isa;
 mod linear;
+mod matrix;
 mod norm;
 pub mod peak;
 mod pool;
+mod rope;
 mod rows;
 mod simd;
 mod threads;
+mod weights;
 
-pub use activation::{exp, gelu_tanh, relu, silu};
+pub use activation::{exp, gelu_erf, gelu_tanh, relu, silu};
 pub use aligned::AllocError;
 pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
 pub use half::bf16;
 pub use isa::{ISA_VARIABLE, Isa, IsaError};
-pub use linear::{
-    Arithmetic, Element, Epilogue, KernelError, LinearScratch, PackedLinear, WeightRef, quantize_rows,
-};
-pub use norm::layer_norm;
+pub use linear::{Epilogue, KernelError, LinearScratch, PackedLinear};
+pub use matrix::Matrix;
+pub use norm::layer::layer_norm;
+pub use norm::rms::{rms_norm, rms_norm_in_place};
 pub use pool::{Interrupted, interrupted, interruptible, parallel_for};
-pub use rows::{Matrix, Rows, RowsMut};
+pub use rope::rotary_embedding;
+pub use rows::{Rows, RowsMut};
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};
+pub use weights::{Arithmetic, Element, WeightRef, quantize_rows};

@@ -1,17 +1,14 @@
 //! What this CPU can do at most: multiply-accumulates from registers, the clock they run at, and reading memory. Kernels are compared with it.
 
 use std::hint::black_box;
-use std::marker::PhantomData;
 use std::sync::Barrier;
 use std::time::Instant;
 
 use crate::aligned::{AlignedBuffer, AllocError};
+use crate::gemm::Product;
 use crate::isa::Isa;
-use crate::linear::Arithmetic;
-use crate::simd::{Dot, DotKernel, Dots, Kernel, Vector, dispatch, dispatch_dots};
-
-/// Links of each chain in one call of [`multiply_accumulate`]: some milliseconds, beside which starting a thread is nothing.
-const ITERATIONS: usize = 1 << 20;
+use crate::simd::{Kernel, Simd, Vector};
+use crate::weights::Arithmetic;
 
 /// Calls of which the fastest counts: what disturbs a machine makes some of them slow, never fast.
 const CALLS: usize = 10;
@@ -41,11 +38,12 @@ pub fn macs_per_second(isa: Isa, arithmetic: Arithmetic, threads: usize) -> f64 
 /// # Panics
 /// As [`macs_per_second`].
 pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> usize {
-    on_threads(threads, &|_| match arithmetic {
-        Arithmetic::Bfloat16 if isa.has_bf16_dot() => dispatch_dots(isa, Bf16Chains),
-        Arithmetic::Float32 | Arithmetic::Bfloat16 => dispatch(isa, FloatChains),
-        Arithmetic::Int8 => dispatch_dots(isa, Int8Chains),
-    })
+    let gemm = isa.gemm(match arithmetic {
+        Arithmetic::Float32 => Product::Float32,
+        Arithmetic::Bfloat16 => Product::Bf16,
+        Arithmetic::Int8 => Product::Int8,
+    });
+    on_threads(threads, &|_| gemm.chains())
 }
 
 /// Bytes a second that `threads` threads read from memory together; takes a few tenths of a second.
@@ -63,7 +61,7 @@ pub fn read_bytes_per_second(threads: usize) -> Result<f64, AllocError> {
         let start = Instant::now();
         let words = on_threads(threads, &|thread| {
             let part = memory.len() / threads;
-            dispatch(Isa::best(), Read(&memory[thread * part..][..part]))
+            Isa::best().run(Read(&memory[thread * part..][..part]))
         });
         (words * size_of::<u32>()) as f64 / start.elapsed().as_secs_f64()
     };
@@ -100,147 +98,6 @@ pub fn clock_hz() -> Option<f64> {
     None
 }
 
-/// The instruction of an arithmetic, as a chain of which each link needs the one before.
-trait Link<V: Vector> {
-    type Sum: Copy;
-    /// Multiply-accumulates of a lane.
-    const MACS: usize;
-
-    /// # Safety
-    /// Here and below: the CPU has the instruction set of `V` and what else the implementation needs.
-    unsafe fn start() -> Self::Sum;
-
-    /// # Safety
-    /// As above.
-    unsafe fn next(sum: Self::Sum) -> Self::Sum;
-}
-
-/// Independent chains hide the latency of the instructions: 4 to 7 cycles, two of them beginning in each.
-///
-/// # Safety
-/// The CPU has what `L` needs.
-#[inline(always)]
-unsafe fn chains<V: Vector, L: Link<V>, const COUNT: usize>() -> usize {
-    // SAFETY: the caller's promise.
-    unsafe {
-        let mut sums = [L::start(); COUNT];
-        for _ in 0..ITERATIONS {
-            for sum in &mut sums {
-                *sum = L::next(*sum);
-            }
-        }
-        black_box(&sums);
-        ITERATIONS * COUNT * V::LANES * L::MACS
-    }
-}
-
-/// As many chains as fit the registers.
-///
-/// # Safety
-/// As [`chains`].
-#[inline(always)]
-unsafe fn all_chains<V: Vector, L: Link<V>>() -> usize {
-    // SAFETY: the caller's promise.
-    unsafe {
-        if V::REGISTERS == 8 {
-            chains::<V, L, 6>()
-        } else {
-            chains::<V, L, 12>()
-        }
-    }
-}
-
-struct FloatChains;
-struct Bf16Chains;
-struct Int8Chains;
-struct With<K, D>(PhantomData<(K, D)>);
-
-impl<V: Vector> Link<V> for FloatChains {
-    type Sum = V;
-    const MACS: usize = 1;
-
-    #[inline(always)]
-    unsafe fn start() -> V {
-        // SAFETY: the caller's promise.
-        unsafe { V::splat(black_box(1.0)) }
-    }
-
-    #[inline(always)]
-    unsafe fn next(sum: V) -> V {
-        // SAFETY: the caller's promise.
-        unsafe { sum.fma(V::splat(0.5), V::splat(1.0)) }
-    }
-}
-
-impl<V: Vector, D: Dots<V>> Link<V> for With<Bf16Chains, D> {
-    type Sum = V;
-    const MACS: usize = 2;
-
-    #[inline(always)]
-    unsafe fn start() -> V {
-        // SAFETY: the caller's promise.
-        unsafe { V::splat(black_box(1.0)) }
-    }
-
-    #[inline(always)]
-    unsafe fn next(sum: V) -> V {
-        // One bf16 a lane, and zero.
-        const ONE: i32 = 0x3f80;
-        // SAFETY: the caller's promise.
-        unsafe { D::bf16(sum, V::splat_int(ONE), V::splat_int(ONE)) }
-    }
-}
-
-impl<V: Vector, D: Dots<V>> Link<V> for With<Int8Chains, D> {
-    type Sum = V::Ints;
-    const MACS: usize = 4;
-
-    #[inline(always)]
-    unsafe fn start() -> V::Ints {
-        // SAFETY: the caller's promise.
-        unsafe { V::splat_int(black_box(1)) }
-    }
-
-    /// The bytes are those of the sum: products that do not change would be computed once.
-    #[inline(always)]
-    unsafe fn next(sum: V::Ints) -> V::Ints {
-        // SAFETY: the caller's promise. Whether the products saturate does not matter here.
-        unsafe { D::int8(sum, sum, V::splat_int(0x0102_0304)) }
-    }
-}
-
-impl Kernel for FloatChains {
-    type Output = usize;
-
-    #[inline(always)]
-    unsafe fn run<V: Vector>(self) -> usize {
-        // SAFETY: the caller's promise.
-        unsafe { all_chains::<V, Self>() }
-    }
-}
-
-impl DotKernel for Bf16Chains {
-    type Output = usize;
-    const DOT: Dot = Dot::Bf16;
-
-    #[inline(always)]
-    unsafe fn run<V: Vector, D: Dots<V>>(self) -> usize {
-        // SAFETY: the caller's promise.
-        unsafe { all_chains::<V, With<Self, D>>() }
-    }
-}
-
-impl DotKernel for Int8Chains {
-    type Output = usize;
-    const DOT: Dot = Dot::Int8;
-
-    #[inline(always)]
-    unsafe fn run<V: Vector, D: Dots<V>>(self) -> usize {
-        // SAFETY: the caller's promise.
-        unsafe { all_chains::<V, With<Self, D>>() }
-    }
-}
-
 /// Reads all words; returns how many.
 struct Read<'a>(&'a [u32]);
 
@@ -248,14 +105,16 @@ impl Kernel for Read<'_> {
     type Output = usize;
 
     #[inline(always)]
-    unsafe fn run<V: Vector>(self) -> usize {
+    unsafe fn run<S: Simd>(self, _: S) -> usize {
         const VECTORS: usize = 8;
         // SAFETY: chunks have as many words as are loaded; the caller has the instruction set.
         unsafe {
-            let mut sums = [V::splat_int(0); VECTORS];
-            for words in self.0.chunks_exact(VECTORS * V::LANES) {
+            let lanes = S::Vector::LANES;
+            let mut sums = [S::Vector::splat_int(0); VECTORS];
+            for words in self.0.chunks_exact(VECTORS * lanes) {
                 for (vector, sum) in sums.iter_mut().enumerate() {
-                    *sum = V::add_ints(*sum, V::load_ints(words.as_ptr().add(vector * V::LANES).cast()));
+                    let words = S::Vector::load_ints(words.as_ptr().add(vector * lanes).cast());
+                    *sum = S::Vector::add_ints(*sum, words);
                 }
             }
             black_box(&sums);
@@ -299,7 +158,15 @@ mod tests {
         for isa in Isa::available() {
             let [float, bf16, int8] = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8]
                 .map(|arithmetic| multiply_accumulate(isa, arithmetic, 1));
-            assert_eq!(bf16 / float, if isa.has_bf16_dot() { 2 } else { 1 }, "{isa}");
+            assert_eq!(
+                bf16 / float,
+                if isa.dot_products().contains(&"bf16") {
+                    2
+                } else {
+                    1
+                },
+                "{isa}"
+            );
             assert_eq!(int8 / float, 4, "{isa}");
             assert_eq!(
                 multiply_accumulate(isa, Arithmetic::Float32, 2),

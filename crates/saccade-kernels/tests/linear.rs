@@ -9,12 +9,14 @@ use saccade_kernels::{
     Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, WeightRef,
 };
 
-const EPILOGUES: [Epilogue; 5] = [
+const EPILOGUES: [Epilogue; 7] = [
     Epilogue::Store,
     Epilogue::GeluTanh,
+    Epilogue::GeluErf,
     Epilogue::Relu,
     Epilogue::Silu,
     Epilogue::Add,
+    Epilogue::Mul,
 ];
 
 /// A part of a stacked layer.
@@ -87,9 +89,11 @@ fn pack(isa: Isa, parts: &[Part], weights: &[Weights], inputs: usize) -> PackedL
 fn exact(epilogue: Epilogue, value: f64, before: f32) -> (f64, f64) {
     match epilogue {
         Epilogue::GeluTanh => (common::gelu_tanh(value), 1.13),
+        Epilogue::GeluErf => (common::gelu_erf(value), 1.13),
         Epilogue::Relu => (value.max(0.0), 1.0),
         Epilogue::Silu => (common::silu(value), 1.1),
         Epilogue::Add => (value + f64::from(before), 1.0),
+        Epilogue::Mul => (value * f64::from(before), f64::from(before).abs()),
         _ => (value, 1.0),
     }
 }
@@ -118,7 +122,11 @@ fn check(parts: &[Part], weights: &[Weights], x: &Strided, before: &[f32], out: 
                 let (value, slope) = exact(epilogue, sum, before[index]);
                 let bound = slope * gamma(inputs + 2) * magnitude
                     + gamma(16) * (value.abs() + f64::from(before[index]).abs())
-                    + 1e-7 * f64::from(u8::from(epilogue == Epilogue::GeluTanh));
+                    + 1e-7
+                        * f64::from(u8::from(matches!(
+                            epilogue,
+                            Epilogue::GeluTanh | Epilogue::GeluErf
+                        )));
                 let error = (f64::from(out[index]) - value).abs();
                 assert!(
                     error <= bound,

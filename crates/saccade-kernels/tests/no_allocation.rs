@@ -9,7 +9,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use common::{numbers, rows, rows_mut};
 use saccade_kernels::{
     Arithmetic, Element, Epilogue, Isa, LinearScratch, LogitBias, Mask, Matrix, PackedKeyValues,
-    PackedLinear, WeightRef, attention, gelu_tanh, layer_norm, parallel_for, silu,
+    PackedLinear, WeightRef, attention, gelu_erf, gelu_tanh, layer_norm, parallel_for, rms_norm_in_place,
+    rotary_embedding, silu,
 };
 
 /// The system's allocator, counting what all threads ask of it.
@@ -53,6 +54,8 @@ fn the_second_call_of_a_shape_allocates_nothing() {
         let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);
         let mut scratch = LinearScratch::new();
         let mut held = PackedKeyValues::new(isa, Element::F32, 8, WIDTH / 8);
+        let mut appended = PackedKeyValues::new(isa, Element::Bf16, 8, WIDTH / 8);
+        let norm_weight = numbers(4, WIDTH / 8, 1.0);
         let mut out = vec![0.0; 296 * WIDTH];
         let mut weights = vec![0.0; 8 * 296 * 296];
         let mut pass = |threads, count: usize| {
@@ -91,7 +94,23 @@ fn the_second_call_of_a_shape_allocates_nothing() {
                 Some(weights),
                 rows_mut(out, WIDTH),
             );
+            let mask = Mask::Causal { offset: 0 };
+            attention(threads, x, &held, 0.1, mask, None, rows_mut(out, WIDTH));
+            appended.pack(threads, x.rows(0..1), x.rows(0..1)).unwrap();
+            appended.reserve(300).unwrap();
+            appended.append(threads, x, x).unwrap();
+            rms_norm_in_place(isa, threads, rows_mut(out, WIDTH), 1e-6, &norm_weight);
+            let angles = rows(&norm_weight, 1).rows(0..1);
+            rotary_embedding(
+                isa,
+                threads,
+                rows_mut(&mut out[..WIDTH], WIDTH),
+                WIDTH / 8,
+                angles,
+                angles,
+            );
             gelu_tanh(isa, out);
+            gelu_erf(isa, out);
             silu(isa, out);
             parallel_for(threads, 10, &|_| {});
         };

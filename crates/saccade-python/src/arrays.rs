@@ -1,19 +1,45 @@
 //! Arrays of Python as views, and arrays of the core as NumPy's.
 
-use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{
+    Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
+    PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{Array, ElementsRef, OwnedArray, TensorView, TensorViews};
+use saccade::{Array, ArrayMut, ElementsRef, Error, OwnedArray, TensorView, TensorViews};
+
+use crate::error::raise;
 
 /// A view of an array that the Python package made C-contiguous.
 pub(crate) fn view<'a, T: Element>(array: &'a PyReadonlyArrayDyn<'_, T>) -> PyResult<Array<'a, T>> {
-    Ok(Array::new(array.as_slice()?, array.shape()))
+    Array::new(array.as_slice()?, array.shape()).map_err(raise)
 }
 
 pub(crate) fn optional_view<'a, T: Element>(
     array: &'a Option<PyReadonlyArrayDyn<'_, T>>,
 ) -> PyResult<Option<Array<'a, T>>> {
     array.as_ref().map(view).transpose()
+}
+
+/// An array to be written, with its `shape`.
+pub(crate) fn view_mut<'a>(
+    array: &'a mut PyReadwriteArrayDyn<'_, f32>,
+    shape: &'a [usize],
+) -> PyResult<ArrayMut<'a>> {
+    ArrayMut::new(array.as_slice_mut()?, shape).map_err(raise)
+}
+
+/// A copy, or a `MemoryError`.
+pub(crate) fn copied<T: Copy>(what: &'static str, data: &[T]) -> PyResult<Vec<T>> {
+    let mut copy = Vec::new();
+    copy.try_reserve_exact(data.len()).map_err(|_| {
+        raise(Error::Memory {
+            what,
+            bytes: size_of_val(data),
+        })
+    })?;
+    copy.extend_from_slice(data);
+    Ok(copy)
 }
 
 pub(crate) fn to_numpy<'py, T: Element>(
@@ -25,7 +51,7 @@ pub(crate) fn to_numpy<'py, T: Element>(
 }
 
 pub(crate) fn owned(array: &PyReadonlyArrayDyn<'_, f32>) -> PyResult<OwnedArray> {
-    Ok(OwnedArray::new(array.as_slice()?.to_vec(), array.shape()))
+    OwnedArray::new(copied("intervention", array.as_slice()?)?, array.shape()).map_err(raise)
 }
 
 /// A tensor as the Python package gives it: float32, or 16 bits with the name of what they are.
@@ -45,14 +71,16 @@ pub(crate) fn held_tensors<'py>(tensors: &Bound<'py, PyDict>) -> PyResult<Vec<(S
 pub(crate) fn tensor_views<'a>(held: &'a [(String, PyTensor<'_>)]) -> PyResult<TensorViews<'a>> {
     let view = |tensor: &'a PyTensor<'_>| {
         Ok::<_, PyErr>(match tensor {
-            PyTensor::Float32(array) => TensorView::new(array.shape(), ElementsRef::F32(array.as_slice()?)),
+            PyTensor::Float32(array) => {
+                TensorView::new(array.shape(), ElementsRef::F32(array.as_slice()?)).map_err(raise)?
+            }
             PyTensor::Half((dtype, array)) => {
                 let bits = array.as_slice()?;
                 let elements = match dtype.as_str() {
                     "bfloat16" => ElementsRef::Bf16(bits),
                     _ => ElementsRef::F16(bits),
                 };
-                TensorView::new(array.shape(), elements)
+                TensorView::new(array.shape(), elements).map_err(raise)?
             }
         })
     };

@@ -1,10 +1,11 @@
 //! `saccade._saccade.CrossAttention` and its keys and values.
 
-use numpy::{PyReadonlyArrayDyn, PyReadwriteArrayDyn};
+use numpy::{PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use saccade::KeyOptions;
 
-use crate::arrays::{held_tensors, optional_view, tensor_views, view};
+use crate::arrays::{held_tensors, optional_view, tensor_views, view, view_mut};
 use crate::detached::call;
 use crate::error::raise;
 
@@ -91,14 +92,16 @@ impl CrossAttention {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let hidden_states = view(&hidden_states)?;
-        let (key_mask, key_bias) = (optional_view(&key_mask)?, optional_view(&key_bias)?);
-        let weights = weights
-            .as_mut()
-            .map(|weights| weights.as_slice_mut())
-            .transpose()?;
-        let (kv, out) = (&kv.0, out.as_slice_mut()?);
-        call(py, || {
-            self.0.attend(hidden_states, kv, key_mask, key_bias, weights, out)
-        })
+        let keys = KeyOptions::default()
+            .with_key_mask(optional_view(&key_mask)?)
+            .with_key_bias(optional_view(&key_bias)?);
+        let weights_shape = weights.as_ref().map(|weights| weights.shape().to_vec());
+        let weights = match (&mut weights, &weights_shape) {
+            (Some(weights), Some(shape)) => Some(view_mut(weights, shape)?),
+            _ => None,
+        };
+        let shape = out.shape().to_vec();
+        let (kv, out) = (&kv.0, view_mut(&mut out, &shape)?);
+        call(py, || self.0.attend(hidden_states, kv, keys, weights, out))
     }
 }

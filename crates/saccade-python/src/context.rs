@@ -5,7 +5,7 @@ use std::sync::Arc;
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 
-use crate::arrays::to_numpy;
+use crate::arrays::{copied, to_numpy};
 
 #[pyclass(frozen, module = "saccade._saccade")]
 pub(crate) struct Context(pub(crate) Arc<saccade::Context>);
@@ -32,16 +32,14 @@ impl Context {
         let data = self.0.vl_embs();
         to_numpy(
             py,
-            data.to_vec(),
+            copied("vl_embs", data)?,
             &[self.0.batch(), self.0.num_vl_tokens(), data.len() / rows],
         )
     }
 
     fn image_mask<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArrayDyn<bool>>>> {
         let shape = [self.0.batch(), self.0.num_vl_tokens()];
-        self.0
-            .image_mask()
-            .map(|mask| to_numpy(py, mask.to_vec(), &shape))
-            .transpose()
+        let to_numpy = |mask| to_numpy(py, copied("image_mask", mask)?, &shape);
+        self.0.image_mask().map(to_numpy).transpose()
     }
 }

@@ -3,12 +3,14 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn};
+use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{Chunking, Features, Group, Integrator, Keep, LoadOptions, Sampling, TraceOptions};
+use saccade::{
+    Chunking, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Sampling, TraceOptions,
+};
 
-use crate::arrays::{held_tensors, optional_view, tensor_views, to_numpy, view};
+use crate::arrays::{copied, held_tensors, optional_view, tensor_views, to_numpy, view, view_mut};
 use crate::config::config_dict;
 use crate::context::Context;
 use crate::detached::call;
@@ -29,12 +31,11 @@ impl ActionHead {
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = LoadOptions {
-            config,
-            embodiment_ids,
-            precision: precision.parse().map_err(raise)?,
-            num_threads,
-        };
+        let options = LoadOptions::default()
+            .with_config(config)
+            .with_embodiment_ids(embodiment_ids)
+            .with_precision(precision.parse().map_err(raise)?)
+            .with_num_threads(num_threads);
         call(py, || saccade::ActionHead::load(&source, &options)).map(Self)
     }
 
@@ -47,12 +48,11 @@ impl ActionHead {
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = LoadOptions {
-            config: Some(config),
-            embodiment_ids,
-            precision: precision.parse().map_err(raise)?,
-            num_threads,
-        };
+        let options = LoadOptions::default()
+            .with_config(config)
+            .with_embodiment_ids(embodiment_ids)
+            .with_precision(precision.parse().map_err(raise)?)
+            .with_num_threads(num_threads);
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
         call(py, || saccade::ActionHead::from_tensors(&views, &options)).map(Self)
@@ -69,7 +69,7 @@ impl ActionHead {
 
     fn future_tokens<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let tokens = self.0.future_tokens();
-        to_numpy(py, tokens.data.to_vec(), tokens.shape)
+        to_numpy(py, copied("future_tokens", tokens.data())?, tokens.shape())
     }
 
     #[getter]
@@ -116,13 +116,11 @@ impl ActionHead {
         attention: bool,
         hidden: bool,
     ) -> PyResult<(Context, PyRecorded<'py>)> {
-        let features = Features {
-            backbone_features: view(&backbone_features)?,
-            attention_mask: optional_view(&attention_mask)?,
-            image_mask: optional_view(&image_mask)?,
-            drop_vl: optional_view(&drop_vl)?,
-            record: Keep { attention, hidden },
-        };
+        let features = Features::new(view(&backbone_features)?)
+            .with_attention_mask(optional_view(&attention_mask)?)
+            .with_image_mask(optional_view(&image_mask)?)
+            .with_drop_vl(optional_view(&drop_vl)?)
+            .with_record(Keep { attention, hidden });
         let mut context = call(py, || self.0.encode(&features))?;
         let kept = recorded(py, context.take_recorded())?;
         Ok((Context(Arc::new(context)), kept))
@@ -146,23 +144,25 @@ impl ActionHead {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
-        let (context, out) = (&context.0, out.as_slice_mut()?);
-        let sampling = Sampling {
-            num_steps,
-            integrator: Integrator::from_name(integrator).map_err(raise)?,
-            num_samples,
-            future_refresh,
-            chunking: optional_view(&previous_chunk)?.zip(chunking).map(
-                |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
-                    previous_chunk,
-                    overlap,
-                    frozen,
-                    ramp_rate,
-                    horizon,
-                },
-            ),
-            interventions: &interventions(intervention)?,
-        };
+        let shape = out.shape().to_vec();
+        let (context, out) = (&context.0, view_mut(&mut out, &shape)?);
+        let chunking = optional_view(&previous_chunk)?.zip(chunking).map(
+            |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
+                previous_chunk,
+                overlap,
+                frozen,
+                ramp_rate,
+                horizon,
+            },
+        );
+        let interventions = interventions(intervention)?;
+        let sampling = Sampling::default()
+            .with_num_steps(num_steps)
+            .with_integrator(Integrator::from_name(integrator).map_err(raise)?)
+            .with_num_samples(num_samples)
+            .with_future_refresh(future_refresh)
+            .with_chunking(chunking)
+            .with_interventions(&interventions);
         call(py, || {
             self.0
                 .sample(context, state, embodiment_id, noise, &sampling, out)
@@ -187,17 +187,14 @@ impl ActionHead {
     ) -> PyResult<(PyRecorded<'py>, Bound<'py, PyDict>, Bound<'py, PyArrayDyn<f32>>)> {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
         let context = &context.0;
-        let sampling = Sampling {
-            num_steps,
-            interventions: &interventions(intervention)?,
-            ..Sampling::default()
-        };
-        let options = TraceOptions {
-            record: Keep { attention, hidden },
-            blocks,
-            steps,
-            max_bytes,
-        };
+        let interventions = interventions(intervention)?;
+        let sampling = Sampling::default()
+            .with_num_steps(num_steps)
+            .with_interventions(&interventions);
+        let options = TraceOptions::new(Keep { attention, hidden })
+            .with_blocks(blocks)
+            .with_steps(steps)
+            .with_max_bytes(max_bytes);
         let trace = call(py, || {
             self.0
                 .trace(context, state, embodiment_id, noise, &sampling, &options)
@@ -207,7 +204,8 @@ impl ActionHead {
             let range = trace.groups.range(group);
             rows.set_item(group.name(), (range.start, range.end))?;
         }
-        let actions = to_numpy(py, trace.actions.data, &trace.actions.shape)?;
+        let (actions, shape) = trace.actions.into_parts();
+        let actions = to_numpy(py, actions, &shape)?;
         Ok((recorded(py, trace.recorded)?, rows, actions))
     }
 
@@ -224,19 +222,16 @@ impl ActionHead {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let (state, embodiment_id) = (view(&state)?, view(&embodiment_id)?);
-        let (actions, timestep) = (view(&actions)?, view(&timestep)?);
-        let (context, out) = (&context.0, out.as_slice_mut()?);
+        let noisy = NoisyActions {
+            actions: view(&actions)?,
+            timestep: view(&timestep)?,
+        };
+        let shape = out.shape().to_vec();
+        let (context, out) = (&context.0, view_mut(&mut out, &shape)?);
         let interventions = interventions(intervention)?;
         call(py, || {
-            self.0.velocity(
-                context,
-                state,
-                embodiment_id,
-                actions,
-                timestep,
-                &interventions,
-                out,
-            )
+            self.0
+                .velocity(context, state, embodiment_id, noisy, &interventions, out)
         })
     }
 }

@@ -61,17 +61,18 @@ pub(crate) fn interventions(given: Vec<PyIntervention<'_>>) -> PyResult<Vec<sacc
     given.into_iter().map(intervention).collect()
 }
 
-/// Attention and hidden rows, each by place.
+/// Attention and hidden rows, each by block, or by step and block.
 pub(crate) type PyRecorded<'py> = (Bound<'py, PyDict>, Bound<'py, PyDict>);
 
-pub(crate) fn recorded<'py, Place: IntoPyObject<'py>>(
+pub(crate) fn recorded<'py, Key: IntoPyObject<'py>>(
     py: Python<'py>,
-    recorded: Recorded<Place>,
+    recorded: Recorded<Key>,
 ) -> PyResult<PyRecorded<'py>> {
-    let to_dict = |arrays: BTreeMap<Place, OwnedArray>| {
+    let to_dict = |arrays: BTreeMap<Key, OwnedArray>| {
         let dict = PyDict::new(py);
-        for (place, array) in arrays {
-            dict.set_item(place, to_numpy(py, array.data, &array.shape)?)?;
+        for (key, array) in arrays {
+            let (data, shape) = array.into_parts();
+            dict.set_item(key, to_numpy(py, data, &shape)?)?;
         }
         Ok::<_, PyErr>(dict)
     };

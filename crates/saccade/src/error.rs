@@ -27,6 +27,9 @@ pub enum Error {
         /// How much was asked for.
         bytes: usize,
     },
+    /// The call was stopped by [`interruptible`](crate::interruptible).
+    #[error("the call was interrupted")]
+    Interrupted,
     /// A file cannot be read or written.
     #[error(transparent)]
     File(#[from] saccade_checkpoint::Error),
@@ -48,6 +51,8 @@ pub enum ErrorKind {
     NotFound,
     /// Memory that the system refused.
     Memory,
+    /// The caller asked for an end.
+    Interrupted,
 }
 
 impl Error {
@@ -59,6 +64,7 @@ impl Error {
             Self::Shape(_) => ErrorKind::Shape,
             Self::Input(_) | Self::File(File::Input(_)) => ErrorKind::Input,
             Self::Memory { .. } | Self::File(File::Memory { .. }) => ErrorKind::Memory,
+            Self::Interrupted => ErrorKind::Interrupted,
             Self::File(File::NotFound { .. }) => ErrorKind::NotFound,
             Self::File(File::Output { .. } | File::Stranded { .. }) => ErrorKind::Output,
             Self::Checkpoint(_) | Self::File(_) => ErrorKind::Checkpoint,

@@ -8,44 +8,43 @@
 
 #![forbid(unsafe_code)]
 
+mod alloc;
 mod array;
-mod attention;
-mod cache;
-mod checkpoint;
-mod chunking;
 mod config;
-mod context;
-mod cross_attention;
-mod dit;
+mod engine;
 mod error;
-mod footprint;
 mod head;
-mod intervention;
-mod layers;
-mod layout;
+mod inspect;
 mod memory;
+mod nn;
+mod ops;
 mod precision;
 mod profile;
-mod reading;
 mod recognise;
 mod rewrite;
-mod tables;
-mod trace;
+mod sampling;
 
-pub use array::{Array, OwnedArray};
-pub use chunking::Chunking;
+pub use array::{Array, ArrayMut, OwnedArray};
 pub use config::HeadConfig;
-pub use context::Context;
-pub use cross_attention::{CrossAttention, KeyValues};
 pub use error::{Error, ErrorKind, Result};
-pub use head::{ActionHead, Features, Integrator, LoadOptions, Sampling};
-pub use intervention::{Group, Groups, Intervention, Patch, Tokens};
-pub use layout::tensor_shapes;
+pub use head::action_head::ActionHead;
+pub use head::context::Context;
+pub use head::cross_attention::{CrossAttention, KeyOptions, KeyValues};
+pub use head::encode::Features;
+pub use head::load::LoadOptions;
+pub use head::plan::tensor_shapes;
+pub use head::sample::Sampling;
+pub use head::velocity::NoisyActions;
+pub use inspect::groups::{Group, Groups, Tokens};
+pub use inspect::intervention::{Intervention, Patch};
+pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
 pub use memory::{ElementsRef, TensorView, TensorViews};
+pub use ops::interruptible;
 pub use precision::Precision;
 pub use profile::{Counter, Part, Profile};
-pub use recognise::{Layout, Published, TensorFacts};
-pub use rewrite::convert::{ConvertOptions, ConvertReport, Float, convert};
+pub use recognise::{Published, TensorFacts};
+pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
+pub use rewrite::float::Float;
 pub use rewrite::quantize::{QuantizeReport, quantize};
 pub use rewrite::resize::{
     MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config,
@@ -53,4 +52,5 @@ pub use rewrite::resize::{
 pub use rewrite::{RewriteOptions, Written};
 pub use saccade_checkpoint::{self as files, Checkpoint, Elements};
 pub use saccade_kernels::{Arithmetic, Isa, default_num_threads, peak};
-pub use trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
+pub use sampling::chunking::Chunking;
+pub use sampling::integrator::Integrator;

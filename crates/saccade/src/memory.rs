@@ -8,8 +8,10 @@ use half::slice::HalfBitsSliceExt;
 use half::{bf16, f16};
 use safetensors::Dtype;
 
+use crate::alloc::reserve;
 use crate::error::{Error, Result, show_shape};
-use crate::layers::TensorSource;
+use crate::nn::weights::{Request, Source, Tensor};
+use crate::ops::check_interrupted;
 use saccade_checkpoint::spec::{self, Problem};
 use saccade_checkpoint::{Elements, TensorSpec};
 
@@ -49,27 +51,38 @@ impl<'a> ElementsRef<'a> {
     }
 
     /// A copy, in the memory of `spare` if that has its type.
-    fn to_elements(self, spare: Option<Elements>) -> Elements {
-        fn fill<T>(memory: Option<Vec<T>>, values: impl Iterator<Item = T>) -> Vec<T> {
-            let mut memory = memory.unwrap_or_default();
-            memory.clear();
-            memory.extend(values);
-            memory
-        }
+    fn to_elements(self, spare: Option<Elements>) -> Result<Elements> {
         let (floats, halves) = match spare {
-            Some(Elements::F32(floats)) => (Some(floats), None),
-            Some(Elements::Bf16(halves)) => (None, Some(halves)),
-            _ => (None, None),
+            Some(Elements::F32(floats)) => (floats, Vec::new()),
+            Some(Elements::Bf16(halves)) => (Vec::new(), halves),
+            _ => (Vec::new(), Vec::new()),
         };
-        match self {
-            Self::F32(values) => Elements::F32(fill(floats, values.iter().copied())),
-            Self::Bf16(bits) => Elements::Bf16(fill(halves, bits.reinterpret_cast::<bf16>().iter().copied())),
-            Self::F16(bits) => {
-                let values = bits.reinterpret_cast::<f16>().iter();
-                Elements::F32(fill(floats, values.map(|value| value.to_f32())))
+        Ok(match self {
+            Self::F32(values) => Elements::F32(copied(floats, values, |value| *value)?),
+            Self::Bf16(bits) => {
+                let values: &[bf16] = bits.reinterpret_cast();
+                Elements::Bf16(copied(halves, values, |value| *value)?)
             }
-        }
+            Self::F16(bits) => {
+                let values: &[f16] = bits.reinterpret_cast();
+                Elements::F32(copied(floats, values, |value| value.to_f32())?)
+            }
+        })
     }
+}
+
+/// Elements between two looks at whether the call is to stop.
+const TOGETHER: usize = 1 << 20;
+
+/// `values`, converted, in `memory`.
+fn copied<S, T>(mut memory: Vec<T>, values: &[S], convert: impl Fn(&S) -> T) -> Result<Vec<T>> {
+    memory.clear();
+    reserve("weights", &mut memory, values.len())?;
+    for values in values.chunks(TOGETHER) {
+        check_interrupted()?;
+        memory.extend(values.iter().map(&convert));
+    }
+    Ok(memory)
 }
 
 /// A tensor that someone else holds.
@@ -82,19 +95,23 @@ pub struct TensorView<'a> {
 impl<'a> TensorView<'a> {
     /// `elements` of this shape.
     ///
-    /// # Panics
-    /// If there are more or fewer than the shape says.
-    #[must_use]
-    pub fn new(shape: &[usize], elements: ElementsRef<'a>) -> Self {
-        assert_eq!(
-            shape.iter().product::<usize>(),
-            elements.len(),
-            "as many elements as the shape says"
-        );
-        Self {
+    /// # Errors
+    /// [`Error::Shape`] if there are more or fewer than the shape says.
+    pub fn new(shape: &[usize], elements: ElementsRef<'a>) -> Result<Self> {
+        let expected = shape
+            .iter()
+            .try_fold(1_usize, |count, &size| count.checked_mul(size));
+        if expected != Some(elements.len()) {
+            return Err(Error::Shape(format!(
+                "tensors: {} does not fit {} elements",
+                show_shape(shape),
+                elements.len()
+            )));
+        }
+        Ok(Self {
             shape: shape.to_vec(),
             elements,
-        }
+        })
     }
 }
 
@@ -140,25 +157,29 @@ impl<'a> MemorySource<'a> {
     }
 }
 
-impl TensorSource for MemorySource<'_> {
-    fn tensor(&self, name: &str) -> Result<Elements> {
-        let elements = self.tensor_view(name)?.elements;
-        Ok(elements.to_elements(self.spare.take()))
-    }
-
-    fn slices(&self, name: &str, slices: Range<usize>) -> Result<Elements> {
-        let TensorView { shape, elements } = self.tensor_view(name)?;
-        match shape.split_first() {
-            Some((&size, rest)) if slices.start <= slices.end && slices.end <= size => {
+impl Source for MemorySource<'_> {
+    fn tensor(&self, request: &Request) -> Result<Tensor> {
+        let Request { spec, slices, .. } = request;
+        if spec.shape.contains(&0) {
+            return Ok(Tensor::Held(Elements::F32(Vec::new())));
+        }
+        let TensorView { shape, elements } = self.tensor_view(&spec.name)?;
+        let elements = match (slices, shape.split_first()) {
+            (None, _) => elements.to_elements(self.spare.take())?,
+            (Some(slices), Some((&size, rest))) if slices.start <= slices.end && slices.end <= size => {
                 let width: usize = rest.iter().product();
                 let range = slices.start * width..slices.end * width;
-                Ok(elements.range(range).to_elements(None))
+                elements.range(range).to_elements(None)?
             }
-            _ => Err(Error::Checkpoint(format!(
-                "tensors: {name} has shape {} and no slices {slices:?}",
-                show_shape(shape)
-            ))),
-        }
+            (Some(slices), _) => {
+                return Err(Error::Checkpoint(format!(
+                    "tensors: {} has shape {} and no slices {slices:?}",
+                    spec.name,
+                    show_shape(shape)
+                )));
+            }
+        };
+        Ok(Tensor::Held(elements))
     }
 
     fn give_back(&self, used: Elements) {

@@ -6,7 +6,17 @@ use std::str::FromStr;
 use saccade_kernels::{Arithmetic, Element};
 
 use crate::error::{Error, Result};
-use crate::layout::Role;
+
+/// What a layer is to a model's cost, which decides how precisely it is worth computing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Role {
+    /// Attention and feed-forward of the blocks: nearly all of the work.
+    Block,
+    /// A function of the time alone, so computed once for each bucket.
+    Time,
+    /// Encoders, decoder and output: under one percent.
+    Other,
+}
 
 /// What weights are held in, and what the inputs of linear layers are rounded to. The residual stream, norms, softmax and all sums of
 /// floating-point products are float32 in each.

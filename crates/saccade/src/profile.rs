@@ -3,12 +3,6 @@
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
-use saccade_kernels::{
-    AllocError, Epilogue, LinearScratch, LogitBias, PackedKeyValues, PackedLinear, Rows, RowsMut,
-};
-
-use crate::layers::Engine;
-
 /// A part of the head's work.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -114,11 +108,11 @@ thread_local! {
     static CURRENT: RefCell<Option<Profile>> = const { RefCell::new(None) };
 }
 
-/// Runs `call`, whose work is `(multiply_adds, bytes)`, and counts it if this thread counts.
-fn counted<R>(part: Part, work: (usize, usize), call: impl FnOnce() -> R) -> R {
-    if !CURRENT.with_borrow(Option::is_some) {
+/// Runs `call`, whose work is `(multiply_adds, bytes)`, and counts it under `part` if this thread counts.
+pub(crate) fn counted<R>(part: Option<Part>, work: (usize, usize), call: impl FnOnce() -> R) -> R {
+    let Some(part) = part.filter(|_| CURRENT.with_borrow(Option::is_some)) else {
         return call();
-    }
+    };
     let start = Instant::now();
     let result = call();
     let time = start.elapsed();
@@ -134,81 +128,13 @@ fn counted<R>(part: Part, work: (usize, usize), call: impl FnOnce() -> R) -> R {
     result
 }
 
-/// [`PackedLinear::apply`], counted.
-#[allow(clippy::too_many_arguments)] // The kernel's, and the part.
-pub(crate) fn apply(
-    part: Part,
-    layer: &PackedLinear,
-    threads: usize,
-    x: Rows<'_>,
-    epilogue: Epilogue,
-    out: RowsMut<'_>,
-    scratch: &mut LinearScratch,
-) {
-    let multiply_adds = x.num_rows() * layer.in_features() * layer.out_features();
-    counted(part, (multiply_adds, layer.nbytes()), || {
-        let applied = layer.apply(threads, x, epilogue, out, scratch);
-        applied.unwrap_or_else(|error| out_of_memory(error));
-    });
-}
-
-/// Until every caller passes the error on.
-pub(crate) fn out_of_memory(error: AllocError) -> ! {
-    panic!("{error}")
-}
-
-/// [`saccade_kernels::attention`], counted.
-pub(crate) fn attention(
-    threads: usize,
-    queries: Rows<'_>,
-    kv: &PackedKeyValues,
-    scale: f32,
-    bias: Option<LogitBias<'_>>,
-    weights: Option<&mut [f32]>,
-    out: RowsMut<'_>,
-) {
-    let multiply_adds = 2 * queries.num_rows() * kv.len() * queries.num_columns();
-    counted(Part::Attention, (multiply_adds, kv.nbytes()), || {
-        saccade_kernels::attention(threads, queries, kv, scale, bias.into(), weights, out);
-    });
-}
-
-/// [`saccade_kernels::layer_norm`], counted.
-pub(crate) fn layer_norm(
-    engine: Engine,
-    x: Rows<'_>,
-    eps: f32,
-    scale_shift: Option<(&[f32], &[f32])>,
-    out: RowsMut<'_>,
-) {
-    counted(Part::Norm, (0, 0), || {
-        saccade_kernels::layer_norm(engine.isa, engine.threads, x, eps, scale_shift, out);
-    });
-}
-
-/// [`PackedKeyValues::pack_from`], counted; from 0 it is [`PackedKeyValues::pack`].
-pub(crate) fn pack(
-    threads: usize,
-    packed: &mut PackedKeyValues,
-    first: usize,
-    keys: Rows<'_>,
-    values: Rows<'_>,
-) {
-    counted(Part::Pack, (0, 0), || match first {
-        0 => packed
-            .pack(threads, keys, values)
-            .unwrap_or_else(|error| out_of_memory(error)),
-        _ => packed.pack_from(threads, first, keys, values),
-    });
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn counts_between_start_and_take_on_this_thread_only() {
-        let work = || counted(Part::ToQ, (6, 24), || 7);
+        let work = || counted(Some(Part::ToQ), (6, 24), || 7);
         assert_eq!(work(), 7);
         assert_eq!(Profile::take(), None, "nothing is counted before");
         Profile::start();

@@ -4,7 +4,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use saccade::{ActionHead, Array, Chunking, Features, LoadOptions, Sampling};
+use saccade::{ActionHead, Array, ArrayMut, Chunking, Features, LoadOptions, Sampling};
 
 struct Counting;
 
@@ -35,11 +35,10 @@ fn released(name: &str, threads: usize) -> ActionHead {
     let bytes = std::fs::read(&path).unwrap();
     let size = usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
     let header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + size]).unwrap();
-    let options = LoadOptions {
-        config: Some(header["__metadata__"]["config"].as_str().unwrap().to_owned()),
-        num_threads: Some(threads),
-        ..Default::default()
-    };
+    let config = header["__metadata__"]["config"].as_str().unwrap().to_owned();
+    let options = LoadOptions::default()
+        .with_config(config)
+        .with_num_threads(threads);
     ActionHead::load(&path, &options).unwrap()
 }
 
@@ -57,12 +56,10 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let (horizon, width) = (config.action_horizon, config.encoder_action_dim);
         let features = vec![0.1; 2 * 50 * config.context_dim];
         let image_mask: Vec<_> = (0..2 * 50).map(|token| token % 3 == 1).collect();
-        let context = head
-            .encode(&Features {
-                image_mask: Some(Array::new(&image_mask, &[2, 50])),
-                ..Features::new(Array::new(&features, &[2, 50, config.context_dim]))
-            })
-            .unwrap();
+        let features_shape = [2, 50, config.context_dim];
+        let features = Features::new(Array::new(&features, &features_shape).unwrap());
+        let features = features.with_image_mask(Array::new(&image_mask, &[2, 50]).unwrap());
+        let context = head.encode(&features).unwrap();
         let (state, noise) = (
             vec![0.2; 2 * config.state_dim],
             vec![0.3; 2 * 3 * horizon * width],
@@ -70,26 +67,25 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let previous_chunk = vec![0.4; 2 * horizon * width];
         let shape = [2, horizon, width];
         let mut out = vec![0.0; 2 * 3 * horizon * config.action_dim];
-        let mut sample = |future_refresh, is_chunked: bool| {
+        let mut sample = |future_refresh: Option<usize>, is_chunked: bool| {
             let chunking = Chunking {
-                previous_chunk: Array::new(&previous_chunk, &shape),
+                previous_chunk: Array::new(&previous_chunk, &shape).unwrap(),
                 overlap: 4,
                 frozen: 1,
                 ramp_rate: 6.0,
                 horizon: None,
             };
+            let sampling = Sampling::default()
+                .with_num_samples(3)
+                .with_future_refresh(future_refresh)
+                .with_chunking(is_chunked.then_some(chunking));
             head.sample(
                 &context,
-                Array::new(&state, &[2, config.state_dim]),
-                Array::new(&[1, 3], &[2]),
-                Array::new(&noise, &[2, 3, horizon, width]),
-                &Sampling {
-                    num_samples: Some(3),
-                    future_refresh,
-                    chunking: is_chunked.then_some(chunking),
-                    ..Default::default()
-                },
-                &mut out,
+                Array::new(&state, &[2, config.state_dim]).unwrap(),
+                Array::new(&[1, 3], &[2]).unwrap(),
+                Array::new(&noise, &[2, 3, horizon, width]).unwrap(),
+                &sampling,
+                ArrayMut::new(&mut out, &[2, 3, horizon, config.action_dim]).unwrap(),
             )
             .unwrap();
         };

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade.bench.work import ATTENTION, Call, Work, Works, encode_work, sample_work
 from saccade.config import HeadConfig
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 
 #: Sizes of nvidia/GR00T-N1.5-3B with one embodiment; further embodiments cost memory but no time.
 N15: Mapping[str, Any] = {

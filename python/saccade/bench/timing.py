@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import saccade
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade.observation import Observation
 
 #: What a user waits for: encoding an observation, sampling a chunk from its context, and both.

@@ -255,8 +255,8 @@ def _rewrite(
     config_text = None if config is None else to_json(config)
     published = _saccade.Published.open(os.fspath(path), config_text)
     published.check()  # before the hash, which takes long
-    beside = (path if path.is_dir() else path.parent) / "config.json"
-    hashed = [beside] if beside.is_file() else []
+    config_file = (path if path.is_dir() else path.parent) / "config.json"
+    hashed = [config_file] if config_file.is_file() else []
     return {
         "source": os.fspath(path),
         "out": os.fspath(out),

@@ -8,6 +8,7 @@ standard error for bad input, missing packages, and paths or streams that cannot
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import importlib
 import os
@@ -57,6 +58,17 @@ EXIT_OK = 0
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+
+
+EPILOG = """\
+Lists take commas, spaces or both: --tasks reach,push or --tasks reach push. Bad arguments, paths that cannot
+be used and missing packages give one line on standard error and exit status 2.
+
+examples:
+  saccade rollout --help
+  saccade rollout --tasks reach --episodes 2
+  saccade inspect checkpoint/
+"""
 
 
 class UsageError(Exception):
@@ -119,10 +131,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
         prog="saccade",
         description="GR00T-style action heads on CPUs: run and train policies, inspect and convert "
         "checkpoints.",
-        epilog="examples:\n"
-        "  saccade rollout --help\n"
-        "  saccade rollout --tasks reach --episodes 2\n"
-        "  saccade inspect checkpoint/",
+        epilog=EPILOG,
     )
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command", title="commands", parser_class=Parser)
@@ -229,6 +238,7 @@ def dispatch(argv: list[str]) -> int:
 
 
 def refuse(message: str) -> int:
-    """Prints one line to standard error; returns the status of bad input."""
-    print(f"saccade: {message}", file=sys.stderr)
+    """Prints one line to standard error, if that can be written; returns the status of bad input."""
+    with contextlib.suppress(OSError):
+        print(f"saccade: {message}", file=sys.stderr)
     return EXIT_BAD_INPUT

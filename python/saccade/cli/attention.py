@@ -242,7 +242,7 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from saccade.maps.sheet import NO_FUTURE, NO_IMAGES
+    from saccade.maps.notes import NO_FUTURE, NO_IMAGES
 
     console = _output.console(width=WIDTH)
     console.print(maps.view.title, style="bold", markup=False, soft_wrap=True)

@@ -185,9 +185,9 @@ def memory(report: Inspection) -> Section:
             row += [f"{1000 * time:.1f}" for time in (*times, sum(times))]
         rows.append(row)
     columns = ["", ">MB, all embodiments", ">MB, one"]
-    if seconds is None:
-        return Section("Memory", columns, rows)
     machine = report.machine
+    if seconds is None or machine is None:
+        return Section("Memory", columns, rows)
     title = (
         f"Memory, and expected time of a chunk with {report.num_vl_tokens} VL tokens "
         f"({machine.isa}, {machine.num_threads} threads, by the cost model)"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade.cli import EXIT_OK, _output, arguments
@@ -58,9 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains and how far actions move."""
-    from saccade.checkpoints import resize
+    from saccade.checkpoints import describe, resize
     from saccade.comparison import action_changes
+    from saccade.observation import read
 
+    if args.features is not None:  # refused before anything is written
+        read(Path(args.features), describe(args.checkpoint, args.config).config)
     with copying("resizing") as progress:
         report = resize(
             args.checkpoint,
@@ -79,12 +83,12 @@ def run(args: argparse.Namespace) -> int:
         both = {**dataclasses.asdict(report), "actions": dataclasses.asdict(changes)}
         _output.print_json(both, default=str)
         return EXIT_OK
-    describe(args, report, changes)
+    print_report(args, report, changes)
     print_files_not_copied(report)
     return EXIT_OK
 
 
-def describe(args: argparse.Namespace, report: ResizeReport, changes: ActionChanges) -> None:
+def print_report(args: argparse.Namespace, report: ResizeReport, changes: ActionChanges) -> None:
     """Prints what was written, and how far actions move."""
     merged = sum(len(group) > 1 for group in report.sources)
     copied = max(0, report.num_after - report.num_before)

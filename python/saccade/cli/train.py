@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,8 @@ from saccade._files import writable_directory
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, arguments, require
 
 if TYPE_CHECKING:
-    from saccade.sim.train import Progress, TrainingSettings
+    from saccade.sim.train import Progress
+    from saccade.sim.training_settings import TrainingSettings
 
 HELP = "train a policy on recorded demonstrations"
 
@@ -19,8 +19,7 @@ EPILOG = """\
 Writes config.json and model.safetensors (the policy, for `saccade rollout --checkpoint DIR`), settings.json,
 history.json, loss.png and training.pt about once a minute. If the command is interrupted, run it again: it
 continues where it stopped, and the weights at the end are the same as those of an uninterrupted run. The
-bundled policy was trained by the first two examples, one after the other. Every setting that is left out has
-the value of the bundled policy.
+bundled policy was trained by the first two examples, one after the other.
 
 examples:
   saccade train --demos out/demos --out out/first
@@ -31,16 +30,16 @@ examples:
   saccade train --demos out/demos --out out/quick --training-steps 2000 --num-threads 2
 """
 
-# Flag, its smallest value, what it is, and the setting if that has another name.
+# Flag, its smallest value, and what it is.
 INTEGERS = (
-    ("--training-steps", 1, "optimiser steps", "steps"),
-    ("--batch-size", 1, "observations per step", None),
-    ("--seed", 0, "seed of weights, order and noise", None),
-    ("--num-future-tokens", 0, "number of learned query tokens, N", None),
-    ("--patch-size", 2, "pixels along each side of an image token's patch", None),
-    ("--vl-num-layers", 0, "blocks of the head's VL self-attention", None),
-    ("--width", 8, "width of backbone and head", None),
-    ("--num-layers", 1, "blocks of the head", None),
+    ("--training-steps", 1, "optimiser steps"),
+    ("--batch-size", 1, "observations per step"),
+    ("--seed", 0, "seed of weights, order and noise"),
+    ("--num-future-tokens", 0, "number of learned query tokens, N"),
+    ("--patch-size", 2, "pixels along each side of an image token's patch"),
+    ("--vl-num-layers", 0, "blocks of the head's VL self-attention"),
+    ("--width", 8, "width of backbone and head"),
+    ("--num-layers", 1, "blocks of the head"),
 )
 
 # Flag, its smallest value, what it is below, and what it is.
@@ -57,24 +56,29 @@ NUMBERS = (
         "--alignment-weight",
         0.0,
         float("inf"),
-        "weight of the loss that aligns the future tokens' rows with the observation one horizon later "
-        "(FLARE: 0.2)",
+        "weight of the loss that aligns the future tokens' rows with the observation one horizon later; "
+        "FLARE uses 0.2",
     ),
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
+    from saccade.sim.training_settings import TrainingSettings
+
+    defaults = TrainingSettings()
     parser.epilog = EPILOG
     parser.add_argument(
         "--demos", type=Path, required=True, metavar="DIR", help="directory written by `saccade demos`"
     )
     arguments.add_out(parser, None, "directory of the run")
     arguments.add_num_threads(parser, "threads of torch", 1)
-    for flag, smallest, what, _ in INTEGERS:
-        arguments.add_integer(parser, flag, minimum=smallest, help=what)
+    for flag, smallest, what in INTEGERS:
+        default = getattr(defaults, setting(flag))
+        arguments.add_integer(parser, flag, minimum=smallest, default=default, help=what)
     for flag, lowest, limit, what in NUMBERS:
-        arguments.add_number(parser, flag, minimum=lowest, below=limit, help=what)
+        default = getattr(defaults, setting(flag))
+        arguments.add_number(parser, flag, minimum=lowest, below=limit, default=default, help=what)
     parser.add_argument(
         "--start-from", type=Path, metavar="DIR", help="policy to start from (default: random weights)"
     )
@@ -87,12 +91,12 @@ def run(args: argparse.Namespace) -> int:
     if args.start_from is not None and not (args.start_from / "model.safetensors").is_file():
         raise FileNotFoundError(f"{args.start_from}: no policy there")
     recorded_tasks(args.demos)
+    settings = training_settings(args)
     require("train")
     import torch
 
     from saccade.sim import train
 
-    settings = training_settings(args)
     writable_directory(args.out)
     torch.set_num_threads(args.num_threads)
     try:
@@ -116,13 +120,17 @@ def training_settings(args: argparse.Namespace) -> TrainingSettings:
     Raises:
         InputError: they do not fit each other.
     """
-    from saccade.sim.train import TrainingSettings
+    from saccade.sim.training_settings import TrainingSettings
 
-    flags = {flag: setting for flag, _, _, setting in INTEGERS} | dict.fromkeys(flag for flag, *_ in NUMBERS)
-    chosen = {}
-    for flag, setting in flags.items():
-        name = flag.removeprefix("--").replace("-", "_")
-        value = getattr(args, name)
-        if value is not None:
-            chosen[setting or name] = value
-    return dataclasses.replace(TrainingSettings(), **chosen)
+    flags = [flag for flag, *_ in (*INTEGERS, *NUMBERS)]
+    return TrainingSettings(**{setting(flag): getattr(args, destination(flag)) for flag in flags})
+
+
+def destination(flag: str) -> str:
+    """The name of a flag's value."""
+    return flag.removeprefix("--").replace("-", "_")
+
+
+def setting(flag: str) -> str:
+    """The setting that a flag sets."""
+    return "steps" if flag == "--training-steps" else destination(flag)

@@ -1,5 +1,9 @@
-"""Other programs' policies, with saccade's head in the place of their own. Needs torch, which they have."""
+"""Runs the action heads of other programs' policies in saccade. Needs torch, as these policies do."""
 
-from saccade.integrations.accelerated import Accelerated, accelerate
+from saccade._extras import require
+
+require("torch")
+
+from saccade.integrations.accelerated import Accelerated, accelerate  # noqa: E402
 
 __all__ = ["Accelerated", "accelerate"]

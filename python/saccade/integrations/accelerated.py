@@ -1,4 +1,4 @@
-"""A torch action head whose `get_action` runs in saccade."""
+"""Runs the `get_action` of a torch action head in saccade."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MethodType, TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig
-from saccade.errors import InputError
+from saccade.errors import DtypeError, InputError
 from saccade.head import ActionHead
 from saccade.integrations import heads
 from saccade.integrations.weights import Watch, tensors_of
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-#: The largest error of the check at load, as a share of how far the original moves the noise. Exact
-#: arithmetic differs by the released code's own tables, 2e-4; the others round to 8 bits. Another
+#: Largest error in the check at load, relative to how far the original moves the noise. In exact arithmetic
+#: the tables of the released code cause a difference of 2e-4. The other precisions round to 8 bits. Another
 #: architecture differs by about 1.
 EXACT_TOLERANCE = 1e-2
 ROUNDED_TOLERANCE = 0.3
 
-#: What is allowed besides, as a share of the noise: rounding it, at the start and after each of four steps.
-#: It decides for a head that was never trained, which hardly moves the noise.
+#: Additional tolerance, relative to the noise, for rounding it at the start and after each of four steps. It
+#: matters for an untrained head, which hardly moves the noise.
 EXACT_ROUNDING = 1e-5
 ROUNDED_ROUNDING = 1e-2
 
-#: Tokens of the check's observation: text, two of an image, text that is padding.
+#: The tokens of the check's observation: text, two image tokens, and text that is padding.
 CHECK_IMAGE = (False, True, True, False)
 CHECK_ATTENDED = (True, True, True, False)
 
-#: What options of real-time chunking say, in the released names.
+#: The options of real-time chunking, in the released names.
 CHUNKING_OPTIONS = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "rtc_ramp_rate")
 
 
@@ -48,27 +48,30 @@ def accelerate(
     num_threads: int | None = None,
     embodiment_ids: Sequence[int] | None = None,
 ) -> Accelerated:
-    """Lets the action head of a torch policy compute in saccade, on the CPU.
+    """Makes the action head of a torch policy compute in saccade, on the CPU.
 
-    The head's `get_action` is replaced on this instance: same arguments, same results, the noise drawn from
-    torch's generator as the original draws it, so that equal seeds give equal actions up to rounding. Nothing
-    else of the policy changes, and :meth:`Accelerated.restore` puts the original back. Before it returns, the
-    original runs once on four random tokens and must agree.
+    The `get_action` of this instance of the head is replaced. Arguments and results stay the same. The noise
+    is drawn from torch's generator as in the original, so equal seeds give equal actions up to rounding.
+    Nothing else in the policy changes, and :meth:`Accelerated.restore` puts the original back. As a check,
+    the original runs once on four random tokens, and the results must agree.
 
-    Heads are known by their structure: lerobot's and Isaac-GR00T's, N1.5 to N1.7, and forks that
-    :meth:`ActionHead.load` reads. The torch weights stay where they are; saccade's own copy of them takes
-    ``handle.head.nbytes`` beside them.
+    Heads are recognised by their structure: those of lerobot and Isaac-GR00T, N1.5 to N1.7, and forks that
+    :meth:`saccade.ActionHead.load` supports. The torch weights stay in memory. The copy in saccade takes
+    ``handle.head.nbytes`` more.
 
     Args:
-        policy: lerobot's `GrootPolicy`, Isaac-GR00T's policy or model, or the head itself.
-        precision: As in :meth:`ActionHead.load`. ``"float32"`` is exact to rounding for weights of any type.
-        num_threads: As in :meth:`ActionHead.load`.
-        embodiment_ids: The embodiments to take weights of; default all. Another id is then an error.
+        policy: `GrootPolicy` of lerobot, the policy or model of Isaac-GR00T, or the head itself.
+        precision: As in :meth:`saccade.ActionHead.load`. ``"float32"`` is exact up to rounding for weights of
+            any dtype.
+        num_threads: As in :meth:`saccade.ActionHead.load`.
+        embodiment_ids: The embodiments whose weights are copied. A call with another id is an error. Default:
+            all.
 
     Raises:
-        InputError: there is not one head in `policy`; it is in training mode, compiled, quantised, hooked,
-            replaced or accelerated already; the original computes something else.
-        CheckpointError: its weights are not those of a GR00T head; all that is wrong is listed.
+        InputError: `policy` does not contain exactly one head, or the head is in training mode, compiled,
+            quantised, hooked, replaced or accelerated already, or the original gives other actions.
+        DtypeError: The call is made under the default device ``meta``.
+        CheckpointError: The weights are not those of a GR00T head. The message lists every problem.
     """
     module = heads.find(policy)
     if isinstance(vars(module).get("get_action"), Accelerated):
@@ -80,17 +83,23 @@ def accelerate(
 
 @dataclass(frozen=True)
 class Kinds:
-    """What the original makes of inputs of some dtype: the dtypes of its noise and of its actions, and the
-    class in which it returns them.
-    """
+    """The dtypes of the original's noise and actions, and the class of its result."""
 
     noise: torch.dtype
     actions: torch.dtype
     result: type[Any]
 
 
+class LoadOptions(TypedDict):
+    """How the copy of the head is loaded; keyword arguments of :meth:`saccade.ActionHead.from_tensors`."""
+
+    precision: str
+    num_threads: int | None
+    embodiment_ids: Sequence[int] | None
+
+
 class Features(dict[str, Any]):
-    """Keys as attributes: what heads ask of a BatchFeature, for the check's inputs."""
+    """A dict with keys as attributes, as heads expect of a BatchFeature. For the inputs of the check."""
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -100,13 +109,12 @@ class Features(dict[str, Any]):
 
 
 class Accelerated:
-    """What stands in the place of a torch head's `get_action`, and the handle to it. Made by
-    :func:`accelerate`; for any number of threads.
+    """The replacement of a torch head's `get_action`, and a handle to it. Returned by :func:`accelerate`.
 
-    The head's weights may change: they are compared before each call, as far as
-    :class:`saccade.integrations.weights.Watch` says, and taken anew if they have. That takes as long as
-    loading did. An edit that it cannot see, of some values through ``.data``, needs :meth:`refresh`. Copies
-    and pickles of the policy hold the original `get_action`.
+    Any number of threads may call it. The weights of the head may change: each call compares them, as far as
+    :class:`saccade.integrations.weights.Watch` describes, and copies them again after a change, which takes
+    as long as loading. A change that the comparison misses (of a few values through ``.data``) requires
+    :meth:`refresh`. Copies and pickles of the policy have the original `get_action`.
 
     As a context manager it restores the original at the end.
     """
@@ -118,13 +126,12 @@ class Accelerated:
         num_threads: int | None,
         embodiment_ids: Sequence[int] | None,
     ) -> None:
-        # Weak, since the module holds this object: a cycle would keep gigabytes until the next collection.
+        # Weak, since the module refers to this object: a cycle would keep gigabytes until the next
+        # collection.
         self._weak_module = weakref.ref(module)
-        self._options: dict[str, Any] = {
-            "precision": precision,
-            "num_threads": num_threads,
-            "embodiment_ids": embodiment_ids,
-        }
+        self._options = LoadOptions(
+            precision=precision, num_threads=num_threads, embodiment_ids=embodiment_ids
+        )
         self._takes_options = heads.takes_options(module)
         self._lock = threading.RLock()
         self._restored = False
@@ -137,37 +144,39 @@ class Accelerated:
         """The torch head.
 
         Raises:
-            InputError: it is gone, or has been restored.
+            InputError: The original was restored, or the policy no longer exists.
         """
         module = self._weak_module()
         if module is None or self._restored:
-            raise InputError("the head is no longer accelerated: it was restored, or its policy is gone")
+            raise InputError(
+                "the head is no longer accelerated: it was restored, or its policy no longer exists"
+            )
         return module
 
     @property
     def head(self) -> ActionHead:
-        """saccade's head with the weights of now, to look inside:
+        """The head in saccade, with the current weights. Use it to look inside the head, as in
         ``handle.head.trace(handle.head.encode(features), ...)``.
 
         Raises:
-            InputError: as :attr:`module`, and as :func:`accelerate` where the weights have changed.
+            InputError: As :attr:`module`, and as :func:`accelerate` if the weights have changed.
         """
         return self._current(self.module)
 
     def refresh(self) -> None:
-        """Takes the weights anew. Only edits that the comparison cannot see need it.
+        """Copies the weights again. Needed only after a change that the comparison misses.
 
         Raises:
-            InputError, CheckpointError: as :func:`accelerate`.
+            InputError, CheckpointError: As :func:`accelerate`.
         """
         with self._lock:
             self._load(self.module)
 
     def restore(self) -> None:
-        """Puts the original `get_action` back and frees saccade's weights; the second time it does nothing.
+        """Puts the original `get_action` back and frees the weights in saccade. A second call does nothing.
 
         Raises:
-            InputError: something else has taken its place since.
+            InputError: `get_action` has been replaced by something else in the meantime.
         """
         module = self._weak_module()
         if module is None or self._restored:
@@ -175,7 +184,7 @@ class Accelerated:
         now = vars(module).get("get_action")
         if now is not self:
             raise InputError(
-                f"get_action was replaced since by {heads.describe(now)}: take that away first, then restore"
+                f"get_action was replaced since by {heads.describe(now)}: remove that first, then restore"
             )
         del module.__dict__["get_action"]
         with self._lock:
@@ -193,23 +202,23 @@ class Accelerated:
     def __call__(
         self, backbone_output: Any, action_input: Any, options: Mapping[str, Any] | None = None
     ) -> Any:
-        """As the head's own `get_action`.
+        """The replacement of the head's `get_action`.
 
         Args:
-            backbone_output: `backbone_features (batch, T_vl, context_dim)`, which is replaced by what the VL
-                self-attention makes of it, as the original does; heads with image and text blocks also take
+            backbone_output: `backbone_features (batch, T_vl, context_dim)`. As in the original, they are
+                replaced by the output of the VL self-attention. Heads with text and image blocks also need
                 `backbone_attention_mask` and `image_mask`, bool `(batch, T_vl)`.
-            action_input: `state (batch, state_history, state_dim)`, `embodiment_id (batch,)`; with real-time
-                chunking `action`, the previous chunk.
-            options: of real-time chunking, for heads that have it.
+            action_input: `state (batch, state_history, state_dim)` and `embodiment_id (batch,)`. With
+                real-time chunking also `action`, the previous chunk.
+            options: options of real-time chunking, for heads that support it.
 
         Returns:
-            The original's class with `action_pred (batch, action_horizon, action_dim)`, of the original's
-            dtype and device; from N1.6 on also `backbone_features` and `state_features`.
+            An instance of the original's class with `action_pred (batch, action_horizon, action_dim)` in the
+            original's dtype and on its device. From N1.6 on also `backbone_features` and `state_features`.
 
         Raises:
-            InputError: training mode, hooks, gradients asked for; as :meth:`ActionHead.encode` and
-                :meth:`ActionHead.sample`.
+            InputError: The head is in training mode or has hooks, or a gradient is requested. Also as
+                :meth:`saccade.ActionHead.encode` and :meth:`saccade.ActionHead.sample`.
         """
         import torch
 
@@ -221,7 +230,7 @@ class Accelerated:
         features, state = backbone_output["backbone_features"], action_input["state"]
         if torch.is_grad_enabled() and (features.requires_grad or state.requires_grad):
             raise InputError(
-                "backbone_features and state: expected tensors without gradient, since saccade computes "
+                "backbone_features and state: expected tensors without gradient, because saccade computes "
                 "none; call get_action under torch.no_grad(), detach() them, or restore() the original"
             )
         with torch.no_grad():
@@ -244,7 +253,7 @@ class Accelerated:
         return copy.deepcopy(self._original(), memo)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """So has a pickle: while the module is being read, this name is still its class's."""
+        """So has a pickle: during unpickling, the name refers to the method of the class."""
         return getattr, (self.module, "get_action")
 
     def __repr__(self) -> str:
@@ -258,19 +267,24 @@ class Accelerated:
         return MethodType(type(module).get_action, module)  # type: ignore[attr-defined]
 
     def _load(self, module: nn.Module) -> None:
-        """Takes the head's weights, and checks what is made of them against the original."""
+        """Copies the head's weights, and compares the result with the original."""
         import torch
 
-        self._head = None  # first, so that two copies are never in memory
+        if torch.get_default_device().type == "meta":
+            raise DtypeError(
+                "accelerate: expected a default device with memory, got meta; leave `with "
+                "torch.device('meta')`, or call torch.set_default_device('cpu')"
+            )
+        self._head = None  # so that there are never two copies in memory
         heads.check(module, self)
-        # Before the weights are read: what changes while they are is seen at the next call.
+        # Before the weights are read, so that the next call detects changes during the reading.
         self._watch = Watch(module)
         self._settings = heads.settings_of(module)
-        self._parts = list(module.named_modules())[1:]  # without itself, which must not be held
+        self._parts = list(module.named_modules())[1:]  # without the module itself, see _weak_module
         self._kinds: dict[tuple[Any, ...], Kinds] = {}
         head = ActionHead.from_tensors(tensors_of(module), config=heads.config_of(module), **self._options)
         parameters = list(module.parameters())
-        # Of mixed dtypes the original takes inputs under autocast only.
+        # With parameters of mixed dtypes, the original works under autocast only.
         mixed = len({parameter.dtype for parameter in parameters}) > 1
         like = parameters[0].detach()
         with torch.no_grad(), torch.autocast(like.device.type, torch.bfloat16, enabled=mixed):
@@ -278,12 +292,13 @@ class Accelerated:
         self._head = head
 
     def _current(self, module: nn.Module) -> ActionHead:
-        """The head with the weights of now."""
-        # In this order, so that a load in another thread can make this one look stale but not current.
+        """The head with the current weights."""
+        # In this order, so that a load in another thread can make a current head look stale, but not vice
+        # versa.
         watch, head = self._watch, self._head
         if head is None or watch is None or self._settings != heads.settings_of(module) or watch.changed():
             with self._lock:
-                # Unless another thread has loaded it in the meantime.
+                # Another thread may have loaded it in the meantime.
                 if self._head is None or self._head is head:
                     self._load(self.module)
                 head = self._head
@@ -291,8 +306,10 @@ class Accelerated:
         return head
 
     def _kinds_of(self, module: nn.Module, head: ActionHead, features: Tensor, state: Tensor) -> Kinds:
-        """What the original makes of inputs of these dtypes under the autocast of now. The first time it is
-        asked, on four tokens; saccade must agree."""
+        """The dtypes of the original's results for these inputs under the current autocast.
+
+        For a new combination the original runs on four tokens, and saccade must agree.
+        """
         import torch
 
         device = features.device.type
@@ -308,21 +325,19 @@ class Accelerated:
     def _chunk(
         self, action_input: Any, options: Mapping[str, Any] | None, dtype: torch.dtype
     ) -> dict[str, Any]:
-        """Arguments of `sample` for real-time chunking, as the original reads them."""
+        """The arguments of `sample` for real-time chunking, from those of the original."""
         if "action" not in action_input:
             return {}
         if not self._takes_options:
             if getattr(self.module, "inference_rtc_overlap_steps", None) is not None:
                 raise InputError(
-                    "action: this head's own real-time chunking is not known to saccade; leave action out, "
+                    "action: saccade does not support the real-time chunking of this head; leave action out, "
                     "or restore() the original"
                 )
             return {}
         missing = [name for name in CHUNKING_OPTIONS if name not in (options or {})]
         if options is None or missing:
-            raise InputError(
-                f"options: real-time chunking, which action asks for, needs {', '.join(missing)}"
-            )
+            raise InputError(f"options: real-time chunking (action is given) needs {', '.join(missing)}")
         horizon, overlap = int(options["action_horizon"]), int(options["rtc_overlap_steps"])
         if overlap == 0:
             return {}
@@ -334,7 +349,7 @@ class Accelerated:
 
 
 def draw(config: HeadConfig, batch: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The noise `(batch, action_horizon, encoder_action_dim)`, drawn as the original draws it."""
+    """The noise `(batch, action_horizon, encoder_action_dim)`, drawn as in the original."""
     import torch
 
     size = (batch, config.action_horizon, config.encoder_action_dim)
@@ -349,7 +364,7 @@ def run(
     noise: Tensor,
     chunk: Mapping[str, Any],
 ) -> tuple[Tensor, Tensor]:
-    """Actions and vision-language tokens in float32 on the CPU, from what the original takes."""
+    """Actions and vision-language tokens in float32 on the CPU, from the inputs of the original."""
     masks = {}
     if head.config.mask_mode != "none":
         masks = {
@@ -369,7 +384,7 @@ def run(
 
 
 def most_active(module: nn.Module, embodiment_ids: Sequence[int]) -> int:
-    """The embodiment whose decoders have the largest weights: one that was trained, if any was."""
+    """The embodiment whose decoders have the largest weights. It is a trained one, if there is any."""
     import torch
 
     decoders = [
@@ -385,12 +400,14 @@ def most_active(module: nn.Module, embodiment_ids: Sequence[int]) -> int:
 def check_inputs(
     module: nn.Module, head: ActionHead, features: Tensor, state: Tensor
 ) -> tuple[Features, Features]:
-    """A random observation of four tokens, in the dtypes and on the device of others."""
+    """A random observation of four tokens, with the dtypes and devices of `features` and `state`."""
     import torch
 
     config, generator = head.config, torch.Generator().manual_seed(0)
-    tokens = torch.randn(1, len(CHECK_IMAGE), config.context_dim, generator=generator)
-    rows = torch.randn(1, config.state_history, config.state_dim, generator=generator)
+    # On the CPU, whatever the default device is.
+    shape = (1, len(CHECK_IMAGE), config.context_dim)
+    tokens = torch.randn(shape, generator=generator, device="cpu")
+    rows = torch.randn(1, config.state_history, config.state_dim, generator=generator, device="cpu")
     backbone_output = Features(
         backbone_features=tokens.to(features),
         backbone_attention_mask=torch.tensor([CHECK_ATTENDED], device=features.device),
@@ -401,11 +418,16 @@ def check_inputs(
 
 
 def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features], rounded: bool) -> Kinds:
-    """Runs the original and saccade on the same inputs from the same state of torch's generator. `rounded`
-    says that one of the two rounds to 8 bits.
+    """Compares the original and saccade on the same inputs, from the same state of torch's generator.
+
+    Args:
+        module: the original.
+        head: its copy in saccade.
+        inputs: backbone output and action input.
+        rounded: whether one of the two rounds to 8 bits.
 
     Raises:
-        InputError: they do not agree: in the actions, or in how they draw noise.
+        InputError: the actions differ, or the original draws other random numbers.
     """
     import torch
 
@@ -423,7 +445,7 @@ def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features]
         ours_after = generator_state(device)
     if not torch.equal(theirs_after, ours_after):
         raise InputError(
-            f"{name} cannot be accelerated: its get_action draws other random numbers than the noise"
+            f"{name} cannot be accelerated: its get_action draws random numbers besides the noise"
         )
     theirs = result["action_pred"]
     ours, _ = run(module, head, backbone_output, action_input, noise, {})
@@ -435,14 +457,14 @@ def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features]
     error = float(norm(ours - expected)) if ours.shape == expected.shape else math.inf
     if not error <= allowed:
         raise InputError(
-            f"{name} cannot be accelerated: on random inputs its get_action gives other actions than "
-            f"saccade; the norm of the difference is {error:.1e}, expected at most {allowed:.1e}"
+            f"{name} cannot be accelerated: on random inputs its actions differ from those of saccade; "
+            f"expected a difference with norm at most {allowed:.1e}, got {error:.1e}"
         )
     return Kinds(dtype, theirs.dtype, type(result))
 
 
 def generator_state(device: torch.device) -> Tensor:
-    """The state of torch's generator of this device."""
+    """The state of torch's generator for this device."""
     import torch
 
     return torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()

@@ -1,7 +1,7 @@
-"""Finding a torch action head inside a policy, and what can be said of it without running it.
+"""Finds the torch action head in a policy, and checks it without running it.
 
-Heads are known by their structure, so that lerobot's and Isaac-GR00T's classes, and forks of them, need not
-be imported. All have `get_action(backbone_output, action_input)`; later ones take `options` as well.
+Heads are recognised by their structure, so that the classes of lerobot, Isaac-GR00T and forks need not be
+imported. All have `get_action(backbone_output, action_input)`. Later ones also accept `options`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from saccade.errors import InputError
 if TYPE_CHECKING:
     from torch import nn
 
-#: What a head is known by, beside `get_action`.
+#: Attributes of every head, in addition to `get_action`.
 PARTS = ("state_encoder", "action_encoder", "model", "num_inference_timesteps")
 
-#: Attributes under which objects that are no modules hold the module, or another such object.
+#: Attributes of other objects that contain the module, or another such object.
 HOLDERS = ("model", "policy", "_groot_model", "action_head")
 
-#: What of a head's config decides how it computes, in the released names. Some are class defaults.
+#: Keys of a head's config that determine how it computes, in the released names. Some are class defaults.
 CONFIG_KEYS = (
     "action_arm_dim",
     "action_claw_dim",
@@ -56,10 +56,10 @@ CONFIG_KEYS = (
 
 
 def find(policy: object) -> nn.Module:
-    """The one action head in `policy`.
+    """The action head in `policy`.
 
     Args:
-        policy: the head itself, a module that holds it, or an object that holds such a module.
+        policy: the head itself, a module that contains it, or an object that contains such a module.
 
     Raises:
         InputError: there is none, or more than one.
@@ -73,12 +73,13 @@ def find(policy: object) -> nn.Module:
         held = next((getattr(held, name) for name in HOLDERS if hasattr(held, name)), None)
     if not isinstance(held, nn.Module):
         raise InputError(
-            f"policy: expected a torch module, or an object that holds one as {', '.join(HOLDERS)}; got "
+            f"policy: expected a torch module, or an object that contains one as {', '.join(HOLDERS)}; got "
             f"{type(policy).__name__}"
         )
     if hasattr(held, "_orig_mod"):
         raise InputError(
-            f"policy: {type(held).__name__} is compiled by torch.compile: accelerate what it was made from"
+            f"policy: {type(held).__name__} is compiled by torch.compile: accelerate the module that was "
+            "compiled"
         )
     found: dict[str, nn.Module] = {
         name or "itself": module for name, module in held.named_modules() if is_head(module)
@@ -92,24 +93,24 @@ def find(policy: object) -> nn.Module:
 
 
 def is_head(module: nn.Module) -> bool:
-    """Whether `module` has the parts of an action head."""
+    """Whether a module has the attributes of an action head."""
     return callable(getattr(module, "get_action", None)) and all(hasattr(module, name) for name in PARTS)
 
 
 def takes_options(module: nn.Module) -> bool:
-    """Whether the head's own `get_action` takes options of real-time chunking."""
+    """Whether the head's `get_action` accepts options of real-time chunking."""
     return "options" in inspect.signature(type(module).get_action).parameters  # type: ignore[attr-defined]
 
 
 def check(module: nn.Module, stand_in: object = None) -> None:
-    """That the head computes by its parameters alone, as they are and where they are.
+    """Checks that nothing but the head's parameters determines what it computes.
 
     Args:
         module: the head.
-        stand_in: what may stand in the place of its `get_action`.
+        stand_in: an accepted replacement of its `get_action`.
 
     Raises:
-        InputError: with all that speaks against it.
+        InputError: the message lists every problem.
     """
     problems = [
         *in_structure(module, stand_in),
@@ -121,35 +122,35 @@ def check(module: nn.Module, stand_in: object = None) -> None:
 
 
 def in_structure(module: nn.Module, stand_in: object) -> Iterator[str]:
-    """What stands in a head's code in the way."""
+    """Problems in a head's code."""
     import torch
 
     replaced = vars(module).get("get_action")
-    # A copy of an accelerated head holds its class's own method as an attribute.
+    # A copy of an accelerated head has the method of its class as an attribute.
     own = isinstance(replaced, MethodType) and replaced.__func__ is type(module).get_action  # type: ignore[attr-defined]
     if replaced is not None and replaced is not stand_in and not own:
         yield (
-            f"its get_action has been replaced by {describe(replaced)} (TensorRT? torch.compile?): put the "
-            "class's own back"
+            f"its get_action has been replaced by {describe(replaced)} (TensorRT? torch.compile?): put back "
+            "that of the class"
         )
     allowed = {"self", "backbone_output", "action_input", "options"}
     parameters = set(inspect.signature(type(module).get_action).parameters)  # type: ignore[attr-defined]
     if not parameters <= allowed:
-        yield f"its get_action takes {', '.join(sorted(parameters - allowed))}, which no known head does"
+        yield f"its get_action takes {', '.join(sorted(parameters - allowed))}, unlike every known head"
     for name, part in module.named_modules():
         where = name or "the head"
         if isinstance(part, torch.jit.ScriptModule):
-            yield f"{where} is compiled by torch.jit: accelerate it before"
+            yield f"{where} is compiled by torch.jit: accelerate the head before compiling it"
         elif hasattr(part, "_orig_mod"):
-            yield f"{where} is compiled by torch.compile: accelerate what it was made from"
+            yield f"{where} is compiled by torch.compile: accelerate the module that was compiled"
     config = getattr(module, "config", None)
     horizons = [getattr(config, "action_horizon", None), getattr(module, "action_horizon", None)]
     if None in horizons or horizons[0] != horizons[1]:
-        yield f"config.action_horizon is {horizons[0]}, action_horizon is {horizons[1]}"
+        yield f"config.action_horizon is {horizons[0]}, but action_horizon is {horizons[1]}"
 
 
 def in_parameters(module: nn.Module) -> Iterator[str]:
-    """What stands in a head's weights in the way."""
+    """Problems in a head's weights."""
     import torch
 
     parameters = dict(module.named_parameters())
@@ -172,21 +173,21 @@ def in_parameters(module: nn.Module) -> Iterator[str]:
 
 
 def in_use(parts: list[tuple[str, nn.Module]]) -> Iterator[str]:
-    """What stands in the way now and can pass: training mode and hooks.
+    """Problems that may be temporary: training mode, hooks and replaced methods.
 
-    `parts` are a head and its modules, by name.
+    `parts` are a head and its submodules, by name.
     """
     replaced = [name or "the head" for name, part in parts if "forward" in vars(part)]
     if replaced:
         yield (
-            f"the forward of {shortened(replaced)} has been replaced: put the class's own back, or restore() "
-            "the original"
+            f"the forward of {shortened(replaced)} has been replaced: put back that of the class, or "
+            "restore() the original"
         )
     training = [name or "the head" for name, part in parts if part.training]
     if training:
         yield (
-            f"{shortened(training)}: in training mode, in which dropout acts; call eval(), or restore() the "
-            "original while you train"
+            f"{shortened(training)}: in training mode, which has dropout; call eval(), or restore() the "
+            "original during training"
         )
     hooked = [name or "the head" for name, part in parts if part._forward_hooks or part._forward_pre_hooks]
     if hooked:
@@ -194,13 +195,13 @@ def in_use(parts: list[tuple[str, nn.Module]]) -> Iterator[str]:
 
 
 def config_of(module: nn.Module) -> dict[str, Any]:
-    """The head's config in the released names, as `config.json` has it.
+    """The head's config in the released names, as in `config.json`.
 
     Raises:
-        InputError: something in it is not what JSON holds.
+        InputError: it contains values that JSON cannot represent.
     """
     config = module.config
-    # None and "" mean the same as an absent key: transformers' own default of model_type is "".
+    # None and "" mean the same as an absent key. The default of model_type in transformers is "".
     values = {key: getattr(config, key, None) for key in CONFIG_KEYS}
     values = {key: value for key, value in values.items() if value is not None and value != ""}
     try:
@@ -211,7 +212,7 @@ def config_of(module: nn.Module) -> dict[str, Any]:
 
 
 def settings_of(module: nn.Module) -> tuple[Any, ...]:
-    """The numbers in a head's attributes and config that decide how it computes and that a user may set."""
+    """Settings of a head that determine what it computes and that a user may change."""
     config = module.config
     own = [getattr(module, name, None) for name in ("action_horizon", "num_timestep_buckets")]
     names = ("action_horizon", "add_pos_embed", "use_alternate_vl_dit")
@@ -219,10 +220,10 @@ def settings_of(module: nn.Module) -> tuple[Any, ...]:
 
 
 def describe(function: object) -> str:
-    """A function's name for a message."""
+    """The name of a function for a message."""
     return getattr(function, "__qualname__", None) or type(function).__name__
 
 
 def shortened(names: list[str]) -> str:
-    """The first of some names."""
+    """The first three names, and how many more there are."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

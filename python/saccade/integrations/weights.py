@@ -1,4 +1,4 @@
-"""Whether a head's weights are still those that were taken from it."""
+"""Detects changes of a head's weights."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-#: Values of a tensor that are compared at each call, spread over its axes. Each is a read from memory.
+#: Number of values of a tensor that each call compares, spread over its axes. Each is a read from memory.
 SAMPLES = 8
 
-#: A first axis of at most this size is sampled whole: that of category-specific layers is embodiments.
+#: A first axis of at most this size is sampled completely. In category-specific layers, it is embodiments.
 WHOLE = 64
 
 
 class Watch:
-    """What a module's weights are when this is made, to be compared later.
+    """A record of a module's weights, with which they are compared later.
 
-    Seen are: submodules that were added or replaced, parameters and memory that were replaced (`.to()`,
-    `.data =`), every operation in place that torch counts (optimizers, `load_state_dict`, `copy_`), and, for
-    those that it does not count (through `.data` or NumPy), a change of any of a few values of each tensor.
-    Not seen are numbers of a layer that are no weights, such as the `eps` of a norm.
+    It detects submodules that were added or replaced, parameters and memory that were replaced (`.to()`,
+    `.data =`), and every in-place operation that torch counts (optimizers, `load_state_dict`, `copy_`). For
+    operations that torch does not count (through `.data` or NumPy), it detects a change of the few values of
+    each tensor that are sampled. It does not detect changes of other attributes, such as the `eps` of a norm.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -40,7 +40,7 @@ class Watch:
         self._values = self._sampled()
 
     def changed(self) -> bool:
-        """Whether anything that is seen has changed."""
+        """Whether a change is detected."""
         if any(len(children) != count for children, count in self._counts):
             return True
         for modules, name, child in self._children:
@@ -58,17 +58,17 @@ class Watch:
     def _sampled(self) -> bytes:
         import torch
 
-        # Bytes, so that a NaN equals itself.
+        # As bytes, so that NaN equals itself.
         return torch.cat(self._samples).float().cpu().numpy().tobytes()
 
 
 def version(parameter: Tensor) -> int:
-    """How often it was changed in place, as far as torch counts: not for tensors made in inference mode."""
+    """torch's count of in-place changes. Tensors created in inference mode have none."""
     return 0 if parameter.is_inference() else parameter._version
 
 
 def sample(parameter: Tensor) -> Tensor:
-    """A few values spread over its first and its last axis: a view."""
+    """A view of a few values spread over the first and the last axis."""
     tensor = parameter.detach()
     if tensor.ndim == 0 or tensor.numel() == 0:
         return tensor.reshape(-1)
@@ -77,12 +77,12 @@ def sample(parameter: Tensor) -> Tensor:
         index: list[slice | int] = [size // 2 for size in tensor.shape]
         index[0] = slice(None, None, -(-tensor.shape[0] // count))
         return tensor[tuple(index)]
-    # Along the diagonal: from one value to the next a share of the first axis, and one of the last.
+    # Along the diagonal: each step advances on the first axis and on the last.
     width = tensor.shape[-1] if tensor.ndim > 1 else 0
     step = max(1, tensor.numel() // count + width // count)
     return tensor.view(-1)[width // (2 * count) :: step]
 
 
 def tensors_of(module: nn.Module) -> dict[str, torch.Tensor]:
-    """The module's tensors on the CPU under their names; those that are there already are not copied."""
+    """The module's tensors by name, on the CPU. Those that are there already are not copied."""
     return {name: tensor.detach().cpu() for name, tensor in module.state_dict().items()}

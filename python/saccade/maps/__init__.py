@@ -1,4 +1,4 @@
-"""What the rows of the head look at: maps of attention over pictures and words, and how to draw them.
+"""Attention maps: what the rows of the head attend to, over pictures and words, and how to draw it.
 
 Where to read what: `layout` (where each camera's patches sit in T_vl), `view` (one observation, from the
 simulator or from a file of backbone features), `summary` (mass, entropy, overlap), `occlusion` (what moves

@@ -1,4 +1,4 @@
-"""Where things sit in T_vl: each camera's patches, words, special tokens, padding."""
+"""The layout of T_vl: positions of each camera's patches, of words, special tokens and padding."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from saccade.errors import InputError, ShapeError
 from saccade.sim.backbone import BackboneConfig
 from saccade.sim.instructions import PAD, UNKNOWN, words
 
-#: Kinds of tokens that are no image patch, in the order in which they are listed.
+#: Kinds of tokens that are not image patches, in the order in which they are listed.
 OTHER_KINDS = ("text", "special", "pad")
 
-# GR00T N1.5 with Qwen3's tokenizer: from this number on all tokens are special ones.
+# GR00T N1.5 with Qwen3's tokenizer: tokens with this id or a larger one are special.
 FIRST_SPECIAL_ID = 151643
 PADDING_ID = 151643
 IMAGE_TOKEN_INDEX = 151669
@@ -40,7 +40,7 @@ class Camera:
     """The patches of one picture: consecutive positions, row by row from the top left.
 
     Attributes:
-        name: How the camera is called.
+        name: Of the camera.
         start: Position of its first patch.
         rows, columns: Its grid.
     """
@@ -52,19 +52,19 @@ class Camera:
 
     @property
     def positions(self) -> slice:
-        """Where its patches lie in T_vl."""
+        """Positions of its patches in T_vl."""
         return slice(self.start, self.start + self.rows * self.columns)
 
 
 @dataclass(frozen=True)
 class Token:
-    """A token that is no image patch.
+    """A token that is not an image patch.
 
     Attributes:
-        position: Where it lies in T_vl.
+        position: In T_vl.
         kind: One of `OTHER_KINDS`. Special tokens (brackets around pictures, registers, turns of a chat)
-            often take attention that has no better place to go, so their mass is kept apart.
-        name: What is shown for it.
+            are often attention sinks, so their mass is reported separately.
+        name: Its text.
     """
 
     position: int
@@ -74,7 +74,7 @@ class Token:
 
 @dataclass(frozen=True)
 class Layout:
-    """What each of the `num_tokens` positions of T_vl is.
+    """What is at each of the `num_tokens` positions of T_vl.
 
     Raises:
         ShapeError: a position is described twice or not at all, or two cameras have one name.
@@ -115,7 +115,7 @@ class Layout:
             )
 
     def parts(self) -> dict[str, npt.NDArray[np.int64]]:
-        """Positions by camera name, then by kind; what there is none of is left out."""
+        """Positions by camera name, then by kind; empty parts are left out."""
         parts = {camera.name: np.arange(self.num_tokens)[camera.positions] for camera in self.cameras}
         for kind in OTHER_KINDS:
             positions = [token.position for token in self.tokens if token.kind == kind]
@@ -139,7 +139,7 @@ class Layout:
 
 
 def parse_grid(text: str) -> tuple[int, int]:
-    """`"16x16"` to rows and columns; one number is a square of so many patches.
+    """`"16x16"` to rows and columns; a single number is the patches of a square picture.
 
     Raises:
         InputError: it is neither.
@@ -159,25 +159,25 @@ def parse_grid(text: str) -> tuple[int, int]:
 
 
 def square(patches: int, what: str) -> tuple[int, int]:
-    """The square grid of so many patches; raises `InputError` if there is none."""
+    """The square grid with that number of patches; raises `InputError` if there is none."""
     side = math.isqrt(patches)
     if side * side != patches:
-        raise InputError(f"{what}: {patches} image tokens are no square; give the grid as ROWSxCOLUMNS")
+        raise InputError(f"{what}: {patches} image tokens are not a square; give the grid as ROWSxCOLUMNS")
     return side, side
 
 
 def parse_layout(text: str, num_tokens: int, names: Sequence[str] | None = None) -> Layout:
     """Reads a layout written by hand.
 
-    The grammar: parts in the order of their positions, with commas between them. A part is `KIND:SIZE` or
+    The grammar: parts in the order of their positions, separated by commas. A part is `KIND:SIZE` or
     `KIND:SIZE=NAME`. KIND is `image`, `text`, `special` or `pad`. SIZE is `ROWSxCOLUMNS` or a square number
-    for `image` (one camera), the number of tokens for the others; one of those may have `*`, which is what is
-    left of T_vl. NAME is the camera's name, or that of the tokens (numbered if there are several).
+    for `image` (one camera), the number of tokens for the others; one of those may have `*`, for all
+    remaining positions. NAME is the name of the camera or of the tokens (numbered if there are several).
 
     Args:
         text: for instance `"text:14,image:16x16=left,special:1=</img>,text:*"`.
         num_tokens: T_vl.
-        names: of all tokens, instead of those made up here.
+        names: of all tokens, instead of generated ones.
 
     Raises:
         InputError: the text does not follow the grammar.
@@ -213,10 +213,10 @@ def parse_layout(text: str, num_tokens: int, names: Sequence[str] | None = None)
 
 
 def _parse_part(part: str) -> tuple[str, tuple[int, int] | None, str | None]:
-    """Kind, grid (`(1, size)` for what is no image, None for `*`) and name."""
+    """Kind, grid (`(1, size)` for what is not an image, None for `*`) and name."""
     found = re.fullmatch(r"\s*(\w+)\s*:\s*([\dx*]+)\s*(?:=\s*(.+?)\s*)?", part)
     if found is None:
-        raise InputError(f"layout: {part!r} is not understood, expected {GRAMMAR}")
+        raise InputError(f"layout: {part!r} cannot be read, expected {GRAMMAR}")
     kind, size, name = found.groups()
     if kind not in ("image", *OTHER_KINDS):
         raise InputError(f"layout: unknown kind {kind!r}, expected image, {', '.join(OTHER_KINDS)}")
@@ -225,7 +225,7 @@ def _parse_part(part: str) -> tuple[str, tuple[int, int] | None, str | None]:
     if size == "*":
         return kind, None, name
     if not size.isdecimal():
-        raise InputError(f"layout: {part!r} is not understood, expected {GRAMMAR}")
+        raise InputError(f"layout: {part!r} cannot be read, expected {GRAMMAR}")
     return kind, (1, int(size)), name
 
 
@@ -241,10 +241,10 @@ def from_input_ids(
 
     Args:
         input_ids: `(T_vl,)`.
-        image_token_index: the number of the token that stands for one patch.
+        image_token_index: id of the token that stands for one patch.
         grid: rows and columns of a picture.
-        names: strings of all tokens; otherwise numbers are shown.
-        attention_mask: `(T_vl,)`, False at padding; otherwise a first run of `PADDING_ID` is padding.
+        names: strings of all tokens; default: their ids.
+        attention_mask: `(T_vl,)`, False at padding; default: a leading run of `PADDING_ID` is padding.
 
     Raises:
         InputError: there is no image token, or a run does not split into pictures.
@@ -255,8 +255,8 @@ def from_input_ids(
     image = (input_ids == image_token_index) & ~padding
     if not image.any():
         raise InputError(
-            f"input_ids: no image token {image_token_index} among {len(input_ids)}; --image-token-index "
-            "names another, --layout text:* says that there are no pictures"
+            f"input_ids: no image token {image_token_index} among {len(input_ids)}; choose another with "
+            "--image-token-index, or --layout text:* if there are no pictures"
         )
     return _from_mask(
         image,
@@ -275,7 +275,7 @@ def from_image_mask(
     names: Sequence[str] | None = None,
     attention_mask: npt.NDArray[np.bool_] | None = None,
 ) -> Layout:
-    """The layout that a `Context`'s image mask shows.
+    """The layout given by the image mask of a `Context`.
 
     Args:
         image_mask: `(T_vl,)`, True at image tokens.
@@ -291,7 +291,7 @@ def from_image_mask(
     image = image_mask & ~padding
     if not image.any():
         raise InputError(
-            f"image_mask: no image token among {length}; --layout text:* says that there are no pictures"
+            f"image_mask: no image token among {length}; if there are no pictures: --layout text:*"
         )
     if names is None:
         special, names = np.zeros(length, dtype=np.bool_), [f"text {place}" for place in range(length)]
@@ -317,7 +317,7 @@ def _from_mask(
         if length % (rows * columns):
             raise InputError(
                 f"{what}: a run of {length} image tokens at position {start}, expected a multiple of "
-                f"{rows * columns} ({rows} x {columns} a picture); was the prompt cut off?"
+                f"{rows * columns} ({rows} x {columns} per picture); the prompt may have been cut off"
             )
         for first in range(start, stop, rows * columns):
             cameras.append(Camera(f"camera {len(cameras) + 1}", first, rows, columns))
@@ -345,7 +345,7 @@ def of_policy(
 
 
 def readable(name: str) -> str:
-    """A token's string without the marks that byte-level tokenizers put for spaces and line ends.
+    """A token's string without the characters that byte-level tokenizers use for spaces and line ends.
 
     Example:
         >>> readable("\\u0120puck"), readable("\\u010a")

@@ -1,8 +1,7 @@
-"""What moves the actions: take one patch away, sample again from the same noise, measure the change.
+"""Occlusion: remove one patch, sample again from the same noise, measure the change of the actions.
 
-A map of attention says where a row reads; it does not say what it reads there, since after the VL
-self-attention every position holds something of all others. Taking the patch away answers the other question,
-what the actions depend on.
+An attention map shows which positions a row reads, but not what it reads there: after the VL self-attention
+every position contains information of all others. Occlusion shows what the actions depend on.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
 
 BATCH = 16  # one observation of N1.5 holds 32 MB of keys and values
-MAX_CELLS = 8  # along each side of a picture, unless asked for: each costs a pass through the head
-NOISES = 8  # draws that `other_noise` is the mean of
+MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the head
+NOISES = 8  # draws that `other_noise` is computed from
 
 
 @dataclass(frozen=True)
 class Place:
-    """Patches of one camera that are taken away together."""
+    """Patches of one camera that are removed together."""
 
     camera: Camera
     rows: slice
@@ -40,22 +39,22 @@ class Place:
 
 
 class Occluder(Protocol):
-    """Samples chunks with patches taken away."""
+    """Samples chunks with patches removed."""
 
     method: str  # one sentence: how
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
-        """One chunk for each place, `(places, horizon, action_dim)`, normalised; None takes nothing away."""
+        """One chunk for each place, `(places, horizon, action_dim)`, normalised; None removes nothing."""
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """What taking away each patch changes.
+    """How the actions change without each patch.
 
     Attributes:
-        method: How patches were taken away.
-        cell: Patches along each side of what was taken away at once.
-        change: By camera, `(rows, columns)`: mean |change| of the chunk's normalised actions, the same noise.
+        method: How patches were removed.
+        cell: Patches along each side of what was removed at once.
+        change: By camera, `(rows, columns)`: mean |change| of the normalised actions, from equal noise.
         other_noise: Mean |change| between chunks of the whole observation from different noise, to compare.
     """
 
@@ -132,8 +131,12 @@ class DroppedPositions:
 
 
 def cell_for(layout: Layout, cell: int | None) -> int:
-    """Patches along each side of what is taken away at once: as asked for, or so many that no picture has
-    more than `MAX_CELLS` x `MAX_CELLS` of them.
+    """Patches along each side of what is removed at once.
+
+    Args:
+        layout: Has the cameras.
+        cell: The number given by the user; None chooses the smallest with which no picture has more than
+            `MAX_CELLS` x `MAX_CELLS` cells.
 
     Raises:
         InputError: it is below 1.
@@ -147,7 +150,7 @@ def cell_for(layout: Layout, cell: int | None) -> int:
 
 
 def places_of(layout: Layout, cell: int) -> list[Place]:
-    """All that is taken away, one after the other; at the far edges a place may be smaller."""
+    """All places in turn; at the right and lower edges a place may be smaller."""
     return [
         Place(
             camera,
@@ -170,16 +173,16 @@ def measure(
     batch: int = BATCH,
     on_done: Callable[[int], None] = lambda done: None,
 ) -> Occlusion:
-    """Takes away every patch of every camera in turn.
+    """Removes every patch of every camera in turn.
 
     Args:
         head: computes the chunks.
         layout: where the patches are.
-        occluder: takes them away.
-        whole: so many chunks of the whole observation from different noise, `(count, horizon, action_dim)`.
-        cell: patches along each side of what is taken away at once.
+        occluder: removes them.
+        whole: from a number of draws to chunks of the whole observation, `(draws, horizon, action_dim)`.
+        cell: patches along each side of what is removed at once.
         batch: places at once.
-        on_done: told how many places are done.
+        on_done: called with the number of places done.
     """
     places = places_of(layout, cell)
     untouched = occluder(head, [None])[0]

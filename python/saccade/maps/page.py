@@ -1,4 +1,4 @@
-"""The HTML page: one file that holds all it needs; a person picks block, step, head, token and camera."""
+"""The HTML page: one file that needs no network, to choose block, step, head, token and camera."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import numpy.typing as npt
 from PIL import Image
 
 from saccade._files import write_atomically
+from saccade.maps.notes import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES, NO_PICTURES
 from saccade.maps.record import MEAN, Maps
-from saccade.maps.sheet import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES
 
 TEMPLATE = "page.html.j2"
-LEVELS = 65535  # probabilities are stored as shares of their row's largest, in 16 bits
+LEVELS = 65535  # probabilities are stored relative to the largest of their row, in 16 bits
 
 
 def write_page(maps: Maps, path: Path) -> None:
@@ -39,24 +39,24 @@ def render_page(maps: Maps) -> str:
 
 
 def notes(maps: Maps) -> list[str]:
-    """What is not there and why."""
+    """Notes on what is missing, and why."""
     found = []
     if not maps.num_future_tokens:
         found.append(NO_FUTURE)
     if not maps.view.layout.cameras:
         found.append(NO_IMAGES)
     elif not maps.view.images:
-        found.append("The file has no pictures: maps are drawn on white.")
+        found.append(NO_PICTURES)
     if not maps.selection.shown_heads:
         found.append(
-            f"This page has only the mean over {len(maps.selection.heads)} heads; --heads N,... shows them "
-            "one by one."
+            f"This page shows only the mean over {len(maps.selection.heads)} heads; choose single heads with "
+            "--heads."
         )
     return found
 
 
 def page_data(maps: Maps) -> dict[str, Any]:
-    """What the page's script works with."""
+    """The data of the page's script."""
     selection = maps.selection
     return {
         "checkpoint": maps.checkpoint,
@@ -106,7 +106,7 @@ def _base64(array: npt.NDArray[Any]) -> str:
 
 
 def _data_url(picture: npt.NDArray[np.uint8]) -> str:
-    """The picture as a PNG inside an address."""
+    """The picture as a PNG in a data URL."""
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

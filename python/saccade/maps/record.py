@@ -1,4 +1,4 @@
-"""All that is known about one observation: traces, summaries, occlusion; what the sheet and the page show."""
+"""The maps of one observation: traces, summaries and occlusion, as the sheet and the page show them."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ Indices = npt.NDArray[np.int64]
 Attention = Mapping[tuple[int, int], Float32Array]
 
 CAVEAT = (
-    "A bright patch is a position that is read, not a cause. After the backbone and the VL self-attention a "
-    "position holds more than its patch, so what is read there need not come from that patch of the picture."
+    "A bright patch shows where a row reads, not what causes an action. After the backbone and the VL "
+    "self-attention a position contains more than its patch, so what is read there need not come from that "
+    "patch of the picture."
 )
-BESIDE = "The occlusion map beside it shows what the actions depend on."
+OCCLUSION = "The occlusion map shows what the actions depend on."
 MEAN = "mean"
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which maps are wanted.
+    """Which maps are computed and shown.
 
     Attributes:
         blocks, steps: Of the DiT and of the Euler loop.
-        heads: Those that the mean is taken over.
-        shown_heads: Those of them that are shown one by one as well.
+        heads: Heads over which the mean is taken.
+        shown_heads: Those of them that are also shown one by one.
     """
 
     blocks: tuple[int, ...]
@@ -51,17 +52,16 @@ class Selection:
 
 @dataclass(frozen=True)
 class Maps:
-    """One observation and what the head's rows look at.
+    """One observation and what the rows of the head attend to.
 
     Attributes:
         checkpoint: Where the head was loaded from, and its hash.
         config: Of the head.
         view: The observation.
         selection: Which maps.
-        rows: Where the groups lie; a group without rows is left out.
+        rows: Slices of the groups; a group without rows is left out.
         attention: By step and block, `(heads, rows, keys)`, heads in the selection's order.
-        redrawn: The same with future tokens drawn at random, only the future rows; None without future
-            tokens.
+        redrawn: The same with random future tokens, only of the future rows; None without future tokens.
         occlusion: None if there are no image tokens.
     """
 
@@ -76,8 +76,8 @@ class Maps:
 
     @property
     def caveat(self) -> str:
-        """What has to be said with every map."""
-        return CAVEAT if self.occlusion is None else f"{CAVEAT} {BESIDE}"
+        """What a reader of any map must know."""
+        return CAVEAT if self.occlusion is None else f"{CAVEAT} {OCCLUSION}"
 
     @property
     def num_future_tokens(self) -> int:
@@ -105,13 +105,13 @@ class Maps:
         return mean
 
     def parts(self, block: int) -> dict[str, Indices]:
-        """The block's keys by what they are: cameras and kinds of tokens, or groups of rows."""
+        """The keys of a block by camera and kind of token, or by group of rows."""
         return self.view.layout.parts() if self.reads_vl(block) else self._row_parts()
 
     def agreement(self, keys: Float32Array) -> float | None:
         """Spearman's rank correlation over all patches between a map `(T_vl,)` and the occlusion map.
 
-        None where there are no image tokens, or where one of the two is the same everywhere.
+        None without image tokens, or if one of the two maps is constant.
         """
         if self.occlusion is None:
             return None
@@ -123,7 +123,7 @@ class Maps:
         return float(np.corrcoef(rankdata(read), rankdata(change))[0, 1])
 
     def agreements(self) -> list[dict[str, Any]]:
-        """`agreement` of each group's mean map over heads and Euler steps, in the blocks that read vision."""
+        """`agreement` of the mean map of each group over heads and Euler steps, in cross-attention blocks."""
         return [
             {
                 "block": block,
@@ -141,8 +141,8 @@ class Maps:
     def summaries(self) -> list[dict[str, Any]]:
         """One entry for each step, block, group and head, the mean map of all heads first.
 
-        The entry of the mean map has `per_head`: entropy and overlap of each head's own maps, averaged over
-        the heads. Heads that look at different places make a wide mean map though each of them is narrow.
+        The entry of the mean map has `per_head`: entropy and overlap of the maps of each head, averaged over
+        the heads. If heads attend to different keys, the mean map is wide although each head's is narrow.
         """
         rng = np.random.default_rng(0)
         entries = []
@@ -194,9 +194,8 @@ class Maps:
 
 BASELINES = {
     "identical": "tokens with the same map: divergence 0, cosine 1, 1 distinct map",
-    "shuffled": "each token's map shuffled on its own among the keys of one kind: the same spread, unrelated "
-    "places",
-    "redrawn": "future tokens replaced by random directions of the learned tokens' lengths",
+    "shuffled": "each map shuffled by itself among the keys of one kind: equal entropy, unrelated keys",
+    "redrawn": "future tokens replaced by random directions with the lengths of the learned tokens",
 }
 
 
@@ -205,7 +204,7 @@ def _asdict(found: Overlap | None) -> dict[str, float] | None:
 
 
 def _per_head(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the heads of what each head's own maps give."""
+    """Means over the heads of entropy and overlap of their maps."""
     means: dict[str, Any] = {"entropy": float(np.mean([entry["entropy"]["mean"] for entry in entries]))}
     for name in ("overlap", "shuffled", "redrawn"):
         values = [entry[name] for entry in entries if entry.get(name) is not None]
@@ -240,7 +239,7 @@ def choose(name: str, given: Sequence[int] | None, count: int) -> tuple[int, ...
 def look(
     head: ActionHead, view: View, selection: Selection
 ) -> tuple[dict[str, slice], dict[tuple[int, int], Float32Array]]:
-    """Where the groups of rows lie, and the chosen maps, for the learned future tokens."""
+    """The slices of the groups of rows, and the chosen maps with the learned future tokens."""
     return _trace(head, view, selection, None)
 
 

@@ -9,52 +9,32 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
+from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from PIL import Image
 
 from saccade._files import write_atomically
+from saccade.maps.drawing import CAMERA_COLOURS, CHANGE, HEAT, MATRIX_COLOURS, borders, ranges, show
 from saccade.maps.layout import Camera
+from saccade.maps.notes import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES, NO_PICTURES
 from saccade.maps.record import BASELINES, MEAN, Maps
 
 Float32Array = npt.NDArray[np.float32]
-UInt8Array = npt.NDArray[np.uint8]
 
 # All lengths are in inches.
 WIDTH, MARGIN, GAP = 13.0, 0.3, 0.06
 INNER = WIDTH - 2 * MARGIN
 TITLE_HEIGHT = 0.36
 BAR_WIDTH = 0.75  # a colour bar with its numbers
-MASS_WIDTH = 2.3  # the bars that say where attention goes
+MASS_WIDTH = 2.3  # the bars of how attention divides
 DOTS_PER_INCH = 100
-COLOUR_STEP = 5  # of 255: not to be seen, and the file of a sheet is two thirds as large
-
-GROUP_COLOURS = {"state": "#c46210", "future": "#10739e", "action": "#6b3fa0"}
-KIND_COLOURS = {"text": "#5b7083", "special": "#b3261e", "pad": "#c9ced3"}
-CAMERA_COLOURS = ("#1b7837", "#5aae61", "#a6dba0", "#00696b", "#3ba5a7", "#9bd5d6")
-MATRIX_COLOURS = "inferno"
+COLOUR_STEP = 5  # of 255: invisible, and makes the file of a sheet a third smaller
 
 MAX_TOKENS_DRAWN = 32  # one by one
 MAX_NAMED_TOKENS = 60
-NO_FUTURE = "This checkpoint has no future tokens (N = 0): maps of state and action rows only."
-NO_IMAGES = "This layout has no image tokens: nothing to lay on a picture."
-
-
-def see_through(name: str, least: float, name_of_map: str) -> ListedColormap:
-    """A colour map from fully transparent to nearly opaque, for a grey picture below it."""
-    colours = colormaps[name](np.linspace(least, 1.0, 256))
-    colours[:, 3] = 0.88 * np.linspace(0.0, 1.0, 256) ** 0.8
-    return ListedColormap(colours, name=name_of_map)
-
-
-# Two colours for two questions: what is read, and what the actions depend on.
-HEAT = see_through("YlOrRd", 0.25, "saccade-attention")
-CHANGE = see_through("GnBu", 0.35, "saccade-occlusion")
 
 
 def write_sheet(maps: Maps, path: Path) -> None:
@@ -70,7 +50,7 @@ def write_sheet(maps: Maps, path: Path) -> None:
 
 
 class Sheet:
-    """Draws one section under the other; what does not apply is left out, and the header says why.
+    """Draws the sections from top to bottom. Sections that do not apply are left out; the header says why.
 
     Args:
         maps: what to draw.
@@ -82,7 +62,7 @@ class Sheet:
         self._drawn: list[tuple[Axes, tuple[float, float, float, float]]] = []
         self._figure = Figure(figsize=(WIDTH, 1.0))
         self._texts: list[tuple[float, float, str, dict[str, Any]]] = []
-        self._top = 0.15  # where the next section begins
+        self._top = 0.15  # of the next section
 
     def draw(self) -> Figure:
         """The whole sheet."""
@@ -104,7 +84,7 @@ class Sheet:
         return self._placed(self._top + 0.1)
 
     def _placed(self, height: float) -> Figure:
-        """Only now is the height known by which places are divided."""
+        """Sets all positions, which are fractions of a height that is known only now."""
         self._figure.set_size_inches(WIDTH, height)
         for axes, (left, top, wide, high) in self._drawn:
             axes.set_position((left / WIDTH, 1 - (top + high) / height, wide / WIDTH, high / height))
@@ -121,7 +101,7 @@ class Sheet:
         self._texts.append((left, top, text, style))
 
     def _title(self, text: str, *, note: str = "") -> None:
-        """Begins a section."""
+        """Starts a section."""
         self._top += 0.18
         self._text(MARGIN, self._top, text, fontsize=10.5, weight="bold")
         self._top += 0.21
@@ -135,7 +115,7 @@ class Sheet:
         self._top += 0.155 * len(lines) + 0.02
 
     def header(self) -> None:
-        """What was looked at, and the caveat."""
+        """The observation, the checkpoint and the caveat."""
         maps, selection = self.maps, self.maps.selection
         self._text(MARGIN, self._top, maps.view.title, fontsize=13, weight="bold")
         self._top += 0.3
@@ -149,13 +129,13 @@ class Sheet:
         if not self.cameras:
             self._note(NO_IMAGES, weight="bold", color="black")
         elif not maps.view.images:
-            self._note("The file has no pictures: maps are drawn on white.", weight="bold", color="black")
+            self._note(NO_PICTURES, weight="bold", color="black")
         self._note(maps.caveat, fontsize=8.5, style="italic", color="#8c1d18")
 
     def pictures(self) -> None:
-        """The pictures as they are, and beside them what taking away each patch changes."""
+        """The pictures, and next to them how the actions change without each patch."""
         occlusion = self.maps.occlusion
-        assert occlusion is not None  # it is left out only where there are no cameras
+        assert occlusion is not None  # it is None only without cameras
         patches = "one patch" if occlusion.cell == 1 else f"{occlusion.cell} x {occlusion.cell} patches"
         self._title(
             "What the cameras see, and what the actions depend on",
@@ -171,11 +151,11 @@ class Sheet:
         self._top += high
 
     def camera_maps(self, blocks: Sequence[int]) -> None:
-        """One line a block: each group's mean map on each camera, and where all its attention goes."""
+        """One line per block: each group's mean map on each camera, and how its attention divides."""
         self._title(
-            "Mean maps by group of rows, in the blocks that read vision and language",
-            note="Red: probability, on one scale in each block. r: rank correlation with the occlusion map "
-            "over all patches. Right: how a row's attention divides, in %.",
+            "Mean maps by group of rows, in the cross-attention blocks",
+            note="Red: probability, with one scale per block. r: rank correlation with the occlusion map "
+            "over all patches. Right: how the attention of a row divides, in %.",
         )
         groups = len(self.maps.rows)
         high = self._height_for(INNER - BAR_WIDTH - MASS_WIDTH - 0.45 - 0.15 * groups, groups, 1.9)
@@ -201,14 +181,14 @@ class Sheet:
             self._top += high + 0.05
 
     def _masses(self, axes: Axes, block: int) -> None:
-        """Stacked bars of a group's attention by camera and kind of token."""
+        """Stacked bars: the attention of each group by camera and kind of token."""
         mean, parts, groups = self.maps.mean(block), self.maps.parts(block), list(self.maps.rows)
         colours = dict(zip((camera.name for camera in self.cameras), CAMERA_COLOURS * 9, strict=False))
         colours |= KIND_COLOURS
         left = np.zeros(len(groups))
         for name, positions in parts.items():
             wide = np.array([mean[rows][:, positions].sum(axis=1).mean() for rows in self.maps.rows.values()])
-            ink = "white" if np.dot(to_rgb(colours[name]), (0.3, 0.6, 0.1)) < 0.6 else "black"  # as eyes see
+            ink = "white" if np.dot(to_rgb(colours[name]), (0.3, 0.6, 0.1)) < 0.6 else "black"  # brightness
             axes.barh(groups, wide, left=left, color=colours[name], label=name, height=0.8)
             for row, (start, width) in enumerate(zip(left, wide, strict=True)):
                 if width > 0.09:
@@ -224,7 +204,7 @@ class Sheet:
         axes.legend(ncols=3, fontsize=7, frameon=False, handlelength=0.8, columnspacing=0.9, **place)
 
     def named_tokens(self, blocks: Sequence[int]) -> None:
-        """Probability on each token that is no patch, by block and group."""
+        """Probability on each token that is not an image patch, by block and group."""
         tokens: Sequence[Any] = self.maps.view.layout.tokens
         lines = [(block, group) for block in blocks for group in self.maps.rows]
         positions = [token.position for token in tokens]
@@ -234,13 +214,12 @@ class Sheet:
         left_out = ""
         if len(tokens) > MAX_NAMED_TOKENS:
             kept = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:MAX_NAMED_TOKENS])
-            left_out = f"; the {MAX_NAMED_TOKENS} of {len(tokens)} that are read most"
+            left_out = f"; the {MAX_NAMED_TOKENS} of {len(tokens)} with the most attention"
             values, tokens = values[:, kept], [tokens[index] for index in kept]
         self._title(
             f"Words, special tokens (red) and padding (grey): attention in %{left_out}",
-            note="An even share would be "
-            f"{100 / self.maps.view.layout.num_tokens:.2g} %. Special tokens often take attention that has "
-            "no better place to go (sinks).",
+            note="With uniform attention each token has "
+            f"{100 / self.maps.view.layout.num_tokens:.2g} %. Special tokens are often attention sinks.",
         )
         wide, high = INNER - 1.1, 0.19 * len(lines)
         axes = self._axes(MARGIN + 1.1, self._top, min(wide, 0.95 * len(tokens)), high)
@@ -265,15 +244,15 @@ class Sheet:
         self._top += high + (0.1 + 0.085 * min(longest, 24) if upright else 0.25)
 
     def token_maps(self, block: int) -> None:
-        """Every future token's own map on all cameras, on one scale."""
+        """The map of every future token on all cameras, with one scale."""
         mean = self.maps.mean(block)[self.maps.rows["future"]][:MAX_TOKENS_DRAWN]
         shown = [self._on_cameras(one) for one in mean]
         most = max(float(heat.max()) for heats in shown for heat in heats.values())
         first = "" if len(mean) == self.maps.num_future_tokens else f", the first {len(mean)}"
         self._title(
-            f"Future tokens one by one{first}: block {block}",
-            note=f"Cameras {', '.join(camera.name for camera in self.cameras)}. One scale, up to probability "
-            f"{most:.2g}.",
+            f"Single future tokens{first}: block {block}",
+            note=f"Cameras {', '.join(camera.name for camera in self.cameras)}. All maps have one scale, "
+            f"up to probability {most:.2g}.",
         )
         across = {1: 16, 2: 8, 3: 8}.get(len(self.cameras), 4)
         apart = 0.1
@@ -289,10 +268,10 @@ class Sheet:
         self._top += high
 
     def matrices(self, blocks: Sequence[int], what: str, *, across: int, height: float) -> None:
-        """Whole matrices: all rows over all keys."""
+        """Whole matrices: all rows by all keys."""
         self._title(
-            f"All rows (down) over all keys (across): blocks that read the {what}",
-            note="Probability, on one scale in each block.",
+            f"All rows (vertical) by all keys (horizontal): blocks that read the {what}",
+            note="Probability, with one scale per block.",
         )
         pitch = INNER / across
         for place, block in enumerate(blocks):
@@ -305,15 +284,15 @@ class Sheet:
             drawn = axes.imshow(mean, aspect="auto", cmap=MATRIX_COLOURS, vmin=0)
             axes.set_title(f"block {block}", fontsize=9, pad=3)
             keys = self._runs() if self.maps.reads_vl(block) else list(self.maps.rows.items())
-            _borders(axes, list(self.maps.rows.items()), down=True)
-            _borders(axes, keys, down=False)
+            borders(axes, list(self.maps.rows.items()), down=True)
+            borders(axes, keys, down=False)
             bar = self._axes(left + pitch - 0.9, self._top, 0.1, height)
             self._figure.colorbar(drawn, cax=bar)
             bar.tick_params(labelsize=6.5)
         self._top += height + 0.25
 
     def _runs(self) -> list[tuple[str, slice]]:
-        """Cameras, and runs of other tokens, by what stands under them in a matrix."""
+        """Cameras and runs of other tokens, by their label below a matrix."""
         runs = [(camera.name, camera.positions) for camera in self.cameras]
         start: int | None = None
         positions = {token.position for token in self.maps.view.layout.tokens}
@@ -326,14 +305,14 @@ class Sheet:
         return runs
 
     def numbers(self) -> None:
-        """Entropy and overlap by block, with what identical, random and unrelated tokens would give."""
+        """Entropy and overlap by block, compared with identical, random and unrelated tokens."""
         maps = self.maps
         summaries = [entry for entry in maps.summaries if entry["head"] == MEAN]
         blocks = maps.selection.blocks
         several = maps.num_future_tokens > 1
         notes = [f"{name}: {meaning}." for name, meaning in BASELINES.items()] if several else []
         self._title(
-            f"Do the rows look at different places? Means over Euler steps {ranges(maps.selection.steps)}",
+            f"Do the rows attend to different keys? Means over Euler steps {ranges(maps.selection.steps)}",
             note=" ".join(notes),
         )
         self._top += 0.22
@@ -368,8 +347,8 @@ class Sheet:
             spread = np.exp(means(group, "per_head", "entropy")).tolist()
             line(panels[0], spread, "o-", GROUP_COLOURS[group], group)
         keys = [sum(map(len, maps.parts(block).values())) for block in blocks]
-        panels[0].plot(places, keys, "_", color="#888888", markersize=14, label="all keys alike")
-        panels[0].set_title("keys that a row looks at in one head: exp(entropy)", fontsize=9)
+        panels[0].plot(places, keys, "_", color="#888888", markersize=14, label="uniform attention")
+        panels[0].set_title("keys that a row attends to in one head: exp(entropy)", fontsize=9)
         panels[0].set_ylim(bottom=0)
         future = GROUP_COLOURS["future"]
         for axes, key, title, identical in zip(
@@ -399,7 +378,7 @@ class Sheet:
             axes.set_ylim(top=1.7 * axes.get_ylim()[1])  # room for the legend
             axes.legend(fontsize=7, frameon=False, loc="upper right")
         self._top += high + 0.4
-        self._note("Below the axes: the block, and what it reads; lines join blocks that read the same.")
+        self._note("Below the axes: the block and what it reads. Lines join blocks that read the same keys.")
 
     def _on_cameras(self, keys: Float32Array) -> dict[str, Float32Array]:
         """A row's map `(T_vl,)` by camera, `(rows, columns)` each."""
@@ -414,7 +393,7 @@ class Sheet:
         return camera.columns / camera.rows if picture is None else picture.shape[1] / picture.shape[0]
 
     def _height_for(self, wide: float, strips: int, highest: float) -> float:
-        """Of pictures, so that so many strips of all cameras fit beside each other."""
+        """Height of pictures at which `strips` strips of all cameras fit next to each other."""
         aspects = sum(self._aspect(camera) for camera in self.cameras)
         gaps = GAP * (len(self.cameras) - 1) * strips
         return min(highest, (wide - gaps) / (aspects * strips))
@@ -430,16 +409,16 @@ class Sheet:
         names: bool = False,
         gap: float = GAP,
     ) -> float:
-        """All cameras beside each other, with their maps; returns where it ends on the right."""
+        """All cameras next to each other, with their maps; returns the right edge."""
         wide = [high * self._aspect(camera) for camera in self.cameras]
         total = sum(wide) + gap * (len(wide) - 1)
-        axes = self._axes(left, self._top, total, high)  # one for all of them: axes are slow to make
+        axes = self._axes(left, self._top, total, high)  # one for all: axes are slow to create
         axes.set_axis_off()
         start = 0.0
         for camera, width in zip(self.cameras, wide, strict=True):
             heat = None if heats is None else heats[camera.name]
             extent = (start, start + width, high, 0.0)
-            _show(axes, extent, self.maps.view.images.get(camera.name), heat, most, colours)
+            show(axes, extent, self.maps.view.images.get(camera.name), heat, most, colours)
             if names:
                 self._text(left + start, self._top - 0.16, camera.name, fontsize=8.5)
             start += width + gap
@@ -451,56 +430,3 @@ class Sheet:
         bar = self._figure.colorbar(ScalarMappable(Normalize(0, most or 1.0), colours), cax=axes)
         bar.set_label(label, fontsize=7.5)
         axes.tick_params(labelsize=6.5)
-
-
-def _show(
-    axes: Axes,
-    extent: tuple[float, float, float, float],
-    picture: UInt8Array | None,
-    heat: Float32Array | None,
-    most: float,
-    colours: Colormap,
-) -> None:
-    """The picture, in grey with the map on it if there is one; patches keep their edges, since nothing finer
-    is known.
-    """
-    if picture is not None and heat is None:
-        axes.imshow(picture, extent=extent)
-    elif picture is not None:
-        grey = picture.astype(np.float32).mean(axis=2) / 255.0
-        axes.imshow(grey, extent=extent, cmap="gray", vmin=-0.4, vmax=1.0)
-    if heat is not None:
-        axes.imshow(heat, extent=extent, cmap=colours, vmin=0, vmax=most or 1.0, interpolation="nearest")
-    left, right, bottom, _ = extent
-    frame = Rectangle((left, 0.0), right - left, bottom, fill=False, linewidth=0.5, clip_on=False)
-    axes.add_patch(frame)
-
-
-def _borders(axes: Axes, runs: Sequence[tuple[str, slice]], *, down: bool) -> None:
-    """Lines between the runs, and their names in the middle."""
-    for _, run in runs:
-        if run.start:
-            draw = axes.axhline if down else axes.axvline
-            draw(run.start - 0.5, color="white", linewidth=0.7)
-    middles, names = [(run.start + run.stop - 1) / 2 for _, run in runs], [name for name, _ in runs]
-    if down:
-        axes.set_yticks(middles, names, fontsize=7, rotation=90, va="center")
-    else:
-        axes.set_xticks(middles, names, fontsize=7)
-    axes.tick_params(length=0, pad=2)
-
-
-def ranges(numbers: Sequence[int]) -> str:
-    """Sorted numbers with runs drawn together.
-
-    Example:
-        >>> ranges((0, 1, 2, 5))
-        '0-2, 5'
-    """
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)

@@ -1,4 +1,4 @@
-"""Numbers about maps of attention: where the mass goes, how spread it is, how alike the tokens' maps are."""
+"""Statistics of attention maps: mass by part, entropy, and similarity of the maps of several tokens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Overlap:
-    """How alike the maps of several tokens are.
+    """How similar the maps of several tokens are.
 
     Attributes:
         jensen_shannon: Mean over all pairs of the Jensen-Shannon divergence, divided by its largest value
@@ -34,9 +34,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Spread:
-    """Entropies over a group's tokens, in nats; exp(entropy) is how many keys, looked at equally, would be as
-    spread.
-    """
+    """Entropies of the maps of a group, in nats. A uniform map with that entropy has exp(entropy) keys."""
 
     mean: float
     least: float
@@ -52,8 +50,8 @@ class GroupSummary:
         mass: Share of attention by part of the keys, mean over the rows.
         entropy: Of the rows' maps.
         overlap: Between the rows' maps; None with fewer than two.
-        shuffled: The same after each map was shuffled on its own, see `shuffle`: what tokens with the same
-            spread that look at unrelated places would give.
+        shuffled: The same after each map was shuffled by itself, see `shuffle`: the overlap of unrelated maps
+            with the same entropies.
     """
 
     tokens: int
@@ -64,7 +62,7 @@ class GroupSummary:
 
 
 def entropy(maps: FloatArray) -> npt.NDArray[np.float64]:
-    """Of probabilities along the last axis, in nats; keys with probability 0 add nothing.
+    """Entropy of probabilities along the last axis, in nats; keys with probability 0 add nothing.
 
     Example:
         >>> float(np.exp(entropy(np.full(8, 1 / 8)))).__round__(6), float(entropy(np.eye(3)[0]))
@@ -77,7 +75,7 @@ def entropy(maps: FloatArray) -> npt.NDArray[np.float64]:
 
 
 def overlap(maps: FloatArray) -> Overlap | None:
-    """Between maps `(tokens, keys)`; None with fewer than two."""
+    """Overlap of maps `(tokens, keys)`; None with fewer than two."""
     p = np.asarray(maps, dtype=np.float64)
     tokens = len(p)
     if tokens < 2:
@@ -92,7 +90,7 @@ def overlap(maps: FloatArray) -> Overlap | None:
     # All pairs at once: |sum of unit vectors|^2 counts each pair twice and each token with itself once.
     cosines = (np.square(unit.sum(axis=0)).sum() - np.square(unit).sum()) / (tokens * (tokens - 1))
     return Overlap(
-        # Rounding may leave identical maps a little below zero.
+        # Rounding may make identical maps slightly negative.
         jensen_shannon=max(float(np.concatenate(divergences).mean()) / math.log(2), 0.0),
         cosine=float(cosines),
         distinct=max(float(np.exp(entropy(p.mean(axis=0)) - entropies.mean())), 1.0),
@@ -100,10 +98,10 @@ def overlap(maps: FloatArray) -> Overlap | None:
 
 
 def shuffle(maps: FloatArray, parts: Mapping[str, Indices], rng: np.random.Generator) -> FloatArray:
-    """Each map `(tokens, keys)` shuffled on its own, within each part of the keys.
+    """Shuffles each map `(tokens, keys)` by itself, within each part of the keys.
 
-    Every token keeps its mass on each part and its entropy; which keys it looks at becomes unrelated to what
-    the others look at.
+    Every token keeps its mass on each part and its entropy; the keys that it attends to become unrelated to
+    those of the others.
     """
     shuffled = np.array(maps)
     for positions in parts.values():
@@ -117,13 +115,13 @@ def summarize(
     shuffled_within: Mapping[str, Indices],
     rng: np.random.Generator,
 ) -> GroupSummary:
-    """Sums up the maps `(tokens, keys)` of one group, at least one.
+    """Summarises the maps `(tokens, keys)` of one group; at least one token.
 
     Args:
         maps: probabilities.
         parts: the keys by what they are, for `mass`.
-        shuffled_within: the keys among which `shuffled` mixes.
-        rng: shuffles.
+        shuffled_within: the parts within which keys are shuffled.
+        rng: for the shuffling.
     """
     entropies = entropy(maps)
     mean = np.asarray(maps, dtype=np.float64).mean(axis=0)

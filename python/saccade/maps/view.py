@@ -210,6 +210,6 @@ def _layout(
             image_mask, grid=options.grid, names=names, attention_mask=attention_mask
         )
     raise InputError(
-        f"{path}: neither input_ids nor image_mask; --layout says where the image tokens are "
+        f"{path}: neither input_ids nor image_mask; give the positions of image tokens with --layout "
         f"({layouts.GRAMMAR})"
     )

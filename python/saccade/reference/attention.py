@@ -35,16 +35,16 @@ class Attention(nn.Module):
         stop_gradient: Tensor | None = None,
         return_weights: bool = False,
     ) -> tuple[Tensor, Tensor | None]:
-        """Lets the rows of `x` read those of `context`.
+        """Attends from the rows of `x` to those of `context`.
 
         Args:
             x: `(B, Q, width)`.
             context: `(B, S, context_dim)`.
             logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a
-                key. A query with no key left gets zeros from the attention.
-            stop_gradient: `(Q, S)` bool; where true, the query takes this key and its value as constants in
+                key. If no key is left, the attention of a query is zero.
+            stop_gradient: `(Q, S)` bool, True where the query treats this key and its value as constants in
                 the backward pass.
-            return_weights: also return the probabilities.
+            return_weights: whether to return the probabilities as well.
 
         Returns:
             `(B, Q, width)`, and the probabilities `(B, heads, Q, S)` or None.
@@ -53,7 +53,10 @@ class Attention(nn.Module):
         k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
         v = self.split_heads(self.to_v(context))  # (B, heads, S, head_dim)
         if logit_bias is None and stop_gradient is None and not return_weights:
-            weights, values = None, F.scaled_dot_product_attention(q, k, v)  # the same sums, faster to train
+            weights, values = (
+                None,
+                F.scaled_dot_product_attention(q, k, v),
+            )  # the same sums; faster in training
         else:
             weights = attention_weights(q, k, logit_bias, stop_gradient)  # (B, heads, Q, S)
             values = attention_values(weights, v, stop_gradient)  # (B, heads, Q, head_dim)
@@ -67,7 +70,7 @@ class Attention(nn.Module):
 def attention_weights(
     q: Tensor, k: Tensor, logit_bias: Tensor | None, stop_gradient: Tensor | None = None
 ) -> Tensor:
-    """softmax(q k^T / sqrt(head_dim) + bias), and zeros where no key is left.
+    """softmax(q k^T / sqrt(head_dim) + bias), or zeros if no key is left.
 
     Args:
         q: `(B, heads, Q, head_dim)`.
@@ -86,12 +89,12 @@ def attention_weights(
         return torch.softmax(logits, dim=-1)
     logits = logits + logit_bias.to(logits.dtype)
     nothing_left = torch.isneginf(logits).all(dim=-1, keepdim=True)  # (B, heads, Q, 1)
-    # Filled before the softmax too: a row of nan would poison the gradient even where its value is replaced.
+    # Filled before the softmax as well: NaN would reach the gradient even if the value is replaced.
     return torch.softmax(logits.masked_fill(nothing_left, 0.0), dim=-1).masked_fill(nothing_left, 0.0)
 
 
 def attention_values(weights: Tensor, v: Tensor, stop_gradient: Tensor | None) -> Tensor:
-    """The probabilities' mean of the values.
+    """The mean of the values, weighted by the probabilities.
 
     Args:
         weights: `(B, heads, Q, S)`.
@@ -104,5 +107,5 @@ def attention_values(weights: Tensor, v: Tensor, stop_gradient: Tensor | None) -
     if stop_gradient is None:
         return weights @ v
     constant = v.detach()
-    # The second product is zero. It carries the gradient to `v`, and the first one that to the weights.
+    # The second product is zero. It has the gradient to `v`, and the first one has that to the weights.
     return weights @ constant + weights.masked_fill(stop_gradient, 0.0) @ (v - constant)

@@ -1,4 +1,4 @@
-"""Refuses arrays and indices that do not fit, with what was given and what was expected."""
+"""Checks shapes and indices."""
 
 from collections.abc import Iterable
 
@@ -8,7 +8,7 @@ from saccade.errors import InputError, ShapeError
 
 
 def check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
-    """Refuses a tensor of another shape; None stands for any size."""
+    """Raises ShapeError unless the tensor has the expected shape. None allows any size."""
     given = tuple(tensor.shape)
     if len(given) == len(expected) and all(
         want in (None, have) for have, want in zip(given, expected, strict=True)
@@ -19,8 +19,8 @@ def check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> 
 
 
 def check_indices(name: str, indices: Iterable[int] | None, size: int) -> None:
-    """Refuses indices that are not below `size`; None stands for all of them."""
+    """Raises InputError unless all indices are below `size`. None means all."""
     for index in indices or ():
         if index >= size:
-            expected = f"0 to {size - 1}" if size > 0 else "no index, for there is nothing to choose from"
+            expected = f"0 to {size - 1}" if size > 0 else "no index, because there are no tokens"
             raise InputError(f"{name}: {index}, expected {expected}")

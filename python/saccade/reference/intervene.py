@@ -1,8 +1,9 @@
-"""What is changed and what is kept in one run of the torch reference, block by block.
+"""What one run of the torch reference changes and records, block by block.
 
-Written from the definition of `Intervention`, apart from the Rust head, so that each can check the other.
-Shapes in comments as in `model.py`; Q are the rows that read, K the keys they read: the vision-language
-tokens in a cross-attention block, the rows themselves in a self-attention block.
+It is written from the definition of `Intervention`, independently of the Rust head, so that each tests the
+other. Shapes in comments: B is the batch, R the rows, S the vision-language tokens, Q the rows that attend, K
+the keys that they attend to: the vision-language tokens in a cross-attention block, the rows in a
+self-attention block.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,19 +27,18 @@ Mask: TypeAlias = "Tensor | np.ndarray | None"
 
 @dataclass(frozen=True)
 class BlockChange:
-    """What one block of one Euler step does differently, and who is shown what; by default nothing, nobody.
+    """What one block of one velocity evaluation changes and records. By default nothing.
 
     Attributes:
-        logit_bias: added to the attention's scaled scores, broadcast to `(B, heads, Q, K)`; minus infinity
-            removes a key.
-        stop_gradient: `(Q, K)` bool, True where the reader takes key and value as constants.
-        patches: pairs of row indices `(n,)` and what replaces these rows after the block, `(n, width)` or
-            `(B, n, width)`; the last one counts.
-        others: rows as self-attention read them before, where only the rows after these run;
-            `(B, O, width)`.
-        hold: is given the rows as self-attention reads them, `(B, R, width)`.
-        keep_attention: is given the probabilities `(B, heads, Q, K)`.
-        keep_hidden: is given the rows after the block and its patches, `(B, R, width)`.
+        logit_bias: added to the scaled scores of the attention, broadcast to `(B, heads, Q, K)`; minus
+            infinity removes a key.
+        stop_gradient: `(Q, K)` bool, True where the reader treats key and value as constants.
+        patches: pairs of row indices `(n,)` and new values of these rows after the block, `(n, width)` or
+            `(B, n, width)`. Later patches override earlier ones.
+        others: earlier rows that are not recomputed, as self-attention read them last, `(B, O, width)`.
+        hold: called with the rows as self-attention reads them, `(B, R, width)`.
+        keep_attention: called with the probabilities `(B, heads, Q, K)`.
+        keep_hidden: called with the rows after the block and its patches, `(B, R, width)`.
     """
 
     logit_bias: Tensor | None = None
@@ -50,13 +50,13 @@ class BlockChange:
     keep_hidden: Callable[[Tensor], None] | None = None
 
     def all_rows(self, y: Tensor) -> Tensor:
-        """What self-attention reads where the rows `y (B, R', width)` run: `(B, R, width)`."""
+        """The rows that self-attention reads, `(B, R, width)`, from the computed ones, `(B, R', width)`."""
         if self.hold is not None:
             self.hold(y)
         return y if self.others is None else torch.cat((self.others, y), dim=1)
 
     def after(self, rows: Tensor) -> Tensor:
-        """The rows that the next block reads: `(B, R, width)` to the same shape."""
+        """Applies the patches to `rows (B, R, width)`; returns the rows that the next block reads."""
         for index, values in self.patches:
             rows = rows.index_copy(1, index, values.expand(len(rows), -1, -1))
         if self.keep_hidden is not None:
@@ -66,9 +66,9 @@ class BlockChange:
 
 @dataclass(frozen=True)
 class Edit:
-    """An `Intervention` in the types of its normal form, with tensors in the run's dtype.
+    """An `Intervention` with normalised fields and with tensors in the dtype of the run.
 
-    Its fields are those of `Intervention`, without the future tokens.
+    Its fields are those of `Intervention` except the future tokens.
     """
 
     cut: tuple[tuple[Chosen, Chosen], ...]
@@ -80,7 +80,7 @@ class Edit:
 
     @classmethod
     def of(cls, one: Any, like: Tensor) -> "Edit":
-        """Reads an `Intervention`, whose fields are declared as all that may be given."""
+        """Converts an `Intervention`."""
 
         def tensors(arrays: Mapping[Chosen, np.ndarray] | None) -> dict[Chosen, Tensor]:
             found = (arrays or {}).items()
@@ -90,7 +90,7 @@ class Edit:
         return cls(one.cut, tensors(one.key_bias), patch, one.blocks, one.steps, one.heads)
 
     def acts(self, step: int, block: int) -> bool:
-        """Whether its limits include this block of this Euler step."""
+        """Whether its limits include this block of this step."""
         return includes(self.blocks, block) and includes(self.steps, step)
 
 
@@ -100,26 +100,26 @@ def includes(limit: tuple[int, ...] | None, index: int) -> bool:
 
 
 class Run:
-    """One run of a head, over all of its Euler steps: what is changed, and what is kept.
+    """One run of a head over all of its steps: what is changed, and what is recorded.
 
     Args:
-        config: the head's.
-        vl_embs: `(B, S, context_dim)`; its dtype and device are those of the run.
-        num_steps: Euler steps.
-        in_step: evaluations of the velocity in each step.
-        future_refresh: the rows of state and future tokens run at every so many evaluations, from the first
-            one on.
+        config: of the head.
+        vl_embs: `(B, S, context_dim)`. The run has its dtype and device.
+        num_steps: number of steps.
+        in_step: velocity evaluations in each step.
+        future_refresh: the state row and the future rows are recomputed every `future_refresh` evaluations,
+            starting with the first.
         intervention: one, several or none.
         drop_vl, attention_mask, image_mask: as in `forbidden_tokens`.
-        stop_gradient: pairs as in `Intervention.cut`, cut in the backward pass only.
+        stop_gradient: pairs as in `Intervention.cut`, which apply to the backward pass only.
         record: any of "attention" and "hidden".
-        blocks, steps: where it is recorded; default everywhere.
+        blocks, steps: what is recorded. Default: all.
 
     Attributes:
-        rows: where each group of rows lies.
-        future_tokens: `(N', width)` to use in place of the learned ones, or None.
-        held: what self-attention last read of the rows of state and future tokens, by block.
-        attention, hidden: what was kept so far, by `(step, block)`.
+        rows: the slice of each group of rows.
+        future_tokens: `(N', width)`, used in place of the learned ones, or None.
+        held: the state row and the future rows as self-attention last read them, by block.
+        attention, hidden: what was recorded so far, by `(step, block)`.
 
     Raises:
         InputError, ShapeError, DtypeError: an argument does not fit the head or the inputs.
@@ -183,15 +183,15 @@ class Run:
         self.check_edges("stop_gradient", self.stopped)
 
     def first_row(self, evaluation: int) -> int:
-        """The first row that runs at this evaluation of the velocity: 0, or the first of the actions."""
+        """The first row that is computed in this evaluation: 0, or the first action row."""
         return 0 if evaluation % self.future_refresh == 0 else self.rows["action"].start
 
     def hold(self, block: int, y: Tensor) -> None:
-        """Holds the rows of state and future tokens, of all rows `(B, R, width)`."""
+        """Keeps the state row and the future rows of all rows `(B, R, width)`."""
         self.held[block] = y[:, : self.rows["action"].start]
 
     def change(self, evaluation: int, block: int) -> BlockChange:
-        """What happens in this block of this evaluation of the velocity, to the rows that run."""
+        """What this block changes and records in this evaluation."""
         step = evaluation // self.in_step
         place, cross = (step, block), is_cross(self.config, block)
         first = self.first_row(evaluation)
@@ -210,7 +210,7 @@ class Run:
         )
 
     def logit_bias(self, step: int, block: int, cross: bool) -> Tensor | None:
-        """The sum of all biases, broadcast to `(B, heads, Q, K)`; None where there is none."""
+        """The sum of all biases, broadcast to `(B, heads, Q, K)`; None if there is none."""
         biases = []
         if cross and (forbidden := self.forbidden[block]) is not None:
             biases.append(removal_bias(forbidden, self.dtype))  # (B, 1, 1, S)
@@ -222,12 +222,12 @@ class Run:
             bias = self.key_bias(edit, cross).masked_fill(self.cut_keys(edit, cross), -torch.inf)
             in_heads = bias.new_zeros(self.config.num_heads, *bias.shape)  # (heads, Q, K)
             in_heads[slice(None) if edit.heads is None else list(edit.heads)] = bias
-            if in_heads.any():  # else its keys are in the other kind of block
+            if in_heads.any():  # otherwise its keys are in the other kind of block
                 biases.append(in_heads[None])  # (1, heads, Q, K)
         return sum(biases[1:], biases[0]) if biases else None
 
     def key_bias(self, edit: Edit, cross: bool) -> Tensor:
-        """The biases on the keys of such a block, `(Q, K)`, the same for every reader."""
+        """The biases on the keys of this kind of block, `(Q, K)`, equal for every reader."""
         bias = torch.zeros(self.num_keys(cross), dtype=self.dtype, device=self.device)
         for chosen, values in edit.key_bias.items():
             if (chosen[0] == "vl") == cross:
@@ -235,7 +235,7 @@ class Run:
         return bias.expand(self.num_rows, -1)
 
     def cut_keys(self, edit: Edit, cross: bool) -> Tensor:
-        """Which row reads which key of such a block no longer, `(Q, K)` bool."""
+        """The edges that are cut in this kind of block, `(Q, K)` bool."""
         hidden = torch.zeros(self.num_rows, self.num_keys(cross), dtype=torch.bool, device=self.device)
         for reader, source in edit.cut:
             if (source[0] == "vl") == cross:
@@ -251,18 +251,18 @@ class Run:
         ]
 
     def places(self, chosen: Chosen) -> Tensor:
-        """Where these tokens lie among the rows, or among the vision-language tokens; `(n,)` long."""
+        """Indices of tokens among the rows, or among the vision-language tokens, `(n,)` long."""
         group, indices = chosen
         first = 0 if group == "vl" else self.rows[group].start
         numbers = range(self.sizes[group]) if indices is None else indices
         return torch.tensor([first + index for index in numbers], dtype=torch.long, device=self.device)
 
     def num_keys(self, cross: bool) -> int:
-        """K of such a block."""
+        """K of this kind of block."""
         return self.sizes["vl"] if cross else self.num_rows
 
     def bias_of_learned_tokens(self) -> Tensor | None:
-        """`future_key_bias` on the keys of the rows, `(1, 1, 1, R)`; other tokens come without it."""
+        """`future_key_bias` on the keys of the rows, `(1, 1, 1, R)`. It does not apply to other tokens."""
         if self.config.future_key_bias is None or self.future_tokens is not None:
             return None
         bias = torch.zeros(self.num_rows, dtype=self.dtype, device=self.device)
@@ -272,10 +272,10 @@ class Run:
         return bias[None, None, None]
 
     def replaced_tokens(self, interventions: Sequence[Intervention]) -> Tensor | None:
-        """The future tokens of the one intervention that has some, `(N', width)`."""
+        """The future tokens of the only intervention that has any, `(N', width)`, or None."""
         given = [one.future_tokens for one in interventions if one.future_tokens is not None]
         if len(given) > 1:
-            raise InputError(f"future_tokens: in {len(given)} interventions, expected in at most one")
+            raise InputError(f"future_tokens: expected in at most one intervention, got {len(given)}")
         if not given:
             return None
         tokens = torch.tensor(given[0], dtype=self.dtype, device=self.device)
@@ -283,71 +283,89 @@ class Run:
         return tokens
 
     def check(self, edit: Edit) -> None:
-        """Refuses what the sizes of this run do not have."""
+        """Refuses an intervention that does not fit the sizes of this run, or that can act nowhere."""
         check_indices("blocks", edit.blocks, self.config.num_layers)
         check_indices("steps", edit.steps, self.num_steps)
         check_indices("heads", edit.heads, self.config.num_heads)
         self.check_edges("cut", edit)
+        for reader, source in edit.cut:
+            self.some("cut", reader)
+            self.some("cut", source)
+            self.check_acts(f"cut: {reader[0]} reads {source[0]}", source[0], edit.blocks)
         for chosen, biases in edit.key_bias.items():
-            size = self.count("key_bias", chosen)
+            size = self.some("key_bias", chosen)
+            self.check_acts(f"key_bias: {chosen[0]} is read", chosen[0], edit.blocks)
             check_shape(f"key_bias: {chosen[0]}", biases, (size,) if biases.ndim == 1 else ())
-        self.check_effect(edit)
         for (step, block), groups in edit.patch.items():
             check_indices("patch: step", [step], self.num_steps)
             check_indices("patch: block", [block], self.config.num_layers)
             for chosen, rows in groups.items():
                 name = f"patch[({step}, {block})]"
                 batch = (self.batch,) if rows.ndim == 3 else ()
-                count = self.count(name, chosen)
+                count = self.some(name, chosen)
                 check_shape(f"{name}: {chosen[0]}", rows, (*batch, count, self.config.width))
                 evaluations = range(step * self.in_step, (step + 1) * self.in_step)
-                if count and chosen[0] != "action" and any(map(self.first_row, evaluations)):
+                if chosen[0] != "action" and any(map(self.first_row, evaluations)):
                     raise InputError(
-                        f"{name}: {chosen[0]} tokens, expected action tokens, since with future_refresh "
-                        f"{self.future_refresh} the others do not always run at step {step}"
+                        f"{name}: expected action tokens, got {chosen[0]} tokens, which are not always "
+                        f"computed at step {step} with future_refresh {self.future_refresh}"
                     )
 
     def check_edges(self, name: str, edit: Edit) -> None:
-        """Refuses tokens that are not there."""
+        """Refuses edges of tokens that do not exist."""
         for pair in edit.cut:
             for chosen in pair:
                 self.count(name, chosen)
 
-    def check_effect(self, edit: Edit) -> None:
-        """Refuses cuts and biases none of which exists in any of the blocks where they apply.
+    def check_acts(self, edge: str, group: str, blocks: tuple[int, ...] | None) -> None:
+        """Refuses a cut or bias that has no effect in any of the blocks where it applies.
+
+        Args:
+            edge: what is changed, for the message.
+            group: the group of the keys.
+            blocks: where it applies.
 
         Raises:
-            InputError: Says in which blocks the edges exist.
+            InputError: says in which blocks the keys are read.
         """
-        edges = [(f"cut of {source[0]} keys", source[0]) for _, source in edit.cut]
-        edges += [(f"key_bias on {chosen[0]} keys", chosen[0]) for chosen in edit.key_bias]
-        blocks = range(self.config.num_layers) if edit.blocks is None else edit.blocks
-        kinds = {is_cross(self.config, block) for block in blocks}
-        if not edges or any((group == "vl") in kinds for _, group in edges):
-            return
-        what, group = edges[0]
-        existing = [b for b in range(self.config.num_layers) if is_cross(self.config, b) == (group == "vl")]
-        kind = "cross-attention" if group == "vl" else "self-attention"
-        where = ", ".join(map(str, existing)) or "none in this head"
-        raise InputError(
-            f"intervention: a {what} has no effect in blocks {', '.join(map(str, blocks))}: these keys exist "
-            f"in {kind} blocks only ({where})"
-        )
+        kind = "cross" if group == "vl" else "self"
+        existing = [
+            block
+            for block in range(self.config.num_layers)
+            if is_cross(self.config, block) == (group == "vl")
+        ]
+        if not existing:
+            raise InputError(f"{edge} in {kind}-attention blocks only, and this head has none")
+        if blocks is not None and not set(blocks) & set(existing):
+            raise InputError(
+                f"{edge} in {kind}-attention blocks only, which are {existing}; expected blocks with at "
+                f"least one of them, got {list(blocks)}"
+            )
 
     def count(self, name: str, chosen: Chosen) -> int:
-        """How many tokens these are; refuses those that the group does not have."""
+        """The number of these tokens. Refuses tokens that the group does not have."""
         group, indices = chosen
         check_indices(f"{name}: {group}", indices, self.sizes[group])
         return self.sizes[group] if indices is None else len(indices)
 
+    def some(self, name: str, chosen: Chosen) -> int:
+        """The number of these tokens. Refuses an empty choice, and a group without tokens."""
+        count = self.count(name, chosen)
+        if count > 0:
+            return count
+        group, indices = chosen
+        if indices is None:
+            raise InputError(f"{name}: expected tokens, but this call has no {group} tokens")
+        raise InputError(f"{name}: expected at least one {group} token, got an empty list")
+
 
 def is_cross(config: HeadConfig, block: int) -> bool:
-    """Whether this block reads the vision-language tokens; the others read the rows themselves."""
+    """Whether this is a cross-attention block. The others are self-attention."""
     return block % 2 == 0 or not config.interleave_self_attention
 
 
 def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
-    """Pairs (reader, source) in the normal form of a cut."""
+    """Pairs (reader, source) as the normalised cut of an intervention."""
     try:
         return Intervention(cut=pairs)
     except InputError as error:
@@ -355,30 +373,32 @@ def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
 
 
 def reads_images(config: HeadConfig, block: int) -> bool:
-    """Whether this cross-attention block of a head with alternate masks reads the image tokens; the others
-    read the rest."""
+    """Whether this cross-attention block of a head with alternate masks attends to image tokens.
+
+    The others attend to text.
+    """
     return block % (2 * config.attend_text_every_n_blocks) != 0
 
 
 def forbidden_tokens(
     config: HeadConfig, tokens: Tensor, *, drop_vl: Mask, attention_mask: Mask, image_mask: Mask
 ) -> list[Tensor | None]:
-    """Which vision-language tokens no row reads, block by block.
+    """The vision-language tokens that no row attends to, for each block.
 
     Args:
-        config: the head's.
+        config: of the head.
         tokens: `(B, S, context_dim)`.
-        drop_vl: bool `(B, S)`, True where a token is removed.
-        attention_mask: bool `(B, S)`, True where a token is attended; None for all of them.
-        image_mask: bool `(B, S)`, True where a token is of an image; asked for with alternate masks.
+        drop_vl: bool `(B, S)`, True for tokens that are removed.
+        attention_mask: bool `(B, S)`, True where a token is attended; None for all.
+        image_mask: bool `(B, S)`, True for image tokens. Required with alternate masks.
 
     Returns:
-        For every block bool `(B, S)`, or None where all are read.
+        For every block bool `(B, S)`, or None if it attends to all tokens.
 
     Raises:
-        DtypeError, ShapeError: a mask of another dtype or shape.
-        InputError: padding for a head that ignores it; a mask missing; an observation in which a block has
-            nothing left to read.
+        DtypeError, ShapeError: a mask has the wrong dtype or shape.
+        InputError: padding is given to a head that ignores it, a mask is missing, or a block has no token to
+            attend to in an observation.
     """
     removed = token_mask("drop_vl", drop_vl, tokens)
     attended = token_mask("attention_mask", attention_mask, tokens)
@@ -386,13 +406,14 @@ def forbidden_tokens(
     if config.mask_mode == "none":
         if attended is not None and not attended.all():
             raise InputError(
-                "attention_mask: a false entry, expected all true: this head ignores padding, as released "
-                "(None); drop_vl removes tokens"
+                "attention_mask: expected all true, because the released head ignores padding, got a false "
+                "entry; drop_vl removes tokens"
             )
         return [removed] * config.num_layers
     if image is None:
         raise InputError(
-            "image_mask: None, expected bool (batch, T_vl): blocks of this head read either text or images"
+            "image_mask: expected bool (batch, T_vl), because blocks of this head attend to either text or "
+            "images, got None"
         )
     permitted = torch.ones_like(image) if attended is None else attended
     if removed is not None:
@@ -407,18 +428,18 @@ def forbidden_tokens(
         if not read.any(dim=1).all():
             row = int(read.any(dim=1).int().argmin())
             raise InputError(
-                f"image_mask: observation {row} has no {kind} token left for block {block} to read"
+                f"image_mask: observation {row} has no {kind} token that block {block} can attend to"
             )
         forbidden.append(~read)
     return forbidden
 
 
 def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
-    """A mask as a bool tensor `(B, S)` for `tokens (B, S, context_dim)`, or None.
+    """A mask for `tokens (B, S, context_dim)` as a bool tensor `(B, S)`, or None.
 
     Raises:
-        DtypeError: it is not boolean.
-        ShapeError: it is of another shape.
+        DtypeError: the mask is not boolean.
+        ShapeError: the mask has another shape.
     """
     array = boolean(name, given)
     if array is None:
@@ -429,6 +450,6 @@ def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
 
 
 def removal_bias(removed: Tensor, dtype: torch.dtype) -> Tensor:
-    """Minus infinity on the keys that are removed: `(B, S)` bool to `(B, 1, 1, S)`."""
+    """Minus infinity on removed keys, `(B, 1, 1, S)`, from `(B, S)` bool."""
     bias = torch.zeros(removed.shape, dtype=dtype, device=removed.device).masked_fill(removed, -torch.inf)
     return bias[:, None, None]

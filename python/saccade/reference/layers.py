@@ -25,7 +25,7 @@ UNCHANGED = BlockChange()
 
 
 class GeluLinear(nn.Module):
-    """Linear, then GELU in its tanh form."""
+    """Linear, then GELU with the tanh approximation."""
 
     def __init__(self, in_features: int, out_features: int) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class GeluLinear(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """width -> 4 width -> width; place 1 of the list holds dropout in the released code."""
+    """width -> 4 width -> width. Index 1 of the list is dropout in the released code."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class FeedForward(nn.Module):
 
 
 class VlBlock(nn.Module):
-    """Self-attention among the vision-language tokens, norm first, no mask, no positions."""
+    """Self-attention among the vision-language tokens: pre-norm, without mask and positions."""
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class VlBlock(nn.Module):
         self.ff = FeedForward(width)
 
     def forward(self, x: Tensor, logit_bias: Tensor | None = None) -> Tensor:
-        """`x (B, S, context_dim)`, a bias as in `Attention`; returns `(B, S, context_dim)`."""
+        """`x (B, S, context_dim)` to the same shape; the bias is as in `Attention`."""
         y = self.norm1(x)
         attended, _ = self.attn1(y, y, logit_bias=logit_bias)
         x = x + attended
@@ -70,21 +70,21 @@ class VlBlock(nn.Module):
 
 
 class VlSelfAttention(nn.Module):
-    """The blocks that mix the vision-language tokens once per observation."""
+    """The self-attention blocks of the vision-language tokens, computed once per observation."""
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
         self.transformer_blocks = nn.ModuleList(VlBlock(config) for _ in range(config.vl_num_layers))
 
     def forward(self, x: Tensor, logit_bias: Tensor | None = None) -> Tensor:
-        """`x (B, S, context_dim)`, a bias as in `Attention`; returns `(B, S, context_dim)`."""
+        """`x (B, S, context_dim)` to the same shape; the bias is as in `Attention`."""
         for block in self.transformer_blocks:
             x = block(x, logit_bias)
         return x
 
 
 class AdaptiveNorm(nn.Module):
-    """LayerNorm whose scale and shift come from the time embedding: scale first, then shift."""
+    """LayerNorm with scale and shift from the time embedding, in this order."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ def plain_norm(x: Tensor, eps: float) -> Tensor:
 
 
 class DiTBlock(nn.Module):
-    """One attention (to the context, or among the rows) and one feed-forward, without gates."""
+    """Attention (to the vision-language tokens, or among the rows) and a feed-forward layer."""
 
     def __init__(self, config: HeadConfig, is_cross: bool) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class DiTBlock(nn.Module):
     def forward(self, rows: Tensor, vl_embs: Tensor, temb: Tensor, change: BlockChange = UNCHANGED) -> Tensor:
         """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `temb (B, width)`; returns `(B, R, width)`.
 
-        What `change` does after the block is left to the caller.
+        The caller applies what `change` does after the block.
         """
         y = self.norm1(rows, temb)
         attended, weights = self.attn1(
@@ -128,7 +128,7 @@ class DiTBlock(nn.Module):
         if change.keep_attention is not None:
             change.keep_attention(weights)
         rows = rows + attended
-        return rows + self.ff(plain_norm(rows, NORM_EPS))  # this norm does not see the time
+        return rows + self.ff(plain_norm(rows, NORM_EPS))  # this norm does not depend on the time
 
 
 class TimestepEmbedder(nn.Module):
@@ -145,7 +145,7 @@ class TimestepEmbedder(nn.Module):
 
 
 class TimestepEncoder(nn.Module):
-    """The time embedding that steers the adaptive norms."""
+    """The time embedding of the adaptive norms."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -158,7 +158,7 @@ class TimestepEncoder(nn.Module):
 
 
 class DiffusionTransformer(nn.Module):
-    """Blocks 0, 2, 4, ... read the vision-language tokens, blocks 1, 3, 5, ... the rows themselves."""
+    """Even blocks attend to the vision-language tokens, odd blocks are self-attention of the rows."""
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ class DiffusionTransformer(nn.Module):
     ) -> Tensor:
         """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; to `(B, R, hidden_dim)`.
 
-        `changes` has one entry a block.
+        `changes` has one entry for each block.
         """
         temb = self.timestep_encoder(timestep)  # (B, width)
         for block, change in zip(self.transformer_blocks, changes, strict=True):
@@ -182,13 +182,13 @@ class DiffusionTransformer(nn.Module):
         return self.output(rows, temb)
 
     def output(self, rows: Tensor, temb: Tensor) -> Tensor:
-        """The last norm and projection; here the shift comes first, other than in the blocks."""
+        """The last norm and projection. Here the shift comes first, unlike in the blocks."""
         shift, scale = self.proj_out_1(F.silu(temb))[:, None].chunk(2, dim=-1)  # (B, 1, width) each
         return self.proj_out_2(plain_norm(rows, OUTPUT_NORM_EPS) * (1 + scale) + shift)  # (B, R, hidden_dim)
 
 
 class CategoryLinear(nn.Module):
-    """One linear layer per embodiment; weights are stored `(category, in, out)`, not transposed."""
+    """One linear layer per embodiment. Weights are stored as `(category, in, out)`, not transposed."""
 
     def __init__(self, num_categories: int, in_features: int, out_features: int) -> None:
         super().__init__()
@@ -216,7 +216,7 @@ class CategoryMlp(nn.Module):
 
 
 class ActionEncoder(nn.Module):
-    """Noisy actions and the time bucket to action rows."""
+    """Encodes noisy actions and the time bucket as action rows."""
 
     def __init__(self, num_categories: int, action_dim: int, width: int) -> None:
         super().__init__()
@@ -234,5 +234,5 @@ class ActionEncoder(nn.Module):
 
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:
-    """Learned rows, `(num_rows, width)`; zero rows are allowed."""
+    """Learned rows, `(num_rows, width)`. There may be none."""
     return nn.Embedding(num_rows, width, _weight=TABLE_STD * torch.randn(num_rows, width))

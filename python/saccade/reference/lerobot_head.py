@@ -1,10 +1,10 @@
-"""The released N1.5 head, as lerobot 0.4.4 ships it, without the rest of lerobot.
+"""The released N1.5 head from lerobot 0.4.4, without the rest of lerobot.
 
-lerobot's package files import datasets, cameras and robots; the head itself needs torch, diffusers and
-transformers only. So its three files are imported under their own names with empty packages around them,
-which are taken away again.
+The packages of lerobot import datasets, cameras and robots, whereas the head needs only torch, diffusers and
+transformers. Therefore its three files are imported under their own names inside empty packages, which are
+removed afterwards.
 
-Install with `pip install --no-deps lerobot==0.4.4` and `pip install "diffusers~=0.35.0"
+Install it with `pip install --no-deps lerobot==0.4.4` and `pip install "diffusers~=0.35.0"
 "transformers~=4.57.0"`.
 """
 
@@ -26,23 +26,28 @@ from unittest import mock
 import torch
 from torch import Tensor, nn
 
+from saccade._extras import pip_install
+from saccade.errors import MissingExtraError
+
 HEAD = "lerobot.policies.groot.action_head.flow_matching_action_head"
 
 
 def build(config: Mapping[str, Any], *, device: str = "cpu") -> nn.Module:
-    """A `FlowmatchingActionHead` in eval mode with the released code's own initialisation.
+    """A `FlowmatchingActionHead` in evaluation mode, initialised by the released code.
 
     Args:
-        config: a head's config with the released key names, or a whole checkpoint's.
-        device: where it is built; on `"meta"` no time is spent on weights that are to be replaced.
+        config: the config of a head in the released names, or of a whole checkpoint.
+        device: where it is created. On `"meta"` no time is spent on weights that are replaced later.
 
     Raises:
-        ModuleNotFoundError: lerobot, diffusers or transformers is not installed.
+        MissingExtraError: lerobot is not installed.
+        ModuleNotFoundError: diffusers or transformers is not installed.
     """
     module = import_head()
     head_config = dict(config.get("action_head_cfg", config))
     checked_beta = torch.distributions.Beta
-    # It prints what it tunes, and checks its time distribution by value, which a meta tensor has not.
+    # It prints what it trains, and checks the values of its time distribution, which meta tensors do not
+    # have.
     with (
         contextlib.redirect_stdout(io.StringIO()),
         mock.patch.object(module, "Beta", partial(checked_beta, validate_args=False)),
@@ -55,14 +60,14 @@ def build(config: Mapping[str, Any], *, device: str = "cpu") -> nn.Module:
 def get_action(
     head: nn.Module, backbone_features: Tensor, state: Tensor, embodiment_id: Tensor, noise: Tensor
 ) -> Tensor:
-    """The head's own `get_action`, started from the given noise.
+    """Calls `get_action` of the head with the given noise.
 
     Args:
         head: from `build`.
         backbone_features: `(batch, T_vl, context_dim)`.
         state: `(batch, 1, state_dim)`.
         embodiment_id: `(batch,)` long.
-        noise: `(batch, horizon, action_dim)`, used in place of what it would draw.
+        noise: `(batch, horizon, action_dim)`, used in place of the noise that it would draw.
 
     Returns:
         `(batch, horizon, action_dim)`.
@@ -81,21 +86,20 @@ def get_action(
 
 
 def import_head() -> ModuleType:
-    """The module that holds `FlowmatchingActionHead`."""
+    """The module of `FlowmatchingActionHead`."""
     if HEAD in sys.modules:
         return sys.modules[HEAD]
     spec = importlib.util.find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError(
-            "lerobot is not installed: pip install --no-deps lerobot==0.4.4", name="lerobot"
-        )
+        command = pip_install("--no-deps", "lerobot==0.4.4")
+        raise MissingExtraError(f"lerobot is not installed. Install with: {command}", name="lerobot")
     with empty_packages(Path(spec.submodule_search_locations[0])):
         return importlib.import_module(HEAD)
 
 
 @contextlib.contextmanager
 def empty_packages(root: Path) -> Iterator[None]:
-    """Packages of lerobot with a path and none of their own code; puts back what was there before."""
+    """Replaces the packages of lerobot by empty ones with the same paths, and restores them at the end."""
     stubs = {}
     package = HEAD.rpartition(".")[0]
     while package:

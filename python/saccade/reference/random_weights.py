@@ -1,4 +1,4 @@
-"""Seeded random heads and inputs, at the released sizes or any others, for tests and benchmarks."""
+"""Seeded random heads and inputs of the released sizes or others, for tests and benchmarks."""
 
 import copy
 import json
@@ -46,8 +46,9 @@ N1_CONFIG: Mapping[str, Any] = {
         "positional_embeddings": None,
     },
 }
-"""The head's config of nvidia/GR00T-N1-2B: neither future tokens nor VL self-attention, and keys and values
-from vectors as wide as the rows. Its state width, its embodiments and its steps are not confirmed."""
+"""Config of the head of nvidia/GR00T-N1-2B. It has neither future tokens nor VL self-attention, and its
+vision-language tokens are as wide as the rows. Width of the state, number of embodiments and steps are not
+confirmed."""
 
 N15_CONFIG: Mapping[str, Any] = {
     **N1_CONFIG,
@@ -64,7 +65,7 @@ N15_CONFIG: Mapping[str, Any] = {
         "positional_embeddings": None,
     },
 }
-"""The head's config of nvidia/GR00T-N1.5-3B, with the two class defaults that it leaves out."""
+"""Config of the head of nvidia/GR00T-N1.5-3B, including the two class defaults that the file omits."""
 
 N17_CONFIG: Mapping[str, Any] = {
     "model_type": "Gr00tN1d7",
@@ -104,8 +105,7 @@ N17_CONFIG: Mapping[str, Any] = {
     },
     "vl_self_attention_cfg": N15_CONFIG["vl_self_attention_cfg"],
 }
-"""What nvidia/GR00T-N1.7-3B says of its head. The head's keys are the whole checkpoint's: there is no
-`action_head_cfg`."""
+"""The keys about the head in the config of nvidia/GR00T-N1.7-3B, which has no `action_head_cfg`."""
 
 N16_CONFIG: Mapping[str, Any] = {
     **{
@@ -119,7 +119,7 @@ N16_CONFIG: Mapping[str, Any] = {
     "max_state_dim": 128,
     "state_dropout_prob": 0.0,
 }
-"""The same of nvidia/GR00T-N1.6-3B, which has no VL self-attention."""
+"""The same for nvidia/GR00T-N1.6-3B, which has no VL self-attention."""
 
 FORK_CONFIG: Mapping[str, Any] = {
     **N15_CONFIG,
@@ -131,7 +131,7 @@ FORK_CONFIG: Mapping[str, Any] = {
     "use_learnable_loss_weights": True,
     "use_multi_action_heads": True,
 }
-"""The N1.5 head of the humanoid_groot fork: one decoder for the arms, one for the claws."""
+"""The N1.5 head of the humanoid_groot fork, with one decoder for the arms and one for the claws."""
 
 SPLIT_ARMS_CONFIG: Mapping[str, Any] = {
     **FORK_CONFIG,
@@ -154,7 +154,7 @@ CONFIGS: Mapping[str, Mapping[str, Any]] = {
     "fork": FORK_CONFIG,
     "split-arms": SPLIT_ARMS_CONFIG,
 }
-"""The heads that there are, at their published sizes."""
+"""All heads with their published sizes."""
 
 
 def sized_config(
@@ -164,7 +164,7 @@ def sized_config(
     vl_num_layers: int | None = None,
     num_embodiments: int | None = None,
 ) -> dict[str, Any]:
-    """A copy of one of `CONFIGS`, with fewer blocks or embodiments where memory or time is short."""
+    """A copy of one of `CONFIGS`, optionally with fewer blocks or embodiments to save memory and time."""
     config = copy.deepcopy(dict(CONFIGS[kind]))
     if num_layers is not None:
         config["diffusion_model_cfg"]["num_layers"] = num_layers
@@ -183,7 +183,7 @@ def n15_config(*, num_layers: int = 16, vl_num_layers: int = 4, num_embodiments:
 
 
 def small_config(kind: str = "n1.5") -> dict[str, Any]:
-    """One of `CONFIGS` with every size shrunk: milliseconds instead of seconds, the same structure."""
+    """One of `CONFIGS` with small sizes, so that a test takes milliseconds."""
     # Six blocks with alternate masks: text, image and text again.
     alternate = "use_alternate_vl_dit" in CONFIGS[kind]
     config = sized_config(kind, num_layers=6 if alternate else 4, vl_num_layers=2, num_embodiments=3)
@@ -199,9 +199,9 @@ def small_config(kind: str = "n1.5") -> dict[str, Any]:
 
 
 def whole_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The `config.json` of a checkpoint with such a head, as far as the head goes.
+    """The part of a checkpoint's `config.json` that describes the head.
 
-    N1.6 and N1.7 say everything in one object; before them the head has an object of its own.
+    N1.6 and N1.7 have one flat object. In earlier versions the head has an object of its own.
     """
     if "model_type" in config:
         return dict(config)
@@ -210,7 +210,7 @@ def whole_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unused_parameters(config: Mapping[str, Any]) -> list[str]:
-    """Parameters that the released code makes from such a config and inference does not use."""
+    """Parameters that the released code creates from a config, but that inference does not use."""
     names = []
     if config.get("use_multi_action_heads") and config.get("use_learnable_loss_weights"):
         arms = ["left_arm", "right_arm"] if config.get("split_arm_heads") else ["arm"]
@@ -221,7 +221,7 @@ def unused_parameters(config: Mapping[str, Any]) -> list[str]:
 
 
 def random_head(config: Mapping[str, Any], seed: int, *, dtype: torch.dtype = torch.float32) -> ActionHead:
-    """A head whose every tensor is random, so that a forgotten or transposed one shows."""
+    """A head with random tensors only, so that a missing or transposed one shows in the result."""
     with torch.device("meta"):
         head = ActionHead(HeadConfig.from_dict(config), unused=unused_parameters(config))
     generator = torch.Generator().manual_seed(seed)
@@ -240,15 +240,15 @@ def write_checkpoint(
     through: torch.dtype = torch.float32,
     shard_bytes: int = 2**28,
 ) -> None:
-    """Writes the tensors of `random_head(config, seed)` in the published layout, shard by shard.
+    """Writes the tensors of `random_head(config, seed)` as a checkpoint in the published layout.
 
     Args:
-        folder: gets `config.json` and `model-*.safetensors`.
-        config: the head's config in the released key names.
-        seed: of the weights.
-        dtype: that the tensors are stored in.
-        through: that they are rounded to before, so that files in two dtypes can hold equal numbers.
-        shard_bytes: a shard is closed when it reaches this size.
+        folder: the directory of `config.json` and `model-*.safetensors`.
+        config: the config of the head in the released names.
+        seed: seed of the weights.
+        dtype: dtype of the stored tensors.
+        through: dtype that they are rounded to first, so that files in two dtypes can have equal values.
+        shard_bytes: a shard is complete when it reaches this size.
     """
     with torch.device("meta"):
         head = ActionHead(HeadConfig.from_dict(config), unused=unused_parameters(config))
@@ -270,8 +270,8 @@ def random_tensor(name: str, shape: torch.Size, generator: torch.Generator) -> T
     """One tensor of `random_head` in float32, scaled so that activations stay of order one.
 
     Args:
-        name: its name in the checkpoint, which tells weights from biases, norms and tables.
-        shape: its shape.
+        name: name in the checkpoint, which distinguishes weights, biases, norms and tables.
+        shape: shape of the tensor.
         generator: advances.
     """
     drawn = torch.randn(shape, generator=generator)
@@ -287,17 +287,17 @@ def random_tensor(name: str, shape: torch.Size, generator: torch.Generator) -> T
 
 
 def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: int) -> dict[str, Tensor]:
-    """Standard normal inputs, one random embodiment per row, and masks where the head asks for them.
+    """Standard normal inputs, one random embodiment per row, and masks if the head needs them.
 
     Args:
-        config: the head's.
-        seed: for all of them.
-        batch: rows.
+        config: of the head.
+        seed: for all inputs.
+        batch: number of observations.
         num_vl_tokens: T_vl.
 
     Returns:
         Arguments of `ActionHead.forward`: `backbone_features`, `state`, `noise` in float32, `embodiment_id`
-        long. For a head with alternate masks also those of `random_masks`.
+        long. With alternate masks also those of `random_masks`.
     """
     generator = torch.Generator().manual_seed(seed)
     inputs = {
@@ -312,12 +312,12 @@ def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: i
 
 
 def random_masks(generator: torch.Generator, *, batch: int, num_vl_tokens: int) -> dict[str, Tensor]:
-    """Padding on the left and a run of image tokens, of other lengths in every row.
+    """Padding on the left and a sequence of image tokens, of different lengths in every row.
 
     Args:
         generator: advances.
-        batch: rows.
-        num_vl_tokens: T_vl, at least 2: each row has an attended text and an attended image token.
+        batch: number of observations.
+        num_vl_tokens: T_vl, at least 2, since each row has an attended text and an attended image token.
 
     Returns:
         `attention_mask` and `image_mask`, bool `(batch, T_vl)`.

@@ -1,8 +1,8 @@
 """The two sinusoidal tables of the head, correctly rounded to float32.
 
-Exponents are formed in float32 in the order that the released code uses; exp, sin and cos are evaluated in
-float64 and rounded once. Float32 vector libraries differ in the last bit of exp, and at a bucket of 900 that
-bit moves an angle by 6e-5, so the rounding is part of the definition here rather than left to the library.
+Exponents are computed in float32 in the order of the released code. exp, sin and cos are computed in float64
+and rounded once. The float32 exp of vector libraries differs in the last bit, which changes an angle by 6e-5
+at a bucket of 900. Therefore the rounding is part of the definition, and does not depend on the library.
 """
 
 from functools import cache
@@ -17,7 +17,7 @@ TIMESTEP_CHANNELS = 256
 
 @cache
 def action_frequencies(width: int) -> Tensor:
-    """Frequencies of the table beside the action tokens, `(width // 2,)` float32."""
+    """Frequencies of the table for the action tokens, `(width // 2,)` float32."""
     half = width // 2
     exponents = -np.arange(half, dtype=np.float32) * (LOG_10000 / np.float32(half))
     return torch.from_numpy(np.exp(exponents.astype(np.float64)).astype(np.float32))
@@ -25,7 +25,7 @@ def action_frequencies(width: int) -> Tensor:
 
 @cache
 def timestep_frequencies() -> Tensor:
-    """Frequencies behind the time embedding, `(128,)` float32; the divisor 127 makes the last one 1/10000."""
+    """Frequencies of the time embedding, `(128,)` float32. The divisor 127 makes the last one 1/10000."""
     half = TIMESTEP_CHANNELS // 2
     exponents = (-LOG_10000 * np.arange(half, dtype=np.float32)) / np.float32(half - 1)
     return torch.from_numpy(np.exp(exponents.astype(np.float64)).astype(np.float32))
@@ -48,11 +48,11 @@ def sin_and_cos(timestep: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def action_time_table(timestep: Tensor, width: int) -> Tensor:
-    """The vector that is appended to every action token: sines first, `(batch, width)` float32."""
+    """The vector that is appended to every action token, `(batch, width)` float32. Sines come first."""
     return torch.cat(sin_and_cos(timestep, action_frequencies(width)), dim=-1)
 
 
 def timestep_table(timestep: Tensor) -> Tensor:
-    """The input of the timestep encoder: cosines first, `(batch, 256)` float32."""
+    """The input of the timestep encoder, `(batch, 256)` float32. Cosines come first."""
     sin, cos = sin_and_cos(timestep, timestep_frequencies())
     return torch.cat((cos, sin), dim=-1)

@@ -211,7 +211,8 @@ class Normalizer(Robot):
         if state is None:
             keys = ", ".join(group.key for group in relative)
             raise InputError(
-                f"state: expected the robot's state, because {keys} are relative to it, got None"
+                f"state: expected the robot's state, because the actions of {keys} are relative to it, got "
+                "None"
             )
         latest = self._robot("state", state, self.state_groups)
         if latest.ndim > 2:

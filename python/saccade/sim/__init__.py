@@ -1,4 +1,4 @@
-"""Simulated robot tasks seen through cameras, and the small policy that solves them.
+"""Simulated robot tasks with camera images, and the small policy that solves them.
 
 Importing this package registers a gymnasium environment for each task of `saccade.sim.tasks`:
 
@@ -9,10 +9,11 @@ Importing this package registers a gymnasium environment for each task of `sacca
     ((64, 64, 3), (4,), 'open the drawer')
     >>> env.close()
 
-Where to read what: `tasks` (instructions, seeds), `scenarios` (layouts, success, what experts do), `cameras`,
-`environment` (what the robot sees and does), `experts` and `demos` (demonstrations), `backbone` and `policy`
-(numpy at run time), `learner` and `train` (torch), `rollout`, `report` and `video` (closed loop). Needs
-`pip install 'saccade[sim]'`; nothing here opens a window.
+Modules: `tasks` (instructions, seeds), `scenarios` (layouts, success, experts' actions), `cameras`,
+`environment` (observations and actions), `graphics` and `rendering` (OpenGL), `experts` and `demos`
+(demonstrations), `backbone` and `policy` (inference in NumPy), `dataset`, `learner`, `training_settings` and
+`train` (training in torch), `rollout`, `report` and `video` (closed loop). Needs the extra `sim`. Opens no
+window.
 """
 
 from saccade.sim import graphics
@@ -22,10 +23,10 @@ graphics.choose_backend()  # MuJoCo reads the choice once, when it is imported
 
 
 def register_environments() -> None:
-    """Makes `gymnasium.make("saccade/<task>-v0")` work; does nothing where gymnasium is not installed."""
+    """Registers `saccade/<task>-v0` with gymnasium, if it is installed."""
     try:
         import gymnasium
-    except ModuleNotFoundError:  # the numpy side (`policy`, `backbone`) works without the simulator
+    except ModuleNotFoundError:  # `policy` and `backbone` need NumPy only
         return
     entry_point = "saccade.sim.environment:TaskEnvironment"
     for name in TASKS:

@@ -1,8 +1,8 @@
-"""The vision-language backbone in numpy: pictures and words to the tokens that the action head reads.
+"""The vision-language backbone in NumPy: images and words to the tokens that the action head attends to.
 
-A convolutional stem turns each picture into one token per patch, words are looked up, a register token joins
-them, and a small transformer mixes all. `learner.py` has the same in torch for training; a test holds the two
-together.
+A convolutional stem turns each image into one token per patch. Word embeddings and a register token are
+appended, and a small transformer mixes all tokens. `learner.py` has the same network in torch for training; a
+test compares the two.
 """
 
 import math
@@ -18,7 +18,7 @@ from saccade.errors import CheckpointError, ShapeError
 Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
 
-KERNEL, STRIDE, PADDING = 4, 2, 1  # of every convolution: each halves the picture
+KERNEL, STRIDE, PADDING = 4, 2, 1  # of every convolution: each halves the size of the image
 FIRST_CHANNELS = 32
 NORM_EPS = 1e-5
 
@@ -31,11 +31,11 @@ class BackboneConfig:
         width: Of its tokens; the head's `context_dim`.
         num_layers: Transformer blocks.
         num_heads: Attention heads.
-        image_size: Pixels along each side of a picture.
+        image_size: Pixels along each side of an image.
         patch_size: Pixels along each side of the patch behind one token, a power of two.
-        num_cameras: Pictures per observation.
+        num_cameras: Images per observation.
         text_length: Word tokens per instruction.
-        vocabulary_size: Words that are known, special ones included.
+        vocabulary_size: Number of words, special ones included.
     """
 
     width: int = 128
@@ -62,10 +62,10 @@ class BackboneConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "BackboneConfig":
-        """Reads the sizes out of a checkpoint's `backbone_cfg`.
+        """Reads the sizes from a checkpoint's `backbone_cfg`.
 
         Raises:
-            CheckpointError: sizes are missing, no integers, or contradict each other.
+            CheckpointError: sizes are missing, not integers, or contradict each other.
         """
         names = cls.__dataclass_fields__
         wrong = [name for name in names if type(values.get(name)) is not int]
@@ -81,7 +81,7 @@ class BackboneConfig:
 
     @property
     def tokens_per_camera(self) -> int:
-        """Image tokens of one picture."""
+        """Image tokens per image."""
         return (self.image_size // self.patch_size) ** 2
 
     @property
@@ -119,14 +119,14 @@ class BackboneConfig:
 
 
 class Backbone:
-    """Pictures and words to `(batch, T_vl, width)`.
+    """Images and words to tokens `(batch, T_vl, width)`.
 
     Args:
         config: its sizes.
         tensors: name to float32 array, names without prefix.
 
     Raises:
-        CheckpointError: tensors are missing, unknown or of the wrong shape; all of them are listed.
+        CheckpointError: tensors are missing, unknown or of the wrong shape; lists all of them.
 
     Example:
         >>> from saccade.sim.policy import Policy
@@ -224,7 +224,7 @@ class Backbone:
 def kernel_matrix(weight: Float32Array) -> Float32Array:
     """A convolution's weight `(out_channels, channels, 4, 4)` as the matrix `(16 * channels, out_channels)`.
 
-    Channels come last in memory, as in the pictures: then `convolve` copies whole runs.
+    Channels are last in memory, as in the images, so that `convolve` copies contiguous runs.
     """
     return np.ascontiguousarray(weight.transpose(2, 3, 1, 0).reshape(-1, weight.shape[0]))
 
@@ -233,19 +233,19 @@ def convolve(x: Float32Array, kernel: Float32Array, bias: Float32Array) -> Float
     """A 4 x 4 convolution with stride 2 and padding 1, as one matrix product.
 
     Args:
-        x: `(pictures, H, W, channels)`.
+        x: `(images, H, W, channels)`.
         kernel: `(16 * channels, out_channels)`, from `kernel_matrix`.
         bias: `(out_channels,)`.
 
     Returns:
-        `(pictures, H / 2, W / 2, out_channels)`.
+        `(images, H / 2, W / 2, out_channels)`.
     """
     padded = np.pad(x, ((0, 0), (PADDING, PADDING), (PADDING, PADDING), (0, 0)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))
     windows = windows[:, ::STRIDE, ::STRIDE].transpose(
         0, 1, 2, 4, 5, 3
-    )  # (pictures, H / 2, W / 2, 4, 4, channels)
-    rows = windows.reshape(*windows.shape[:3], -1)  # (pictures, H / 2, W / 2, 16 * channels)
+    )  # (images, H / 2, W / 2, 4, 4, channels)
+    rows = windows.reshape(*windows.shape[:3], -1)  # (images, H / 2, W / 2, 16 * channels)
     return rows @ kernel + bias
 
 
@@ -256,12 +256,12 @@ def gelu(x: Float32Array) -> Float32Array:
 
 
 def stack_images(images: Mapping[str, UInt8Array], cameras: Sequence[str]) -> UInt8Array:
-    """The pictures of one observation in the policy's order, `(1, cameras, H, W, 3)`.
+    """The images of one observation in the policy's order, `(1, cameras, H, W, 3)`.
 
     Raises:
         ShapeError: a camera is missing.
     """
     missing = [name for name in cameras if name not in images]
     if missing:
-        raise ShapeError(f"images: no picture of {', '.join(missing)}; there are {', '.join(images)}")
+        raise ShapeError(f"images: none of camera {', '.join(missing)}; there are {', '.join(images)}")
     return np.stack([images[name] for name in cameras])[None]

@@ -1,4 +1,4 @@
-"""Where the cameras stand: plain numbers, kept in a policy's config. `rendering` draws through them."""
+"""The positions of the cameras: plain numbers, stored in a policy's config. `rendering` draws with them."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -7,12 +7,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera on a sphere around a point.
+    """A camera on a sphere around the point that it looks at.
 
     Attributes:
-        name: Key of its pictures.
-        lookat: The point it looks at, metres.
-        distance: Metres from there.
+        name: Key of its images.
+        lookat: The centre of the sphere, metres.
+        distance: Radius of the sphere, metres.
         azimuth: Degrees around the vertical.
         elevation: Degrees above the horizon, negative looks down.
     """
@@ -35,7 +35,7 @@ class Camera:
         return asdict(self)
 
 
-CENTRE = (0.0, 0.72, 0.12)  # of where things happen on the table
+CENTRE = (0.0, 0.72, 0.12)  # of the workspace on the table
 DEFAULT_CAMERAS = (
     Camera("left", CENTRE, 0.95, 145.0, -35.0),
     Camera("right", CENTRE, 0.95, 35.0, -35.0),

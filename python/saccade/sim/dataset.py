@@ -16,7 +16,7 @@ from saccade.sim.tasks import TASKS
 
 Float32Array = npt.NDArray[np.float32]
 
-VALIDATION_EVERY = 20  # of so many demonstrations of a task, one is held out
+VALIDATION_EVERY = 20  # every 20th demonstration of a task is held out
 MIN_VALID_ACTIONS = 4  # a frame with fewer usable actions is left out
 
 
@@ -25,10 +25,10 @@ class Samples:
     """Observations with their chunks, as recorded (nothing is normalised).
 
     Attributes:
-        images: `(frames, cameras, H, W, 3)` uint8, every recorded frame once, also those that are no sample
-            and are only what another one leads to.
-        now: `(samples,)` which frame of `images` is seen.
-        later: `(samples,)` which one is seen when the chunk has been carried out, see `later_frames`.
+        images: `(frames, cameras, H, W, 3)` uint8, every recorded frame once, including those that are only
+            the later frame of a sample.
+        now: `(samples,)` the index in `images` of the observation.
+        later: `(samples,)` the index of the observation after the chunk was executed, see `later_frames`.
         state: `(samples, 4)` float32, proprioception.
         targets: `(samples, 6)` float32, positions of object and goal.
         actions: `(samples, horizon, 4)` float32, zero where not valid.
@@ -50,10 +50,10 @@ class Samples:
 
 
 def chunks(demonstration: demos.Demonstration, horizon: int) -> tuple[Float32Array, Float32Array]:
-    """The expert's actions from each frame on, and which of them follow from what the frame shows.
+    """The expert's actions from each frame on, and which of them are valid.
 
-    After a disturbance the expert reacts to something that the frame could not foretell, so actions count up
-    to and including the first disturbed step.
+    After a disturbance the expert reacts to something that the frame does not show. Actions are therefore
+    valid up to and including the first disturbed step.
 
     Returns:
         `(frames, horizon, 4)` and `(frames, horizon, 1)` of zeros and ones.
@@ -68,9 +68,9 @@ def chunks(demonstration: demos.Demonstration, horizon: int) -> tuple[Float32Arr
 
 
 def later_frames(demonstration: demos.Demonstration, horizon: int) -> npt.NDArray[np.int64]:
-    """For each frame, the first one that was recorded `horizon` control steps later or after that.
+    """For each frame, the first one that was recorded at least `horizon` control steps later.
 
-    Where the demonstration ends before, its last frame: nothing moves any more once the task is done.
+    If the demonstration ends before that, this is its last frame: once the task is done nothing moves.
 
     Returns:
         `(frames,)` indices of frames.
@@ -111,10 +111,10 @@ def load_samples(directory: Path, tasks: list[str], horizon: int) -> tuple[Sampl
 
 
 def describe(directory: Path, tasks: list[str]) -> dict[str, Any]:
-    """What a recording holds, for a run's settings: episodes per task, and a digest that tells others apart.
+    """A recording, for a run's settings: the number of episodes per task, and a digest that identifies it.
 
-    The digest is of the episodes' names and the recording's settings, on which the episodes depend and on
-    nothing else.
+    The digest covers the seeds of the episodes and the settings of the recording, which together determine
+    the episodes.
     """
     seeds = {task: sorted(int(path.stem) for path in (directory / task).glob("[0-9]*.npz")) for task in tasks}
     recorded = {"settings": demos.read_settings(directory, tasks).to_dict(), "seeds": seeds}
@@ -123,7 +123,7 @@ def describe(directory: Path, tasks: list[str]) -> dict[str, Any]:
 
 
 def join(parts: list[Samples]) -> Samples:
-    """All samples in one."""
+    """Concatenates samples."""
     firsts = np.cumsum([0, *(len(part.images) for part in parts[:-1])])  # of each part's images
     moved = [
         replace(part, now=part.now + first, later=part.later + first)
@@ -134,7 +134,7 @@ def join(parts: list[Samples]) -> Samples:
 
 
 def statistics(samples: Samples) -> dict[str, Statistics]:
-    """Of state, valid actions and targets."""
+    """Statistics of state, valid actions and targets."""
     valid = samples.mask[..., 0] > 0
     return {
         "state": Statistics.of(samples.state),

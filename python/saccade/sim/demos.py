@@ -1,9 +1,8 @@
-"""Demonstrations: scripted experts recorded through the policy's cameras, one file per episode.
+"""Demonstrations: scripted experts recorded with the policy's cameras, one file per episode.
 
-A directory holds `<task>/<seed>.npz` and, beside them, `<task>/recording.json` with the settings. Files are
-written under a temporary name and renamed, so an interrupted recording goes on where it stopped. Each episode
-depends on its task, its seed and the settings only, so a recording can also be split between processes by
-task.
+A recording is a directory with `<task>/<seed>.npz` and `<task>/recording.json`, which has the settings. Files
+are written under a temporary name and renamed, so that an interrupted recording can be continued. An episode
+depends only on its task, its seed and the settings, so that several processes can record different tasks.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASK
 if TYPE_CHECKING:
     from saccade.sim.environment import TaskEnvironment
 
-MAX_STEPS = 250  # bursts make the expert's way longer
+MAX_STEPS = 250  # bursts lengthen the expert's path
 STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to stay
-MAX_MISSES = 0.5  # give up a task when more than this share of its episodes fails, once 20 have been tried
-# reach and the study's tasks are judged by where the hand is and by nothing else, so they need the most
-# precision and the most examples.
+MAX_MISSES = 0.5  # a task is given up if more than this share of at least 20 episodes fails
+# The success of reach and of the study tasks depends only on the position of the hand. They need the most
+# precision and therefore the most demonstrations.
 DEFAULT_COUNTS = (
     {task.name: 100 for task in DEMO_TASKS} | {"reach": 300} | {task.name: 200 for task in STUDY_TASKS}
 )
@@ -38,12 +37,12 @@ DEFAULT_COUNTS = (
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """What a recording depends on besides task and seed.
+    """The settings of a recording.
 
     Attributes:
         image_size: Pixels along each side.
-        frame_stride: One observation is kept for that many control steps.
-        cameras: What is recorded.
+        frame_stride: Control steps between recorded observations.
+        cameras: The cameras that are recorded.
     """
 
     image_size: int = DEFAULT_IMAGE_SIZE
@@ -73,9 +72,9 @@ class Demonstration:
         images: `(frames, cameras, H, W, 3)` uint8.
         proprio: `(frames, 4)` float32.
         targets: `(frames, 6)` float32, positions of object and goal, metres.
-        frame_steps: `(frames,)` int32, the control step before which a frame was seen.
-        actions: `(steps, 4)` float32, what the expert would do at each step.
-        disturbed: `(steps,)` bool, where something else was executed.
+        frame_steps: `(frames,)` int32, the control step before which a frame was drawn.
+        actions: `(steps, 4)` float32, the expert's action at each step.
+        disturbed: `(steps,)` bool, where another action was executed.
     """
 
     images: npt.NDArray[np.uint8]
@@ -89,7 +88,7 @@ class Demonstration:
 def record_episode(
     environment: TaskEnvironment, seed: int, settings: RecordingSettings
 ) -> Demonstration | None:
-    """Lets the expert do one episode; `None` if it did not succeed."""
+    """Records one episode of the expert; None if it did not succeed."""
     environment.restart(seed)
     expert = Expert(environment)
     task_number = list(TASKS).index(environment.task.name)
@@ -130,17 +129,18 @@ def record_episode(
 def record_task(
     task: str, count: int, out: Path, settings: RecordingSettings, on_episode: Callable[[], None]
 ) -> None:
-    """Records until `count` episodes of a task lie in `out`, going on from what is there.
+    """Records `count` episodes of a task, less those that are recorded already.
 
     Args:
         task: its name.
-        count: how many; the first seeds at which the expert succeeds.
+        count: number of episodes: those with the first seeds at which the expert succeeds.
         out: directory of the whole recording.
-        settings: must be those of what is there already.
-        on_episode: called after each episode that is new or was found.
+        settings: must be the same as those of earlier episodes in `out`.
+        on_episode: called after each episode, recorded now or earlier.
 
     Raises:
-        InputError: what is there was recorded with other settings, or the expert fails too often.
+        InputError: `out` was recorded with other settings, or the expert fails too often.
+        GraphicsError: OpenGL cannot be loaded.
     """
     from saccade.sim.environment import TaskEnvironment  # not at the top: reading needs no simulator
 
@@ -173,7 +173,7 @@ def claim_directory(path: Path, settings: RecordingSettings) -> None:
     if not path.exists():
         write_json(path, settings.to_dict())
     elif json.loads(path.read_text()) != json.loads(json.dumps(settings.to_dict())):
-        raise InputError(f"{path.parent}: was recorded with other settings; choose another directory")
+        raise InputError(f"{path.parent}: was recorded with other settings; use another directory")
 
 
 def save(demonstration: Demonstration, path: Path) -> None:
@@ -196,7 +196,7 @@ def recorded_tasks(directory: Path) -> list[str]:
     """
     tasks = [name for name in TASKS if (directory / name / "recording.json").is_file()]
     if not tasks:
-        raise FileNotFoundError(f"{directory}: no demonstrations there; `saccade demos` records them")
+        raise FileNotFoundError(f"{directory}: no demonstrations found; `saccade demos` records them")
     return tasks
 
 

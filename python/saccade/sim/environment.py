@@ -1,4 +1,4 @@
-"""The gymnasium environment: a Meta-World task seen through cameras and told in words."""
+"""The gymnasium environment: a Meta-World task with camera images and a text instruction."""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -26,22 +26,22 @@ SIMULATION_HZ = 80  # control steps in a second of simulated time
 class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     """One task as a language-conditioned pixel task.
 
-    An observation holds what a real robot would have: the pictures, where its hand is, and the instruction.
-    Positions of objects and goals are not in it; experts and training targets get them from
+    An observation contains what a real robot would have: images, proprioception and the instruction. It does
+    not contain positions of objects and goals; experts and training targets get them from
     `privileged_state`.
 
-    Made by name: `gymnasium.make("saccade/reach-v0")` after `import saccade.sim`. The same seed gives the
-    same layout, the same wording and the same pixels. An episode ends (`terminated`) at its first success.
+    Create it by name, `gymnasium.make("saccade/reach-v0")`, after `import saccade.sim`. The same seed gives
+    the same layout, wording and pixels. An episode ends (`terminated`) at its first success.
 
     Args:
         task: its name, see `saccade.sim.tasks`.
         image_size: pixels along each side.
-        cameras: what the policy looks through.
-        blanked: names of cameras whose pictures are black, a control: what does the policy do without them?
+        cameras: those of the policy.
+        blanked: names of cameras whose images are black, to test what the policy does without them.
         render_mode: `"rgb_array"` lets `render` draw the whole robot for videos.
 
     Raises:
-        InputError: no such task; image size or cameras that cannot be used; no camera with a blanked name.
+        InputError: unknown task, unusable image size or cameras, or a blanked name without a camera.
         GraphicsError: OpenGL cannot be loaded.
 
     Example:
@@ -83,13 +83,13 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 
         self._world = make_world(self.task.scene)
-        # Otherwise every seed gives the first layout again.
+        # Otherwise every seed would give the same layout.
         self._world._freeze_rand_vec = False
         self._world.seeded_rand_vec = True
         self._world._set_task_called = True
-        self._world._partially_observable = False  # experts are told the goal; the policy sees `observe` only
-        # Meta-World clips what it reports to this space, which was formed while the goal was still hidden: to
-        # zeros.
+        self._world._partially_observable = False  # experts need the goal; the policy gets `observe` only
+        # Meta-World clips its observations to this cached space. It was computed while the goal was hidden
+        # and would clip the goal to zero.
         self._world.__dict__.pop("sawyer_observation_space", None)
         self.scenario = self.task.scenario(self._world)
         prepare_model(self._world.model, draws_goal=self.task.draws_goal)
@@ -102,7 +102,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts an episode; without a seed one of the evaluation seeds is drawn."""
+        """Starts an episode; without a seed, one of the evaluation seeds is drawn."""
         super().reset(seed=seed)
         self.restart(int(self.np_random.integers(1_000_000)) if seed is None else seed)
         return self.observe(), {"success": False, "task": self.task.name}
@@ -126,7 +126,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._steps = 0
 
     def advance(self, action: npt.ArrayLike) -> StepOutcome:
-        """Like `step`, without drawing an observation: policies that act in chunks look only now and then."""
+        """Like `step`, without drawing an observation, which policies need only once per chunk."""
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (ACTION_DIM,):
             raise ShapeError(f"action: given shape {action.shape}, expected ({ACTION_DIM},)")
@@ -137,7 +137,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         return self.scenario.outcome(float(reward), bool(info["success"]))
 
     def observe(self) -> Observation:
-        """What the policy may know now; also kept as `last_observation`."""
+        """The current observation; also stored as `last_observation`."""
         self.last_observation = {
             "images": {camera.name: self._picture(camera) for camera in self.cameras},
             "proprio": self._full_state[:PROPRIO_DIM].astype(np.float32),
@@ -146,7 +146,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         return self.last_observation
 
     def _picture(self, camera: Camera) -> UInt8Array:
-        """What one of the policy's cameras sees now."""
+        """The current image of one of the policy's cameras."""
         if camera.name in self.blanked:
             return np.zeros((self.image_size, self.image_size, 3), dtype=np.uint8)
         if self._renderer is None:
@@ -168,12 +168,12 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     def privileged_targets(self) -> npt.NDArray[np.float32]:
         """Positions of the object and of the goal `(6,)`, metres: training targets, never an input.
 
-        Tasks with balls of their own give the first and the last ball, those that have vanished included.
+        In tasks with balls these are the first and the last ball, also after they have vanished.
         """
         return self.scenario.targets(self._full_state).astype(np.float32)
 
     def fingertips(self) -> npt.NDArray[np.float64]:
-        """The point between the fingertips `(3,)`, metres; Meta-World judges a reach by it."""
+        """The point between the fingertips `(3,)`, metres, which decides the success of a reach."""
         return np.asarray(self._world.tcp_center, dtype=np.float64).copy()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Scripted experts, and how demonstrations are disturbed so that a learner sees how to recover."""
+"""Scripted experts, and disturbances of demonstrations, from which a policy learns to recover."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Float32Array = npt.NDArray[np.float32]
 
 
 class Expert:
-    """The scripted expert of one task, told everything.
+    """The scripted expert of one task, which knows the full state.
 
     Args:
-        environment: the simulation it drives.
+        environment: the simulation that it acts in.
     """
 
     def __init__(self, environment: TaskEnvironment) -> None:
         self._environment = environment
 
     def action(self) -> Float32Array:
-        """What it does now, `(4,)` in [-1, 1]."""
+        """Its action in the current state, `(4,)` in [-1, 1]."""
         action = self._environment.scenario.expert_action(self._environment.privileged_state())
         clipped: Float32Array = np.clip(action[:ACTION_DIM], -1.0, 1.0).astype(np.float32)
         return clipped
@@ -35,16 +35,16 @@ class Expert:
 
 @dataclass
 class NoiseBursts:
-    """Now and then replaces the hand's motion by a constant random one for a few steps.
+    """Occasionally replaces the hand's motion by a constant random one for a few steps.
 
-    The expert's own action stays the label. A burst carries the hand to places that the expert never visits
-    on its own but a learner will.
+    The expert's own action stays the label. A burst moves the hand to places that the expert does not visit
+    but a learned policy will.
 
     Attributes:
-        rng: Source of all randomness.
-        start_probability: Of a burst to start at a step outside one.
-        min_steps, max_steps: Its length.
-        remaining: Steps left of the present burst.
+        rng: Source of randomness.
+        start_probability: Probability that a burst starts, per step outside a burst.
+        min_steps, max_steps: Length of a burst.
+        remaining: Steps left of the current burst.
     """
 
     rng: np.random.Generator
@@ -54,7 +54,7 @@ class NoiseBursts:
     remaining: int = 0
 
     def apply(self, action: Float32Array) -> tuple[Float32Array, bool]:
-        """The action to execute, and whether it was replaced; the gripper is left to the expert."""
+        """The action to execute, and whether it was replaced; the gripper always follows the expert."""
         if self.remaining == 0 and self.rng.random() < self.start_probability:
             self.remaining = int(self.rng.integers(self.min_steps, self.max_steps + 1))
             self._velocity = self.rng.uniform(-1.0, 1.0, size=3).astype(np.float32)

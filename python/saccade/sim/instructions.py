@@ -1,4 +1,4 @@
-"""Words to numbers: a small vocabulary of whole words."""
+"""Tokenization: a small vocabulary of whole words."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,7 +10,7 @@ PAD, UNKNOWN = "<pad>", "<unknown>"
 
 
 def words(instruction: str) -> list[str]:
-    """Lower-case words without punctuation.
+    """The words of an instruction in lower case, without punctuation.
 
     Example:
         >>> words("Open the drawer, please!")
@@ -25,14 +25,14 @@ def build_vocabulary(instructions: Iterable[str]) -> tuple[str, ...]:
 
 
 class Tokenizer:
-    """Maps an instruction to a fixed number of word numbers.
+    """Maps an instruction to a fixed number of word indices.
 
-    Padding tokens are tokens like any other: the head ignores masks as the released one does, and with a
-    fixed length it sees the same in training and at run time.
+    Padding tokens are attended to like any other token: the head ignores padding masks, as the released one
+    does. With a fixed length, training and inference see the same number of them.
 
     Args:
         vocabulary: from `build_vocabulary`.
-        length: tokens of every instruction; what is longer is cut off.
+        length: tokens per instruction; longer instructions are truncated.
     """
 
     def __init__(self, vocabulary: Sequence[str], length: int) -> None:
@@ -40,6 +40,6 @@ class Tokenizer:
         self._number = {word: number for number, word in enumerate(vocabulary)}
 
     def __call__(self, instruction: str) -> npt.NDArray[np.int64]:
-        """Word numbers `(length,)`; 0 pads, 1 stands for a word that is not in the vocabulary."""
+        """Word indices `(length,)`; 0 is padding, 1 a word outside the vocabulary."""
         numbers = [self._number.get(word, 1) for word in words(instruction)][: self.length]
         return np.array(numbers + [0] * (self.length - len(numbers)), dtype=np.int64)

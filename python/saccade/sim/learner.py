@@ -1,4 +1,4 @@
-"""The policy as a torch module, for training: backbone, head, and what only training needs."""
+"""The policy as a torch module for training: backbone, head, and modules that only training needs."""
 
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-any-return, no-untyped-call"
@@ -43,7 +43,7 @@ class Block(nn.Module):
 
 
 class Backbone(nn.Module):
-    """`saccade.sim.backbone.Backbone` with gradients; the tensor names are the same.
+    """`saccade.sim.backbone.Backbone` with gradients and the same tensor names.
 
     Args:
         config: its sizes.
@@ -82,12 +82,12 @@ class Backbone(nn.Module):
 
 
 class Learner(nn.Module):
-    """All that is trained.
+    """All modules that are trained.
 
-    Besides the policy there is a linear layer that reads object and goal positions off the register token.
-    Its loss makes the backbone find them early. With an `alignment_block` there is also a projector from the
-    hidden rows of the future tokens to what the backbone says one horizon later. Neither is part of the
-    checkpoint.
+    In addition to the policy there is a linear layer that predicts object and goal positions from the
+    register token. Its loss makes the backbone locate them early in training. With an `alignment_block` there
+    is also a projector from the hidden rows of the future tokens to the backbone's features one horizon
+    later. Neither is part of the checkpoint.
 
     Args:
         backbone_config: sizes of the backbone.
@@ -104,7 +104,7 @@ class Learner(nn.Module):
         self.target_head = nn.Linear(backbone_config.width, NUM_TARGETS)
         self.alignment_block = alignment_block
         if alignment_block is not None:
-            # Made last, so that a seed gives the other layers the same weights with and without it.
+            # Created last, so that a seed gives the other layers the same weights with and without it.
             self.projector = nn.Sequential(
                 nn.Linear(head_config.width, backbone_config.width),
                 nn.GELU(),
@@ -121,7 +121,7 @@ class Learner(nn.Module):
                 `actions (B, T, action_dim)`, `mask (B, T, 1)`, `targets (B, 6)`; numbers are normalised. With
                 alignment also `later_images`, like `images`.
             generator: for noise and times.
-            average: the averaged tensors of the policy, whose backbone sees the later images.
+            average: the averaged tensors of the policy, whose backbone encodes the later images.
 
         Returns:
             Scalars: `loss` of flow matching, `target_loss` of the positions and, with alignment,
@@ -152,14 +152,14 @@ class Learner(nn.Module):
 
     @torch.no_grad()
     def alignment_targets(self, batch: Mapping[str, Tensor], average: Mapping[str, Tensor]) -> Tensor:
-        """What the future rows should tell: the averaged backbone's tokens of the later images.
+        """The targets of the future rows: the averaged backbone's tokens of the later images.
 
         Args:
             batch: `later_images` and `words`, as in `losses`.
             average: see `losses`.
 
         Returns:
-            `(B, N, width)`: the T_vl tokens pooled to N runs of neighbours.
+            `(B, N, width)`: the T_vl tokens, averaged over N runs of neighbours.
         """
         prefix = "backbone."
         tensors = {
@@ -170,7 +170,7 @@ class Learner(nn.Module):
 
     @contextmanager
     def watched_rows(self) -> Iterator[list[Tensor]]:
-        """Collects the rows `(B, R, width)` that the alignment block returns; nothing without alignment."""
+        """Collects the rows `(B, R, width)` that the alignment block returns; none without alignment."""
         rows: list[Tensor] = []
         if self.alignment_block is None:
             yield rows
@@ -192,10 +192,10 @@ class Learner(nn.Module):
 
 
 def pool_tokens(tokens: Tensor, count: int) -> Tensor:
-    """`(B, S, width)` to `(B, count, width)`: means of runs of neighbours that cover all tokens."""
+    """`(B, S, width)` to `(B, count, width)`: means over runs of neighbours that cover all tokens."""
     return F.adaptive_avg_pool1d(tokens.transpose(1, 2), count).transpose(1, 2)
 
 
 def table(*shape: int) -> nn.Parameter:
-    """Learned positions, small at first."""
+    """A learned table with small initial values."""
     return nn.Parameter(TABLE_STD * torch.randn(shape))

@@ -1,4 +1,4 @@
-"""From an observation to a chunk of actions: numpy backbone, then the action head of either engine."""
+"""The policy: from an observation to a chunk of actions, by the NumPy backbone and either head engine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from saccade.sim.instructions import Tokenizer
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
 Float32Array = npt.NDArray[np.float32]
-#: One, several that act together, or none.
+#: One intervention, several that act together, or none.
 Interventions: TypeAlias = Intervention | Sequence[Intervention] | None
 
 DEMO_CHECKPOINT = Path(__file__).parent / "demo"
@@ -32,21 +32,21 @@ ENGINES = ("rust", "torch")
 
 
 class HeadEngine(Protocol):
-    """An action head, whoever computes it."""
+    """An action head, computed by one of `ENGINES`."""
 
     def encode(self, features: Float32Array) -> Any:
-        """Runs what depends on the observation alone: `(1, T_vl, width)` to something that `sample` takes."""
+        """The context for `sample`, from features `(1, T_vl, width)`."""
 
     def sample(
         self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
     ) -> Float32Array:
-        """`state (1, state_dim)`, `noise (1, horizon, action_dim)`; actions like the noise, normalised.
+        """Normalised actions `(1, horizon, action_dim)` from state `(1, state_dim)` and noise of their shape.
 
-        An `intervention` changes what the head computes on the way, see `saccade.Intervention`.
+        For `intervention` see `saccade.Intervention`.
         """
 
     def describe(self) -> dict[str, Any]:
-        """What a result file should say about it."""
+        """The engine, for a result file."""
 
 
 class RustEngine:
@@ -54,7 +54,7 @@ class RustEngine:
 
     Args:
         checkpoint: directory of a policy.
-        num_threads: default as `saccade.ActionHead.load` has it.
+        num_threads: as `saccade.ActionHead.load` takes it.
     """
 
     def __init__(self, checkpoint: Path, num_threads: int | None = None) -> None:
@@ -86,7 +86,7 @@ class TorchEngine:
 
     Args:
         checkpoint: directory of a policy.
-        num_threads: of torch, for the whole process; default torch's own.
+        num_threads: threads of torch, for the whole process; None leaves torch's default.
     """
 
     def __init__(self, checkpoint: Path, num_threads: int | None = None) -> None:
@@ -122,10 +122,10 @@ class TorchEngine:
 
 
 def make_engine(name: str, checkpoint: Path, num_threads: int | None = None) -> HeadEngine:
-    """The engine of that name with the head of a checkpoint.
+    """The engine of that name, with the head of a checkpoint.
 
     Raises:
-        InputError: no such engine, or `num_threads` below 1.
+        InputError: unknown engine, or `num_threads` below 1.
     """
     if num_threads is not None and num_threads < 1:
         raise InputError(f"num_threads: given {num_threads}, expected at least 1")
@@ -138,11 +138,11 @@ def make_engine(name: str, checkpoint: Path, num_threads: int | None = None) -> 
 
 @dataclass(frozen=True)
 class Chunk:
-    """What the policy wants to do next, and what that took.
+    """A chunk of actions and the time that it took.
 
     Attributes:
         actions: `(horizon, action_dim)` float32 in [-1, 1].
-        milliseconds: By part: backbone, encode, sample.
+        milliseconds: Time of each part: backbone, encode, sample.
     """
 
     actions: Float32Array
@@ -154,9 +154,9 @@ class Policy:
 
     Args:
         config: its config.
-        backbone: in numpy.
-        engine: computes the head.
-        checkpoint: where it was loaded from.
+        backbone: its backbone.
+        engine: computes its head.
+        checkpoint: the directory that it was loaded from.
 
     Example:
         >>> import gymnasium, saccade.sim
@@ -198,7 +198,7 @@ class Policy:
         Raises:
             FileNotFoundError: a file is not there.
             CheckpointError: config or tensors do not fit.
-            InputError: no such engine, or `num_threads` below 1.
+            InputError: unknown engine, or `num_threads` below 1.
         """
         directory = Path(checkpoint)
         if not directory.is_dir():
@@ -215,13 +215,13 @@ class Policy:
         return int(self.config.head["action_horizon"])
 
     def noise(self, rng: np.random.Generator) -> Float32Array:
-        """What a chunk starts from, `(1, horizon, action_dim)`."""
+        """The noise that a chunk starts from, `(1, horizon, action_dim)`."""
         return rng.standard_normal((1, self.horizon, len(self.config.action.mean)), dtype=np.float32)
 
     def features(self, observation: Mapping[str, Any]) -> Float32Array:
         """Backbone features of one observation, `(1, T_vl, width)`."""
         images = stack_images(observation["images"], self._camera_names)
-        # NumPy's BLAS would use every core, and its threads wait by spinning: beside one other busy process
+        # NumPy's BLAS would use every core, and its threads wait by spinning. With one other busy process
         # these small products took up to a hundred times longer than on one thread.
         with self._libraries.limit(limits=1, user_api="blas"):
             return self.backbone(images, self._tokenizer(observation["instruction"])[None])
@@ -236,12 +236,12 @@ class Policy:
     def act(
         self, observation: Mapping[str, Any], *, noise: Float32Array, intervention: Interventions = None
     ) -> Chunk:
-        """Decides on a chunk of actions.
+        """Computes a chunk of actions.
 
         Args:
             observation: `images` by camera name `(H, W, 3)` uint8, `proprio (4,)`, `instruction`.
             noise: from `noise`.
-            intervention: what to change inside the head, see `saccade.Intervention`.
+            intervention: a change inside the head, see `saccade.Intervention`.
         """
         times = [time.perf_counter()]
         features = self.features(observation)
@@ -257,7 +257,7 @@ class Policy:
         return Chunk(np.clip(self.config.action.restore(normalised), -1.0, 1.0), spent)
 
     def warmup(self) -> None:
-        """Acts once on an empty observation, so that the first real one is not slow."""
+        """Acts once on a black observation, so that the first real call is not slow."""
         size = self.config.backbone.image_size
         observation = {
             "images": {name: np.zeros((size, size, 3), np.uint8) for name in self._camera_names},
@@ -267,12 +267,12 @@ class Policy:
         self.act(observation, noise=self.noise(np.random.default_rng(0)))
 
     def checkpoint_sha256(self) -> str:
-        """Hash of config and tensors, in this order."""
+        """SHA-256 of config and tensors, in this order."""
         return sha256_of(self.checkpoint / CONFIG_FILE, self.checkpoint / TENSOR_FILE)
 
 
 def check_trained_on(policy: Policy, tasks: list[str]) -> None:
-    """Raises `CheckpointError` if the policy does not know a task."""
+    """Raises `CheckpointError` if the policy was not trained on a task."""
     unknown = [task for task in tasks if task not in policy.config.tasks]
     if unknown:
         raise CheckpointError(

@@ -1,4 +1,4 @@
-"""Results of a rollout: intervals, summaries, the result file, the contact sheet."""
+"""Results of a rollout: summaries, the result file, the contact sheet."""
 
 import platform
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ class Summary:
 
 
 def summarize(task: str, episodes: Sequence[Episode]) -> Summary:
-    """Sums up at least one episode."""
+    """Summarises at least one episode."""
     steps = [episode.steps for episode in episodes if episode.success]
     chunks = sum(episode.chunks for episode in episodes)
     milliseconds = {
@@ -76,14 +76,14 @@ def result_record(
     tasks: Sequence[str],
     instruction_from: str | None,
 ) -> dict[str, Any]:
-    """What the result file holds: enough to run the same again and to compare it.
+    """The content of the result file: enough to repeat the rollout and to compare the results.
 
     Args:
         episodes: those that were completed.
         policy: the one that acted.
-        seeds: those asked for, each for every task.
-        tasks: those asked for.
-        instruction_from: the task whose words the policy was told, if it was not the task's own.
+        seeds: those that were requested, each for every task.
+        tasks: those that were requested.
+        instruction_from: the task whose instruction the policy got, if not the task's own.
     """
     return {
         "complete": len(episodes) == len(seeds) * len(tasks),

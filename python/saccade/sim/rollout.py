@@ -1,4 +1,4 @@
-"""Closed loop: look, decide on a chunk, carry out its first actions, look again."""
+"""Closed loop: observe, compute a chunk, execute its first actions, observe again."""
 
 import time
 from collections.abc import Callable, Collection
@@ -15,17 +15,17 @@ PARTS = ("render", "backbone", "encode", "sample")
 
 @dataclass
 class Episode:
-    """One episode and how it went.
+    """One episode and its outcome.
 
     Attributes:
         task: The task that was judged.
-        seed: Of the layout, the wording and the noise.
-        instruction: What the policy was told.
+        seed: Seed of layout, wording and noise.
+        instruction: The instruction that the policy got.
         success: Whether the task was done within its `max_steps`.
         steps: Control steps until success, or until the end.
-        chunks: How often the policy looked and decided.
-        milliseconds: Per chunk, by part of `PARTS`: the mean over the episode.
-        video: Its video beside the result file, if one was written.
+        chunks: Number of chunks that the policy computed.
+        milliseconds: Mean time per chunk over the episode, by part of `PARTS`.
+        video: Path of its video relative to the result file, if one was written.
     """
 
     task: str
@@ -38,8 +38,8 @@ class Episode:
     video: str | None = None
 
 
-def told(task: str, seed: int, instruction_from: str | None) -> str:
-    """The episode's instruction; with `instruction_from`, the words of that task instead."""
+def instruction_for(task: str, seed: int, instruction_from: str | None) -> str:
+    """The instruction of an episode; with `instruction_from`, that of another task."""
     return find_task(instruction_from or task).instruction(seed)
 
 
@@ -56,16 +56,16 @@ def run_episode(
 
     Args:
         environment: with the cameras and image size of the policy, see `environment_for`.
-        policy: decides.
-        seed: of layout, wording and noise; the noise does not depend on the engine.
-        instruction_from: tell the policy this task's words (a control: it should then fail).
-        intervention: what to change inside the head at every chunk. Or what says it for each chunk, called
-            with the number of the chunk, counted from 0, and the seed.
-        on_step: called after the first look and after every control step, for videos.
+        policy: computes the chunks.
+        seed: seed of layout, wording and noise, which are the same with every engine.
+        instruction_from: a task whose instruction the policy gets instead (a control: it should then fail).
+        intervention: a change inside the head at every chunk; or a function that returns it, called with the
+            index of the chunk and the seed.
+        on_step: called after the first observation and after every control step, for videos.
     """
     task = environment.task
     environment.restart(seed)
-    environment.instruction = told(task.name, seed, instruction_from)
+    environment.instruction = instruction_for(task.name, seed, instruction_from)
     rng = np.random.default_rng((list(TASKS).index(task.name), seed))
     episode = Episode(task.name, seed, environment.instruction)
     total = dict.fromkeys(PARTS, 0.0)
@@ -93,7 +93,7 @@ def run_episode(
 def environment_for(
     policy: Policy, task: str, *, render_mode: str | None = None, blanked: Collection[str] = ()
 ) -> TaskEnvironment:
-    """The task as the policy was trained to see it; pictures of the cameras named in `blanked` are black."""
+    """The task with the policy's cameras and image size; images of the cameras in `blanked` are black."""
     return TaskEnvironment(
         task,
         image_size=policy.config.backbone.image_size,

@@ -1,7 +1,7 @@
-"""Scenarios: how one task is laid out, judged and solved inside its Meta-World scene.
+"""Scenarios: the layout, the success and the expert of a task inside its Meta-World scene.
 
-Most tasks leave all of that to Meta-World. Those at the end put balls of our own into the scene of reach.
-They only exist in the pictures: the hand passes through them.
+Most tasks use those of Meta-World. The tasks at the end add balls to the scene of reach. The balls exist in
+the images only: the hand passes through them.
 """
 
 import warnings
@@ -15,17 +15,17 @@ import numpy.typing as npt
 Float64Array = npt.NDArray[np.float64]
 Rgba = tuple[float, float, float, float]
 
-TOUCH = 0.05  # metres between fingertips and middle of a ball; Meta-World judges a reach by the same
-GAIN = 4.0  # of the expert here: full speed from 25 cm on, slower below
+TOUCH = 0.05  # metres between fingertips and centre of a ball; Meta-World uses the same for a reach
+GAIN = 4.0  # gain of the expert: full speed at 25 cm and more
 BALL_RADIUS = 0.03
-NOT_NEARER = 0.15  # metres from the fingertips at the start
+NOT_NEARER = 0.15  # smallest distance from the fingertips at the start, metres
 YELLOW, BLUE, GREEN = (1.0, 0.85, 0.0, 1.0), (0.1, 0.2, 1.0, 1.0), (0.0, 1.0, 0.0, 1.0)
-PUCK_AWAY = np.array([0.0, 0.15, 0.02])  # off the table, where no camera looks
+PUCK_AWAY = np.array([0.0, 0.15, 0.02])  # off the table, outside all images
 
 
 @dataclass(frozen=True)
 class StepOutcome:
-    """What the simulator says about one control step."""
+    """The outcome of one control step."""
 
     reward: float
     success: bool
@@ -33,12 +33,12 @@ class StepOutcome:
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball drawn into the scene.
+    """A ball that is drawn into the scene.
 
     Attributes:
-        position: Of its middle `(3,)`, metres.
-        radius: Metres.
-        rgba: Its colour, each in [0, 1].
+        position: Its centre `(3,)`, metres.
+        radius: Its radius, metres.
+        rgba: Its colour, each component in [0, 1].
     """
 
     position: Float64Array
@@ -47,33 +47,33 @@ class Ball:
 
 
 class Scenario(Protocol):
-    """One environment's rules. `state` is Meta-World's own observation `(39,)`, goal included."""
+    """The rules of one environment. `state` is Meta-World's own observation `(39,)`, goal included."""
 
     def start(self, seed: int) -> None:
-        """Lays an episode out; Meta-World has already been reset with the same seed."""
+        """Creates the layout of an episode; Meta-World has already been reset with the same seed."""
 
     def outcome(self, reward: float, success: bool) -> StepOutcome:
-        """Judges a control step, told what Meta-World says of it."""
+        """The outcome of a control step, given Meta-World's reward and success."""
 
     def balls(self) -> tuple[Ball, ...]:
-        """What is to be drawn into the scene now."""
+        """The balls to draw into the scene now."""
 
     def targets(self, state: Float64Array) -> Float64Array:
-        """Two positions `(6,)`, metres, that a policy should find in the pictures."""
+        """Two positions `(6,)`, metres, that a policy should locate in the images."""
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """What the expert does now `(4,)`; may ask for more than full speed."""
+        """The expert's action `(4,)`; may exceed full speed."""
 
 
 class MetaWorldScenario:
-    """A task as Meta-World has it: its layout, its success, its scripted expert.
+    """A task with the layout, success and scripted expert of Meta-World.
 
     Args:
         world: the Meta-World environment.
         expert: class of the expert in `metaworld.policies`.
         aims_with_fingertips: bring the fingertips to the goal instead of the wrist. The script of reach
-            brings the wrist there, but success is judged between the fingertips, 4.5 cm below: aiming with
-            them leaves the whole 5 cm for the errors of whoever learns from it.
+            brings the wrist there, but success is measured between the fingertips, 4.5 cm below. With this
+            correction the whole tolerance of 5 cm is left for the errors of the learned policy.
     """
 
     def __init__(self, world: Any, *, expert: str, aims_with_fingertips: bool = False) -> None:
@@ -84,14 +84,14 @@ class MetaWorldScenario:
         self._aims_with_fingertips = aims_with_fingertips
 
     def start(self, seed: int) -> None:
-        """Leaves the layout as it is."""
+        """Keeps the layout."""
 
     def outcome(self, reward: float, success: bool) -> StepOutcome:
-        """What Meta-World says."""
+        """The outcome according to Meta-World."""
         return StepOutcome(reward, success)
 
     def balls(self) -> tuple[Ball, ...]:
-        """None: Meta-World draws its own marker."""
+        """No balls: Meta-World draws its own marker."""
         return ()
 
     def targets(self, state: Float64Array) -> Float64Array:
@@ -100,12 +100,12 @@ class MetaWorldScenario:
         return np.concatenate((state[4:7], goal))
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """What the script does."""
+        """The action of the script."""
         state = state.copy()
         if self._aims_with_fingertips:
             state[-3:] += state[:3] - self._world.tcp_center
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it warns whenever it asks for more than full speed
+            warnings.simplefilter("ignore")  # it warns whenever an action exceeds full speed
             return np.asarray(self._script.get_action(state), dtype=np.float64)
 
 
@@ -116,8 +116,8 @@ class BallScenario(ABC):
         world: Meta-World's reach environment.
 
     Attributes:
-        workspace: Where middles of balls may lie, lower and upper corner, metres. All three cameras see it.
-        placed: The episode's balls, those that have vanished included. `targets` are the positions of the
+        workspace: Lower and upper corner of the region of the balls' centres, metres. All cameras see it.
+        placed: The balls of the episode, vanished ones included. `targets` are the positions of the
             first and the last one, which may be the same ball.
     """
 
@@ -133,23 +133,23 @@ class BallScenario(ABC):
 
     @abstractmethod
     def aim(self) -> Float64Array:
-        """Where the expert brings the fingertips now `(3,)`."""
+        """The point that the expert moves the fingertips to `(3,)`, metres."""
 
     @abstractmethod
-    def way_left(self) -> float:
-        """Metres from the fingertips to the end of the task, by way of all that is still to be touched."""
+    def distance_left(self) -> float:
+        """Length of the path from the fingertips through all balls that must still be touched, metres."""
 
     def start(self, seed: int) -> None:
-        """Draws the layout and puts the puck out of sight."""
+        """Draws the layout and moves the puck out of sight."""
         self.placed = self.place(np.random.default_rng(seed))
         self._world._set_obj_xyz(PUCK_AWAY)
 
     def outcome(self, reward: float, success: bool) -> StepOutcome:
-        """Success is a touch; the reward is minus the way that is left."""
-        return StepOutcome(-self.way_left(), self.way_left() <= TOUCH)
+        """Success is a touch; the reward is minus the distance that is left."""
+        return StepOutcome(-self.distance_left(), self.distance_left() <= TOUCH)
 
     def balls(self) -> tuple[Ball, ...]:
-        """All that were placed."""
+        """All balls."""
         return self.placed
 
     def targets(self, state: Float64Array) -> Float64Array:
@@ -157,38 +157,38 @@ class BallScenario(ABC):
         return np.concatenate((self.placed[0].position, self.placed[-1].position))
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """Straight to where it aims; the gripper is left alone."""
+        """Moves straight to `aim`; the gripper is not used."""
         return np.append(GAIN * (self.aim() - self.fingertips()), 0.0)
 
     def fingertips(self) -> Float64Array:
-        """The point between them `(3,)`, metres."""
+        """The point between the fingertips `(3,)`, metres."""
         return np.asarray(self._world.tcp_center, dtype=np.float64)
 
     def draw_position(self, rng: np.random.Generator) -> Float64Array:
-        """A place for a ball, not too close to the fingertips as they are now."""
+        """A position for a ball, at least `NOT_NEARER` from the fingertips."""
         while True:
             position = rng.uniform(*self.workspace)
             if np.linalg.norm(position - self.fingertips()) >= NOT_NEARER:
                 return position
 
     def distance(self, ball: Ball) -> float:
-        """Metres between the fingertips and the ball's middle."""
+        """Distance between the fingertips and the centre of a ball, metres."""
         return float(np.linalg.norm(self.fingertips() - ball.position))
 
 
 class TwoGoals(BallScenario):
     """Two equal balls, about equally far from the hand; touching either is success.
 
-    The expert goes to one of them, drawn anew for each episode and not to be seen in the pictures. A policy
-    that answers with the mean of what it was shown goes between them. The balls are kept in the order left,
-    right, which does not tell the choice.
+    The expert goes to one of them, which is drawn for each episode and cannot be seen in the images. A policy
+    that predicts the mean of the demonstrations goes between them. The balls are in the order left, right,
+    which does not reveal the choice.
 
     Attributes:
-        chosen: Which one the expert goes to, 0 or 1.
+        chosen: The ball that the expert goes to, 0 or 1.
     """
 
-    APART = 0.2  # metres at least
-    EQUALLY_FAR = 0.02  # metres by which the ways from the hand may differ
+    APART = 0.2  # smallest distance between the balls, metres
+    EQUALLY_FAR = 0.02  # largest difference of the distances from the hand, metres
 
     chosen = 0
 
@@ -205,20 +205,20 @@ class TwoGoals(BallScenario):
         """The chosen ball."""
         return self.placed[self.chosen].position
 
-    def way_left(self) -> float:
-        """To the nearer ball."""
+    def distance_left(self) -> float:
+        """Distance to the nearer ball."""
         return min(self.distance(ball) for ball in self.placed)
 
 
 class StereoReach(BallScenario):
-    """One ball whose size says nothing about how far away it is.
+    """One ball whose apparent size does not give its distance.
 
-    Its radius is random and it may hang at any height, so one picture tells the direction in which it lies
-    and not the distance. The workspace is deep: the best guess from where the ball is in one picture and how
-    large it looks comes within `TOUCH` in half of the layouts, from two pictures in all.
+    Its radius and its height are random, so that one image gives the direction of the ball but not its
+    distance. The workspace is deep: the best estimate from the ball's position and size in one image is
+    within `TOUCH` in half of the layouts; from two images it always is.
     """
 
-    RADII = (0.018, 0.045)  # metres; the logarithm is drawn evenly
+    RADII = (0.018, 0.045)  # metres; the logarithm is uniform
     workspace = (np.array([-0.16, 0.62, 0.06]), np.array([0.16, 0.9, 0.34]))
 
     def place(self, rng: np.random.Generator) -> tuple[Ball, ...]:
@@ -230,19 +230,19 @@ class StereoReach(BallScenario):
         """The ball."""
         return self.placed[0].position
 
-    def way_left(self) -> float:
-        """To the ball."""
+    def distance_left(self) -> float:
+        """Distance to the ball."""
         return self.distance(self.placed[0])
 
 
 class TwoStage(BallScenario):
-    """A blue ball to be touched first, which then vanishes, and a green one to be touched next.
+    """A blue ball that must be touched first and then vanishes, and a green one to touch next.
 
     Attributes:
-        stage: Which one is next, 0 or 1.
+        stage: The ball that is next, 0 or 1.
     """
 
-    APART = 0.3  # metres at least
+    APART = 0.3  # smallest distance between the balls, metres
 
     stage = 0
 
@@ -256,21 +256,21 @@ class TwoStage(BallScenario):
                 return first, second
 
     def outcome(self, reward: float, success: bool) -> StepOutcome:
-        """Takes the blue ball away once it is touched."""
+        """Removes the blue ball once it is touched."""
         if self.stage == 0 and self.distance(self.placed[0]) <= TOUCH:
             self.stage = 1
         return super().outcome(reward, success)
 
     def balls(self) -> tuple[Ball, ...]:
-        """Those that have not vanished."""
+        """The balls that have not vanished."""
         return self.placed[self.stage :]
 
     def aim(self) -> Float64Array:
         """The ball that is next."""
         return self.placed[self.stage].position
 
-    def way_left(self) -> float:
-        """To the ball that is next, and on to the other one if that is the first."""
+    def distance_left(self) -> float:
+        """Distance to the next ball, and from the first ball to the second if the first is next."""
         between = np.linalg.norm(self.placed[0].position - self.placed[1].position)
         return self.distance(self.placed[self.stage]) + (float(between) if self.stage == 0 else 0.0)
 
@@ -278,21 +278,21 @@ class TwoStage(BallScenario):
 class Fork(BallScenario):
     """A blue ball straight ahead that must not be touched, and a yellow one on each side: touch either.
 
-    The hand starts on the middle line and the layout is its own mirror image, so both ways are equally good.
-    The expert takes one of them, drawn anew for each episode and not to be seen in the pictures; once the
-    hand is off the middle line the nearer ball is the one to go to. A policy that answers with the mean of
-    what it was shown goes straight ahead, to the blue ball.
+    The hand starts on the middle line and the layout is symmetric, so that both paths are equally good. The
+    expert takes one of them, which is drawn for each episode and cannot be seen in the images. Once the hand
+    has left the middle line, the nearer ball is the better one. A policy that predicts the mean of the
+    demonstrations goes straight ahead, to the blue ball.
 
     Attributes:
-        chosen: Which yellow ball the expert goes to, 0 or 1.
-        spoiled: Whether the blue one was touched; the episode can then not succeed any more.
+        chosen: The yellow ball that the expert goes to, 0 or 1.
+        spoiled: Whether the blue ball was touched, after which the episode cannot succeed.
     """
 
     ASIDE = 0.17  # metres from the middle line to a yellow ball
-    AHEAD = 0.1  # metres from the fingertips, forwards, to all three
-    JITTER = np.array([0.015, 0.015, 0.03])  # metres by which a layout may differ: aside, ahead, height
+    AHEAD = 0.1  # metres from the fingertips forwards to the balls
+    JITTER = np.array([0.015, 0.015, 0.03])  # variation of a layout, metres: aside, ahead, height
     HEIGHT = 0.15  # metres
-    SPEED = 6.0  # gain of the expert: full speed from 17 cm on
+    SPEED = 6.0  # gain of the expert: full speed at 17 cm and more
 
     chosen = 0
     spoiled = False
@@ -310,7 +310,7 @@ class Fork(BallScenario):
         )
 
     def outcome(self, reward: float, success: bool) -> StepOutcome:
-        """A touch of a yellow ball counts if the blue one was not touched before."""
+        """Touching a yellow ball is success if the blue one was not touched before."""
         self.spoiled = self.spoiled or self.distance(self.placed[1]) <= TOUCH
         judged = super().outcome(reward, success)
         return StepOutcome(judged.reward, judged.success and not self.spoiled)
@@ -319,10 +319,10 @@ class Fork(BallScenario):
         """The chosen ball."""
         return self.placed[2 * self.chosen].position
 
-    def way_left(self) -> float:
-        """To the nearer yellow ball."""
+    def distance_left(self) -> float:
+        """Distance to the nearer yellow ball."""
         return min(self.distance(ball) for ball in self.placed[::2])
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """Straight to where it aims, faster than in the other tasks; the gripper is left alone."""
+        """Moves straight to `aim`, faster than in the other tasks; the gripper is not used."""
         return np.append(self.SPEED * (self.aim() - self.fingertips()), 0.0)

@@ -1,4 +1,4 @@
-"""A policy's config.json: the published head config, the backbone's sizes, and what surrounds them."""
+"""A policy's config.json: the published head config, the backbone's sizes, cameras, words, statistics."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -33,17 +33,17 @@ class Statistics:
 
     @classmethod
     def of(cls, values: npt.NDArray[np.floating[Any]]) -> "Statistics":
-        """Of `(samples, dimensions)`; a dimension that hardly varies keeps its scale."""
+        """The statistics of `(samples, dimensions)`; the deviation is at least 0.001."""
         std = np.maximum(values.std(axis=0, dtype=np.float64), 1e-3)
         return cls(mean=rounded(values.mean(axis=0, dtype=np.float64)), std=rounded(std))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Statistics":
-        """Reads the two lists of numbers."""
+        """Reads a dict with the lists `mean` and `std`."""
         return cls(*(tuple(float(value) for value in values[key]) for key in ("mean", "std")))
 
     def normalize(self, values: npt.ArrayLike) -> Float32Array:
-        """`(..., dimensions)` to zero mean and unit deviation."""
+        """Normalises `(..., dimensions)` to zero mean and unit standard deviation."""
         given: Float32Array = np.asarray(values, dtype=np.float32)
         mean, std = np.array(self.mean, dtype=np.float32), np.array(self.std, dtype=np.float32)
         normalised: Float32Array = (given - mean) / std
@@ -58,14 +58,14 @@ class Statistics:
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """All of a policy's config.
+    """The whole config of a policy.
 
     Attributes:
         head: The published head config, as in `config.json` under `action_head_cfg`.
-        backbone: Sizes of the backbone.
-        cameras: What the pictures are drawn through, in the order of the image tokens.
-        vocabulary: The words that are known.
-        execute_steps: Actions of a chunk that are carried out before the next look.
+        backbone: The sizes of the backbone.
+        cameras: The cameras, in the order of the image tokens.
+        vocabulary: The words of the tokenizer.
+        execute_steps: Actions of a chunk that are executed before the next observation.
         tasks: The tasks it was trained on.
         state: Statistics of the proprioception.
         action: Statistics of the actions.
@@ -103,7 +103,7 @@ class PolicyConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "PolicyConfig":
-        """Reads what `to_dict` wrote; raises what a dict of another form leads to."""
+        """Reads a dict that `to_dict` returned; any other may raise `KeyError`, `TypeError` or similar."""
         policy = values["policy_cfg"]
         config = cls(
             head=dict(values["action_head_cfg"]),
@@ -119,7 +119,7 @@ class PolicyConfig:
         return config
 
     def check(self) -> None:
-        """Raises `CheckpointError` with all that does not fit together."""
+        """Raises `CheckpointError` that lists every inconsistency."""
         head = HeadConfig.from_dict(self.head)
         pairs = {
             "backbone width and backbone_embedding_dim": (self.backbone.width, head.context_dim),
@@ -135,7 +135,7 @@ class PolicyConfig:
             raise CheckpointError("; ".join(problems))
 
     def to_dict(self) -> dict[str, Any]:
-        """For `config.json`; the head's part is what every reader of published checkpoints looks for."""
+        """For `config.json`; the head's part has the keys of published checkpoints."""
         return {
             "model_type": "gr00t_n1_5",
             "action_dim": self.head["action_dim"],
@@ -204,5 +204,5 @@ def head_config(
 
 
 def rounded(values: Sequence[float] | npt.NDArray[np.floating[Any]]) -> tuple[float, ...]:
-    """Six digits, so that a config stays readable."""
+    """Rounds to six decimals, so that a config stays readable."""
     return tuple(round(float(value), 6) for value in values)

@@ -1,4 +1,4 @@
-"""The tasks: which Meta-World task, how it is told to the robot, and which seeds are used for what."""
+"""The tasks: their Meta-World scenes and instructions, and the ranges of seeds for each purpose."""
 
 import functools
 from collections.abc import Callable
@@ -12,8 +12,9 @@ from saccade.sim.scenarios import Fork, MetaWorldScenario, Scenario, StereoReach
 ACTION_DIM = 4  # hand velocity along x, y, z and gripper effort, each in [-1, 1]
 PROPRIO_DIM = 4  # hand position in metres and gripper opening in [0, 1]
 
-# A seed fixes where objects and goals lie. The three uses have ranges of their own, so that no policy is
-# judged on a layout it was trained or chosen on. `check_evaluation_seeds` and `demos.py` hold to them.
+# A seed determines the positions of objects and goals. The three purposes have separate ranges, so that no
+# policy is evaluated on a layout that it was trained or selected on. `check_evaluation_seeds` and `demos.py`
+# enforce them.
 EVALUATION_SEEDS = range(1_000_000)
 DEMONSTRATION_SEEDS = range(1_000_000, 2_000_000)
 VALIDATION_SEEDS = range(2_000_000, 3_000_000)
@@ -24,15 +25,15 @@ class Task:
     """One task.
 
     Attributes:
-        name: How users call it.
-        scene: Meta-World's name of its environment.
-        scenario: Makes the rules of one environment, given Meta-World's.
-        objects: What stands on the table. Tasks with the same objects can all be done in the same scene.
-        instructions: Wordings; an episode's seed picks one of them. The first is the plainest.
-        draws_goal: Whether the goal is marked in the picture. Where the goal is an object's own state (an
-            open drawer), a marker would only give the answer away.
-        max_steps: An episode that has not succeeded by then has failed. About twice what the slowest expert
-            takes, unless the task is one of choosing at once.
+        name: Its name in saccade.
+        scene: Meta-World's name of the environment.
+        scenario: Creates the rules of one environment, given the Meta-World environment.
+        objects: The objects on the table. Tasks with the same objects can be done in the same scene.
+        instructions: Wordings; the seed of an episode selects one of them. The first is the plainest.
+        draws_goal: Whether the goal is marked in the images. Where the goal is the state of an object (an
+            open drawer), a marker would reveal the answer.
+        max_steps: Control steps after which an episode has failed. About twice those of the slowest expert,
+            unless the task requires an immediate choice.
     """
 
     name: str
@@ -48,8 +49,8 @@ class Task:
         return self.instructions[seed % len(self.instructions)]
 
 
-# The tasks of the demo, on which the shipped policy was trained. reach and push show the same scene, hand,
-# puck and green ball alike: only the instruction tells them apart.
+# The tasks of the demo, on which the bundled policy was trained. reach and push have the same scene with puck
+# and green ball: only the instruction distinguishes them.
 DEMO_TASKS = (
     Task(
         name="reach",
@@ -121,8 +122,8 @@ DEMO_TASKS = (
         ),
     ),
 )
-# Harder ones, for studies: two answers that are equally good, a place that one picture does not tell, two
-# things to be done in turn, and two ways around an obstacle.
+# Harder tasks for studies: two equally good answers, a position that one image does not determine, two steps
+# in order, and two paths around an obstacle.
 STUDY_TASKS = (
     Task(
         name="two-goals",
@@ -178,10 +179,10 @@ STUDY_TASKS = (
             "move to one yellow ball, not the blue ball",
             "pass the blue ball and touch a yellow ball",
         ),
-        max_steps=28,  # 5 more than the expert takes: no time to drift off the middle line step by step
+        max_steps=28,  # 5 more than the expert needs: no time to drift off the middle line gradually
     ),
 )
-# A task's number in this order seeds its noise: new ones come last.
+# The index of a task in this order seeds its noise: append new tasks at the end.
 TASKS = {task.name: task for task in (*DEMO_TASKS, *STUDY_TASKS)}
 
 
@@ -197,7 +198,7 @@ def find_task(name: str) -> Task:
 
 
 def check_evaluation_seeds(first: int, count: int) -> range:
-    """The seeds `first .. first + count - 1`, all of them meant for evaluation.
+    """The seeds `first .. first + count - 1`, checked to be evaluation seeds.
 
     Raises:
         InputError: `count` is below 1, or a seed belongs to demonstrations or validation.

@@ -1,10 +1,10 @@
 """Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
 
-A run lives in a directory: `training.pt` (all that is needed to go on), `config.json` and `model.safetensors`
-(the policy so far), `settings.json` (how and on what it is trained), `history.json` and `loss.png`. They are
-written about once a minute, each under a temporary name that is then renamed, so a run can be stopped at any
-time and goes on where it was. Every step draws its samples and noise from the seed and its own number, so a
-resumed run gives what an uninterrupted one gives.
+A run is a directory with `training.pt` (all that is needed to continue), `config.json` and
+`model.safetensors` (the policy so far), `settings.json` (settings and demonstrations), `history.json` and
+`loss.png`. They are written about once a minute, each under a temporary name that is then renamed, so that a
+run can be interrupted at any time and continued. Every step draws its samples and noise from the seed and the
+number of the step, so that a continued run gives the same weights as an uninterrupted one.
 """
 
 # Calls of torch modules are untyped.
@@ -34,6 +34,7 @@ from saccade.sim.instructions import Tokenizer, build_vocabulary, words
 from saccade.sim.learner import Learner
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
+from saccade.sim.training_settings import TrainingSettings
 
 STATE_FILE = "training.pt"
 CHECKPOINT_SECONDS = 60.0
@@ -44,79 +45,9 @@ WEIGHT_DECAY = 0.01
 BETAS = (0.9, 0.95)
 
 
-@dataclass(frozen=True)
-class TrainingSettings:
-    """What a run depends on besides the demonstrations.
-
-    Attributes:
-        steps: Optimiser steps; the learning rate falls to zero over them.
-        batch_size: Frames per step. More small steps beat fewer large ones at equal time.
-        learning_rate: Of AdamW, after the warm-up.
-        ema_decay: Of the averaged weights, which are the ones that are kept.
-        target_weight: Weight of the loss that finds object and goal.
-        alignment_weight: Weight of the loss that pulls the hidden rows of the future tokens towards what the
-            averaged backbone says of the observation one horizon later; as in FLARE, which used 0.2.
-        alignment_block: Block of the head after which those rows are taken. Default the middle one: as many
-            blocks for the rows to read the pictures as for the actions to read the rows.
-        absent_share: Share of frames that are told a task whose object is not there, and shown to stand
-            still. Without them the pictures alone tell most tasks apart, and their words go unread.
-        start_sha256: Of the tensors that it starts from; empty for random ones. `train` sets it.
-        seed: Of initial weights, order and noise.
-        width, num_layers, num_heads: Of the head; the backbone has its width and heads.
-        backbone_layers: Transformer blocks of the backbone.
-        vl_num_layers: Of the head's VL self-attention.
-        num_future_tokens: N.
-        horizon: Actions per chunk.
-        execute_steps: Of them carried out before the next look.
-        num_steps: Euler steps at run time.
-        patch_size: Pixels along each side of an image token's patch.
-    """
-
-    steps: int = 8000
-    batch_size: int = 16
-    learning_rate: float = 6e-4
-    ema_decay: float = 0.999
-    target_weight: float = 1.0
-    alignment_weight: float = 0.0
-    alignment_block: int | None = None
-    absent_share: float = 0.0
-    start_sha256: str = ""
-    seed: int = 0
-    width: int = 128
-    num_layers: int = 4
-    num_heads: int = 4
-    backbone_layers: int = 2
-    vl_num_layers: int = 1
-    num_future_tokens: int = 32
-    horizon: int = 16
-    execute_steps: int = 8
-    num_steps: int = 4
-    patch_size: int = 16
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.alignment_weight < math.inf:
-            raise InputError(f"alignment_weight: given {self.alignment_weight}, expected at least 0")
-        if self.alignment_weight and self.num_future_tokens == 0:
-            raise InputError(
-                f"alignment_weight: given {self.alignment_weight}, expected 0 with num_future_tokens 0: "
-                "there is no row to align"
-            )
-        if self.alignment_block is not None and not 0 <= self.alignment_block < self.num_layers:
-            raise InputError(
-                f"alignment_block: given {self.alignment_block}, expected 0 to {self.num_layers - 1}"
-            )
-
-    @property
-    def aligned_block(self) -> int | None:
-        """The block whose future rows are aligned; None if none are."""
-        if self.alignment_weight == 0:
-            return None
-        return (self.num_layers - 1) // 2 if self.alignment_block is None else self.alignment_block
-
-
 @dataclass
 class Progress:
-    """Where a run is, for a progress bar."""
+    """The state of a run, for a progress bar."""
 
     step: int
     steps: int
@@ -182,7 +113,7 @@ def policy_config(
 
 
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
-    """A run before its first step; `demonstrations` says what it trains on, see `dataset.describe`."""
+    """A run before its first step; for `demonstrations` see `dataset.describe`."""
     torch.manual_seed(settings.seed)
     learner = Learner(config.backbone, HeadConfig.from_dict(config.head), settings.aligned_block)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
@@ -198,7 +129,7 @@ def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: di
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """Linear warm-up, then half a cosine down to zero."""
+    """Linear warm-up, then a half cosine to zero."""
     warmup = min(1.0, (step + 1) / WARMUP_STEPS)
     return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
 
@@ -207,12 +138,12 @@ class Batches:
     """Draws normalised batches.
 
     Args:
-        samples: what to draw from.
-        config: for statistics and vocabulary.
-        target_statistics: of the positions.
+        samples: the samples to draw from.
+        config: of the policy, for statistics and vocabulary.
+        target_statistics: statistics of the positions.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
-        with_later: whether batches have the images seen when the chunk has been carried out.
+        with_later: whether batches contain the images after the chunk was executed.
     """
 
     def __init__(
@@ -243,7 +174,7 @@ class Batches:
         self._still = config.action.normalize(np.zeros(samples.actions.shape[1:], np.float32))
 
     def draw(self, *key: int) -> dict[str, Tensor]:
-        """The batch that belongs to `key`, with a wording drawn anew for each frame."""
+        """The batch of `key`, with a wording drawn for each frame."""
         rng = np.random.default_rng(key)
         rows = rng.integers(len(self._samples), size=self._batch_size)
         tasks, later = self._samples.tasks[rows], self._samples.later[rows]
@@ -283,7 +214,7 @@ def train_step(run: Run, batches: Batches) -> dict[str, float]:
     total.backward()
     torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
     run.optimizer.step()
-    # A short memory at first, so that the average is not held back by the initial weights.
+    # A short memory at first, so that the initial weights do not dominate the average.
     decay = min(settings.ema_decay, (1 + run.step) / (10 + run.step))
     with torch.no_grad():
         current = run.learner.policy_tensors()
@@ -294,7 +225,7 @@ def train_step(run: Run, batches: Batches) -> dict[str, float]:
 
 @torch.no_grad()
 def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
-    """The losses of the averaged weights on the same held-out frames and noise each time."""
+    """The losses of the averaged weights, each time on the same held-out frames and noise."""
     current = {name: tensor.clone() for name, tensor in run.learner.policy_tensors().items()}
     run.learner.load_state_dict(run.average, strict=False)
     losses = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0), run.average)
@@ -305,8 +236,7 @@ def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
 def export(run: Run, out: Path) -> None:
     """Writes the averaged weights as a policy.
 
-    They are stored as bfloat16, which the head reads without loss: half the size, and the rounding is far
-    below what training with noise leaves undecided.
+    They are stored as bfloat16, which halves the size. The rounding is far below the noise of training.
     """
     tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
     with write_atomically(out / TENSOR_FILE) as temporary:
@@ -337,7 +267,7 @@ def save(run: Run, out: Path) -> None:
 
 
 def resume(run: Run, path: Path) -> None:
-    """Takes up a run where it was saved.
+    """Continues a run from a saved state.
 
     Raises:
         InputError: it was started with other settings or other demonstrations.
@@ -357,11 +287,11 @@ def resume(run: Run, path: Path) -> None:
 
 
 def start_from(run: Run, policy: Path) -> None:
-    """Takes the weights of a policy as the initial ones.
+    """Starts from the weights of a policy.
 
     Raises:
-        FileNotFoundError: no policy there.
-        InputError: it has other sizes, tasks or statistics.
+        FileNotFoundError: there is no policy.
+        InputError: the policy has other sizes, tasks or statistics.
     """
     if PolicyConfig.from_file(policy / CONFIG_FILE) != run.config:
         raise InputError(f"{policy}: was trained with other sizes or other demonstrations")
@@ -378,21 +308,21 @@ def train(
     *,
     start: Path | None = None,
 ) -> PolicyConfig:
-    """Trains a policy, going on from what lies in `out`.
+    """Trains a policy, or continues the run in `out`.
 
     Args:
         demonstrations: directory written by `saccade demos`.
         out: directory of the run.
         settings: of the run.
         on_step: called after each step.
-        start: a policy to start from; default random weights.
+        start: a policy to start from; None for random weights.
 
     Returns:
         The config of the policy.
 
     Raises:
-        FileNotFoundError: no demonstrations there, or no policy to start from.
-        InputError: demonstrations of several kinds, or a run with other settings in `out`.
+        FileNotFoundError: there are no demonstrations, or no policy to start from.
+        InputError: demonstrations with different settings, or `out` contains a run with other settings.
     """
     tasks = demos.recorded_tasks(demonstrations)
     recording = demos.read_settings(demonstrations, tasks)
@@ -422,7 +352,7 @@ def train(
 def loop(
     run: Run, batches: Batches, held_out: Batches, out: Path, on_step: Callable[[Progress], None]
 ) -> None:
-    """Trains to the last step, saving about once a minute."""
+    """Trains to the last step and saves about once a minute."""
     saved, steps = time.monotonic(), list[dict[str, float]]()
     latest: float | None = None
     while run.step < run.settings.steps:
@@ -439,7 +369,7 @@ def loop(
 
 
 def plot_history(history: list[dict[str, Any]], path: Path) -> None:
-    """Draws the losses over the steps, on a logarithmic scale."""
+    """Plots the losses over the steps on a logarithmic scale."""
     import matplotlib
 
     matplotlib.use("agg")

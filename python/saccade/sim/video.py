@@ -14,7 +14,7 @@ from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import Episode
 
 EVERY = 2  # control steps between pictures
-SPEED = 0.5  # of simulated time: an episode takes only about a second
+SPEED = 0.5  # relative to simulated time, in which an episode takes only about a second
 FRAMES_PER_SECOND = SIMULATION_HZ * SPEED / EVERY
 LINGER_FRAMES = 15  # repeats of the last picture
 TITLE_HEIGHT = 40

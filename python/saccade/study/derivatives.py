@@ -42,14 +42,14 @@ def path_derivatives(
     embodiment_id: int = 0,
     masks: Mapping[str, Tensor] = NO_MASKS,
 ) -> dict[str, Tensor]:
-    """Derivatives of projections of the actions by the vision-language tokens, path by path.
+    """Derivatives of projections of the actions by the vision-language tokens, for each path.
 
     Args:
         head: computes, in its dtype.
         vl_embs: of one observation, `(1, T_vl, context_dim)`.
         state: `(1, state_dim)` or `(1, history, state_dim)`.
         noise: `(1, T, action_dim)`.
-        cotangents: `(projections, T, action_dim)`; each is multiplied with the actions and summed up.
+        cotangents: `(projections, T, action_dim)`; a projection is the sum of the product with the actions.
         embodiment_id: of the robot.
         masks: of `sample`, by name: `drop_vl`, `attention_mask`, `image_mask`, `(1, T_vl)` bool.
 
@@ -67,7 +67,7 @@ def path_derivatives(
             stop_gradient=stopped,
             **conditions(count, embodiment_id, masks),
         )
-        # Elements of a batch do not mix: each copy of the tokens gets the derivative of its own projection.
+        # Rows of a batch do not interact: each copy of the tokens gets the derivative of its own projection.
         return torch.autograd.grad((actions * cotangents).sum(), leaf)[0]
 
     whole, direct, read = derivative(()), derivative(LEAVING_FUTURE), derivative(READ_BY_OTHERS)
@@ -76,12 +76,12 @@ def path_derivatives(
 
 @dataclass(frozen=True)
 class Shares:
-    """How paths make up a derivative.
+    """The contributions of the paths to a derivative.
 
     Attributes:
-        length: Of each path, its Frobenius norm over that of the whole. Lengths do not add up.
-        share: Of each path, how far it goes along the whole. Shares add up to 1; one may be negative.
-        cosine: Between two paths, NaN where one is zero.
+        length: Of each path: its Frobenius norm divided by that of the whole. Lengths do not add up.
+        share: Of each path: its projection on the whole. Shares add up to 1; one may be negative.
+        cosine: Between two paths; NaN if one is zero.
     """
 
     length: dict[str, float]
@@ -90,7 +90,7 @@ class Shares:
 
 
 def shares(parts: Mapping[str, Tensor]) -> Shares:
-    """From what `path_derivatives` returned.
+    """The shares of derivatives from `path_derivatives`.
 
     With independent standard normal cotangents, the mean product of two projected derivatives is the
     Frobenius product of the two.
@@ -115,11 +115,12 @@ def shares(parts: Mapping[str, Tensor]) -> Shares:
 class Nudges:
     """Zeros that are added to the rows of every block, to take derivatives by the rows.
 
-    One nudge counts at every Euler step, as a change of a learned token does.
+    The same zeros are added at every Euler step, so a derivative is that of a change at all steps, such as a
+    change of a learned token.
 
     Args:
-        head: whose rows.
-        batch: elements of the batch to come.
+        head: Its blocks get hooks.
+        batch: Of the calls.
     """
 
     def __init__(self, head: ActionHead, batch: int) -> None:
@@ -135,7 +136,7 @@ class Nudges:
 
     @contextlib.contextmanager
     def applied(self) -> Iterator[None]:
-        """Adds them to all that the head computes inside."""
+        """Adds them in all calls of the head in the context."""
 
         def nudge(place: int, rows: Tensor) -> Tensor:
             self._squares[place] += rows.detach().square().sum(dim=-1)
@@ -158,11 +159,11 @@ class Nudges:
                 handle.remove()
 
     def derivatives(self, scalar: Tensor) -> list[Tensor]:
-        """Of a scalar computed inside `applied`, by place: `(batch, rows, width)`."""
+        """Derivatives of a scalar computed in `applied`, by place: `(batch, rows, width)`."""
         return list(torch.autograd.grad(scalar, self._zeros))
 
     def lengths(self) -> list[Tensor]:
-        """Of the rows, by place: root of the mean square over batch and steps, `(rows,)`."""
+        """Lengths of the rows, by place: root mean square over batch and steps, `(rows,)`."""
         return [(square.mean(dim=0) / self._steps).sqrt() for square in self._squares]
 
 
@@ -181,8 +182,8 @@ def action_sensitivity(
 
     Returns:
         By place, `(rows,)` each: the Frobenius norm of the derivative by each row, and the same times the
-        row's length, which is the change if the row changed by its length. Every block normalises what it
-        reads, so the norm alone says as much about how long a row is as about how it is used.
+        length of the row, which is the change if the row changed by its own length. Every block normalises
+        its inputs, so the norm alone depends on the length of a row as much as on its use.
     """
     count = len(cotangents)
     nudges = Nudges(head, count)
@@ -208,15 +209,16 @@ def loss_sensitivity(
     draws: int,
     embodiment_id: int = 0,
 ) -> Sensitivity:
-    """How the flow-matching loss at one observation depends on the rows, its mean over times and noises.
+    """How the flow-matching loss of one observation, averaged over times and noises, depends on the rows.
 
     Args:
         head: computes, in its dtype.
         features: backbone features, `(1, T_vl, context_dim)`.
         state: `(1, state_dim)`.
         actions: the demonstrated chunk, `(1, T, action_dim)`, normalised.
-        mask: which of them count, `(1, T, 1)`.
-        generator, draws: of times and noises, and how many.
+        mask: weights of the actions, `(1, T, 1)`.
+        generator: draws times and noises.
+        draws: number of times and noises.
         embodiment_id: of the robot.
 
     Returns:
@@ -238,7 +240,7 @@ def loss_sensitivity(
 
 
 def pooled(measured: Sequence[Sensitivity]) -> Sensitivity:
-    """What `action_sensitivity` says of several projections, from what it says of each."""
+    """`action_sensitivity` of several projections, from that of each."""
 
     def pool(values: Sequence[Tensor]) -> Tensor:
         return torch.stack(list(values)).square().mean(dim=0).sqrt()
@@ -250,6 +252,6 @@ def pooled(measured: Sequence[Sensitivity]) -> Sensitivity:
 
 
 def row_groups(head: ActionHead) -> dict[str, slice]:
-    """Where the groups of rows lie."""
+    """Slices of the groups of rows."""
     future = head.config.num_future_tokens
     return {"state": slice(0, 1), "future": slice(1, 1 + future), "action": slice(1 + future, None)}

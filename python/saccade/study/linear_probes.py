@@ -36,13 +36,13 @@ VL: Input = ("vl_embs", -1, "all")
 
 @dataclass(frozen=True)
 class Frames:
-    """What was seen and known at every look of several episodes; the first axis of every array is the look.
+    """Observations of several episodes; the first axis of every array is the observation.
 
     Attributes:
-        episodes: `(frames,)`, a number per episode.
-        tasks: `(frames,)`, a number per task.
-        inputs: What probes may read, each `(frames, dimensions)`.
-        targets: What they should tell, name to `(frames, coordinates)`.
+        episodes: `(frames,)`, number of the episode.
+        tasks: `(frames,)`, number of the task.
+        inputs: What probes read, each `(frames, dimensions)`.
+        targets: What they predict, by name, each `(frames, coordinates)`.
     """
 
     episodes: npt.NDArray[np.int64]
@@ -54,8 +54,8 @@ class Frames:
 def shuffled_targets(frames: Frames, seed: int) -> dict[str, FloatArray]:
     """Gives every episode the targets of another episode of its task.
 
-    Looks keep their order, so that what follows from the time alone is still there to be found. An episode
-    that is longer than the other one repeats its last targets.
+    The order within an episode is kept, so that what follows from the time alone can still be found. An
+    episode that is longer than the other one repeats the last targets.
     """
     rng = np.random.default_rng(seed)
     taken = np.empty(len(frames.episodes), np.int64)
@@ -73,20 +73,20 @@ def held_out_errors(
 ) -> dict[Target, tuple[FloatArray, FloatArray]]:
     """Squared errors of linear probes, each on episodes that it was not fitted to.
 
-    In each fold everything is fitted to the training episodes. The task's mean is taken off inputs and
-    targets, so that nothing is won or lost by telling tasks apart. Inputs are then standardised and reduced
-    to their first principal components, at most `dimensions`; then comes a ridge regression for each target,
-    whose penalty is the best of `PENALTIES` in a cross-validation among the training episodes.
+    In each fold everything is fitted to the training episodes. The mean of the task is subtracted from inputs
+    and targets, so that the difference between tasks does not count. Inputs are then standardised and reduced
+    to at most `dimensions` principal components. A ridge regression for each target follows; its penalty is
+    the best of `PENALTIES` in a cross-validation among the training episodes.
 
     Args:
         values: `(frames, inputs)`, what the probes read.
         targets: each `(frames, coordinates)`.
-        frames: its episodes and tasks are used.
-        dimensions: how much a probe may read at most.
+        frames: provides episodes and tasks.
+        dimensions: principal components that a probe reads at most.
 
     Returns:
-        For each target two arrays `(frames,)`: the probe's squared error, and that of always saying the mean
-        of the task's training frames. Both are summed over the coordinates.
+        For each target two arrays `(frames,)`: the squared error of the probe, and that of predicting the
+        mean of the training frames of the task. Both are summed over the coordinates.
     """
     found = {name: (np.zeros(len(values)), np.zeros(len(values))) for name in targets}
     asked = np.concatenate(list(targets.values()), axis=1, dtype=np.float64)  # (frames, all coordinates)
@@ -94,18 +94,18 @@ def held_out_errors(
     splitter = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0)
     for train, test in splitter.split(values, frames.tasks, frames.episodes):
         inputs = values - task_means(values, frames.tasks, train)
-        wanted = asked - task_means(asked, frames.tasks, train)
+        expected = asked - task_means(asked, frames.tasks, train)
         scaler = StandardScaler().fit(inputs[train])
         reduction = PCA(min(dimensions, len(train) - 1, values.shape[1]), random_state=0)
-        with np.errstate(invalid="ignore"):  # rows that only name the task are all zeros now
+        with np.errstate(invalid="ignore"):  # rows that encode only the task are all zeros now
             known = reduction.fit_transform(scaler.transform(inputs[train])).astype(np.float64)
         scale = np.sqrt(np.mean(np.square(known))) or 1.0
         new = reduction.transform(scaler.transform(inputs[test])).astype(np.float64) / scale
-        penalties = best_penalties(known / scale, wanted[train], owners, frames.episodes[train])
-        told = Ridge(alpha=penalties[owners]).fit(known / scale, wanted[train]).predict(new)
+        penalties = best_penalties(known / scale, expected[train], owners, frames.episodes[train])
+        predicted = Ridge(alpha=penalties[owners]).fit(known / scale, expected[train]).predict(new)
         for owner, (errors, spreads) in enumerate(found.values()):
-            errors[test] = np.square(told - wanted[test])[:, owners == owner].sum(axis=1)
-            spreads[test] = np.square(wanted[test])[:, owners == owner].sum(axis=1)
+            errors[test] = np.square(predicted - expected[test])[:, owners == owner].sum(axis=1)
+            spreads[test] = np.square(expected[test])[:, owners == owner].sum(axis=1)
     return found
 
 
@@ -122,7 +122,7 @@ def best_penalties(
     Args:
         values: `(frames, dimensions)`.
         targets: `(frames, coordinates)` of all targets.
-        owners: `(coordinates,)`, to which target each belongs.
+        owners: `(coordinates,)`, the target of each.
         episodes: `(frames,)`.
 
     Returns:
@@ -135,8 +135,8 @@ def best_penalties(
         projected = left.T @ (targets[train] - offset)  # (dimensions, coordinates)
         for place, penalty in enumerate(PENALTIES):
             weights = right.T @ (projected * (singular / (singular**2 + penalty))[:, None])
-            told = (values[test] - mean) @ weights + offset
-            errors[place] += np.square(told - targets[test]).sum(axis=0)
+            predicted = (values[test] - mean) @ weights + offset
+            errors[place] += np.square(predicted - targets[test]).sum(axis=0)
     by_target = np.stack([errors[:, owners == owner].sum(axis=1) for owner in np.unique(owners)])
     best: FloatArray = np.asarray(PENALTIES)[by_target.argmin(axis=1)]
     return best
@@ -157,7 +157,7 @@ def within_tasks(values: FloatArray, tasks: npt.NDArray[np.int64]) -> float:
 
 
 def per_episode(values: FloatArray, episodes: npt.NDArray[np.int64]) -> FloatArray:
-    """Sums over the looks of each episode, in the order of the episodes' numbers."""
+    """Sums over the frames of each episode, in the order of the episode numbers."""
     _, inverse = np.unique(episodes, return_inverse=True)
     return np.bincount(inverse, weights=values)
 
@@ -165,11 +165,11 @@ def per_episode(values: FloatArray, episodes: npt.NDArray[np.int64]) -> FloatArr
 def explained(
     errors: FloatArray, spreads: FloatArray, draws: npt.NDArray[np.int64]
 ) -> tuple[float, FloatArray]:
-    """R^2 of all episodes together, and of each bootstrap draw of them.
+    """R^2 of all episodes together, and of each bootstrap resample.
 
     Args:
-        errors, spreads: of `held_out_errors`, added up by episode, `(episodes,)`.
-        draws: how often each draw takes each episode, `(resamples, episodes)`.
+        errors, spreads: of `held_out_errors`, summed by episode, `(episodes,)`.
+        draws: how often each resample contains each episode, `(resamples, episodes)`.
 
     Returns:
         1 - errors / spreads, and `(resamples,)` of the same.
@@ -178,7 +178,7 @@ def explained(
 
 
 def estimate(value: float, drawn: FloatArray) -> Estimate:
-    """A number with the percentile interval of its bootstrap draws."""
+    """A number with the percentile interval of its bootstrap resamples."""
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high))
 
@@ -186,10 +186,10 @@ def estimate(value: float, drawn: FloatArray) -> Estimate:
 def probe(frames: Frames, dimensions: int) -> list[dict[str, Any]]:
     """All probes of a scope, with intervals over its episodes.
 
-    The draws of the bootstrap are the same for all probes, so differences are paired.
+    All probes use the same bootstrap resamples, so differences are paired.
 
     Args:
-        frames: of the scope; the inputs `PROPRIO` and `VL` among them are what the others are compared with.
+        frames: of the scope; the others are compared with the inputs `PROPRIO` and `VL`.
         dimensions: see `held_out_errors`.
 
     Returns:
@@ -230,7 +230,7 @@ def probe(frames: Frames, dimensions: int) -> list[dict[str, Any]]:
 
 
 def join(parts: Sequence[Frames], tasks: Sequence[int]) -> Frames:
-    """Several episodes in one; each part is one episode, of the task with that number."""
+    """Joins episodes; each part is one episode, of the task with that number."""
     lengths = [len(part.episodes) for part in parts]
     return Frames(
         np.repeat(np.arange(len(parts)), lengths),

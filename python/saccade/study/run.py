@@ -1,4 +1,4 @@
-"""Resumable work: a study is many small cells, each kept as soon as it is done, spread over processes."""
+"""Running a study: its cells are stored as soon as they are done, spread over processes, and resumable."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from saccade.study.table import (
 )
 
 BACKENDS = ("loky", "ray")
-ROUND = 4  # cells a worker between two looks at what Ray has done
+ROUND = 4  # cells per worker in a round, after which results are stored (Ray only)
 RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld", "scikit-learn")
 
 
 class StudyError(SaccadeError):
-    """Some cells of a study failed; those that are done are kept, and the next run tries the others again."""
+    """Some cells of a study failed. The others are stored; the next run repeats only the failed ones."""
 
 
 @dataclass(frozen=True)
 class Finished:
-    """What came of a cell: rows, or an error and no rows."""
+    """The result of a cell: rows, or an error and no rows."""
 
     cell: Cell
     rows: Rows
@@ -52,18 +52,18 @@ class Finished:
     error: str | None = None
 
 
-#: Called after each cell with what came of it, the number of cells done or failed so far, and of all.
+#: Called after each cell with its result, the number of cells done or failed so far, and the number of all.
 OnDone: TypeAlias = Callable[[Finished, int, int], None]
 
 
 def silent(finished: Finished, done: int, total: int) -> None:
-    """An `OnDone` that says nothing."""
+    """An `OnDone` that does nothing."""
 
 
 def run(
     study: Study, out: Path, *, backend: str = "loky", jobs: int = 1, on_done: OnDone = silent
 ) -> pd.DataFrame:
-    """Works through all stages of a study.
+    """Computes all stages of a study, and its table.
 
     Args:
         study: what is measured.
@@ -104,38 +104,38 @@ def run_cells(
     on_done: OnDone = silent,
     expected: int = 0,
 ) -> pd.DataFrame:
-    """Works through the cells that are not done yet; a run that was killed goes on where it was.
+    """Computes the cells that are not done yet. A run that was killed continues where it stopped.
 
-    A finished cell is a file in `OUT/<study>/cells`. After each, `OUT/<study>.csv` (rows of all finished
+    A finished cell is a file in `OUT/<study>/cells`. After each cell `OUT/<study>.csv` (rows of all finished
     cells, sorted by key, with the columns that `work` returned and `settings_sha256`, `saccade` and `cpu`)
-    and `OUT/<study>.json` are written anew. Cells that lie there from an earlier run with the same settings
-    stay in the table, so a study can be widened by running it again with more cells.
+    and `OUT/<study>.json` are rewritten. Cells of an earlier run with the same settings stay in the table, so
+    a study can be extended by running it again with more cells.
 
     Args:
-        study: names the table.
+        study: name of the table.
         cells: all of them, done or not, with distinct keys.
-        work: a cell to its rows; values are text, numbers, booleans or None. Runs in other processes, so it
-            must be picklable: a function of a module, or a frozen dataclass with `__call__`.
+        work: from a cell to its rows; values are text, numbers, booleans or None. It runs in other
+            processes, so it must be picklable.
         out: directory of the tables.
-        settings: what all rows depend on, for JSON: hashes of checkpoints, engine, and so on. Not what only
-            says which cells there are.
+        settings: what all rows depend on, as JSON has it: hashes of checkpoints, engine, and so on; not what
+            only determines which cells there are.
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
-        jobs: how many at once; with loky -1 takes all cores.
-        on_done: progress.
-        expected: how many cells there will be, where later calls bring more: until then the table is not
-            complete.
+        jobs: number of processes; with loky -1 for one per core.
+        on_done: reports progress.
+        expected: number of cells of all stages; the table is complete when that many are done.
 
     Returns:
-        The table, as `tables.read_table` gives it.
+        The table, as `saccade.study.table.read_table` returns it.
 
     Raises:
         InputError: an unknown backend, `jobs` out of range, keys that are not distinct, or `out` holds this
             study with other settings.
-        StudyError: cells failed, each named with its error; or a worker process died. What is done is kept.
+        StudyError: cells failed, and the first ones are named with their errors; or a worker process died.
+            Finished cells stay stored.
     """
     check_workers(backend, jobs)
     if len({cell.key for cell in cells}) != len(cells):
-        raise InputError(f"cells: {study} has keys that occur twice")
+        raise InputError(f"cells: {study} has duplicate keys")
     store = Store(study, out, settings, cells, expected)
     todo = [cell for cell in cells if cell.digest not in store.finished]
     store.write()
@@ -153,7 +153,7 @@ def run_cells(
 
 
 def check_workers(backend: str, jobs: int) -> None:
-    """Raises `InputError` for an unknown backend or a number of jobs that makes no sense."""
+    """Raises `InputError` for an unknown backend or a number of jobs out of range."""
     if backend not in BACKENDS:
         raise InputError(f"backend: unknown name {backend!r}, expected one of {', '.join(BACKENDS)}")
     if jobs < 1 and (backend, jobs) != ("loky", -1):
@@ -184,9 +184,9 @@ class Store:
         asked = {cell.key: cell.digest for cell in cells}
         for path in self.directory.glob("*.json"):
             if path.name.startswith("."):
-                continue  # half a file, of a run that was killed
+                continue  # incomplete, of a run that was killed
             record = read_record(path)
-            # One whose settings, or those of the study, have changed must not stand beside its successor.
+            # A cell with outdated settings must not be in the table together with its replacement.
             if record is None or any(
                 row.get("settings_sha256") != digest(settings) for row in record["rows"]
             ):
@@ -210,7 +210,7 @@ class Store:
             )
 
     def add(self, finished: Finished) -> None:
-        """Keeps what came of a cell."""
+        """Stores the result of a cell."""
         self.added += 1
         if finished.error is not None:
             self.failed.append(finished)
@@ -251,7 +251,7 @@ class Store:
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
-    """A cell's file; None if it holds something else, so that the cell is done anew."""
+    """Reads the file of a cell; None if its content is unusable, so that the cell is computed again."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         hash(tuple(record["key"]))
@@ -264,17 +264,17 @@ def read_record(path: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Guarded:
-    """`work` that returns its exceptions, with what is written into every row."""
+    """`work` that returns exceptions instead of raising them, and adds `marks` to every row."""
 
     work: Callable[[Cell], Rows]
     marks: Mapping[str, str]
 
     def __call__(self, cell: Cell) -> Finished:
-        """What came of the cell."""
+        """The result of the cell."""
         start = time.perf_counter()
         try:
-            rows = plain(self.work(cell))  # what has no form in JSON is this cell's error
-        except Exception as error:  # one bad cell must not end the others; it is raised when they are done
+            rows = plain(self.work(cell))  # a value that JSON cannot represent is an error of this cell
+        except Exception as error:  # raised as StudyError when the other cells are done
             spent = time.perf_counter() - start
             return Finished(cell, [], spent, f"{type(error).__name__}: {error}")
         marks = {**self.marks, "cpu": cpu_name()}
@@ -284,7 +284,7 @@ class Guarded:
 def spread(
     work: Callable[[Cell], Finished], cells: Sequence[Cell], backend: str, jobs: int
 ) -> Iterable[Finished]:
-    """Works through cells in processes, in any order; one job works in this process.
+    """Computes cells in processes, in any order; with one job in this process.
 
     Raises:
         StudyError: a worker process died.
@@ -295,7 +295,7 @@ def spread(
         from ray.util.joblib import register_ray
 
         register_ray()
-        # Through joblib, Ray gives no result before the last one, so it gets a few cells a worker at a time.
+        # joblib returns Ray's results only when all are there, so cells are given in rounds.
         size = ROUND * jobs
         rounds = [todo[start : start + size] for start in range(0, len(todo), size)]
         for several in rounds:
@@ -303,20 +303,20 @@ def spread(
                 yield from joblib.Parallel(n_jobs=jobs, backend=backend, batch_size=1)(several)
             except RayError as error:
                 reason = str(error).strip().splitlines()[-1]
-                raise StudyError(f"ray could not go on: {reason}; what is done is kept") from None
+                raise StudyError(f"ray failed: {reason}; finished cells are stored") from None
         return
     parallel = joblib.Parallel(n_jobs=jobs, backend=backend, return_as="generator_unordered", batch_size=1)
     try:
         yield from parallel(todo)
     except BrokenProcessPool:
         raise StudyError(
-            "a worker process died, perhaps for want of memory; what is done is kept, run again to go on"
+            "a worker process died, perhaps out of memory; finished cells are stored, run again to continue"
         ) from None
 
 
 @functools.cache
 def packages() -> dict[str, str]:
-    """Versions of saccade and of what computes beside it, as far as it is installed."""
+    """Versions of saccade and of the installed packages that compute with it."""
     found = {"saccade": saccade.__version__}
     for name in RECORDED_PACKAGES:
         with contextlib.suppress(PackageNotFoundError):

@@ -1,4 +1,4 @@
-"""A study's table: tidy CSV, one row a measurement, with a JSON beside it that says where it comes from."""
+"""The table of a study: tidy CSV, one row per measurement, and JSON with its provenance."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from saccade.errors import InputError
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a table comes from; `OUT/<study>.json`.
+    """The provenance of a table; `OUT/<study>.json`.
 
     Attributes:
         study: Its name.
         settings: What the whole table depends on: checkpoint and its hash, engine, seeds, and so on.
-        done, total: Cells that are finished, and all that were asked for.
-        failed: Of each cell that raised, its key and the error.
-        cell_seconds: Time spent in the finished cells, all added up.
-        packages: Versions of what computed it.
-        machine: CPU, system and Python of the process that wrote the table; each row names its own CPU.
-        table_sha256: Of the table as it was written; empty if that is not known.
+        done, total: Number of finished cells, and of all.
+        failed: Key and error of each cell that failed.
+        cell_seconds: Total time of the finished cells.
+        packages: Versions of the packages that computed it.
+        machine: CPU, system and Python of the process that wrote the table; each row has its own CPU.
+        table_sha256: Hash of the table as written; empty if unknown.
     """
 
     study: str
@@ -41,14 +41,14 @@ class Provenance:
 
     @property
     def complete(self) -> bool:
-        """Whether every cell that was asked for is in the table."""
+        """Whether all cells are in the table."""
         return self.done == self.total
 
 
 def write_table(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
-    """Writes rows as CSV; columns are those of all rows, in the order in which they first occur.
+    """Writes rows as CSV with the columns of all rows, in the order of their first occurrence.
 
-    A value that is missing, `None` or not a number is an empty field.
+    A value that is missing, None or NaN is an empty field.
     """
     with write_atomically(path) as temporary:
         pd.DataFrame(list(rows)).to_csv(temporary, index=False)
@@ -58,10 +58,10 @@ def read_table(path: Path) -> pd.DataFrame:
     """Reads what `write_table` wrote; empty fields are NaN.
 
     Raises:
-        FileNotFoundError: there is none.
-        InputError: it is no CSV.
+        FileNotFoundError: it does not exist.
+        InputError: it is not CSV.
     """
-    if path.stat().st_size <= 1:  # a table without rows has no columns either
+    if path.stat().st_size <= 1:  # a table without rows has no columns
         return pd.DataFrame()
     try:
         # Words like "none" or "NA" are names here, not missing values.
@@ -71,7 +71,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def write_provenance(provenance: Provenance, path: Path) -> None:
-    """Writes it as JSON, with `complete` for readers that do not count."""
+    """Writes it as JSON, with `complete`."""
     write_json(path, {**asdict(provenance), "complete": provenance.complete})
 
 
@@ -79,8 +79,8 @@ def read_provenance(path: Path) -> Provenance:
     """Reads what `write_provenance` wrote.
 
     Raises:
-        FileNotFoundError: there is none.
-        InputError: it is something else.
+        FileNotFoundError: it does not exist.
+        InputError: it has other content.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -91,19 +91,19 @@ def read_provenance(path: Path) -> Provenance:
 
 
 def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
-    """A study's table and where it comes from.
+    """The table of a study and its provenance.
 
     Raises:
-        FileNotFoundError: one of the two is not there.
-        InputError: they do not belong together.
+        FileNotFoundError: one of the two files does not exist.
+        InputError: the table is not the one that the study wrote.
     """
     provenance = read_provenance(provenance_path(out, study))
     path = table_path(out, study)
     table = read_table(path)
     if provenance.table_sha256 not in ("", sha256_of(path)):
         raise InputError(
-            f"{path}: not as its study wrote it (edited, cut short, or the run was killed just then); "
-            "run the study again, which takes no time for what is done"
+            f"{path}: not as its study wrote it (edited, truncated, or the run was killed while writing); "
+            "run the study again: finished cells are not repeated"
         )
     return table, provenance
 
@@ -122,17 +122,17 @@ def truths(column: pd.Series) -> pd.Series:
 
 
 def table_path(out: Path, study: str) -> Path:
-    """Where a study's table lies."""
+    """Path of the table of a study."""
     return out / f"{study}.csv"
 
 
 def provenance_path(out: Path, study: str) -> Path:
-    """Where it says what the table comes from."""
+    """Path of the provenance of a study."""
     return out / f"{study}.json"
 
 
 def clusters_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
-    """Of each row what it stands and falls with: its episode, in a table of the simulator the seed."""
+    """The bootstrap cluster of each row: task and episode; the episode of the simulator is its seed."""
     return list(zip(table["task"], table["episode" if "episode" in table else "seed"], strict=True))
 
 

@@ -36,12 +36,14 @@ impl PlannedTensor {
     /// Bytes in the file.
     #[must_use]
     pub fn nbytes(&self) -> usize {
-        self.shape.iter().product::<usize>() * self.dtype.bitsize() / 8
+        let elements: u128 = self.shape.iter().map(|&size| size as u128).product();
+        let bits = elements.saturating_mul(self.dtype.bitsize() as u128);
+        usize::try_from(bits / 8).unwrap_or(usize::MAX)
     }
 }
 
 /// Where a tensor's bytes are in the files.
-struct Extent {
+struct Region {
     shard: usize,
     start: u64,
     nbytes: u64,
@@ -57,7 +59,7 @@ pub struct CheckpointWriter {
     companions: BTreeSet<PathBuf>,
     temporary: TemporaryDirectory,
     shards: Vec<(String, File)>,
-    extents: BTreeMap<String, Extent>,
+    regions: BTreeMap<String, Region>,
 }
 
 impl CheckpointWriter {
@@ -78,18 +80,18 @@ impl CheckpointWriter {
         let out = &out.canonicalize().unwrap_or_else(|_| out.to_owned());
         let carried = companions.all_paths();
         let replaces = check_replaceable(out, &carried, force)?;
-        let temporary = TemporaryDirectory::beside(out)?;
-        // Wide elements first, as the format's own writer does: each tensor then lies at a multiple of its element.
+        let temporary = TemporaryDirectory::next_to(out)?;
+        // Wide elements first, as the format's own writer does: each tensor then starts at a multiple of its element size.
         planned.sort_by(|a, b| (b.dtype.bitsize(), &a.name).cmp(&(a.dtype.bitsize(), &b.name)));
         let mut sharded: Vec<Vec<PlannedTensor>> = vec![Vec::new()];
         let mut held = 0;
         for tensor in planned {
             let nbytes = tensor.nbytes() as u64;
-            if held > 0 && held + nbytes > max_shard_bytes {
+            if held > 0 && u64::saturating_add(held, nbytes) > max_shard_bytes {
                 sharded.push(Vec::new());
                 held = 0;
             }
-            held += nbytes;
+            held = u64::saturating_add(held, nbytes);
             sharded.last_mut().expect("there is at least one").push(tensor);
         }
         let mut writer = Self {
@@ -99,7 +101,7 @@ impl CheckpointWriter {
             companions: carried,
             temporary,
             shards: Vec::new(),
-            extents: BTreeMap::new(),
+            regions: BTreeMap::new(),
         };
         let count = sharded.len();
         for (index, tensors) in sharded.into_iter().enumerate() {
@@ -129,7 +131,7 @@ impl CheckpointWriter {
         }
         let (mut offset, mut offsets) = (0, Vec::new());
         for tensor in tensors {
-            let end = offset + tensor.nbytes();
+            let end = usize::saturating_add(offset, tensor.nbytes());
             let info = TensorInfo {
                 dtype: tensor.dtype,
                 shape: tensor.shape,
@@ -144,20 +146,20 @@ impl CheckpointWriter {
         header.push_str(&" ".repeat(header.len().next_multiple_of(8) - header.len()));
         let data = 8 + header.len() as u64;
         for (name, start, nbytes) in offsets {
-            let extent = Extent {
+            let region = Region {
                 shard,
-                start: data + start,
+                start: data.saturating_add(start),
                 nbytes,
                 written: 0,
             };
-            self.extents.insert(name, extent);
+            self.regions.insert(name, region);
         }
         let path = self.temporary.path().join(&name);
         let write = || {
             let mut file = File::create_new(&path)?;
             file.write_all(&(header.len() as u64).to_le_bytes())?;
             file.write_all(header.as_bytes())?;
-            file.set_len(data + offset as u64)?;
+            file.set_len(data.saturating_add(offset as u64))?;
             Ok(file)
         };
         let file = write().map_err(|error| Error::writing(&path, error))?;
@@ -166,11 +168,11 @@ impl CheckpointWriter {
     }
 
     fn write_index(&self) -> Result<()> {
-        let total: u64 = self.extents.values().map(|extent| extent.nbytes).sum();
+        let total: u64 = self.regions.values().map(|region| region.nbytes).sum();
         let map: BTreeMap<&str, &str> = self
-            .extents
+            .regions
             .iter()
-            .map(|(name, extent)| (name.as_str(), self.shards[extent.shard].0.as_str()))
+            .map(|(name, region)| (name.as_str(), self.shards[region.shard].0.as_str()))
             .collect();
         let index = serde_json::json!({ "metadata": { "total_size": total }, "weight_map": map });
         self.file("model.safetensors.index.json", &format!("{index:#}\n"))
@@ -198,15 +200,15 @@ impl CheckpointWriter {
     /// # Panics
     /// If there is no such tensor, or it is shorter.
     pub fn tensor(&mut self, name: &str, bytes: &[u8]) -> Result<()> {
-        let extent = self.extents.get_mut(name).expect("the tensor was planned");
-        let (shard, file) = &mut self.shards[extent.shard];
-        let first = extent.written;
-        extent.written += bytes.len() as u64;
+        let region = self.regions.get_mut(name).expect("the tensor was planned");
+        let (shard, file) = &mut self.shards[region.shard];
+        let first = region.written;
+        region.written += bytes.len() as u64;
         assert!(
-            extent.written <= extent.nbytes,
+            region.written <= region.nbytes,
             "{name}: more bytes than were planned"
         );
-        file.seek(SeekFrom::Start(extent.start + first))
+        file.seek(SeekFrom::Start(region.start + first))
             .and_then(|_| file.write_all(bytes))
             .map_err(|error| Error::writing(&self.temporary.path().join(shard), error))
     }
@@ -216,10 +218,10 @@ impl CheckpointWriter {
     /// # Panics
     /// As [`CheckpointWriter::tensor`].
     pub fn zeros(&mut self, name: &str, nbytes: u64) {
-        let extent = self.extents.get_mut(name).expect("the tensor was planned");
-        extent.written += nbytes;
+        let region = self.regions.get_mut(name).expect("the tensor was planned");
+        region.written += nbytes;
         assert!(
-            extent.written <= extent.nbytes,
+            region.written <= region.nbytes,
             "{name}: more bytes than were planned"
         );
     }
@@ -234,9 +236,9 @@ impl CheckpointWriter {
     /// could get the name; both are then kept.
     pub fn finish(self) -> Result<Vec<String>> {
         assert!(
-            self.extents
+            self.regions
                 .values()
-                .all(|extent| extent.written == extent.nbytes),
+                .all(|region| region.written == region.nbytes),
             "all planned tensors are written"
         );
         for (name, file) in &self.shards {
@@ -252,5 +254,59 @@ impl CheckpointWriter {
             place(&Disk, self.temporary, &self.out)?;
         }
         Ok(files)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Checkpoint, Elements};
+
+    fn planned(name: &str, shape: &[usize]) -> PlannedTensor {
+        PlannedTensor {
+            name: name.to_owned(),
+            dtype: Dtype::F32,
+            shape: shape.to_vec(),
+        }
+    }
+
+    /// A checkpoint of two tensors, half written, at `out`.
+    fn half_written(out: &Path, max_shard_bytes: u64) -> CheckpointWriter {
+        let metadata = BTreeMap::from([("key".to_owned(), "value".to_owned())]);
+        let companions = Companions::of(Path::new("none.safetensors"), std::iter::empty()).unwrap();
+        let tensors = vec![planned("a", &[2]), planned("b", &[3])];
+        let mut writer =
+            CheckpointWriter::create(out, tensors, &metadata, &companions, max_shard_bytes, false).unwrap();
+        writer.file("config.json", "{}").unwrap();
+        for value in [1.0f32, 2.0] {
+            writer.tensor("a", &value.to_le_bytes()).unwrap();
+        }
+        writer
+    }
+
+    #[test]
+    fn what_is_written_can_be_read() {
+        for (max_shard_bytes, num_files) in [(u64::MAX, 1), (10, 2)] {
+            let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
+            let out = parent.join("out");
+            let mut writer = half_written(&out, max_shard_bytes);
+            writer.zeros("b", 12);
+            assert_eq!(writer.finish().unwrap().len(), num_files);
+            let checkpoint = Checkpoint::open(&out).unwrap();
+            assert_eq!(checkpoint.files().count(), num_files);
+            assert_eq!(checkpoint.metadata()["key"], "value");
+            assert_eq!(checkpoint.read("a").unwrap(), Elements::F32(vec![1.0, 2.0]));
+            assert_eq!(checkpoint.read("b").unwrap(), Elements::F32(vec![0.0; 3]));
+            assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 1);
+            std::fs::remove_dir_all(parent).unwrap();
+        }
+    }
+
+    #[test]
+    fn what_is_not_finished_leaves_nothing() {
+        let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
+        drop(half_written(&parent.join("out"), u64::MAX));
+        assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 0);
+        std::fs::remove_dir_all(parent).unwrap();
     }
 }

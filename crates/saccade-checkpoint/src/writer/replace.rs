@@ -191,7 +191,7 @@ mod tests {
         let out = parent.join("out");
         fs::create_dir_all(&out).unwrap();
         fs::write(out.join("old"), "old").unwrap();
-        let new = TemporaryDirectory::beside(&out).unwrap();
+        let new = TemporaryDirectory::next_to(&out).unwrap();
         fs::write(new.path().join("new"), "new").unwrap();
         (parent, out, new)
     }

@@ -33,7 +33,7 @@ const ABANDONED_AFTER: Duration = Duration::from_secs(60);
 
 impl TemporaryDirectory {
     /// In the directory of `out`, so that renaming needs no copy.
-    pub(super) fn beside(out: &Path) -> Result<Self> {
+    pub(super) fn next_to(out: &Path) -> Result<Self> {
         let name = out.file_name().ok_or_else(|| {
             Error::Input(format!(
                 "out: expected the name of a directory, got {}",
@@ -116,10 +116,10 @@ mod tests {
     fn a_writer_that_is_done_takes_nothing_from_the_next() {
         let parent = std::env::temp_dir().join(format!("saccade-temporary-{}", unique()));
         let out = parent.join("out");
-        let mut first = TemporaryDirectory::beside(&out).unwrap();
+        let mut first = TemporaryDirectory::next_to(&out).unwrap();
         std::fs::rename(first.path(), &out).unwrap();
         // The name is free, and the next writer begins before the first one is dropped.
-        let second = TemporaryDirectory::beside(&out).unwrap();
+        let second = TemporaryDirectory::next_to(&out).unwrap();
         assert_ne!(first.path(), second.path());
         first.disarm();
         drop(first);
@@ -139,7 +139,7 @@ mod tests {
             for _ in 0..8 {
                 scope.spawn(|| {
                     for _ in 0..50 {
-                        let one = TemporaryDirectory::beside(&out).unwrap();
+                        let one = TemporaryDirectory::next_to(&out).unwrap();
                         let file = one.path().join("file");
                         std::fs::File::create_new(&file).expect("nobody else writes here");
                         assert!(file.exists(), "nobody else removes it");

@@ -39,6 +39,9 @@ const LONGEST_WAIT: Duration = Duration::from_micros(500);
 /// Upper bound of threads a call can have; a guard against nonsense, not a limit that anyone meets.
 const MAX_THREADS: usize = 1024;
 
+/// Address space that must be left for a thread to be started: more than the allocator may still hold from before.
+const THREAD_ROOM: usize = 80 << 20;
+
 struct Pool {
     /// Where its workers live. A child of `fork` has this memory but not the threads.
     process: u32,
@@ -75,9 +78,11 @@ impl Pool {
             else {
                 return;
             };
+            // Where the system grants a stack and little more, the standard library aborts the process as the thread begins.
+            let has_room = Vec::<u8>::new().try_reserve_exact(THREAD_ROOM).is_ok();
             let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));
-            if thread.spawn(|| self.work()).is_err() {
-                // The caller manages alone; a later call tries again.
+            if !has_room || thread.spawn(|| self.work()).is_err() {
+                // The caller manages with those that there are; a later call tries again.
                 self.workers.fetch_sub(1, Ordering::Relaxed);
                 return;
             }

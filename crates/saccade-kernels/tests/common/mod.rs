@@ -2,6 +2,8 @@
 
 #![allow(dead_code, reason = "each test file uses a part")]
 
+pub mod attention;
+
 use saccade_kernels::{Rows, RowsMut};
 
 /// Half a unit in the last place of 1.
@@ -92,4 +94,21 @@ pub fn gelu_tanh(x: f64) -> f64 {
 
 pub fn silu(x: f64) -> f64 {
     x / (1.0 + (-x).exp())
+}
+
+/// `x Phi(x)`, with `erfc` by its series for small arguments and its continued fraction for large ones.
+pub fn gelu_erf(x: f64) -> f64 {
+    let z = x.abs() / std::f64::consts::SQRT_2;
+    let erfc = if z < 2.0 {
+        let (mut term, mut sum) = (z, z);
+        for n in 1..80 {
+            term *= 2.0 * z * z / f64::from(2 * n + 1);
+            sum += term;
+        }
+        1.0 - std::f64::consts::FRAC_2_SQRT_PI * (-z * z).exp() * sum
+    } else {
+        let fraction = (1..200).rev().fold(z, |rest, n| z + f64::from(n) / 2.0 / rest);
+        std::f64::consts::FRAC_2_SQRT_PI / 2.0 * (-z * z).exp() / fraction
+    };
+    x.max(0.0) - x.abs() * 0.5 * erfc
 }

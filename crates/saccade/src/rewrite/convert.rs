@@ -3,118 +3,26 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use half::{bf16, f16};
 use saccade_checkpoint::spec::SCALE_SUFFIX;
-use saccade_checkpoint::{CheckpointWriter, Dtype};
+use saccade_checkpoint::{CheckpointWriter, Dtype, PlannedTensor};
 
-use crate::checkpoint::{KEPT_EMBODIMENTS, kept_embodiments};
 use crate::error::{Error, Result};
-use crate::head::chosen_embodiments;
-use crate::layout::tensor_specs;
-use crate::rewrite::{RewriteOptions, Source, Written};
-
-/// A type that weights are stored in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Float {
-    /// float32.
-    F32,
-    /// bfloat16.
-    Bf16,
-    /// float16.
-    F16,
-}
-
-impl std::str::FromStr for Float {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        match name {
-            "float32" => Ok(Self::F32),
-            "bfloat16" => Ok(Self::Bf16),
-            "float16" => Ok(Self::F16),
-            _ => Err(Error::Input(format!(
-                "dtype: expected float32, bfloat16 or float16, got {name}"
-            ))),
-        }
-    }
-}
-
-impl Float {
-    pub(crate) fn of(dtype: Dtype) -> Option<Self> {
-        match dtype {
-            Dtype::F32 => Some(Self::F32),
-            Dtype::BF16 => Some(Self::Bf16),
-            Dtype::F16 => Some(Self::F16),
-            _ => None,
-        }
-    }
-
-    pub(crate) fn dtype(self) -> Dtype {
-        match self {
-            Self::F32 => Dtype::F32,
-            Self::Bf16 => Dtype::BF16,
-            Self::F16 => Dtype::F16,
-        }
-    }
-
-    /// The numbers whose bytes these are.
-    fn read(self, bytes: &[u8], values: &mut Vec<f32>) {
-        let pairs = || {
-            bytes
-                .as_chunks::<2>()
-                .0
-                .iter()
-                .map(|&pair| u16::from_le_bytes(pair))
-        };
-        values.clear();
-        match self {
-            Self::F32 => {
-                let fours = bytes.as_chunks::<4>().0.iter();
-                values.extend(fours.map(|&four| f32::from_le_bytes(four)));
-            }
-            Self::Bf16 => values.extend(pairs().map(|bits| bf16::from_bits(bits).to_f32())),
-            Self::F16 => values.extend(pairs().map(|bits| f16::from_bits(bits).to_f32())),
-        }
-    }
-
-    /// The bytes of these numbers, each the nearest of this type.
-    pub(crate) fn write(self, values: &[f32], bytes: &mut Vec<u8>) {
-        bytes.clear();
-        match self {
-            Self::F32 => bytes.extend(values.iter().flat_map(|value| value.to_le_bytes())),
-            Self::Bf16 => bytes.extend(
-                values
-                    .iter()
-                    .flat_map(|&value| bf16::from_f32(value).to_le_bytes()),
-            ),
-            Self::F16 => bytes.extend(
-                values
-                    .iter()
-                    .flat_map(|&value| f16::from_f32(value).to_le_bytes()),
-            ),
-        }
-    }
-
-    /// A number as this type holds it.
-    pub(crate) fn round(self, value: f32) -> f32 {
-        match self {
-            Self::F32 => value,
-            Self::Bf16 => bf16::from_f32(value).to_f32(),
-            Self::F16 => f16::from_f32(value).to_f32(),
-        }
-    }
-}
+use crate::head::embodiments::chosen_embodiments;
+use crate::head::plan::tensor_specs;
+use crate::recognise::contents::{KEPT_EMBODIMENTS, kept_embodiments};
+use crate::rewrite::float::Float;
+use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
 /// How a checkpoint is converted.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub struct ConvertOptions {
-    /// What is common to all rewriting.
+    /// Options that all rewriting shares.
     pub rewrite: RewriteOptions,
-    /// Keep only these embodiments; default all. Ids keep their numbers: the slices of the others are zero, and the files' metadata say
-    /// which are not.
+    /// Keep only these embodiments; default all. They keep their ids: the slices of the others become zero, and the files' metadata list
+    /// those that were kept.
     pub embodiment_ids: Option<Vec<i64>>,
-    /// What floating point tensors become; default what they are. int8 and its scales stay.
+    /// The type of all floating-point tensors; default the one that each has. int8 and its scales stay.
     pub dtype: Option<Float>,
 }
 
@@ -136,40 +44,40 @@ pub struct ConvertReport {
     pub written: Written,
     /// Tensors of another type than before.
     pub num_converted: usize,
-    /// Numbers that are not what they were, by rounding.
+    /// Numbers that rounding changed.
     pub num_rounded: u64,
     /// The largest difference between a number and what it was.
     pub largest_error: f32,
-    /// Where that is.
+    /// The tensor with the largest difference.
     pub largest_error_in: Option<String>,
-    /// The largest difference over the number's own size.
+    /// The largest difference relative to the number itself.
     pub largest_relative_error: f32,
-    /// The embodiments that are kept; none if nothing was asked.
+    /// The embodiments that were kept, if the options list any.
     pub embodiment_ids: Option<Vec<usize>>,
-    /// Bytes that are zero now, of the embodiments that are not kept.
+    /// Bytes of the embodiments that were not kept, which are zero now.
     pub zeroed_bytes: u64,
-    /// Bytes of all tensors before, those left out included.
+    /// Bytes of all tensors before, including those that were left out.
     pub bytes_before: u64,
     /// Bytes of all tensors now.
     pub bytes_after: u64,
 }
 
-/// Writes the checkpoint `source` to the directory `out`, changed as the options say. What they leave alone is copied bit for bit.
+/// Writes the checkpoint `source` to the directory `out`, changed as the options say. Everything else is copied bit for bit.
 ///
-/// One piece of a tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; where it returns
-/// false, nothing is written.
+/// NaN and infinity are copied too; [`ActionHead::load`](crate::ActionHead::load) refuses them in the copy as in the source. One piece of a
+/// tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
 /// # Errors
-/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a finite number that the type cannot hold; [`Error::Input`]
-/// for ids out of range, and if `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source;
-/// [`Error::Output`] if it cannot be written.
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, and for a finite number that the
+/// type cannot hold; [`Input`](crate::ErrorKind::Input) for ids out of range, and if `out` exists and `force` is not set, holds anything but
+/// such a checkpoint, or is the source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn convert(
     source: &Path,
     out: &Path,
     options: &ConvertOptions,
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<ConvertReport> {
-    let source = Source::open(source, options.rewrite.config.as_deref())?;
+    let source = SourceCheckpoint::open(source, options.rewrite.config.as_deref())?;
     let mut report = ConvertReport::default();
     let mut rewrite = options.rewrite.clone();
     let mut kept = None;
@@ -189,19 +97,7 @@ pub fn convert(
         .filter(|spec| spec.per_embodiment)
         .map(|spec| format!("{}{}", source.prefix, spec.name))
         .collect();
-    for name in source.checkpoint.names() {
-        report.bytes_before += source.checkpoint.nbytes(name)?;
-    }
-    let mut planned = Vec::new();
-    for name in source.names(&options.rewrite) {
-        let mut tensor = source.as_it_is(name)?;
-        if let Some((_, to)) = change(&source, name, options)? {
-            tensor.dtype = to.dtype();
-            report.num_converted += 1;
-        }
-        report.bytes_after += tensor.nbytes() as u64;
-        planned.push(tensor);
-    }
+    let planned = plan(&source, options, &mut report)?;
     let config = [("config.json", Some(source.given_config.as_str()))];
     let mut rounding = Rounding::default();
     let mut zeroed_bytes = 0;
@@ -226,9 +122,7 @@ pub fn convert(
                         Some((from, to)) => rounding.write(name, bytes, from, to, writer),
                     })?;
             } else {
-                let nbytes = change.map_or(nbytes, |(from, to)| {
-                    nbytes * to.dtype().bitsize() as u64 / from.dtype().bitsize() as u64
-                });
+                let nbytes = change.map_or(nbytes, |(from, to)| nbytes / from.size() * to.size());
                 writer.zeros(name, nbytes);
                 zeroed_bytes += nbytes;
             }
@@ -246,8 +140,31 @@ pub fn convert(
     })
 }
 
-/// What type tensor `name` has and gets, if another.
-fn change(source: &Source, name: &str, options: &ConvertOptions) -> Result<Option<(Float, Float)>> {
+/// The tensors of the copy; their sizes are added to `report`.
+fn plan(
+    source: &SourceCheckpoint,
+    options: &ConvertOptions,
+    report: &mut ConvertReport,
+) -> Result<Vec<PlannedTensor>> {
+    for name in source.checkpoint.names() {
+        let nbytes = source.checkpoint.nbytes(name)?;
+        report.bytes_before = report.bytes_before.saturating_add(nbytes);
+    }
+    let mut planned = Vec::new();
+    for name in source.names(&options.rewrite) {
+        let mut tensor = source.as_it_is(name)?;
+        if let Some((_, to)) = change(source, name, options)? {
+            tensor.dtype = to.dtype();
+            report.num_converted += 1;
+        }
+        report.bytes_after = report.bytes_after.saturating_add(tensor.nbytes() as u64);
+        planned.push(tensor);
+    }
+    Ok(planned)
+}
+
+/// The types of tensor `name` before and after, if they differ.
+fn change(source: &SourceCheckpoint, name: &str, options: &ConvertOptions) -> Result<Option<(Float, Float)>> {
     let from = Float::of(source.checkpoint.dtype(name)?);
     let is_scale = name
         .strip_suffix(SCALE_SUFFIX)

@@ -1,6 +1,7 @@
-//! What all commands that write a checkpoint from another have in common: opening it, what they keep of it, writing it.
+//! Writing a checkpoint from another: opening the source, choosing what is kept, writing the copy.
 
 pub(crate) mod convert;
+pub(crate) mod float;
 pub(crate) mod quantize;
 pub(crate) mod resize;
 
@@ -20,15 +21,15 @@ const MAX_SHARD_BYTES: u64 = 5_000_000_000;
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub struct RewriteOptions {
-    /// The source's config as JSON; default the `config.json` beside the weights.
+    /// The source's config as JSON; default the `config.json` next to the weights.
     pub config: Option<String>,
     /// Whether tensors outside the head's prefix, such as a backbone's, are left out; otherwise they are copied.
     pub head_only: bool,
-    /// Whether a checkpoint that is there is replaced.
+    /// Whether to replace a checkpoint that exists.
     pub force: bool,
-    /// What the files' metadata say, besides what the source's do.
+    /// Metadata of the files, added to the source's.
     pub metadata: BTreeMap<String, String>,
-    /// A file is closed before it grows larger than this; default one file of one, and 5 GB of several, as they are published.
+    /// The largest size of a file, unless a single tensor is larger. Default: no limit if the source is one file, otherwise 5 GB.
     pub max_shard_bytes: Option<u64>,
 }
 
@@ -45,28 +46,28 @@ impl RewriteOptions {
 pub struct Written {
     /// The files with tensors.
     pub files: Vec<PathBuf>,
-    /// Files beside the weights that were copied, by their path in the directory.
+    /// Files next to the weights that were copied, by their path in the directory.
     pub carried: Vec<PathBuf>,
-    /// Files and folders beside the weights that were not: other weights, states of an optimizer, other checkpoints.
+    /// Files and folders next to the weights that were not copied: other weights, states of an optimizer, other checkpoints.
     pub left: Vec<PathBuf>,
     /// Tensors outside the head that were left out.
     pub num_dropped: usize,
 }
 
-/// A checkpoint that another is written from: open, and its tensors checked against its config.
-pub(crate) struct Source {
+/// An open checkpoint whose tensors fit its config.
+pub(crate) struct SourceCheckpoint {
     path: PathBuf,
     pub checkpoint: Checkpoint,
     pub prefix: &'static str,
     pub config: HeadConfig,
-    /// The config as it was given, or as it stands in `config.json`.
+    /// The config as it was given, or as `config.json` has it.
     pub given_config: String,
 }
 
-/// Calls itself with bytes done and bytes in all; false stops the work.
+/// Called with the bytes done and the bytes in all; false stops the work.
 pub(crate) type Progress<'a> = &'a mut dyn FnMut(u64, u64) -> bool;
 
-impl Source {
+impl SourceCheckpoint {
     /// # Errors
     /// As [`ActionHead::load`](crate::ActionHead::load).
     pub(crate) fn open(path: &Path, config: Option<&str>) -> Result<Self> {
@@ -92,7 +93,7 @@ impl Source {
         name.starts_with(self.prefix)
     }
 
-    /// Tensor `name` as it is.
+    /// Tensor `name` as it is stored.
     pub(crate) fn as_it_is(&self, name: &str) -> Result<PlannedTensor> {
         Ok(PlannedTensor {
             name: name.to_owned(),
@@ -106,18 +107,19 @@ impl Source {
         shape.expect("the name is one of the checkpoint's")
     }
 
+    /// Copies tensor `name` bit for bit.
     pub(crate) fn copy(&self, name: &str, writer: &mut CheckpointWriter) -> Result<()> {
         Ok(self
             .checkpoint
             .read_bytes(name, |bytes| writer.tensor(name, bytes))?)
     }
 
-    /// Writes a checkpoint to the directory `out`: the `small` files by name and contents (`config.json` is one), what else lies beside the
+    /// Writes a checkpoint to the directory `out`: the `small` files by name and contents (`config.json` is one), the other files next to the
     /// source's weights, and the `planned` tensors, by calling `write` for each tensor that is kept.
     ///
     /// # Errors
-    /// [`Error::Input`] if `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source, and where
-    /// `progress` says stop; [`Error::Output`] if it cannot be written.
+    /// [`Error::Input`] and [`Error::File`] if `out` exists and `force` is not given, holds anything but such a checkpoint, or is the source, if
+    /// it cannot be written, and if `progress` stops the work.
     pub(crate) fn write(
         &self,
         out: &Path,
@@ -154,11 +156,11 @@ impl Source {
         let names = self.names(options);
         let (mut done, mut total) = (0, 0);
         for name in &names {
-            total += self.checkpoint.nbytes(name)?;
+            total = u64::saturating_add(total, self.checkpoint.nbytes(name)?);
         }
         for name in &names {
             write(name, &mut writer)?;
-            done += self.checkpoint.nbytes(name)?;
+            done = u64::saturating_add(done, self.checkpoint.nbytes(name)?);
             if !progress(done, total) {
                 return Err(Error::Input("stopped; nothing was written".to_owned()));
             }

@@ -46,17 +46,17 @@ def shuffled(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
 
 
 def averaged(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """As many copies of their mean."""
+    """Copies of the mean of the learned tokens."""
     return Intervention(future_tokens=np.tile(tokens.mean(axis=0), (len(tokens), 1)))
 
 
 def zeroed(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """Zeros in their place."""
+    """Zeros instead of the learned tokens."""
     return Intervention(future_tokens=np.zeros_like(tokens))
 
 
 def redrawn(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """Random numbers with the mean and the standard deviation of theirs."""
+    """Random tokens with the mean and the standard deviation of the learned ones."""
     drawn = rng.normal(tokens.mean(), tokens.std(), tokens.shape)
     return Intervention(future_tokens=drawn.astype(np.float32))
 
@@ -67,13 +67,13 @@ ALL_ARMS = (
         "future-unread",
         "{state, action} <- future cut",
         "State and action rows do not see the future rows. This removes every effect of the future tokens, "
-        "like N = 0 without training anew.",
+        "like N = 0 without retraining.",
         cut(("state", "future"), ("action", "future")),
     ),
     Arm(
         "future-blind",
         "future <- vl cut",
-        "The future rows do not see the vision-language tokens: are they a summary of what is seen?",
+        "The future rows do not see the vision-language tokens: do they summarise what the cameras see?",
         cut(("future", "vl")),
     ),
     Arm(
@@ -85,31 +85,31 @@ ALL_ARMS = (
     Arm(
         "action-blind",
         "action <- vl cut",
-        "The action rows do not see the vision-language tokens. What is seen reaches them through the future "
-        "rows, and also through the state row.",
+        "The action rows do not see the vision-language tokens. Visual information reaches them through the "
+        "future rows, and also through the state row.",
         cut(("action", "vl")),
         needs_future=False,
     ),
     Arm(
         "rows-blind",
         "{state, action} <- vl cut",
-        "Neither state nor action rows see the vision-language tokens: all that is seen must pass through "
-        "the future rows.",
+        "Neither state nor action rows see the vision-language tokens: all visual information must pass "
+        "through the future rows.",
         cut(("state", "vl"), ("action", "vl")),
     ),
     Arm(
         "all-blind",
         "{state, future, action} <- vl cut",
-        "No row sees the vision-language tokens. A control that must fail: it shows what these tasks are "
-        "worth without sight.",
+        "No row sees the vision-language tokens. A control that must fail: it shows how well these tasks can "
+        "be done without vision.",
         cut(*((row, "vl") for row in ROW_GROUPS)),
         needs_future=False,
     ),
     Arm(
         "future-shuffled",
         "future tokens shuffled",
-        "The learned tokens in another order. A control: they have no positions, so nothing may change but "
-        "rounding.",
+        "The learned tokens in another order. A control: they have no positions, so nothing may change "
+        "except rounding.",
         shuffled,
     ),
     Arm(
@@ -121,13 +121,13 @@ ALL_ARMS = (
     Arm(
         "future-zeroed",
         "future tokens zeroed",
-        "Zeros in place of the learned tokens; the rows still read and are read.",
+        "Zeros instead of the learned tokens; the rows still read and are read.",
         zeroed,
     ),
     Arm(
         "future-redrawn",
         "future tokens re-drawn",
-        "Random tokens with the mean and the standard deviation of the learned ones, others in every "
+        "Random tokens with the mean and the standard deviation of the learned ones, different in every "
         "episode: does it matter what was learned?",
         redrawn,
     ),

@@ -87,7 +87,7 @@ class Fast(Study):
 
     Attributes:
         source: Checkpoint and observations.
-        parts: Of `PARTS`; without a closed loop `episodes` is left out.
+        parts: Of `PARTS`; `episodes` is skipped without a closed loop.
         modes: Names; None takes the default of each part.
         calibration: What calibrated modes depend on; None until it has been measured.
     """
@@ -118,8 +118,7 @@ class Fast(Study):
             modes = tuple(dict.fromkeys(Mode.parse(name).name for name in args.modes))
         if args.features is not None and args.parts is not None and EPISODES in parts:
             raise InputError("--parts: episodes: not with --features, which has no simulator")
-        source = source_of(args)
-        return cls(source, tuple(part for part in parts if source.closed_loop or part != EPISODES), modes)
+        return cls(source_of(args), tuple(parts), modes)
 
     def settings(self) -> Mapping[str, Any]:
         """See `Study`."""
@@ -130,7 +129,11 @@ class Fast(Study):
         """The modes of each part, the baseline first. Calibrated ones need something to calibrate them on."""
         defaults = {CHUNKS: (*SCREENED, *JUDGED), EPISODES: JUDGED, TIME: (*SCREENED, *JUDGED)}
         calibrates = bool(calibration_units(self.source))
-        named = {part: dict.fromkeys((BASELINE, *(self.modes or defaults[part]))) for part in self.parts}
+        named = {
+            part: dict.fromkeys((BASELINE, *(self.modes or defaults[part])))
+            for part in self.parts
+            if self.source.closed_loop or part != EPISODES
+        }
         modes = {part: [Mode.parse(name) for name in names] for part, names in named.items()}
         return {
             part: [mode for mode in found if calibrates or not mode.calibrated]

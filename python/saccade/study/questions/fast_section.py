@@ -217,7 +217,7 @@ def pictures(prose: Prose, results: Mapping[str, ModeResult]) -> list[Figure]:
         }
         if success:
             caption = prose.line("caption_frontier", SIZES[size])
-            picture = scattered(success, "milliseconds a chunk", "success, %")
+            picture = scattered(success, "milliseconds per chunk", "success, %")
             found.append(Figure(f"frontier-{size.replace('.', '')}", caption, picture))
     for size in timed_sizes(results)[:1]:
         errors = {
@@ -227,7 +227,7 @@ def pictures(prose: Prose, results: Mapping[str, ModeResult]) -> list[Figure]:
         }
         if errors:
             caption = prose.line("caption_errors", SIZES[size])
-            picture = scattered(errors, "milliseconds a chunk", "|difference| of an action", falling=True)
+            picture = scattered(errors, "milliseconds per chunk", "|difference| of an action", falling=True)
             found.append(Figure("errors", caption, picture))
     return found
 

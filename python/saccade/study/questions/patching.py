@@ -26,7 +26,6 @@ from saccade.study.study import Study
 from saccade.study.table import Provenance
 
 if TYPE_CHECKING:
-    from saccade.study.recording import Recording
     from saccade.study.simulator import Simulator
 
 

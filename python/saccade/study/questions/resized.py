@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade.cli.arguments import add_list, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import Intervention

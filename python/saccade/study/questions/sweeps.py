@@ -33,7 +33,7 @@ from saccade.study.study import Study
 from saccade.study.table import Provenance
 
 if TYPE_CHECKING:
-    from saccade.sim.train import TrainingSettings
+    from saccade.sim.training_settings import TrainingSettings
 
 EPILOG = """\
 Reads finished runs of `saccade train` (--policies), which must differ in nothing else, or trains them
@@ -45,6 +45,7 @@ examples:
   saccade study {study} --demos out/demos {flag} {values} --training-seeds 0,1 --jobs 2 --out out/study
 """
 
+TRAINING, EPISODES, COST = range(3)  # the stages
 # Assumptions of what can be detected; with few runs neither can be known beforehand.
 SUPPOSED_RATE, SUPPOSED_DEVIATIONS, SUPPOSED_DISCORDANT = 0.7, (0.04, 0.08), (0.1, 0.25)
 
@@ -74,7 +75,7 @@ class Sweep(Study):
         runs: Directory of each run, by name.
         planned: What is trained, by name.
         tasks, seeds: The episodes of every policy: each seed in each task.
-        stage: 0, 1 or 2.
+        stage: `TRAINING`, `EPISODES` or `COST`.
         varied: What defines a point of the sweep.
         setting: The training setting whose values are given on the command line.
         values: Its default values.
@@ -85,7 +86,7 @@ class Sweep(Study):
     planned: Mapping[str, Planned]
     tasks: tuple[str, ...]
     seeds: range
-    stage: int = 0
+    stage: int = TRAINING
     varied: ClassVar[Varied]
     setting: ClassVar[str]
     values: ClassVar[tuple[int, ...]]
@@ -178,7 +179,7 @@ class Sweep(Study):
     @classmethod
     def plan(cls, args: argparse.Namespace) -> list[Planned]:
         """The runs to be trained, checked before anything is trained."""
-        from saccade.sim.train import TrainingSettings
+        from saccade.sim.training_settings import TrainingSettings
 
         steps = TrainingSettings.steps if args.training_steps is None else args.training_steps
         weights = getattr(args, "alignment_weights", (0.0,))
@@ -280,9 +281,9 @@ class Sweep(Study):
             planned = self.planned.get(name)
             settings = planned_settings(planned) if planned else {"step": self.read(name).step}
             cells.append(Cell(("training", name), settings))
-        if self.stage > 0:
+        if self.stage >= EPISODES:
             cells += self.episode_cells()
-        if self.stage > 1:
+        if self.stage == COST:
             first = {tuple(run.point.values()): run.name for run in reversed(self.finished())}
             cells.append(Cell(("cost",), {"policies": [first[point] for point in sorted(first)]}))
         return cells
@@ -307,14 +308,14 @@ class Sweep(Study):
     @property
     def num_cells(self) -> int:
         """See `Study`; without the control of equal mass until the policies are trained."""
-        missing = len(self.runs) if self.stage == 0 else len(self.runs) - len(self.finished())
-        return len(self.cells()) + missing * len(self.tasks) * len(self.seeds) + (self.stage < 2)
+        missing = len(self.runs) if self.stage == TRAINING else len(self.runs) - len(self.finished())
+        return len(self.cells()) + missing * len(self.tasks) * len(self.seeds) + (self.stage < COST)
 
     def then(self, table: pd.DataFrame) -> Sweep | None:
         """See `Study`: after the training the episodes, then, alone, the cost."""
-        if self.stage == 0:
+        if self.stage == TRAINING:
             self.check_comparable([self.read(name) for name in self.runs])
-        if self.stage == 2 or (self.stage == 1 and not self.finished()):
+        if self.stage == COST or (self.stage == EPISODES and not self.finished()):
             return None
         return replace(self, stage=self.stage + 1)
 

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use saccade_checkpoint::UniqueMap;
 
 /// A value in a config.
-pub(super) struct Place<'a> {
+pub(super) struct Found<'a> {
     /// The keys that lead to it, with dots between them.
     pub path: String,
     pub key: String,
@@ -16,7 +16,7 @@ pub(super) struct Place<'a> {
 }
 
 /// All values of the objects in `value`, which is at `path`.
-pub(super) fn find<'a>(path: &str, value: &'a RawValue, places: &mut Vec<Place<'a>>) -> Result<()> {
+pub(super) fn find<'a>(path: &str, value: &'a RawValue, found: &mut Vec<Found<'a>>) -> Result<()> {
     let broken = |error: serde_json::Error| Error::Checkpoint(format!("config: {path}: {error}"));
     match value.get().as_bytes().first() {
         Some(b'{') => {
@@ -26,14 +26,14 @@ pub(super) fn find<'a>(path: &str, value: &'a RawValue, places: &mut Vec<Place<'
                     "" => key.clone(),
                     _ => format!("{path}.{key}"),
                 };
-                find(&path, value, places)?;
-                places.push(Place { path, key, value });
+                find(&path, value, found)?;
+                found.push(Found { path, key, value });
             }
         }
         Some(b'[') => {
             let array: Vec<&RawValue> = serde_json::from_str(value.get()).map_err(broken)?;
             for (index, value) in array.into_iter().enumerate() {
-                find(&format!("{path}[{index}]"), value, places)?;
+                find(&format!("{path}[{index}]"), value, found)?;
             }
         }
         _ => {}
@@ -54,7 +54,7 @@ pub(super) fn entry(text: &str, value: &Range<usize>, key: &str) -> Option<Range
     })
 }
 
-/// Where in `text` the value stands that was read from it.
+/// The position in `text` of a value that was read from it.
 pub(super) fn span(text: &str, value: &RawValue) -> Range<usize> {
     let start = value.get().as_ptr() as usize - text.as_ptr() as usize;
     start..start + value.get().len()

@@ -2,6 +2,8 @@
 //!
 //! All weights are logarithms, and sums of them are taken relative to the largest (log-sum-exp), so that no finite bias over- or underflows.
 
+use saccade_checkpoint::{granted, reserve};
+
 use crate::error::{Error, Result};
 
 /// A smaller bias is rounding error of the logarithms and is written as no bias.
@@ -10,16 +12,16 @@ const NO_BIAS: f64 = 1e-6;
 /// Biases up to this size are exponentiated as they are: products and sums of 4096 such weights stay within float64.
 const MAX_PLAIN_BIAS: f64 = 300.0;
 
-/// Future tokens that stand for those of a head.
+/// Future tokens that represent a head's.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MergedTokens {
     /// The rows, `(num_future_tokens, width)`.
     pub tokens: Vec<f32>,
-    /// For each row, the indices of the source's tokens that it stands for.
+    /// For each row, the indices of the given tokens that it represents.
     pub sources: Vec<Vec<usize>>,
     /// What is added to the logit of each row's key in self-attention, `(num_future_tokens)`; none if it is zero everywhere.
     pub key_bias: Option<Vec<f32>>,
-    /// Whether every row stands for equal tokens only, so that attention gives the same output but for rounding.
+    /// Whether every row represents equal tokens only, so that attention gives the same output but for rounding.
     pub is_exact: bool,
 }
 
@@ -65,21 +67,27 @@ pub fn merge_future_tokens(
             "num_future_tokens: expected at most the {count} tokens that are given, got {num_future_tokens}"
         )));
     }
-    Ok(resized(tokens, width, key_bias, num_future_tokens))
+    resized(tokens, width, key_bias, num_future_tokens)
 }
 
 /// `count` tokens in place of `tokens`, rows of `width`, with `bias` on their keys: copied in turn, or merged.
-pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> MergedTokens {
+///
+/// # Errors
+/// [`Error::File`] if there is no memory for them.
+pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Result<MergedTokens> {
     let before = bias.len();
+    let mut rows = Vec::new();
+    reserve("future tokens", &mut rows, count * width)?;
     let sources: Vec<Vec<usize>> = if count >= before {
         (0..count).map(|index| vec![index % before]).collect()
     } else {
+        // As float64, while they are compared.
+        granted("future tokens", tokens.len().saturating_mul(size_of::<f64>()))?;
         merged(tokens, width, bias, count)
     };
     let row = |index: usize| &tokens[index * width..(index + 1) * width];
     let is_equal = |group: &Vec<usize>| group.iter().all(|&one| row(one) == row(group[0]));
     let is_exact = count > 0 && sources.iter().all(is_equal);
-    let mut rows = Vec::with_capacity(count * width);
     let mut biases = Vec::with_capacity(count);
     for group in &sources {
         let copies = match count >= before {
@@ -106,12 +114,12 @@ pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) 
         }));
     }
     let has_bias = biases.iter().any(|bias| bias.abs() > NO_BIAS);
-    MergedTokens {
+    Ok(MergedTokens {
         tokens: rows,
         key_bias: has_bias.then(|| biases.into_iter().map(|bias| bias as f32).collect()),
         sources,
         is_exact,
-    }
+    })
 }
 
 /// What is subtracted from biases before they are exponentiated: 0, or the largest of them where one is too large for that.
@@ -125,14 +133,14 @@ fn shift(biases: impl Iterator<Item = f32>) -> f64 {
 }
 
 /// Tokens that are merged.
-struct Group {
+struct Cluster {
     members: Vec<usize>,
     weight: f64,
     /// The weighted sum of the members' directions.
     sum: Vec<f64>,
 }
 
-impl Group {
+impl Cluster {
     /// What merging with `other` adds to the weighted squared distances of directions from their group's mean.
     fn cost(&self, other: &Self) -> f64 {
         let both = self.sum.iter().zip(&other.sum);
@@ -193,7 +201,7 @@ fn merged(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Vec<Vec<u
 }
 
 /// A group for each token.
-fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Group>> {
+fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Cluster>> {
     let shift = shift(bias.iter().copied());
     let group = |(index, (row, &bias)): (usize, (&[f32], &f32))| {
         let row = row.iter().map(|&value| f64::from(value));
@@ -201,7 +209,7 @@ fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Group
         let norm = if norm > 0.0 { norm } else { 1.0 };
         // Lighter tokens than this all cost nothing to merge.
         let weight = (f64::from(bias) - shift).max(-MAX_PLAIN_BIAS).exp();
-        Some(Group {
+        Some(Cluster {
             members: vec![index],
             weight,
             sum: row.map(|value| weight * (value / norm)).collect(),
@@ -212,7 +220,7 @@ fn single_tokens(tokens: &[f32], width: usize, bias: &[f32]) -> Vec<Option<Group
 }
 
 /// The cheapest group after number `index` to merge it with, and its cost.
-fn cheapest(groups: &[Option<Group>], index: usize) -> Option<(f64, usize)> {
+fn cheapest(groups: &[Option<Cluster>], index: usize) -> Option<(f64, usize)> {
     let group = groups[index].as_ref()?;
     let mut best: Option<(f64, usize)> = None;
     for (other, candidate) in groups.iter().enumerate().skip(index + 1) {
@@ -256,7 +264,7 @@ mod tests {
             let mut number = || uniform(&mut state) as f32 - 0.5;
             let tokens: Vec<f32> = (0..before * width).map(|_| number()).collect();
             let bias: Vec<f32> = (0..before).map(|_| number()).collect();
-            let grown = resized(&tokens, width, &bias, before + more);
+            let grown = resized(&tokens, width, &bias, before + more).unwrap();
             proptest::prop_assert!(grown.is_exact);
             proptest::prop_assert_eq!(&grown.tokens[..before * width], &tokens[..]);
             let was = mass(&tokens, width, Some(&bias));
@@ -266,7 +274,7 @@ mod tests {
                 proptest::prop_assert!((was - is).abs() < 1e-6 * was, "{} {}", was, is);
             }
             let all_zero = vec![0.0; before + more];
-            let shrunk = resized(&grown.tokens, width, grown.key_bias.as_deref().unwrap_or(&all_zero), before);
+            let shrunk = resized(&grown.tokens, width, grown.key_bias.as_deref().unwrap_or(&all_zero), before).unwrap();
             // Rows of one element have one of two directions: merging those of different lengths is as good.
             if width > 1 {
                 proptest::prop_assert!(shrunk.is_exact);
@@ -289,7 +297,7 @@ mod tests {
             let mut state = seed;
             let tokens: Vec<f32> = (0..before * 3).map(|_| uniform(&mut state) as f32 - 0.5).collect();
             let bias = if is_small { &small[..before] } else { &bias[..before] };
-            let resized = resized(&tokens, 3, bias, count);
+            let resized = resized(&tokens, 3, bias, count).unwrap();
             proptest::prop_assert!(resized.tokens.iter().all(|value| value.is_finite() && value.abs() <= 0.5));
             proptest::prop_assert!(resized.key_bias.iter().flatten().all(|value| value.is_finite()));
             let mut all: Vec<usize> = resized.sources.concat();
@@ -310,7 +318,7 @@ mod tests {
             let tokens: Vec<f32> = (0..before * 3).map(|_| uniform(&mut state) as f32 - 0.5).collect();
             let bias: Vec<f32> = (0..before).map(|_| (uniform(&mut state) * 8192.0) as f32 / 8192.0).collect();
             let moved: Vec<f32> = bias.iter().map(|bias| bias + f32::from(shift)).collect();
-            let (one, other) = (resized(&tokens, 3, &bias, 1), resized(&tokens, 3, &moved, 1));
+            let (one, other) = (resized(&tokens, 3, &bias, 1).unwrap(), resized(&tokens, 3, &moved, 1).unwrap());
             for (one, other) in one.tokens.iter().zip(&other.tokens) {
                 proptest::prop_assert!((one - other).abs() < 1e-4, "{} {}", one, other);
             }

@@ -1,8 +1,8 @@
 //! Checkpoints with another number of future tokens.
 //!
-//! Copies of a token, each with the logarithm of their number taken off its key's logit in every self-attention block, are together what the
-//! token was (spec I2), and so is one token in place of equal ones with the logarithm of their number added. No published layout has a place
-//! for such a bias, so it stands in a key of saccade's own: exact in saccade, while other programs see plain copies.
+//! A token can be replaced by n copies if log(n) is subtracted from the logits of their keys in every self-attention block, and n equal tokens
+//! by one if log(n) is added (spec I2). No published layout has a place for such a bias, so it is written under a key of saccade's own: the
+//! result is exact in saccade, while other programs see plain copies.
 
 mod json_edit;
 mod merge;
@@ -11,12 +11,12 @@ mod plan;
 
 use std::path::Path;
 
-use saccade_checkpoint::OWN_CONFIG;
+use saccade_checkpoint::{OWN_CONFIG, reserve};
 
 use crate::error::{Error, Result};
-use crate::layout::FUTURE_TOKENS;
-use crate::rewrite::convert::Float;
-use crate::rewrite::{RewriteOptions, Source, Written};
+use crate::head::plan::FUTURE_TOKENS;
+use crate::rewrite::float::Float;
+use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 use merge::resized;
 use perturb::perturb;
 use plan::plan;
@@ -28,13 +28,13 @@ pub use plan::resized_config;
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ResizeOptions {
-    /// What is common to all rewriting.
+    /// Options that all rewriting shares.
     pub rewrite: RewriteOptions,
-    /// Future tokens that the copy is to have.
+    /// Future tokens of the copy.
     pub num_future_tokens: usize,
-    /// Root mean square of what is added to the copies of tokens, as a part of that of all tokens; 0 adds nothing.
+    /// Root mean square of the noise added to copies of tokens, relative to that of all tokens; 0 adds nothing.
     pub perturbation: f64,
-    /// Of what is added.
+    /// Seed of the noise.
     pub seed: u64,
 }
 
@@ -60,35 +60,35 @@ pub struct ResizeReport {
     pub num_before: usize,
     /// Future tokens of the copy.
     pub num_after: usize,
-    /// For each token of the copy, which ones of the source it stands for: one if it is a copy, several if they were merged.
+    /// For each token of the copy, the indices of the source's tokens that it represents: one for a copy, several for merged ones.
     pub sources: Vec<Vec<usize>>,
-    /// What saccade adds to the logits of the tokens' keys; none if nothing.
+    /// What saccade adds to the logits of the tokens' keys; none if it is zero everywhere.
     pub future_key_bias: Option<Vec<f32>>,
-    /// Whether chunks of actions in saccade stay what they were, but for rounding.
+    /// Whether actions in saccade stay the same but for rounding.
     pub is_exact: bool,
-    /// Whether the tokens are float32 now because the type that they had cannot hold the new ones.
+    /// Whether the tokens are stored as float32 because their former type cannot hold the new ones exactly.
     pub is_widened: bool,
-    /// Root mean square of what was added to copies.
+    /// Root mean square of the noise added to copies.
     pub perturbation_rms: f64,
 }
 
 /// Writes the checkpoint `source` to the directory `out` with another number of future tokens. Going up, tokens are copied in turn; going
-/// down, the most similar are merged. All other tensors are copied bit for bit, and the number is changed wherever the config says it.
+/// down, the most similar are merged. All other tensors are copied bit for bit, and the number is changed wherever the config has it.
 ///
-/// `progress(done, total)`, in bytes read, is called after each tensor; where it returns false, nothing is written.
+/// `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
 /// # Errors
-/// As [`ActionHead::load`](crate::ActionHead::load); [`Error::Checkpoint`] for a version without future tokens, a source that has none, one
-/// whose config says different numbers, and tokens that are not finite; [`Error::Input`] for a number or a perturbation out of range, and if
-/// `out` is there and `force` is not given, holds anything but such a checkpoint, or is the source; [`Error::Output`] if it cannot be
-/// written.
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, a version without future
+/// tokens, a source that has none, a config with different numbers of them, and tokens that are not finite; [`Input`](crate::ErrorKind::Input)
+/// for a number or a perturbation out of range, and if `out` exists and `force` is not set, holds anything but such a checkpoint, or is the
+/// source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn resize(
     source: &Path,
     out: &Path,
     options: &ResizeOptions,
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<ResizeReport> {
-    let source = Source::open(source, options.rewrite.config.as_deref())?;
+    let source = SourceCheckpoint::open(source, options.rewrite.config.as_deref())?;
     let config = &source.config;
     let plan = plan(config, &source.given_config, options.num_future_tokens)?;
     let name = format!("{}{FUTURE_TOKENS}", source.prefix);
@@ -100,7 +100,7 @@ pub fn resize(
     }
     let no_bias = || vec![0.0; config.num_future_tokens];
     let bias = config.future_key_bias.clone().unwrap_or_else(no_bias);
-    let mut resized = resized(&tokens, config.width, &bias, options.num_future_tokens);
+    let mut resized = resized(&tokens, config.width, &bias, options.num_future_tokens)?;
     let perturbation_rms = perturb(
         &mut resized.tokens,
         &tokens,
@@ -115,6 +115,7 @@ pub fn resize(
     let dtype = if is_widened { Float::F32 } else { dtype };
     (stored.dtype, stored.shape) = (dtype.dtype(), vec![options.num_future_tokens, config.width]);
     let mut bytes = Vec::new();
+    reserve("source", &mut bytes, stored.nbytes())?;
     dtype.write(&resized.tokens, &mut bytes);
 
     let mut planned = Vec::new();

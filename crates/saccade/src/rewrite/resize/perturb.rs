@@ -41,7 +41,10 @@ pub(super) fn perturb(
         *value = (f64::from(*value) + scale * noise) as f32;
     }
     let bound = (f64::from(f32::MAX) / width as f64).sqrt() / 2.0;
-    if let Some(large) = resized.iter().find(|value| !(f64::from(value.abs()) <= bound)) {
+    if let Some(large) = resized
+        .iter()
+        .find(|value| value.is_nan() || f64::from(value.abs()) > bound)
+    {
         return Err(Error::Input(format!(
             "perturbation: {amount} gives a token with an element of {large:e}; a layer norm of {width} float32 elements overflows above {bound:.1e}"
         )));

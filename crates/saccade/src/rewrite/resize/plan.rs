@@ -5,7 +5,7 @@ use std::ops::Range;
 use serde_json::Value;
 use serde_json::value::RawValue;
 
-use super::json_edit::{Place, entry, find, span};
+use super::json_edit::{Found, entry, find, span};
 use crate::config::HeadConfig;
 use crate::error::{Error, Result};
 
@@ -31,14 +31,14 @@ pub fn resized_config(config_json: &str, num_future_tokens: usize) -> Result<Str
 pub(super) struct Plan {
     given: String,
     count: usize,
-    /// Where the number of future tokens stands.
+    /// Where the number of future tokens is.
     counts: Vec<Range<usize>>,
     /// The head's own object; none if the config has none, as lerobot's.
-    head: Option<Object>,
+    head: Option<HeadObject>,
 }
 
 /// An object in a config's text.
-struct Object {
+struct HeadObject {
     range: Range<usize>,
     has_count: bool,
     /// Where saccade's own key has its value, and the object that it is.
@@ -74,11 +74,11 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
             "source: it has {before} future tokens, expected at most {MAX_TOKENS}"
         ));
     }
-    let mut places = Vec::new();
+    let mut found = Vec::new();
     let whole: &RawValue = serde_json::from_str(given)
         .map_err(|error| Error::Checkpoint(format!("config: not valid JSON: {error}")))?;
-    find("", whole, &mut places)?;
-    let counts: Vec<&Place<'_>> = places.iter().filter(|place| place.key == COUNT_KEY).collect();
+    find("", whole, &mut found)?;
+    let counts: Vec<&Found<'_>> = found.iter().filter(|place| place.key == COUNT_KEY).collect();
     let others: Vec<String> = counts
         .iter()
         .filter(|place| serde_json::from_str::<usize>(place.value.get()).ok() != Some(before))
@@ -90,24 +90,24 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
             others.join("; ")
         ));
     }
-    let head = places
+    let head = found
         .iter()
         .find(|place| place.path == "action_head_cfg")
         .map(|place| place.value)
-        .or_else(|| (!places.iter().any(|place| place.path == "type")).then_some(whole));
+        .or_else(|| (!found.iter().any(|place| place.path == "type")).then_some(whole));
     let in_head = |key: &str, head: &RawValue| {
         let path = if std::ptr::eq(head, whole) {
             key.to_owned()
         } else {
             format!("action_head_cfg.{key}")
         };
-        places.iter().find(|place| place.path == path)
+        found.iter().find(|place| place.path == path)
     };
     Ok(Plan {
         given: given.to_owned(),
         count,
         counts: counts.iter().map(|place| span(given, place.value)).collect(),
-        head: head.map(|head| Object {
+        head: head.map(|head| HeadObject {
             range: span(given, head),
             has_count: in_head(COUNT_KEY, head).is_some(),
             own: in_head(OWN_KEY, head).map(|place| {
@@ -119,7 +119,7 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
 }
 
 impl Plan {
-    /// The text of the new `config.json`, and that of a file of saccade's own beside it if the bias has no place in there.
+    /// The text of the new `config.json`, and that of a file of saccade's own if the bias has no place in it.
     pub(super) fn config(&self, bias: Option<&[f32]>) -> (String, Option<String>) {
         let count = self.count.to_string();
         let mut edits: Vec<(Range<usize>, String)> = self
@@ -128,9 +128,9 @@ impl Plan {
             .map(|range| (range.clone(), count.clone()))
             .collect();
         let own = bias.map(|bias| serde_json::json!({ BIAS_KEY: bias }));
-        let mut beside = None;
+        let mut own_file = None;
         match &self.head {
-            None => beside = own.map(|own| format!("{own:#}\n")),
+            None => own_file = own.map(|own| format!("{own:#}\n")),
             Some(head) => {
                 // New keys come first, spaced as the first one is.
                 let start = head.range.start + 1;
@@ -161,7 +161,7 @@ impl Plan {
         for (range, new) in edits.into_iter().rev() {
             text.replace_range(range, &new);
         }
-        (text, beside)
+        (text, own_file)
     }
 }
 
@@ -185,12 +185,12 @@ mod tests {
 
     #[test]
     fn all_of_a_config_but_the_number_stays_as_it_is_written() {
-        let (text, beside) = planned(CONFIG, 9).unwrap().config(None);
+        let (text, own_file) = planned(CONFIG, 9).unwrap().config(None);
         assert_eq!(
             text,
             CONFIG.replace("num_target_vision_tokens\": 4", "num_target_vision_tokens\": 9")
         );
-        assert_eq!(beside, None);
+        assert_eq!(own_file, None);
     }
 
     #[test]
@@ -208,7 +208,7 @@ mod tests {
         );
         let (back, _) = planned(&other, 4).unwrap().config(None);
         assert_eq!(back, CONFIG);
-        // Wherever the key stands.
+        // Wherever the key is.
         for written in [
             CONFIG.replace(
                 "\"use_vlln\": false,",
@@ -255,9 +255,9 @@ mod tests {
         let given = "{\"type\": \"groot\", \"chunk_size\": 50}";
         let plan = plan(&config, given, 8).unwrap();
         assert_eq!(plan.config(None), (given.to_owned(), None));
-        let (text, beside) = plan.config(Some(&[0.5]));
+        let (text, own_file) = plan.config(Some(&[0.5]));
         assert_eq!(text, given);
-        let beside: Value = serde_json::from_str(&beside.unwrap()).unwrap();
-        assert_eq!(beside, serde_json::json!({"future_key_bias": [0.5]}));
+        let own_file: Value = serde_json::from_str(&own_file.unwrap()).unwrap();
+        assert_eq!(own_file, serde_json::json!({"future_key_bias": [0.5]}));
     }
 }

@@ -1,0 +1,218 @@
+//! The product of a tile: a few rows of factors by vectors of keys or values, in registers.
+
+use std::marker::PhantomData;
+
+use super::arithmetic::{Arithmetic, Float32, Pairs, Stored};
+use super::mask::Mask;
+use crate::simd::{Kernel, Simd, Vector};
+
+/// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
+pub(super) struct Product {
+    pub rows: usize,
+    /// `a`, as factors.
+    pub factors: *const f32,
+    pub factors_stride: usize,
+    pub b: *const u32,
+    /// Words from one step over `k` to the next.
+    pub b_step: usize,
+    /// Words from one vector to the next.
+    pub b_vector: usize,
+    /// Elements over which is summed.
+    pub depth: usize,
+    pub out: *mut f32,
+    pub out_stride: usize,
+    /// Columns, in whole vectors.
+    pub vectors: usize,
+    /// Whether to add to what `out` holds.
+    pub add: bool,
+}
+
+/// An [`Arithmetic`] whose products are a piece of code of their own: their tiles are many, and compilers take minutes over them.
+pub(super) trait Multiply<S: Simd>: Arithmetic<S> {
+    /// # Safety
+    /// As [`Product::run`].
+    unsafe fn multiply(simd: S, product: &Product);
+}
+
+impl<S: Simd, H: Stored> Multiply<S> for Float32<H> {
+    #[inline(always)]
+    unsafe fn multiply(simd: S, product: &Product) {
+        let held = PhantomData::<H>;
+        simd.run(FloatProduct { product, held });
+    }
+}
+
+impl<S: Simd> Multiply<S> for Pairs {
+    #[inline(always)]
+    unsafe fn multiply(simd: S, product: &Product) {
+        simd.run(PairProduct(product));
+    }
+}
+
+struct FloatProduct<'a, H> {
+    product: &'a Product,
+    held: PhantomData<H>,
+}
+
+impl<H: Stored> Kernel for FloatProduct<'_, H> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self, _: S) {
+        // SAFETY: the promise to `Multiply::multiply`.
+        unsafe { self.product.run::<S, Float32<H>>() }
+    }
+}
+
+struct PairProduct<'a>(&'a Product);
+
+impl Kernel for PairProduct<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self, _: S) {
+        // SAFETY: the promise to `Multiply::multiply`.
+        unsafe { self.0.run::<S, Pairs>() }
+    }
+}
+
+impl Product {
+    /// All of it.
+    ///
+    /// # Safety
+    /// The pointers are valid for all rows, at most `TILE_ROWS`, for `depth` elements in whole steps and for all vectors; called within
+    /// [`Simd::run`] of `S`.
+    #[inline(always)]
+    unsafe fn run<S: Simd, A: Arithmetic<S>>(&self) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match self.rows {
+                1 => self.all::<S, A, 1>(),
+                2 => self.all::<S, A, 2>(),
+                3 => self.all::<S, A, 3>(),
+                4 => self.all::<S, A, 4>(),
+                5 if S::Vector::TILE_ROWS >= 5 => self.all::<S, A, 5>(),
+                6 if S::Vector::TILE_ROWS >= 6 => self.all::<S, A, 6>(),
+                7 if S::Vector::TILE_ROWS >= 7 => self.all::<S, A, 7>(),
+                8 if S::Vector::TILE_ROWS >= 8 => self.all::<S, A, 8>(),
+                rows => unreachable!("a tile of {rows} rows"),
+            }
+        }
+    }
+
+    /// All columns of `MR` rows, a few at a time.
+    ///
+    /// # Safety
+    /// As [`Self::run`].
+    #[inline(always)]
+    unsafe fn all<S: Simd, A: Arithmetic<S>, const MR: usize>(&self) {
+        let most = S::Vector::TILE_VECTORS;
+        let groups = self.vectors.div_ceil(most);
+        for group in 0..groups {
+            let first = self.vectors * group / groups;
+            let end = self.vectors * (group + 1) / groups;
+            // SAFETY: the caller's promise.
+            unsafe {
+                match end - first {
+                    1 => self.tile::<S, S::Vector, A, MR, 1>(first),
+                    2 if most >= 2 => self.tile::<S, S::Vector, A, MR, 2>(first),
+                    3 if most >= 3 => self.tile::<S, S::Vector, A, MR, 3>(first),
+                    4 if most >= 4 => self.tile::<S, S::Vector, A, MR, 4>(first),
+                    vectors => unreachable!("a tile of {vectors} vectors"),
+                }
+            }
+        }
+    }
+
+    /// `NV` vectors from `first` on.
+    ///
+    /// # Safety
+    /// As [`Self::run`].
+    #[inline(always)]
+    unsafe fn tile<S: Simd<Vector = V>, V: Vector, A: Arithmetic<S>, const MR: usize, const NV: usize>(
+        &self,
+        first: usize,
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let out = self.out.add(first * V::LANES);
+            let mut acc = [[V::splat(0.0); NV]; MR];
+            if self.add {
+                for (r, row) in acc.iter_mut().enumerate() {
+                    for (v, sum) in row.iter_mut().enumerate() {
+                        *sum = V::load(out.add(r * self.out_stride + v * V::LANES));
+                    }
+                }
+            }
+            let mut b = self.b.add(first * self.b_vector);
+            let mut factors = self.factors;
+            for _ in 0..self.depth.div_ceil(A::STEP) {
+                for part in 0..A::FACTORS {
+                    let mut columns = [A::column(b, part); NV];
+                    for (v, column) in columns.iter_mut().enumerate().skip(1) {
+                        *column = A::column(b.add(v * self.b_vector), part);
+                    }
+                    for (r, row) in acc.iter_mut().enumerate() {
+                        let factor = A::broadcast(factors.add(r * self.factors_stride + part));
+                        for (sum, &column) in row.iter_mut().zip(&columns) {
+                            *sum = A::multiply_add(factor, column, *sum);
+                        }
+                    }
+                }
+                b = b.wrapping_add(self.b_step);
+                factors = factors.wrapping_add(A::FACTORS);
+            }
+            for (r, row) in acc.iter().enumerate() {
+                for (v, sum) in row.iter().enumerate() {
+                    sum.store(out.add(r * self.out_stride + v * V::LANES));
+                }
+            }
+        }
+    }
+
+    /// Adds as [`Self::run`] does, where values are not all finite: keys that the mask removes are passed over, because zero times infinity
+    /// is not zero.
+    ///
+    /// # Safety
+    /// As [`Self::run`].
+    #[inline(always)]
+    pub(super) unsafe fn without_removed<S: Simd<Vector = V>, V: Vector, A: Arithmetic<S>>(
+        &self,
+        removed: &Removed<'_>,
+    ) {
+        for r in 0..self.rows {
+            let query = removed.first_query + r;
+            let bias = removed.mask.bias(removed.head, query, removed.len);
+            let seen = removed.mask.visible(query, removed.len);
+            for k in 0..self.depth.min(seen.saturating_sub(removed.first_key)) {
+                if bias.is_some_and(|bias| bias[removed.first_key + k] == f32::NEG_INFINITY) {
+                    continue;
+                }
+                // SAFETY: the caller's promise.
+                unsafe {
+                    let factor = V::splat(A::element(self.factors.add(r * self.factors_stride), k));
+                    for v in 0..self.vectors {
+                        let value = A::widen(
+                            self.b.add(k / A::STEP * self.b_step + v * self.b_vector),
+                            k % A::STEP,
+                        );
+                        let at = self.out.add(r * self.out_stride + v * V::LANES);
+                        factor.fma(value, V::load(at)).store(at);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Which keys the rows of a product are without.
+pub(super) struct Removed<'a> {
+    pub mask: &'a Mask<'a>,
+    pub head: usize,
+    /// The first row's.
+    pub first_query: usize,
+    /// The first of the summed elements.
+    pub first_key: usize,
+    /// All keys.
+    pub len: usize,
+}

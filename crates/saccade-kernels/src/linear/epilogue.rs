@@ -1,0 +1,232 @@
+//! From the sums of a block to results: scales, bias, activation, and what is done with what `out` holds.
+
+use std::marker::PhantomData;
+use std::ops::Range;
+
+use crate::gemm::Quantized;
+use crate::simd::math::{self, Activation};
+use crate::simd::{Kernel, Simd, Vector, load, store};
+
+/// What is done with `x W^T + bias`, element by element.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Epilogue {
+    /// Stored as it is.
+    Store,
+    /// `0.5 x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3)))`.
+    GeluTanh,
+    /// `0.5 x (1 + erf(x / sqrt(2)))`.
+    GeluErf,
+    /// `max(x, 0)`.
+    Relu,
+    /// `x / (1 + exp(-x))`.
+    Silu,
+    /// Added to what `out` holds: the residual stream.
+    Add,
+    /// Multiplied by what `out` holds: the activated gate of a gated layer.
+    Mul,
+}
+
+/// The sums of some rows and one panel, and where the results go.
+pub(super) struct Finish<'a> {
+    pub epilogue: Epilogue,
+    /// Rows of `columns` words, from the first of `rows` on.
+    pub sums: *const u32,
+    pub columns: usize,
+    pub rows: Range<usize>,
+    /// Columns of the panel that the layer has.
+    pub width: usize,
+    /// Of each column of the panel.
+    pub bias: &'a [f32],
+    /// For int8; otherwise empty.
+    pub int8: Int8<'a>,
+    /// Row 0 of the results of this panel.
+    pub out: *mut f32,
+    pub out_stride: isize,
+}
+
+/// How int8 sums become float32: what one step of a column's weights is worth and their sum, and how each row was quantised.
+#[derive(Clone, Copy)]
+pub(super) struct Int8<'a> {
+    pub scales: &'a [f32],
+    pub sums: &'a [i32],
+    pub quantized: &'a [Quantized],
+}
+
+impl Kernel for Finish<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self, _: S) {
+        // SAFETY: the views of the call have the rows and columns; all sums have been written.
+        unsafe {
+            if self.int8.scales.is_empty() {
+                self.of::<S::Vector, FloatSums>();
+            } else {
+                self.of::<S::Vector, Int8Sums>();
+            }
+        }
+    }
+}
+
+impl Finish<'_> {
+    /// # Safety
+    /// Called within [`Simd::run`]. The rows and the panel's columns are in `out`; `sums` holds the rows, as `M` reads them.
+    #[inline(always)]
+    unsafe fn of<V: Vector, M: Sums>(&self) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match self.epilogue {
+                Epilogue::Store => self.each::<V, M, Store>(),
+                Epilogue::GeluTanh => self.each::<V, M, Activated<math::GeluTanh>>(),
+                Epilogue::GeluErf => self.each::<V, M, Activated<math::GeluErf>>(),
+                Epilogue::Relu => self.each::<V, M, Activated<math::Relu>>(),
+                Epilogue::Silu => self.each::<V, M, Activated<math::Silu>>(),
+                Epilogue::Add => self.each::<V, M, Add>(),
+                Epilogue::Mul => self.each::<V, M, Mul>(),
+            }
+        }
+    }
+
+    /// After the tiles and not in them: a sum's way through the first-level cache is nothing next to its making, and the code is there
+    /// once, not in each tile.
+    ///
+    /// # Safety
+    /// As [`Self::of`].
+    #[inline(always)]
+    unsafe fn each<V: Vector, M: Sums, R: Result>(&self) {
+        for vector in 0..self.width.div_ceil(V::LANES) {
+            let column = vector * V::LANES;
+            let lanes = V::LANES.min(self.width - column);
+            // SAFETY: the caller's promise; partial vectors stay within the panel's columns.
+            unsafe {
+                let bias = V::load(self.bias.as_ptr().add(column));
+                let columns = M::columns::<V>(&self.int8, column);
+                let mut out = self
+                    .out
+                    .offset(self.rows.start as isize * self.out_stride)
+                    .add(column);
+                let mut sums = self.sums.add(column);
+                for row in self.rows.clone() {
+                    let value = M::value(sums, columns, &self.int8, row).add(bias);
+                    store(R::of(value, out, lanes), out, lanes);
+                    out = out.wrapping_offset(self.out_stride);
+                    sums = sums.wrapping_add(self.columns);
+                }
+            }
+        }
+    }
+}
+
+/// What sums stand for.
+trait Sums {
+    /// What is known of a vector of columns.
+    type Columns<V: Vector>: Copy;
+
+    /// # Safety
+    /// Here and below: called within [`Simd::run`] with the vectors of `V`. The columns are in the panel.
+    unsafe fn columns<V: Vector>(int8: &Int8<'_>, column: usize) -> Self::Columns<V>;
+
+    /// # Safety
+    /// `sums` points to a vector of words; the row was quantised, if sums are those of quantised rows.
+    unsafe fn value<V: Vector>(sums: *const u32, columns: Self::Columns<V>, int8: &Int8<'_>, row: usize)
+    -> V;
+}
+
+/// Themselves.
+struct FloatSums;
+
+/// Multiples of the product of two scales.
+struct Int8Sums;
+
+impl Sums for FloatSums {
+    type Columns<V: Vector> = ();
+
+    #[inline(always)]
+    unsafe fn columns<V: Vector>(_: &Int8<'_>, _: usize) {}
+
+    #[inline(always)]
+    unsafe fn value<V: Vector>(sums: *const u32, (): (), _: &Int8<'_>, _: usize) -> V {
+        // SAFETY: the caller gives a vector of words.
+        unsafe { V::load(sums.cast()) }
+    }
+}
+
+impl Sums for Int8Sums {
+    /// Scales, and the sums of the weights.
+    type Columns<V: Vector> = (V, V::Ints);
+
+    #[inline(always)]
+    unsafe fn columns<V: Vector>(int8: &Int8<'_>, column: usize) -> (V, V::Ints) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            (
+                V::load(int8.scales.as_ptr().add(column)),
+                V::load_ints(int8.sums.as_ptr().add(column)),
+            )
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn value<V: Vector>(
+        sums: *const u32,
+        (scales, weights): (V, V::Ints),
+        int8: &Int8<'_>,
+        row: usize,
+    ) -> V {
+        let Quantized { scale, zero } = int8.quantized[row];
+        // SAFETY: the caller's promise.
+        unsafe {
+            // Every byte of the row is `zero` too large.
+            let sum = V::sub_ints(
+                V::load_ints(sums.cast()),
+                V::mul_ints(V::splat_int(zero), weights),
+            );
+            // The weights' scale first: a row of huge values would overflow before weights make it small again.
+            V::from_ints(sum).mul(scales).mul(V::splat(scale))
+        }
+    }
+}
+
+/// What an [`Epilogue`] makes of a vector of sums with their bias.
+trait Result {
+    /// # Safety
+    /// Called within [`Simd::run`] with the vectors of `V`; `out` points to `lanes` elements.
+    unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V;
+}
+
+struct Store;
+struct Activated<A>(PhantomData<A>);
+struct Add;
+struct Mul;
+
+impl Result for Store {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
+        value
+    }
+}
+
+impl<A: Activation> Result for Activated<A> {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { A::of(value) }
+    }
+}
+
+impl Result for Add {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { load::<V>(out, lanes).add(value) }
+    }
+}
+
+impl Result for Mul {
+    #[inline(always)]
+    unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { load::<V>(out, lanes).mul(value) }
+    }
+}

@@ -1,0 +1,164 @@
+//! RMSNorm over rows, or over each head of a row.
+
+use super::split;
+use crate::isa::Isa;
+use crate::pool::parallel_for;
+use crate::rows::{Rows, RowsMut};
+use crate::simd::{Kernel, Simd, Vector, load, store};
+
+/// `out = x / sqrt(mean(x^2) + eps) * weight`, the mean over `weight.len()` consecutive columns.
+///
+/// `x` and `out` are `(rows, width)`. A weight of `width` elements norms whole rows; one of `head_dim` elements norms each of the
+/// `width / head_dim` heads of a row by itself, as query and key norms do. An element's bits depend on its head alone. A head of zeros gives
+/// zeros if `eps` is positive; NaN and infinity give NaN in their head.
+///
+/// # Panics
+/// If a shape does not fit, or this CPU lacks `isa`.
+///
+/// ```
+/// use saccade_kernels::{Isa, Rows, RowsMut, rms_norm};
+/// let mut out = [0.0; 4];
+/// let x = Rows::new(&[3.0, 3.0, 0.0, -2.0], 4); // two heads of width 2
+/// rms_norm(Isa::best(), 1, x, 2.0, &[1.0, 10.0], RowsMut::new(&mut out, 4));
+/// assert!((out[1] - 30.0 / 11f32.sqrt()).abs() < 1e-5);
+/// assert_eq!(out[2..], [0.0, -10.0]);
+/// ```
+pub fn rms_norm(isa: Isa, threads: usize, x: Rows<'_>, eps: f32, weight: &[f32], mut out: RowsMut<'_>) {
+    assert_eq!(
+        (out.num_rows(), out.num_columns()),
+        (x.num_rows(), x.num_columns()),
+        "out: expected the shape of x"
+    );
+    let job = Job {
+        x: x.as_ptr(),
+        x_stride: x.row_stride(),
+        out_stride: out.row_stride(),
+        out: out.as_mut_ptr(),
+        width: x.num_columns(),
+        eps,
+        weight,
+    };
+    run(isa, threads, x.num_rows(), &job);
+}
+
+/// [`rms_norm`] where the results replace the rows.
+///
+/// # Panics
+/// As [`rms_norm`].
+pub fn rms_norm_in_place(isa: Isa, threads: usize, mut x: RowsMut<'_>, eps: f32, weight: &[f32]) {
+    let to = x.as_mut_ptr();
+    let job = Job {
+        x: to,
+        x_stride: x.row_stride(),
+        out_stride: x.row_stride(),
+        out: to,
+        width: x.num_columns(),
+        eps,
+        weight,
+    };
+    run(isa, threads, x.num_rows(), &job);
+}
+
+struct Job<'a> {
+    /// May be `out`.
+    x: *const f32,
+    x_stride: usize,
+    out: *mut f32,
+    out_stride: usize,
+    width: usize,
+    eps: f32,
+    /// Not empty, and its length divides `width`.
+    weight: &'a [f32],
+}
+
+// SAFETY: tasks read and write different rows; the views are borrowed for the whole call.
+unsafe impl Sync for Job<'_> {}
+
+fn run(isa: Isa, threads: usize, rows: usize, job: &Job<'_>) {
+    isa.check();
+    if rows == 0 || job.width == 0 {
+        return;
+    }
+    assert!(
+        job.width.is_multiple_of(job.weight.len()),
+        "weight: expected {} elements, or a divisor of that, got {}",
+        job.width,
+        job.weight.len()
+    );
+    let (threads, tasks) = split(threads, rows, job.width);
+    parallel_for(threads, tasks, &|task| {
+        let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
+        isa.run(Part { job, first, end });
+    });
+}
+
+struct Part<'a> {
+    job: &'a Job<'a>,
+    first: usize,
+    end: usize,
+}
+
+impl Kernel for Part<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self, _: S) {
+        let job = self.job;
+        for row in self.first..self.end {
+            for head in (0..job.width).step_by(job.weight.len()) {
+                // SAFETY: rows are within the views, heads within rows.
+                unsafe {
+                    let x = job.x.add(row * job.x_stride + head);
+                    let out = job.out.add(row * job.out_stride + head);
+                    norm_head::<S::Vector>(job, x, out);
+                }
+            }
+        }
+    }
+}
+
+/// # Safety
+/// Called within [`Simd::run`] with the vectors of `V`. `x` and `out` point to as many elements as the weight has; they are the same, or do
+/// not overlap.
+#[inline(always)]
+unsafe fn norm_head<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
+    let width = job.weight.len();
+    let weight = job.weight.as_ptr();
+    // SAFETY: vectors lie within the first `width` elements, the last one is partial. Each is read before it is written.
+    unsafe {
+        let mean = squares::<V>(x, width) / width as f32;
+        let factor = V::splat(1.0 / (mean + job.eps).sqrt());
+        for i in (0..width).step_by(V::LANES) {
+            let lanes = V::LANES.min(width - i);
+            let y = load::<V>(x.add(i), lanes).mul(factor);
+            store(y.mul(load(weight.add(i), lanes)), out.add(i), lanes);
+        }
+    }
+}
+
+/// The sum of the squares, in four chains: short ones round less, and do not wait for each other.
+///
+/// # Safety
+/// Called within [`Simd::run`] with the vectors of `V`. `x` points to `width` elements.
+#[inline(always)]
+unsafe fn squares<V: Vector>(x: *const f32, width: usize) -> f32 {
+    const CHAINS: usize = 4;
+    // SAFETY: the caller's promise.
+    unsafe {
+        let mut squares = [V::splat(0.0); CHAINS];
+        let vectors = width / V::LANES;
+        for i in (0..vectors / CHAINS * CHAINS).step_by(CHAINS) {
+            for (chain, square) in squares.iter_mut().enumerate() {
+                let x = V::load(x.add((i + chain) * V::LANES));
+                *square = x.fma(x, *square);
+            }
+        }
+        let mut sum = squares[0].add(squares[1]).add(squares[2].add(squares[3]));
+        for i in vectors / CHAINS * CHAINS..width.div_ceil(V::LANES) {
+            let first = i * V::LANES;
+            let x = load::<V>(x.add(first), V::LANES.min(width - first));
+            sum = x.fma(x, sum);
+        }
+        sum.reduce_add()
+    }
+}

@@ -1,0 +1,125 @@
+//! Whether the sizes and switches of a head's config agree with each other.
+
+use serde_json::Value;
+
+use super::head_config::{HeadConfig, MAX_SIZE};
+use super::versions::Version;
+use super::whole::Object;
+
+/// Everything in a head's config that contradicts itself. `head` and `dit` are the objects that it was read from.
+pub(super) fn disagreements(
+    version: Version,
+    config: &HeadConfig,
+    head: &Object,
+    dit: &Object,
+) -> Vec<String> {
+    let mut problems = Vec::new();
+    let mut equal = |what: &str, given: usize, other: &str, expected: usize| {
+        if given != expected {
+            problems.push(format!("{what} is {given}, but {other} is {expected}"));
+        }
+    };
+    equal(
+        "input_embedding_dim",
+        config.width,
+        "diffusion_model_cfg.num_attention_heads x attention_head_dim",
+        config.num_heads * config.head_dim,
+    );
+    if config.vl_num_layers > 0 {
+        equal(
+            "backbone_embedding_dim",
+            config.context_dim,
+            "vl_self_attention_cfg.num_attention_heads x attention_head_dim",
+            config.vl_num_heads * config.vl_head_dim,
+        );
+    }
+    let number = |map: &Object, key: &str| {
+        let number = map.get(key).and_then(Value::as_u64);
+        number.map(|number| usize::try_from(number).unwrap_or(usize::MAX))
+    };
+    let cross = "diffusion_model_cfg.cross_attention_dim";
+    match number(dit, "cross_attention_dim") {
+        Some(given) => equal(cross, given, "backbone_embedding_dim", config.context_dim),
+        // Null means the width; the later versions give their class `backbone_embedding_dim` instead.
+        None if version == Version::N15 => equal(
+            &format!("{cross} (null, so input_embedding_dim)"),
+            config.width,
+            "backbone_embedding_dim",
+            config.context_dim,
+        ),
+        None => {}
+    }
+    if let Some(output) = number(dit, "output_dim") {
+        equal(
+            "diffusion_model_cfg.output_dim",
+            output,
+            "hidden_size",
+            config.hidden_dim,
+        );
+    }
+    if version.is_flat()
+        && let Some(action_dim) = number(head, "action_dim")
+    {
+        equal("action_dim", action_dim, "max_action_dim", config.action_dim);
+    }
+    if let Some(bias) = &config.future_key_bias {
+        equal(
+            "the length of saccade.future_key_bias",
+            bias.len(),
+            "num_target_vision_tokens",
+            config.num_future_tokens,
+        );
+    }
+    problems.extend(impossible_sizes(config));
+    problems
+}
+
+/// Sizes that no head can be computed with.
+fn impossible_sizes(config: &HeadConfig) -> Vec<String> {
+    let mut problems = Vec::new();
+    if config.encoder_action_dim < config.action_dim {
+        problems.push(format!(
+            "pretrained_action_dim is {}, expected at least the {} of the actions that are decoded",
+            config.encoder_action_dim, config.action_dim
+        ));
+    }
+    if config.attend_text_every_n_blocks > 0 && !config.interleave_self_attention {
+        problems.push(
+            "diffusion_model_cfg.interleave_self_attention is false, expected true with use_alternate_vl_dit"
+                .to_owned(),
+        );
+    }
+    for (what, size) in [
+        (
+            "diffusion_model_cfg.num_attention_heads x attention_head_dim",
+            config.width,
+        ),
+        (
+            "max_state_dim x state_history_length",
+            config.state_dim * config.state_history,
+        ),
+    ] {
+        if size as u64 > MAX_SIZE {
+            problems.push(format!("{what} is {size}, expected at most {MAX_SIZE}"));
+        }
+    }
+    if !config.width.is_multiple_of(2) {
+        problems.push(format!(
+            "input_embedding_dim is {}, expected an even number (half sines, half cosines)",
+            config.width
+        ));
+    }
+    if config.add_pos_embed && config.action_horizon > config.max_positions {
+        problems.push(format!(
+            "action_horizon is {}, more than the {} rows of the position table (max_seq_len)",
+            config.action_horizon, config.max_positions
+        ));
+    }
+    if config.num_steps > config.num_timestep_buckets {
+        problems.push(format!(
+            "num_inference_timesteps is {}, more than num_timestep_buckets {}",
+            config.num_steps, config.num_timestep_buckets
+        ));
+    }
+    problems
+}

@@ -1,0 +1,168 @@
+//! Whether the arguments of a call fit the head and each other.
+
+use super::action_head::ActionHead;
+use super::context::Context;
+use super::sample::Sampling;
+use crate::array::{Array, ArrayMut};
+use crate::error::{Error, Result, show_shape};
+use crate::inspect::extent::Extent;
+use crate::inspect::intervention::Intervention;
+use crate::sampling::chunking::Seam;
+
+impl ActionHead {
+    pub(super) fn check_context(&self, context: &Context) -> Result<()> {
+        if context.head == self.id {
+            return Ok(());
+        }
+        Err(Error::Input(
+            "context: expected one that this head encoded, got that of another head".to_owned(),
+        ))
+    }
+
+    pub(super) fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
+        let (history, width) = (self.config.state_history, self.config.state_dim);
+        let is_one_state = history == 1 && state.shape() == [batch, width];
+        if !is_one_state && state.shape() != [batch, history, width] {
+            let axes = match history {
+                1 => format!(
+                    "(batch, state_dim) = {} or (batch, state_history, state_dim)",
+                    show_shape(&[batch, width])
+                ),
+                _ => format!("the last {history} states, (batch, state_history, state_dim)"),
+            };
+            return Err(Error::Shape(format!(
+                "state: expected {axes} = {}, normalised and zero-padded to state_dim as the checkpoint's normaliser does, got {}",
+                show_shape(&[batch, history, width]),
+                show_shape(state.shape())
+            )));
+        }
+        Ok(state.check_finite("state")?.data())
+    }
+
+    pub(super) fn check_num_steps(&self, num_steps: Option<usize>) -> Result<usize> {
+        let num_steps = num_steps.unwrap_or(self.config.num_steps);
+        let buckets = self.config.num_timestep_buckets;
+        if (1..=buckets).contains(&num_steps) {
+            return Ok(num_steps);
+        }
+        Err(Error::Input(format!(
+            "num_steps: expected 1 to {buckets} (num_timestep_buckets), got {num_steps}"
+        )))
+    }
+
+    /// The number of samples an observation.
+    pub(super) fn check_noise(
+        &self,
+        noise: Array<'_>,
+        batch: usize,
+        num_samples: Option<usize>,
+    ) -> Result<usize> {
+        let (horizon, width) = (self.config.action_horizon, self.config.encoder_action_dim);
+        match num_samples {
+            None => {
+                let axes = "(batch, action_horizon, encoder_action_dim)";
+                noise.check_shape("noise", axes, &[batch, horizon, width])?;
+            }
+            Some(0) => return Err(Error::Input("num_samples: expected at least 1, got 0".to_owned())),
+            Some(samples) => {
+                let axes = "(batch, num_samples, action_horizon, encoder_action_dim)";
+                noise.check_shape("noise", axes, &[batch, samples, horizon, width])?;
+            }
+        }
+        noise.check_finite("noise")?;
+        Ok(num_samples.unwrap_or(1))
+    }
+
+    /// The elements of `out`, whose shape is that of the noise but for the width of an action.
+    pub(super) fn check_out<'a>(
+        &self,
+        out: ArrayMut<'a>,
+        batch: usize,
+        num_samples: Option<usize>,
+    ) -> Result<&'a mut [f32]> {
+        let (horizon, width) = (self.config.action_horizon, self.config.action_dim);
+        match num_samples {
+            None => out.check_shape(
+                "out",
+                "(batch, action_horizon, action_dim)",
+                &[batch, horizon, width],
+            ),
+            Some(samples) => {
+                let axes = "(batch, num_samples, action_horizon, action_dim)";
+                out.check_shape("out", axes, &[batch, samples, horizon, width])
+            }
+        }
+    }
+
+    pub(super) fn check_chunking<'a>(
+        &self,
+        sampling: &Sampling<'a>,
+        batch: usize,
+    ) -> Result<Option<Seam<'a>>> {
+        let chunking = sampling.chunking.as_ref();
+        chunking
+            .map(|chunking| chunking.check(&self.config, batch))
+            .transpose()
+    }
+
+    pub(super) fn check_embodiments(
+        &self,
+        ids: Array<'_, i64>,
+        batch: usize,
+        checked: &mut Vec<usize>,
+    ) -> Result<()> {
+        checked.clear();
+        if !ids.shape().is_empty() {
+            ids.check_shape("embodiment_id", "(batch,)", &[batch])?;
+        }
+        for &id in ids.data() {
+            let loaded = usize::try_from(id)
+                .ok()
+                .filter(|id| self.embodiment_ids.contains(id));
+            checked.push(loaded.ok_or_else(|| self.embodiment_error(id))?);
+        }
+        checked.resize(batch, checked[0]);
+        Ok(())
+    }
+
+    fn embodiment_error(&self, id: i64) -> Error {
+        let last = self.config.num_embodiments - 1;
+        if (0..=last as i64).contains(&id) {
+            return Error::Input(format!(
+                "embodiment_id: {id} is not loaded, only {:?} are",
+                self.embodiment_ids
+            ));
+        }
+        Error::Input(format!("embodiment_id: expected 0 to {last}, got {id}"))
+    }
+
+    /// What a call on `context` is over.
+    pub(super) fn extent<'a>(
+        &'a self,
+        interventions: &'a [Intervention],
+        context: &Context,
+        num_steps: usize,
+    ) -> Result<Extent<'a>> {
+        let learned = self.layers.future_tokens.data();
+        let tokens = [context.batch, context.num_vl_tokens];
+        Extent::new(&self.config, learned, interventions, tokens, num_steps)
+    }
+
+    pub(super) fn check_timestep(&self, timestep: Array<'_, i64>, batch: usize) -> Result<Vec<usize>> {
+        if !timestep.shape().is_empty() {
+            timestep.check_shape("timestep", "(batch,)", &[batch])?;
+        }
+        let last = self.config.num_timestep_buckets - 1;
+        let mut buckets = Vec::with_capacity(batch);
+        for &given in timestep.data() {
+            let bucket = usize::try_from(given).ok().filter(|bucket| *bucket <= last);
+            buckets.push(bucket.ok_or_else(|| {
+                Error::Input(format!(
+                    "timestep: expected a bucket from 0 to {last}, got {given}"
+                ))
+            })?);
+        }
+        buckets.resize(batch, buckets[0]);
+        Ok(buckets)
+    }
+}

@@ -1,0 +1,158 @@
+//! Loading a head: from a checkpoint, or from tensors in memory.
+
+use std::path::Path;
+
+use saccade_checkpoint::granted;
+use saccade_checkpoint::spec::{self, Problem};
+
+use super::action_head::ActionHead;
+use super::embodiments::{Embodiments, chosen_embodiments};
+use super::layers::HeadLayers;
+use super::plan::{is_unused, reading_order, tensor_specs};
+use crate::config::HeadConfig;
+use crate::engine::Engine;
+use crate::error::{Error, Result};
+use crate::memory::{self, MemorySource, TensorViews};
+use crate::nn::file::FileSource;
+use crate::nn::weights::{Builder, Source};
+use crate::precision::Precision;
+use crate::recognise::Published;
+
+/// How a head is loaded.
+///
+/// ```
+/// use saccade::{LoadOptions, Precision};
+/// let options = LoadOptions::default().with_precision(Precision::Int8).with_num_threads(4);
+/// assert_eq!(options.num_threads, Some(4));
+/// ```
+#[derive(Clone, Debug, Default)]
+#[non_exhaustive]
+pub struct LoadOptions {
+    /// The config as JSON; default the `config.json` in the checkpoint's directory.
+    pub config: Option<String>,
+    /// Keep only these embodiments; default all.
+    pub embodiment_ids: Option<Vec<i64>>,
+    /// What is computed in what.
+    pub precision: Precision,
+    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
+    pub num_threads: Option<usize>,
+}
+
+impl LoadOptions {
+    /// With this config, as JSON.
+    #[must_use]
+    pub fn with_config(self, config: impl Into<Option<String>>) -> Self {
+        Self {
+            config: config.into(),
+            ..self
+        }
+    }
+
+    /// With these embodiments only.
+    #[must_use]
+    pub fn with_embodiment_ids(self, embodiment_ids: impl Into<Option<Vec<i64>>>) -> Self {
+        Self {
+            embodiment_ids: embodiment_ids.into(),
+            ..self
+        }
+    }
+
+    /// With this precision.
+    #[must_use]
+    pub fn with_precision(self, precision: Precision) -> Self {
+        Self { precision, ..self }
+    }
+
+    /// With this number of threads.
+    #[must_use]
+    pub fn with_num_threads(self, num_threads: impl Into<Option<usize>>) -> Self {
+        Self {
+            num_threads: num_threads.into(),
+            ..self
+        }
+    }
+}
+
+impl ActionHead {
+    /// Loads a head from `source`: one `.safetensors` file, or a directory of one or more of them with a `config.json`.
+    ///
+    /// # Errors
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
+    /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
+    pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
+        let engine = Engine::new(options.precision, options.num_threads)?;
+        let published = Published::open(source, options.config.as_deref())?;
+        let embodiment_ids = chosen_embodiments(
+            options.embodiment_ids.as_deref(),
+            published.kept_embodiments()?.as_deref(),
+            published.config.num_embodiments,
+        )?;
+        published.check()?;
+        granted(
+            "source",
+            published.nbytes(options.precision, embodiment_ids.len())?,
+        )?;
+        let Published {
+            checkpoint,
+            prefix,
+            config,
+            ..
+        } = published;
+        let wanted = reading_order(&config, &embodiment_ids);
+        FileSource::read_ahead(&checkpoint, prefix, wanted, |tensors| {
+            Self::build(tensors, engine, config, embodiment_ids)
+        })
+    }
+
+    /// A head from `tensors` in memory, by their names in a checkpoint without a prefix, with the sizes of the config in `options`, which must
+    /// be there: bit for bit the head that [`Self::load`] reads from a file of them. The tensors are borrowed for the call only, and of
+    /// layers for each embodiment only the wanted slices are touched.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights that are not finite;
+    /// [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both); [`Error::Input`] for options out of range;
+    /// [`Error::Memory`].
+    pub fn from_tensors(tensors: &TensorViews<'_>, options: &LoadOptions) -> Result<Self> {
+        let engine = Engine::new(options.precision, options.num_threads)?;
+        let config = options.config.as_deref().ok_or_else(|| {
+            Error::Input("config: expected one, since tensors in memory bring none".to_owned())
+        })?;
+        let config = HeadConfig::from_json(config)?;
+        let embodiment_ids =
+            chosen_embodiments(options.embodiment_ids.as_deref(), None, config.num_embodiments)?;
+        let problems = memory::problems(tensors, &tensor_specs(&config), |name, shape| {
+            is_unused(&config, name, shape)
+        });
+        if !problems.is_empty() {
+            let message = format!("tensors: {}", spec::list(&problems, "the config"));
+            let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
+            return Err(if problems.iter().all(is_shape) {
+                Error::Shape(message)
+            } else {
+                Error::Checkpoint(message)
+            });
+        }
+        Self::build(&MemorySource::new(tensors), engine, config, embodiment_ids)
+    }
+
+    fn build(
+        source: &dyn Source,
+        engine: Engine,
+        config: HeadConfig,
+        embodiment_ids: Vec<usize>,
+    ) -> Result<Self> {
+        let builder = Builder::new(source, engine);
+        let embodiments = Embodiments {
+            ids: &embodiment_ids,
+            count: config.num_embodiments,
+        };
+        let layers = HeadLayers::new(&builder.weights(), &config, embodiments)?;
+        Ok(Self::new(
+            config,
+            engine,
+            embodiment_ids,
+            layers,
+            builder.nbytes(),
+        ))
+    }
+}

@@ -1,0 +1,24 @@
+//! The action head: encode an observation once, sample chunks of actions from it as often as wanted.
+
+mod action_encoder;
+pub(crate) mod action_head;
+mod cache;
+mod category;
+mod check;
+pub(crate) mod context;
+pub(crate) mod cross_attention;
+mod dit;
+pub(crate) mod embodiments;
+pub(crate) mod encode;
+mod layers;
+pub(crate) mod load;
+pub(crate) mod plan;
+pub(crate) mod sample;
+mod size;
+#[cfg(test)]
+mod tests;
+mod trace;
+pub(crate) mod velocity;
+mod vl_encoder;
+mod warmup;
+mod workspace;

@@ -1,0 +1,64 @@
+//! The tensors of a head without the head: what its checkpoint must hold, and in which order it is read.
+
+use saccade_checkpoint::{TensorSpec, Wanted};
+use saccade_kernels::Isa;
+
+use super::embodiments::Embodiments;
+use super::layers::HeadLayers;
+use crate::config::HeadConfig;
+use crate::engine::Engine;
+use crate::nn::planner::{Plan, Planner};
+use crate::nn::weights::Builder;
+use crate::precision::Precision;
+
+/// Name, without a prefix, and shape of every tensor that a head's checkpoint must hold.
+#[must_use]
+pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
+    let tensors = tensor_specs(config);
+    tensors
+        .into_iter()
+        // A head without future tokens may come with an empty tensor of them, and need not.
+        .filter(|tensor| !tensor.shape.contains(&0))
+        .map(|tensor| (tensor.name, tensor.shape))
+        .collect()
+}
+
+/// Every tensor that a checkpoint of a head of this config must hold, by its name without a prefix.
+pub(crate) fn tensor_specs(config: &HeadConfig) -> Vec<TensorSpec> {
+    // Any embodiment: they have the same tensors.
+    plan(config, &[0]).specs
+}
+
+/// What a head with these embodiments reads, in the order in which it is built.
+pub(crate) fn reading_order(config: &HeadConfig, embodiment_ids: &[usize]) -> Vec<Wanted> {
+    plan(config, embodiment_ids).wanted
+}
+
+fn plan(config: &HeadConfig, ids: &[usize]) -> Plan {
+    let planner = Planner::default();
+    let engine = Engine {
+        isa: Isa::best(),
+        threads: 1,
+        precision: Precision::default(),
+    };
+    let embodiments = Embodiments {
+        ids,
+        count: config.num_embodiments,
+    };
+    HeadLayers::new(&Builder::new(&planner, engine).weights(), config, embodiments)
+        .expect("a planner refuses nothing");
+    planner.into_plan()
+}
+
+/// The name, without a prefix, of the future tokens.
+pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
+
+/// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
+/// logarithms of loss weights, what N1.6 puts in place of a state that it hides, how often N1.7 hides one.
+pub(crate) fn is_unused(config: &HeadConfig, name: &str, shape: &[usize]) -> bool {
+    match name {
+        "mask_token" => shape == [1, 1, config.width],
+        "dropout_prob_by_embodiment" => shape == [config.num_embodiments],
+        _ => name.starts_with("task_log_sigma.") && shape.iter().all(|&size| size == 1),
+    }
+}

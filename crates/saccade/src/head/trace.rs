@@ -1,0 +1,108 @@
+//! Sampling a chunk and keeping what goes on inside.
+
+use super::action_head::ActionHead;
+use super::context::Context;
+use super::dit::{ActiveRows, Pass};
+use super::sample::{Sampling, Steps};
+use crate::alloc::filled;
+use crate::array::{Array, OwnedArray};
+use crate::error::{Error, Result};
+use crate::inspect::changes::Changes;
+use crate::inspect::groups::Groups;
+use crate::inspect::trace::{Recorded, Shapes, StepBlock, Trace, TraceOptions};
+use crate::sampling::integrator::Integrator;
+
+impl ActionHead {
+    /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last included.
+    ///
+    /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and `sampling.future_refresh` must
+    /// be none, and `sampling.integrator` Euler's.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, for a trace of more than `options.max_bytes`, and for actions that
+    /// are not finite; [`Error::Memory`].
+    pub fn trace(
+        &self,
+        context: &Context,
+        state: Array<'_>,
+        embodiment_id: Array<'_, i64>,
+        noise: Array<'_>,
+        sampling: &Sampling<'_>,
+        options: &TraceOptions,
+    ) -> Result<Trace> {
+        self.check_context(context)?;
+        check_traceable(sampling)?;
+        let (batch, config) = (context.batch, &self.config);
+        let state = self.check_state(state, batch)?;
+        let num_steps = self.check_num_steps(sampling.num_steps)?;
+        let samples = self.check_noise(noise, batch, None)?;
+        let seam = self.check_chunking(sampling, batch)?;
+        let extent = self.extent(sampling.interventions, context, num_steps)?;
+        let groups = extent.groups;
+        let chosen = options.chosen(num_steps, config.num_layers)?;
+        let shapes: Vec<_> = chosen
+            .into_iter()
+            .map(|key| (key, self.shapes(&groups, batch, key)))
+            .collect();
+        // Before the interventions are worked out, since that takes memory too.
+        let mut recorded = Recorded::claim("max_bytes", options.record, &shapes, options.max_bytes)?;
+        let changes = Changes::new(sampling.interventions, extent)?;
+        let pass = Pass {
+            context,
+            samples,
+            changes: &changes,
+            step: 0,
+            rows: ActiveRows::All,
+        };
+        let steps = Steps {
+            count: num_steps,
+            integrator: Integrator::Euler,
+            refresh: 1,
+        };
+        self.with_workspace(|workspace| {
+            self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
+            self.encode_state(state, workspace)?;
+            self.begin(noise.data(), seam.as_ref(), samples, workspace)?;
+            self.follow(&pass, steps, &mut recorded, workspace)?;
+            let shape = [batch, config.action_horizon, config.action_dim];
+            let mut actions = filled("actions", shape.iter().product(), 0.0)?;
+            self.copy_actions(&workspace.x, noise.shape(), &mut actions)?;
+            Ok(Trace {
+                recorded,
+                groups,
+                actions: OwnedArray::new(actions, &shape)?,
+            })
+        })
+    }
+
+    /// The shapes of what a block of a step has.
+    fn shapes(&self, groups: &Groups, batch: usize, (_, block): StepBlock) -> Shapes {
+        let config = &self.config;
+        let rows = groups.num_rows();
+        let keys = if config.is_cross(block) { groups.vl } else { rows };
+        Shapes {
+            attention: [batch, config.num_heads, rows, keys],
+            hidden: [batch, rows, config.width],
+        }
+    }
+}
+
+/// That a call of these options is one that a trace can be made of.
+fn check_traceable(sampling: &Sampling<'_>) -> Result<()> {
+    if let Some(samples) = sampling.num_samples {
+        return Err(Error::Input(format!(
+            "num_samples: expected none, since a trace is of one chunk an observation, got {samples}"
+        )));
+    }
+    if sampling.integrator != Integrator::Euler {
+        return Err(Error::Input(
+            "integrator: expected euler, since a trace has one evaluation a step, got midpoint".to_owned(),
+        ));
+    }
+    if let Some(refresh) = sampling.future_refresh {
+        return Err(Error::Input(format!(
+            "future_refresh: expected none, since a trace is of all rows at every step, got {refresh}"
+        )));
+    }
+    Ok(())
+}

@@ -1,0 +1,106 @@
+//! Whether an intervention fits a call, and acts in it at all.
+
+use super::extent::Extent;
+use super::groups::{Group, Tokens, check_indices};
+use super::intervention::Intervention;
+use crate::config::HeadConfig;
+use crate::error::{Error, Result, show_shape};
+
+/// That cuts and biases fit the call, and that each of them acts somewhere.
+///
+/// # Errors
+/// [`Error::Shape`] and [`Error::Input`] if not.
+pub(super) fn check(intervention: &Intervention, extent: &Extent<'_>) -> Result<()> {
+    let Extent { config, groups, .. } = extent;
+    for (name, indices, count) in [
+        ("intervention: blocks", &intervention.blocks, config.num_layers),
+        ("intervention: steps", &intervention.steps, extent.num_steps),
+        ("intervention: heads", &intervention.heads, config.num_heads),
+    ] {
+        let Some(indices) = indices else {
+            continue;
+        };
+        if indices.is_empty() {
+            return Err(Error::Input(format!(
+                "{name}: expected at least one index, got an empty list"
+            )));
+        }
+        check_indices(name, indices, count)?;
+    }
+    for (reader, source) in &intervention.cut {
+        if reader.group == Group::Vl {
+            return Err(Error::Input(
+                "cut: vl is read, it does not read; expected a reader among state, future, action".to_owned(),
+            ));
+        }
+        for tokens in [reader, source] {
+            check_not_empty("cut", tokens, groups.check("cut", tokens)?)?;
+        }
+        let edge = format!("cut: {} reads {}", reader.group.name(), source.group.name());
+        check_acts(&edge, source.group, intervention.blocks.as_deref(), config)?;
+    }
+    for (tokens, bias) in &intervention.key_bias {
+        let count = groups.check("key_bias", tokens)?;
+        check_not_empty("key_bias", tokens, count)?;
+        let keys = format!("key_bias: {} is read", tokens.group.name());
+        check_acts(&keys, tokens.group, intervention.blocks.as_deref(), config)?;
+        if !bias.shape().is_empty() && bias.shape() != [count] {
+            return Err(Error::Shape(format!(
+                "key_bias: expected a number or ({count},) for {}, got {}",
+                tokens.group.name(),
+                show_shape(bias.shape())
+            )));
+        }
+        if let Some(bad) = bias
+            .data()
+            .iter()
+            .find(|value| value.is_nan() || **value == f32::INFINITY)
+        {
+            return Err(Error::Input(format!(
+                "key_bias: expected numbers below infinity, got {bad}"
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// That there are tokens: `count` of them.
+pub(super) fn check_not_empty(name: &str, tokens: &Tokens, count: usize) -> Result<()> {
+    if count > 0 {
+        return Ok(());
+    }
+    Err(Error::Input(match tokens.indices {
+        None => format!(
+            "{name}: expected tokens, but this call has no {} tokens",
+            tokens.group.name()
+        ),
+        Some(_) => format!(
+            "{name}: expected at least one {} token, got an empty list",
+            tokens.group.name()
+        ),
+    }))
+}
+
+/// That keys of `group` are read in some of `blocks`. `edge` says what is changed.
+fn check_acts(edge: &str, group: Group, blocks: Option<&[usize]>, config: &HeadConfig) -> Result<()> {
+    let is_of_vl = group == Group::Vl;
+    let has_edge = |block: &usize| config.is_cross(*block) == is_of_vl;
+    let kind = if is_of_vl { "cross" } else { "self" };
+    let existing: Vec<usize> = (0..config.num_layers).filter(has_edge).collect();
+    if existing.is_empty() {
+        return Err(Error::Input(format!(
+            "{edge} in {kind}-attention blocks only, and this head has none"
+        )));
+    }
+    match blocks {
+        Some(blocks) if !blocks.iter().any(has_edge) => Err(Error::Input(format!(
+            "{edge} in {kind}-attention blocks only, which are {existing:?}; expected blocks with at least one of them, got {blocks:?}"
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// Whether blocks of this kind have these keys.
+pub(super) fn is_read(tokens: &Tokens, is_cross: bool) -> bool {
+    (tokens.group == Group::Vl) == is_cross
+}

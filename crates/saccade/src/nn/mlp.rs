@@ -1,0 +1,51 @@
+//! Feed-forward layers.
+
+use saccade_kernels::{Epilogue, LinearScratch};
+
+use super::linear::Linear;
+use super::weights::Weights;
+use crate::alloc::sized;
+use crate::engine::Engine;
+use crate::error::Result;
+use crate::precision::Role;
+use crate::profile::Part;
+
+/// `W2 activation(W1 y + b1) + b2`.
+pub(crate) struct FeedForward {
+    proj: Linear,
+    out: Linear,
+    activation: Epilogue,
+}
+
+impl FeedForward {
+    /// From `net.0.proj` and `net.2`, as diffusers names them.
+    pub(crate) fn new(
+        weights: &Weights<'_>,
+        width: usize,
+        hidden: usize,
+        activation: Epilogue,
+    ) -> Result<Self> {
+        let proj = Linear::new(&weights.at("net.0.proj"), width, hidden, Role::Block)?;
+        let out = Linear::new(&weights.at("net.2"), hidden, width, Role::Block)?;
+        Ok(Self {
+            proj: proj.counted(Part::FeedForwardIn),
+            out: out.counted(Part::FeedForwardOut),
+            activation,
+        })
+    }
+
+    /// `x += feed_forward(y)`, both `(rows, width)`.
+    pub(crate) fn add(
+        &self,
+        engine: Engine,
+        y: &[f32],
+        buffer: &mut Vec<f32>,
+        scratch: &mut LinearScratch,
+        x: &mut [f32],
+    ) -> Result<()> {
+        let rows = y.len() / self.proj.in_features();
+        let hidden = sized(buffer, rows * self.proj.out_features())?; // (rows, hidden)
+        self.proj.apply(engine, y, self.activation, hidden, scratch)?;
+        self.out.apply(engine, hidden, Epilogue::Add, x, scratch)
+    }
+}

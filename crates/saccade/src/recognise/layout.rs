@@ -1,0 +1,54 @@
+//! What a layout of checkpoints is: who writes them, where the head is in them, and where its sizes come from.
+
+use std::path::Path;
+
+use super::sizes::{self, HeadShapes};
+use crate::config::{Object, Version, WholeConfig};
+use crate::error::Result;
+
+/// What is known of a checkpoint before its version is.
+pub(super) struct Clues<'a> {
+    pub config: &'a WholeConfig,
+    /// Whether the config holds the head's.
+    pub has_head_config: bool,
+    pub tensors: HeadShapes<'a>,
+    /// The directory of the weights.
+    pub directory: &'a Path,
+}
+
+/// Something that only some versions have.
+pub(super) struct Evidence {
+    pub versions: Vec<Version>,
+    pub what: String,
+}
+
+/// How one program writes checkpoints.
+pub(super) trait CheckpointLayout: Sync {
+    /// Its name in [`Published::layout`](super::Published::layout).
+    fn name(&self) -> &'static str;
+
+    /// What the names of the head's tensors begin with, if it is always the same.
+    fn prefix(&self) -> Option<&'static str>;
+
+    /// Whether a checkpoint is written so.
+    fn matches(&self, clues: &Clues<'_>) -> bool;
+
+    /// Whether a config is written so and holds no head, whose sizes must then come from elsewhere.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`](crate::Error::Checkpoint) for a config of another kind of policy.
+    fn is_without_head(&self, _config: &WholeConfig) -> Result<bool> {
+        Ok(false)
+    }
+
+    /// Adds what the layout says about the version.
+    fn add_evidence(&self, _clues: &Clues<'_>, _found: &mut Vec<Evidence>) {}
+
+    /// The head's config in the released keys, and everything that it and the tensors disagree on.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`](crate::Error::Checkpoint) if there is no head's config, and the tensors do not make one.
+    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
+        Ok(sizes::complete(clues.config.head(), version, &clues.tensors))
+    }
+}

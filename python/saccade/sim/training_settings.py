@@ -1,0 +1,79 @@
+"""What a training run depends on besides the demonstrations; needs no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from saccade.errors import InputError
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """The settings of a training run. The defaults are those of the bundled policy.
+
+    Attributes:
+        steps: Optimiser steps; the learning rate falls to zero over them.
+        batch_size: Frames per step. Many small steps are better than fewer large ones of the same total time.
+        learning_rate: Learning rate of AdamW after the warm-up.
+        ema_decay: Decay of the averaged weights, which are those that are saved.
+        target_weight: Weight of the loss that locates object and goal.
+        alignment_weight: Weight of the loss that aligns the hidden rows of the future tokens with the
+            averaged backbone's features of the observation one horizon later, as in FLARE, which used 0.2.
+        alignment_block: Block of the head after which those rows are taken. None for the middle one: as many
+            blocks for the rows to attend to the images as for the actions to attend to the rows.
+        absent_share: Share of frames that get the instruction of a task whose object is absent, with standing
+            still as the action. Without them the images alone distinguish most tasks, and the policy ignores
+            the words.
+        start_sha256: Hash of the tensors that the run starts from; empty for random ones. `train` sets it.
+        seed: Seed of initial weights, order and noise.
+        width, num_layers, num_heads: Sizes of the head; the backbone has the same width and heads.
+        backbone_layers: Transformer blocks of the backbone.
+        vl_num_layers: Blocks of the head's VL self-attention.
+        num_future_tokens: N.
+        horizon: Actions per chunk.
+        execute_steps: Actions of a chunk that are executed before the next observation.
+        num_steps: Euler steps at run time.
+        patch_size: Pixels along each side of an image token's patch.
+    """
+
+    steps: int = 8000
+    batch_size: int = 16
+    learning_rate: float = 6e-4
+    ema_decay: float = 0.999
+    target_weight: float = 1.0
+    alignment_weight: float = 0.0
+    alignment_block: int | None = None
+    absent_share: float = 0.0
+    start_sha256: str = ""
+    seed: int = 0
+    width: int = 128
+    num_layers: int = 4
+    num_heads: int = 4
+    backbone_layers: int = 2
+    vl_num_layers: int = 1
+    num_future_tokens: int = 32
+    horizon: int = 16
+    execute_steps: int = 8
+    num_steps: int = 4
+    patch_size: int = 16
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.alignment_weight < math.inf:
+            raise InputError(f"alignment_weight: given {self.alignment_weight}, expected at least 0")
+        if self.alignment_weight and self.num_future_tokens == 0:
+            raise InputError(
+                f"alignment_weight: given {self.alignment_weight}, expected 0 with num_future_tokens 0: "
+                "there is no row to align"
+            )
+        if self.alignment_block is not None and not 0 <= self.alignment_block < self.num_layers:
+            raise InputError(
+                f"alignment_block: given {self.alignment_block}, expected 0 to {self.num_layers - 1}"
+            )
+
+    @property
+    def aligned_block(self) -> int | None:
+        """The block after which future rows are aligned; None without alignment."""
+        if self.alignment_weight == 0:
+            return None
+        return (self.num_layers - 1) // 2 if self.alignment_block is None else self.alignment_block
