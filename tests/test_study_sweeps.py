@@ -22,6 +22,7 @@ from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
+from saccade.sim.training_settings import TrainingSettings
 from saccade.study.questions import resized, sweeps, sweeps_cost, sweeps_results, sweeps_runs
 from saccade.study.questions.resized_section import BASELINE, TWICE, TWICE_EQUAL
 from saccade.study.questions.sweeps import FutureTokens, VlSelfAttention, VlTokens
@@ -31,7 +32,7 @@ from saccade.study.statistics import paired_difference
 from saccade.study.table import read_provenance, read_table
 
 TASK = "button-press-topdown"
-TINY = train.TrainingSettings(
+TINY = TrainingSettings(
     steps=2, batch_size=2, width=8, num_layers=2, num_heads=1, backbone_layers=1, patch_size=8
 )
 
@@ -76,7 +77,7 @@ def policies(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """N = 2 and 4, the latter also aligned; two training seeds of the first."""
     out = tmp_path_factory.mktemp("policies")
     for name, changes in RUNS.items():
-        settings = train.TrainingSettings(**{**vars(TINY), **changes})
+        settings = TrainingSettings(**{**vars(TINY), **changes})
         train.train(recording, out / name, settings, lambda progress: None)
     return out
 
@@ -338,7 +339,7 @@ def test_resized_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_resizing_a_policy_without_tokens(recording: Path, tmp_path: Path) -> None:
-    settings = train.TrainingSettings(**{**vars(TINY), "num_future_tokens": 0, "steps": 1})
+    settings = TrainingSettings(**{**vars(TINY), "num_future_tokens": 0, "steps": 1})
     train.train(recording, tmp_path / "policy", settings, lambda progress: None)
     arguments = ["--checkpoint", str(tmp_path / "policy"), "--episodes", "1", "--out", str(tmp_path)]
     assert study("n-runtime", *arguments) == 0
