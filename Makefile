@@ -72,16 +72,18 @@ format: setup-test
 
 # Memory errors of the only crate with unsafe code. AddressSanitizer runs its tests on every instruction set of this CPU; a toolchain's own
 # target directory, since everything is built with it. Slowed down so, a test runs for longer than a minute; the test runner then says so, and that
-# allocates: the test that counts allocations is left out. Valgrind shows programs a CPU without AVX-512, so that it runs the portable and the AVX2
-# paths; it is slow, and leaves out the tests that try many sizes.
+# allocates: the test that counts allocations is left out. So are those that run out of memory, which AddressSanitizer reports as an error.
+# Valgrind shows programs a CPU without AVX-512, so that it runs the portable and the AVX2 paths; it is slow, and leaves out the tests that try
+# many sizes.
 ASAN_TARGET := x86_64-unknown-linux-gnu
-VALGRIND_TESTS := attention layer_norm linear
+VALGRIND_TESTS := attention layer_norm linear masks rms_norm rope
+ASAN_SKIPPED := allocates_nothing without_memory cannot_be_had cannot_be_started
 
 sanitize:
 	@cargo +nightly --version >/dev/null 2>&1 || { echo "make sanitize: AddressSanitizer needs a nightly Rust: rustup toolchain install nightly"; exit 1; }
 	@command -v valgrind >/dev/null || { echo "make sanitize: valgrind is missing: install the package of that name"; exit 1; }
 	RUSTFLAGS=-Zsanitizer=address cargo +nightly test --locked --quiet -p saccade-kernels --lib --tests \
-		--target $(ASAN_TARGET) --target-dir target/sanitize -- --skip allocates_nothing
+		--target $(ASAN_TARGET) --target-dir target/sanitize -- $(ASAN_SKIPPED:%=--skip %)
 	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER="valgrind --quiet --error-exitcode=1" \
 		cargo test --locked --quiet -p saccade-kernels $(VALGRIND_TESTS:%=--test %) -- --test-threads 1 --skip float64
 

@@ -192,7 +192,7 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
         loop {
             let end = part.end.min(first + P::PART_STEPS);
             let mut acc = [[P::zero(); NV]; MR];
-            // Rows that are read where they lie may end within the last step.
+            // Rows that are not converted may end within the last step.
             let whole = end.min(block.in_features / P::STEP);
             // Few rows leave little time: a step's share is then longer than a cache line. The loops are apart because one register more
             // for the general case makes the common one spill.

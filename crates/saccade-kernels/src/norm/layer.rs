@@ -108,11 +108,11 @@ impl Kernel for Part<'_> {
 unsafe fn norm_row<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
     let width = job.width;
     let columns = width as f32;
-    // SAFETY: vectors lie within the first `width` elements, the last one is partial; scale and shift are as long.
+    // SAFETY: vectors are within the first `width` elements, the last one is partial; scale and shift are as long.
     unsafe {
         let (total, _) = sums::<V>(x, width, 0.0);
         let mean = total / columns;
-        // What the distances from the mean add up to is the error of the mean, which matters where it is large beside them.
+        // What the distances from the mean add up to is the error of the mean, which matters where the mean is large compared with them.
         let (distances, squares) = sums::<V>(x, width, mean);
         let error = distances / columns;
         let variance = (squares - distances * error) / columns;

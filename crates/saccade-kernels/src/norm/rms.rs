@@ -124,7 +124,7 @@ impl Kernel for Part<'_> {
 unsafe fn norm_head<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
     let width = job.weight.len();
     let weight = job.weight.as_ptr();
-    // SAFETY: vectors lie within the first `width` elements, the last one is partial. Each is read before it is written.
+    // SAFETY: vectors are within the first `width` elements, the last one is partial. Each is read before it is written.
     unsafe {
         let mean = squares::<V>(x, width) / width as f32;
         let factor = V::splat(1.0 / (mean + job.eps).sqrt());
