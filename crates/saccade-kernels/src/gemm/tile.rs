@@ -124,7 +124,7 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
             let (first, end) = (block.tiles.first_row(number), block.tiles.first_row(number + 1));
             // SAFETY: the caller's promise; the tile is within the rows, and its sums within the block's.
             unsafe {
-                let tile = Tile {
+                let tile = RowTile {
                     row: first,
                     sums: block.sums.add((first - first_row) * NV * V::LANES),
                     tile: number - tiles.start,
@@ -147,7 +147,7 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
 }
 
 /// A tile: its first row, where its sums go, and its number among those of the block.
-struct Tile {
+struct RowTile {
     row: usize,
     sums: *mut u32,
     tile: usize,
@@ -162,7 +162,7 @@ struct Tile {
 unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize, const MR: usize>(
     block: &Block<'_>,
     part: &Range<usize>,
-    tile: &Tile,
+    tile: &RowTile,
 ) {
     // SAFETY: the caller's promise for all pointers below; prefetching is allowed at any address.
     unsafe {
