@@ -13,6 +13,7 @@ from saccade.sim.instructions import Tokenizer
 from saccade.sim.policy import Policy
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.tasks import TASKS
+from saccade.sim.training_settings import TrainingSettings
 
 FRAMES, HORIZON = 40, 4
 
@@ -33,7 +34,7 @@ def make_batches(tasks: list[str], absent_share: float) -> tuple[train.Batches, 
         tasks=rng.choice(numbers, size=FRAMES),
     )
     found = statistics(samples)
-    settings = train.TrainingSettings(horizon=HORIZON, execute_steps=2, patch_size=8)
+    settings = TrainingSettings(horizon=HORIZON, execute_steps=2, patch_size=8)
     config = train.policy_config(settings, recording, tasks, found)
     batches = train.Batches(samples, config, found["targets"], 64, absent_share)
     return batches, Tokenizer(config.vocabulary, config.backbone.text_length)

@@ -27,6 +27,7 @@ __all__ = [
     "default_num_threads",
     "dot_products",
     "measure_peaks",
+    "merge_future_tokens",
     "panic_in_core",
     "parse_config",
     "quantize",
@@ -198,7 +199,7 @@ def resize(
 ) -> dict[str, Any]: ...
 def merge_future_tokens(
     tokens: _Float32, num_future_tokens: int, key_bias: list[float] | None = None
-) -> tuple[_Float32, list[list[int]], list[float] | None]: ...  # rows, the tokens each stands for, key biases
+) -> tuple[_Float32, list[list[int]], list[float] | None]: ...  # rows, their tokens, key biases
 def available_isas() -> list[str]: ...
 def selected_isa() -> str: ...
 def dot_products() -> list[str]: ...

@@ -3,5 +3,5 @@
 Where to read what: `layout` (where each camera's patches sit in T_vl), `view` (one observation, from the
 simulator or from a file of backbone features), `summary` (mass, entropy, overlap), `occlusion` (what moves
 the actions when a patch is taken away), `record` (all that is known about one observation), `sheet` (the PNG)
-and `page` (the HTML page). `saccade attention` puts them together. Needs `pip install 'saccade[study]'`.
+and `page` (the HTML page). `saccade attention` puts them together. Needs the extra `sim`.
 """
