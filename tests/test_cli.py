@@ -16,6 +16,7 @@ import pytest
 
 import saccade
 from saccade import _extras, cli
+from saccade._arguments import UsageError
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = tuple(cli.COMMANDS)
@@ -83,7 +84,7 @@ def test_installed_script_is_the_same_program() -> None:
 
 def test_every_file_is_a_command_and_every_command_a_file() -> None:
     files = (path.stem for path in Path(cli.__file__).parent.glob("*.py"))
-    assert {name for name in files if not name.startswith("_")} == {*COMMANDS, "arguments"}
+    assert {name for name in files if not name.startswith("_")} == set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -124,7 +125,7 @@ def test_arguments_that_do_not_parse_are_one_line(
     ("error", "line"),
     [
         (
-            cli.UsageError("--episodes: given 0, expected at least 1"),
+            UsageError("--episodes: given 0, expected at least 1"),
             "--episodes: given 0, expected at least 1",
         ),
         (saccade.CheckpointError("2 problems:\n  this\n  that"), "2 problems:; this; that"),

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from saccade import InputError, cli
-from saccade.cli import UsageError, arguments
+from saccade import _arguments as arguments
+from saccade._arguments import UsageError
 from saccade.study.study import STUDIES
 
 #: Flags that say what another one says.

@@ -646,10 +646,10 @@ def test_the_table_keeps_the_names_of_cameras(tmp_path: Path, capsys: pytest.Cap
 
 
 CASES: list[tuple[list[str], str]] = [
-    (["--blocks", "4"], "--blocks: given 4, the checkpoint has blocks 0 to 3"),
+    (["--blocks", "4"], "--blocks: given 4, expected 0 to 3"),
     (["--blocks", "-1"], "--blocks: given -1"),
-    (["--steps", "0,4"], "--steps: given 0, 4, the checkpoint has steps 0 to 3"),
-    (["--heads", "7"], "--heads: given 7, the checkpoint has heads 0 to 3"),
+    (["--steps", "0,4"], "--steps: given 0, 4, expected 0 to 3"),
+    (["--heads", "7"], "--heads: given 7, expected 0 to 3"),
     (["--heads", "one"], "--heads: given 'one', expected numbers"),
     (["--heads", "mean", "1"], "--heads: given mean and numbers"),
     (["--task", "fly"], "unknown name 'fly'"),

@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn, Protocol, cast
 
+from saccade._arguments import UsageError
+
 # A command is the module of its name in this package. Its line of help is repeated here, so that
 # `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
@@ -69,10 +71,6 @@ examples:
   saccade rollout --tasks reach --episodes 2
   saccade inspect checkpoint/
 """
-
-
-class UsageError(Exception):
-    """Arguments that a command cannot follow; printed as one line, without a traceback."""
 
 
 class Command(Protocol):

@@ -7,7 +7,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from saccade.cli import _output, arguments
+from saccade import _arguments as arguments
+from saccade.cli import _output
 
 if TYPE_CHECKING:
     from saccade.checkpoints import Written

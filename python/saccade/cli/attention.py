@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from saccade import _arguments as arguments
+from saccade._arguments import UsageError
 from saccade._files import writable_directory, write_json
-from saccade.cli import EXIT_OK, UsageError, _output, arguments, require
+from saccade.cli import EXIT_OK, _output, require
 
 if TYPE_CHECKING:
     from saccade.config import HeadConfig
@@ -138,10 +140,10 @@ def look(args: argparse.Namespace) -> Maps:
 
     checkpoint = args.checkpoint or DEMO_CHECKPOINT
     head = ActionHead.load(checkpoint, config=args.config, num_threads=args.num_threads)
-    blocks = record.choose("blocks", args.blocks, head.config.num_layers)
-    steps = record.choose("steps", args.steps, head.config.num_steps)
+    blocks = arguments.indices("--blocks", args.blocks, head.config.num_layers)
+    steps = arguments.indices("--steps", args.steps, head.config.num_steps)
     named = args.heads not in (None, ("mean",))
-    heads = record.choose("heads", args.heads if named else None, head.config.num_heads)
+    heads = arguments.indices("--heads", args.heads if named else None, head.config.num_heads)
     view = take(args, checkpoint, head.config)
     few = probabilities(head.config, view, len(blocks), len(steps)) <= MAX_PROBABILITIES
     shown = heads if named or (args.heads is None and few) else ()

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import saccade
+from saccade import _arguments as arguments
+from saccade._arguments import UsageError
 from saccade.bench import heads
 from saccade.bench.cost import (
     PRECISIONS,
@@ -27,7 +29,7 @@ from saccade.bench.cost import (
 )
 from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
 from saccade.bench.work import Call, Works, encode_work, sample_work, total
-from saccade.cli import EXIT_OK, UsageError, _output, arguments
+from saccade.cli import EXIT_OK, _output
 from saccade.hub import resolve
 
 HELP = "time the action head and compare it with the limits of this machine"

@@ -6,7 +6,9 @@ import argparse
 import dataclasses
 import re
 
-from saccade.cli import EXIT_OK, UsageError, _output, arguments
+from saccade import _arguments as arguments
+from saccade._arguments import UsageError
+from saccade.cli import EXIT_OK, _output
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
 HELP = "write a checkpoint with other embodiments, another dtype or other shards"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from saccade import _arguments as arguments
 from saccade._files import writable_directory
-from saccade.cli import EXIT_OK, _output, arguments, require
+from saccade.cli import EXIT_OK, _output, require
 
 HELP = "record demonstrations of the tasks with scripted experts"
 

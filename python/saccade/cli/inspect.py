@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saccade.cli import EXIT_OK, _output, arguments
+from saccade import _arguments as arguments
+from saccade.cli import EXIT_OK, _output
 
 if TYPE_CHECKING:
     from saccade.checkpoints.findings import Embodiment, Inspection, Resemblance, Spread, TokenStatistics

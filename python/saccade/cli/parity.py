@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import saccade
-from saccade.cli import UsageError, _output, arguments, require
+from saccade import _arguments as arguments
+from saccade._arguments import UsageError
+from saccade.cli import _output, require
 from saccade.environment import cpu_name
 from saccade.hub import resolve
 from saccade.observation import Observation, read

@@ -7,7 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saccade.cli import EXIT_OK, _output, arguments
+from saccade import _arguments as arguments
+from saccade.cli import EXIT_OK, _output
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
 if TYPE_CHECKING:

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from saccade import _arguments as arguments
 from saccade._files import writable_directory, write_json
-from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, arguments, require
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
 
 if TYPE_CHECKING:
     from rich.table import Table

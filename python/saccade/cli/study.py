@@ -7,8 +7,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from saccade import _arguments as arguments
 from saccade._files import writable_directory
-from saccade.cli import EXIT_OK, Parser, _output, arguments, require
+from saccade.cli import EXIT_OK, Parser, _output, require
 from saccade.study.study import STUDIES, load_study
 
 if TYPE_CHECKING:

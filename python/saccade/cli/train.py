@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from saccade import _arguments as arguments
 from saccade._files import writable_directory
-from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, arguments, require
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
 
 if TYPE_CHECKING:
     from saccade.sim.train import Progress

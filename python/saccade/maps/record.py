@@ -13,7 +13,6 @@ from scipy.stats import rankdata
 
 import saccade
 from saccade.config import HeadConfig
-from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.maps.occlusion import Occlusion
@@ -217,23 +216,6 @@ def _per_head(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def reads_vl(config: HeadConfig, block: int) -> bool:
     """Whether a block is a cross-attention block."""
     return not (config.interleave_self_attention and block % 2)
-
-
-def choose(name: str, given: Sequence[int] | None, count: int) -> tuple[int, ...]:
-    """Those given, sorted, or all.
-
-    Raises:
-        InputError: one is out of range.
-    """
-    if given is None:
-        return tuple(range(count))
-    wrong = [number for number in given if not 0 <= number < count]
-    if wrong or not given:
-        raise InputError(
-            f"--{name}: given {', '.join(map(str, given)) or 'none'}, the checkpoint has {name} 0 to "
-            f"{count - 1}"
-        )
-    return tuple(sorted(set(given)))
 
 
 def look(

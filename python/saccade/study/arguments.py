@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from saccade.cli.arguments import check_tasks
+from saccade._arguments import check_tasks
 from saccade.errors import InputError
 from saccade.study.recording import Recording
 from saccade.study.source import Source
@@ -18,7 +18,7 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
     """The source that the arguments ask for, checked.
 
     Args:
-        args: as `saccade.cli.arguments.add_rollout_arguments` declares them.
+        args: as `saccade._arguments.add_rollout_arguments` declares them.
         refused: options of the study that cannot be used with a file of features.
 
     Raises:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade.cli.arguments import add_list, add_rollout_arguments, check_known
+from saccade._arguments import add_list, add_rollout_arguments, check_known
 from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.study.arguments import source_of
 from saccade.study.arms import Arm, ArmStudy

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade.cli.arguments import add_list, add_rollout_arguments, check_known
+from saccade._arguments import add_list, add_rollout_arguments, check_known
 from saccade.errors import InputError
 from saccade.observation import Observation
 from saccade.study.arguments import source_of

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade.cli.arguments import add_integer, add_rollout_arguments
+from saccade._arguments import add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS
 from saccade.observation import MASKS, Observation

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from saccade.cli.arguments import add_list, add_rollout_arguments, check_known, indices
+from saccade._arguments import add_list, add_rollout_arguments, check_known, indices
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention, Tokens
 from saccade.observation import Observation

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import threadpoolctl  # type: ignore[import-untyped]
 
-from saccade.cli.arguments import add_integer, add_rollout_arguments
+from saccade._arguments import add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS

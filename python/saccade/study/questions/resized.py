@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 import saccade._saccade as _saccade
-from saccade.cli.arguments import add_list, add_rollout_arguments
+from saccade._arguments import add_list, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import Intervention
 from saccade.study.arguments import source_of

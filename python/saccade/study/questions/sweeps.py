@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import pandas as pd
 
-from saccade.cli.arguments import add_episodes, add_integer, add_list, add_seed, add_tasks, check_tasks
+from saccade._arguments import add_episodes, add_integer, add_list, add_seed, add_tasks, check_tasks
 from saccade.errors import InputError
 from saccade.intervention import Intervention
 from saccade.study.cell import Cell, Rows

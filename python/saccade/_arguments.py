@@ -14,13 +14,16 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from saccade.cli import UsageError
 from saccade.errors import InputError
 
 #: A parser, or a group of its arguments.
 Arguments: TypeAlias = argparse._ActionsContainer
 
 PRECISIONS = ("float32", "bfloat16", "int8")
+
+
+class UsageError(Exception):
+    """Arguments that a command cannot follow; printed as one line, without a traceback."""
 
 
 class StoreNumber(argparse.Action):
