@@ -37,6 +37,16 @@ def test_a_released_file_gives_the_released_actions(name: str) -> None:
     np.testing.assert_array_equal(by_row, found.sample(head))
 
 
+def test_sampling_starts_from_the_noise_of_the_observation() -> None:
+    given = load_released("n15_tiny")
+    head = loaded(given)
+    found = read(given.path, head.config)
+    assert found.noise is not None
+    for run in (found.sample, found.trace):
+        with pytest.raises(InputError, match="noise: expected none"):
+            run(head, noise=np.zeros_like(found.noise))
+
+
 def test_masks_of_n17_are_kept_row_by_row() -> None:
     given = load_released("n17_tiny")
     found = read(given.path, loaded(given).config)

@@ -7,7 +7,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from saccade.checkpoints.description import Config, Source, open_published
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation, from_arrays, read_arrays
+from saccade.options import LoadOptions
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def action_changes(
     arrays = None if features is None else read_arrays(Path(features))
     kept = open_published(source, config).kept_embodiments() or [0]
     ids = kept[:1] if arrays is None else np.unique(arrays["embodiment_id"]).tolist()
-    loading: dict[str, Any] = {"embodiment_ids": ids, "num_threads": num_threads}
+    loading: LoadOptions = {"embodiment_ids": ids, "num_threads": num_threads}
     head = ActionHead.load(source, config=config, **loading)
     if arrays is None:
         observations = [

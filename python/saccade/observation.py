@@ -14,15 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
+from saccade._arrays import Float32Array
 from saccade.errors import CheckpointError, InputError, ShapeError
+from saccade.options import SampleOptions, TraceOptions
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from saccade.config import HeadConfig
     from saccade.context import Context
     from saccade.head import ActionHead
     from saccade.trace import Trace
 
-Float32Array = npt.NDArray[np.float32]
 BoolArray = npt.NDArray[np.bool_]
 
 REQUIRED = ("backbone_features", "state", "embodiment_id")
@@ -38,9 +41,9 @@ class Observation:
         backbone_features: ``(batch, T_vl, context_dim)``, floating point.
         state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``, normalised, floating point.
         embodiment_id: ``(batch,)`` int64.
-        noise: What chunks start from: ``(batch, action_horizon, encoder_action_dim)``, or with several draws
-            for each row ``(batch, draws, action_horizon, encoder_action_dim)``; None if it is still to be
-            drawn.
+        noise: The noise that sampling starts from, ``(batch, action_horizon, encoder_action_dim)``, or with
+            several draws for each row ``(batch, draws, action_horizon, encoder_action_dim)``; None if it has
+            not been drawn.
         attention_mask, image_mask, drop_vl: ``(batch, T_vl)`` bool, see :meth:`saccade.ActionHead.encode`; or
             None.
         episode: ``(batch,)`` int64, the episode of each row, counted from 0; None if unknown.
@@ -101,7 +104,7 @@ class Observation:
         return (self.row(row) for row in range(len(self)))
 
     def repeated(self, count: int) -> Observation:
-        """One row, `count` times."""
+        """Every row `count` times, one after the other."""
 
         def repeat(array: npt.NDArray[Any] | None) -> Any:
             return None if array is None else np.repeat(array, count, axis=0)
@@ -114,12 +117,12 @@ class Observation:
     def with_noise(
         self, rng: np.random.Generator, config: HeadConfig, draws: int | None = None
     ) -> Observation:
-        """The same with standard normal float32 noise, drawn only if there is none.
+        """The same observation with standard normal float32 noise; unchanged if it already has noise.
 
         Args:
-            rng: Draws it.
-            config: Of the head.
-            draws: For each row; None makes a noise without that axis.
+            rng: Generator of the noise.
+            config: Config of the head.
+            draws: Number of draws for each row. None: one draw, without an axis of draws.
         """
         if self.noise is not None:
             return self
@@ -128,43 +131,68 @@ class Observation:
         return dataclasses.replace(self, noise=rng.standard_normal(shape, dtype=np.float32))
 
     def with_draw(self, draw: int) -> Observation:
-        """The same with one of the draws as its noise, ``(batch, action_horizon, encoder_action_dim)``."""
+        """The same observation with only one draw of its noise, ``(batch, action_horizon,
+        encoder_action_dim)``.
+        """
         if self.noise is None or self.noise.ndim == 3:
             return self
         return dataclasses.replace(self, noise=self.noise[:, draw])
 
-    def encode(self, head: ActionHead, **options: Any) -> Context:
-        """:meth:`saccade.ActionHead.encode` of the features with these masks; ``options`` as there."""
-        masks = {name: getattr(self, name) for name in MASKS}
-        return head.encode(self.backbone_features, **masks, **options)
+    def encode(self, head: ActionHead) -> Context:
+        """:meth:`saccade.ActionHead.encode` of the features with these masks."""
+        return head.encode(
+            self.backbone_features,
+            attention_mask=self.attention_mask,
+            image_mask=self.image_mask,
+            drop_vl=self.drop_vl,
+        )
 
-    def sample(self, head: ActionHead, context: Context | None = None, **options: Any) -> Float32Array:
-        """The head's own, normalised actions.
+    def sample(
+        self, head: ActionHead, context: Context | None = None, **options: Unpack[SampleOptions]
+    ) -> Float32Array:
+        """The head's own, normalised actions from this noise.
 
         Args:
-            head: Computes.
-            context: From :meth:`encode` with this head, so that it is computed once; None computes it.
-            **options: Of :meth:`saccade.ActionHead.sample`, except noise and ``num_samples``.
+            head: The head that computes them.
+            context: The result of :meth:`encode` with this head. Default: it is computed.
+            **options: Keyword arguments of :meth:`saccade.ActionHead.sample`, except ``noise`` and
+                ``num_samples``.
 
         Returns:
-            ``(batch, action_horizon, action_dim)``, with an axis of the draws after batch where the noise has
-            one.
+            ``(batch, action_horizon, action_dim)`` float32, or ``(batch, draws, action_horizon, action_dim)``
+            if the noise has an axis of draws.
+
+        Raises:
+            InputError: As :meth:`saccade.ActionHead.sample`, or ``noise`` is given.
         """
+        _refuse_noise(options)
+        options["noise"] = self.noise
         if self.noise is not None and self.noise.ndim == 4:
             options["num_samples"] = self.draws
         found = head.sample(
             self.encode(head) if context is None else context,
             self.state,
             self.embodiment_id,
-            noise=self.noise,
             **options,
         )
         return np.asarray(found)
 
-    def trace(self, head: ActionHead, context: Context | None = None, **options: Any) -> Trace[Any]:
-        """:meth:`saccade.ActionHead.trace` from this noise (one draw); ``context`` as in :meth:`sample`."""
+    def trace(
+        self, head: ActionHead, context: Context | None = None, **options: Unpack[TraceOptions]
+    ) -> Trace[Any]:
+        """:meth:`saccade.ActionHead.trace` from this noise, which must be a single draw.
+
+        Args:
+            head, context: As in :meth:`sample`.
+            **options: Keyword arguments of :meth:`saccade.ActionHead.trace`, except ``noise``.
+
+        Raises:
+            InputError: As :meth:`saccade.ActionHead.trace`, or ``noise`` is given.
+        """
+        _refuse_noise(options)
+        options["noise"] = self.noise
         found = self.encode(head) if context is None else context
-        return head.trace(found, self.state, self.embodiment_id, noise=self.noise, **options)
+        return head.trace(found, self.state, self.embodiment_id, **options)
 
     @classmethod
     def random(
@@ -180,24 +208,29 @@ class Observation:
         return cls(features, state, np.array([embodiment_id]), noise)
 
 
+def _refuse_noise(options: Mapping[str, Any]) -> None:
+    if "noise" in options:
+        raise InputError("noise: expected none, since sampling starts from the noise of the observation")
+
+
 def read(path: Path, config: HeadConfig) -> Observation:
     """All observations of a file, checked against the head that will take them; see :func:`read_arrays`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError, ShapeError: an array is missing, does not fit the head or the others, or holds NaN or
+        InputError, ShapeError: an array is missing, does not fit the head or the others, or contains NaN or
             infinity.
     """
     return from_arrays(read_arrays(path), config, str(path))
 
 
 def from_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig, where: str) -> Observation:
-    """Observations from the arrays of a file.
+    """Creates observations from the arrays of a file.
 
     Args:
-        arrays: From :func:`read_arrays`.
-        config: Of the head that will take them.
-        where: Where they come from, for messages.
+        arrays: The arrays by name, as :func:`read_arrays` returns them.
+        config: Config of the head that will take them.
+        where: Name of the file, for messages.
 
     Raises:
         InputError, ShapeError: as :func:`read`.
@@ -307,10 +340,10 @@ def _check_masks(found: Observation, config: HeadConfig, where: str) -> Observat
 
 
 def as_mask(where: str, name: str, array: npt.NDArray[Any] | None) -> BoolArray | None:
-    """A mask as booleans; tokenizers write integers 0 and 1.
+    """A mask as booleans. Tokenizers write integers 0 and 1.
 
     Raises:
-        InputError: it holds anything else.
+        InputError: The array contains anything else.
     """
     if array is None:
         return None
@@ -322,18 +355,18 @@ def as_mask(where: str, name: str, array: npt.NDArray[Any] | None) -> BoolArray 
 def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Reads a file of backbone features.
 
-    It holds ``backbone_features (batch, T_vl, context_dim)``, ``state (batch, state_dim)`` and
-    ``embodiment_id``. It may hold ``noise (batch, action_horizon, encoder_action_dim)``; ``input_ids``,
+    It contains ``backbone_features (batch, T_vl, context_dim)``, ``state (batch, state_dim)`` and
+    ``embodiment_id``. It may contain ``noise (batch, action_horizon, encoder_action_dim)``; ``input_ids``,
     ``image_mask``, ``attention_mask`` and ``drop_vl``, each ``(batch, T_vl)``; ``images (batch, cameras, H,
     W, 3)`` uint8; ``tokens (batch, T_vl)`` strings; ``episode (batch,)`` integers. A file with one row may
-    leave out the batch axis of the optional arrays. Names may be prefixed with ``_in.``. A safetensors file
-    holds no strings; there ``tokens`` is a JSON list in the metadata.
+    leave out the batch axis of the optional arrays. Names may be prefixed with ``_in.``. In a safetensors
+    file, which cannot contain strings, ``tokens`` is a JSON list in the metadata.
 
     Args:
         path: ``.npz`` or ``.safetensors``.
 
     Returns:
-        The arrays by name; not checked against each other.
+        The arrays by name. Whether they fit each other is not checked.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -1,4 +1,4 @@
-"""The options of ``ActionHead.sample``: their types, and the form that the engine takes."""
+"""The options of ``ActionHead``'s methods: their types, and the form that the engine takes."""
 
 from __future__ import annotations
 
@@ -29,6 +29,27 @@ class SampleOptions(TypedDict, total=False):
     previous_chunk: ArrayLike | None
     chunking: Chunking | None
     out: ArrayLike | None
+
+
+class TraceOptions(TypedDict, total=False):
+    """The keyword arguments of :meth:`saccade.ActionHead.trace`, which documents them."""
+
+    noise: ArrayLike | None
+    seed: Any
+    num_steps: int | None
+    intervention: Intervention | Sequence[Intervention] | None
+    record: Sequence[str]
+    blocks: int | Sequence[int] | None
+    steps: int | Sequence[int] | None
+    max_bytes: int
+
+
+class LoadOptions(TypedDict, total=False):
+    """How a head is loaded: the keyword arguments of :meth:`saccade.ActionHead.load` except the config."""
+
+    embodiment_ids: Sequence[int] | None
+    precision: str
+    num_threads: int | None
 
 
 def optional_integer(name: str, value: int | None) -> int | None:

@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MethodType, TracebackType
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig
@@ -17,6 +17,7 @@ from saccade.errors import DtypeError, InputError
 from saccade.head import ActionHead
 from saccade.integrations import heads
 from saccade.integrations.weights import Watch, tensors_of
+from saccade.options import LoadOptions
 
 if TYPE_CHECKING:
     import torch
@@ -88,14 +89,6 @@ class Kinds:
     noise: torch.dtype
     actions: torch.dtype
     result: type[Any]
-
-
-class LoadOptions(TypedDict):
-    """How the copy of the head is loaded; keyword arguments of :meth:`saccade.ActionHead.from_tensors`."""
-
-    precision: str
-    num_threads: int | None
-    embodiment_ids: Sequence[int] | None
 
 
 class Features(dict[str, Any]):
