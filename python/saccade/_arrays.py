@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LARGEST_RANGE = 1 << 20
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
+UInt8Array: TypeAlias = npt.NDArray[np.uint8]
 #: A tensor as the engine takes it: float32, or the name of a 16-bit type and the bits.
 StoredTensor: TypeAlias = "Float32Array | tuple[str, npt.NDArray[np.uint16]]"
 #: Array arguments: NumPy arrays of any strides, torch CPU tensors, or nested sequences of floats.

@@ -14,8 +14,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from types import ModuleType
-from typing import NoReturn, Protocol, cast
+from typing import NoReturn, Protocol, runtime_checkable
 
 from saccade._arguments import UsageError
 
@@ -73,6 +72,7 @@ examples:
 """
 
 
+@runtime_checkable
 class Command(Protocol):
     """The interface of a command's module in this package."""
 
@@ -110,11 +110,14 @@ def load_command(name: str) -> Command:
 
     Raises:
         KeyError: there is no such command.
+        TypeError: its module lacks a part of `Command`.
     """
     if name not in COMMANDS:
         raise KeyError(name)
-    module: ModuleType = importlib.import_module(f"saccade.cli.{name}")
-    return cast(Command, module)
+    module = importlib.import_module(f"saccade.cli.{name}")
+    if not isinstance(module, Command):
+        raise TypeError(f"{module.__name__}: expected HELP, add_arguments and run")
+    return module
 
 
 def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:

@@ -16,9 +16,9 @@ from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from saccade._arrays import UInt8Array
     from saccade.sim.environment import TaskEnvironment
     from saccade.sim.policy import Policy
-    from saccade.sim.rendering import UInt8Array
     from saccade.sim.report import Summary
     from saccade.sim.rollout import Episode
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.patches import Rectangle
 
-Float32Array = npt.NDArray[np.float32]
-UInt8Array = npt.NDArray[np.uint8]
+from saccade._arrays import Float32Array, UInt8Array
 
 CAMERA_COLOURS = ("#1b7837", "#5aae61", "#a6dba0", "#00696b", "#3ba5a7", "#9bd5d6")
 MATRIX_COLOURS = "inferno"

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from saccade._arrays import Float32Array, UInt8Array
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.maps.layout import Camera, Layout
@@ -21,8 +21,6 @@ from saccade.observation import Observation
 if TYPE_CHECKING:
     from saccade.sim.policy import Policy
 
-Float32Array = npt.NDArray[np.float32]
-UInt8Array = npt.NDArray[np.uint8]
 
 BATCH = 16  # one observation of N1.5 holds 32 MB of keys and values
 MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the head

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 import saccade
+from saccade._arrays import Float32Array
 from saccade.config import HeadConfig
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention
@@ -19,7 +20,6 @@ from saccade.maps.occlusion import Occlusion
 from saccade.maps.summary import Overlap, overlap, summarize
 from saccade.maps.view import View
 
-Float32Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
 #: The maps of one Euler step and block, `(heads, rows, keys)`.
 Attention = Mapping[tuple[int, int], Float32Array]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -16,13 +15,12 @@ from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
+from saccade._arrays import Float32Array
 from saccade._files import write_atomically
 from saccade.maps.drawing import CAMERA_COLOURS, CHANGE, HEAT, MATRIX_COLOURS, borders, ranges, show
 from saccade.maps.layout import Camera
 from saccade.maps.notes import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES, NO_PICTURES
 from saccade.maps.record import BASELINES, MEAN, Maps
-
-Float32Array = npt.NDArray[np.float32]
 
 # All lengths are in inches.
 WIDTH, MARGIN, GAP = 13.0, 0.3, 0.06

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._arrays import UInt8Array
 from saccade.config import HeadConfig
 from saccade.errors import InputError, ShapeError
 from saccade.maps import layout as layouts
@@ -18,8 +19,6 @@ from saccade.maps.layout import Layout
 from saccade.maps.occlusion import BlankedPixels, DroppedPositions, Occluder
 from saccade.observation import Observation, as_mask, from_arrays, read_arrays
 from saccade.sim.policy import EMBODIMENT_ID, Policy
-
-UInt8Array = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._arrays import Float32Array, UInt8Array
 from saccade.errors import CheckpointError, ShapeError
-
-Float32Array = npt.NDArray[np.float32]
-UInt8Array = npt.NDArray[np.uint8]
 
 KERNEL, STRIDE, PADDING = 4, 2, 1  # of every convolution: each halves the size of the image
 FIRST_CHANNELS = 32

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._arrays import Float32Array
 from saccade.errors import InputError
 from saccade.sim import demos
 from saccade.sim.settings import Statistics
 from saccade.sim.tasks import TASKS
-
-Float32Array = npt.NDArray[np.float32]
 
 VALIDATION_EVERY = 20  # every 20th demonstration of a task is held out
 MIN_VALID_ACTIONS = 4  # a frame with fewer usable actions is left out

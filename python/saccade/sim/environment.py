@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from saccade._arrays import UInt8Array
 from saccade.errors import InputError, ShapeError
 from saccade.sim import graphics
 from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, VIDEO_CAMERA, Camera
-from saccade.sim.rendering import Renderer, UInt8Array, prepare_model
+from saccade.sim.rendering import Renderer, prepare_model
 from saccade.sim.scenarios import StepOutcome
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from saccade._arrays import Float32Array
 from saccade.sim.tasks import ACTION_DIM
 
 if TYPE_CHECKING:
     from saccade.sim.environment import TaskEnvironment
-
-Float32Array = npt.NDArray[np.float32]
 
 
 class Expert:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import threadpoolctl  # type: ignore[import-untyped]
 
 import saccade
+from saccade._arrays import Float32Array
 from saccade._files import sha256_of
 from saccade.checkpoints import read_tensors
 from saccade.errors import CheckpointError, InputError, ShapeError
@@ -22,7 +22,6 @@ from saccade.sim.backbone import Backbone, stack_images
 from saccade.sim.instructions import Tokenizer
 from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
 
-Float32Array = npt.NDArray[np.float32]
 #: One intervention, several that act together, or none.
 Interventions: TypeAlias = Intervention | Sequence[Intervention] | None
 

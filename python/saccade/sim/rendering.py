@@ -16,8 +16,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from saccade._arrays import UInt8Array
 from saccade.sim import graphics
 from saccade.sim.cameras import Camera
 from saccade.sim.scenarios import Ball
@@ -25,7 +25,6 @@ from saccade.sim.scenarios import Ball
 if TYPE_CHECKING:
     import mujoco
 
-UInt8Array = npt.NDArray[np.uint8]
 
 SUPERSAMPLING = 2
 HIDDEN_GROUP = 5  # geoms of this group are not drawn for the policy

@@ -11,11 +11,11 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 import saccade
+from saccade._arrays import UInt8Array
 from saccade._files import write_atomically
 from saccade._intervals import wilson
 from saccade.environment import cpu_name
 from saccade.sim.policy import Policy
-from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import PARTS, Episode
 
 RECORDED_PACKAGES = ("numpy", "mujoco", "metaworld", "gymnasium")

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._arrays import Float32Array
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
 from saccade.sim.backbone import BackboneConfig
 from saccade.sim.cameras import Camera
-
-Float32Array = npt.NDArray[np.float32]
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
 

@@ -9,8 +9,8 @@ import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from saccade._arrays import UInt8Array
 from saccade.sim.environment import SIMULATION_HZ, VIDEO_SIZE, TaskEnvironment
-from saccade.sim.rendering import UInt8Array
 from saccade.sim.rollout import Episode
 
 EVERY = 2  # control steps between pictures

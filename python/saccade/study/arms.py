@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from saccade._arrays import Float32Array
 from saccade.errors import InputError
 from saccade.intervention import Intervention
 from saccade.study.cell import Cell, Rows
-from saccade.study.source import Float32Array, Source, changed, unchanged
+from saccade.study.source import Source, changed, unchanged
 from saccade.study.study import Study
 
 NO_TOKENS = "the checkpoint has no future tokens"

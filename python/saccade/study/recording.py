@@ -10,12 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from saccade import observation
+from saccade._arrays import Float32Array
 from saccade._files import checkpoint_identity, sha256_of
 from saccade.config import HeadConfig
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
-from saccade.study.source import Float32Array, Source, episode_rng
+from saccade.study.source import Source, episode_rng
 
 TASK = "features"  # in the tables, in place of the simulator's task
 NOISES = 4  # drawn for each observation if the file has none

@@ -10,20 +10,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from saccade._arrays import Float32Array
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import (
-    DEMO_CHECKPOINT,
-    EMBODIMENT_ID,
-    Float32Array,
-    HeadEngine,
-    Policy,
-    check_trained_on,
-)
+from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, HeadEngine, Policy, check_trained_on
 from saccade.sim.rollout import Episode, environment_for, run_episode
 from saccade.study.source import Source, episode_rng
 

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from saccade._arrays import Float32Array
 from saccade.config import HeadConfig
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.observation import Observation
-
-Float32Array = npt.NDArray[np.float32]
 
 
 class Source(ABC):

@@ -11,13 +11,13 @@ import numpy as np
 import pandas as pd
 
 from saccade._arguments import add_list, add_rollout_arguments, check_known
+from saccade._arrays import Float32Array
 from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.study.arguments import source_of
 from saccade.study.arms import Arm, ArmStudy
 from saccade.study.changes import change_section
 from saccade.study.questions.cuts_section import BASELINE, SHUFFLED, section
 from saccade.study.section import Prose, Section
-from saccade.study.source import Float32Array
 from saccade.study.table import Provenance, from_file
 
 EPILOG = """\

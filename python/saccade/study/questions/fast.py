@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from saccade._arguments import add_list, add_rollout_arguments, check_known
+from saccade._arrays import Float32Array
 from saccade.errors import InputError
 from saccade.observation import Observation
 from saccade.study.arguments import source_of
@@ -32,7 +33,7 @@ from saccade.study.questions.fast_results import BASELINE, ONE_STEP
 from saccade.study.questions.fast_section import section
 from saccade.study.questions.fast_times import FULL, OWN, times_at_full_size, times_of
 from saccade.study.section import Section
-from saccade.study.source import Float32Array, Source
+from saccade.study.source import Source
 from saccade.study.study import Study
 from saccade.study.table import Provenance
 

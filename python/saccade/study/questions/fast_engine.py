@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from saccade._arrays import Float32Array
 from saccade.context import Context
 from saccade.errors import InputError
 from saccade.observation import Observation
-from saccade.sim.policy import EMBODIMENT_ID, Float32Array, Interventions, Policy
+from saccade.sim.policy import EMBODIMENT_ID, Interventions, Policy
 from saccade.study.questions.fast_modes import Calibration, Mode, encode, sample
 from saccade.study.simulator import head_of, policy_of
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._arrays import Float32Array
 from saccade.context import Context
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.observation import Observation
 from saccade.study.cell import digest
-from saccade.study.source import Float32Array
 
 BoolArray = npt.NDArray[np.bool_]
 #: Noisy actions `(1, horizon, encoder_action_dim)` and a time in 0..1 -> `(1, horizon, action_dim)`.

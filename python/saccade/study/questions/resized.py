@@ -16,6 +16,7 @@ import pandas as pd
 
 import saccade._saccade as _saccade
 from saccade._arguments import add_list, add_rollout_arguments
+from saccade._arrays import Float32Array
 from saccade.errors import InputError
 from saccade.intervention import Intervention
 from saccade.study.arguments import source_of
@@ -24,7 +25,6 @@ from saccade.study.cell import Cell
 from saccade.study.changes import change_section
 from saccade.study.questions.resized_section import BASELINE, TWICE, TWICE_EQUAL, arm_order, section
 from saccade.study.section import Prose, Section
-from saccade.study.source import Float32Array
 from saccade.study.table import Provenance, from_file
 
 EPILOG = """\
