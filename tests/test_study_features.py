@@ -313,7 +313,11 @@ def test_arguments_that_mean_nothing(tmp_path: Path, capsys: pytest.CaptureFixtu
         ("cuts", ("--tasks", "push", "--episodes", "3"), "--tasks, --episodes: not with --features"),
         ("cuts", ("--engine", "torch"), "--engine: not with --features"),
         ("patching", ("--kinds", "layout"), "--kinds: not with --features"),
-        ("gradients", ("--looks", "3", "--demos", "x"), "--looks, --demos: not with --features"),
+        (
+            "gradients",
+            ("--num-observations", "3", "--demos", "x"),
+            "--num-observations, --demos: not with --features",
+        ),
         ("n-runtime", ("--seed", "-1"), "--seed: given -1"),
         ("n-runtime", ("--num-future-tokens", "4"), "expected 1 to 3"),
         ("patching", ("--blocks", "4"), "expected 0 to 3"),

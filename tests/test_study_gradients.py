@@ -195,7 +195,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
         TASK,
         "--episodes",
         "2",
-        "--looks",
+        "--num-observations",
         "2",
         "--projections",
         "2",
@@ -232,7 +232,7 @@ def test_a_policy_without_future_tokens(recording: Path, tmp_path: Path) -> None
         str(tmp_path / "policy"),
         "--episodes",
         "1",
-        "--looks",
+        "--num-observations",
         "1",
     ]
     assert main([*arguments, "--projections", "1", "--out", str(tmp_path)]) == 0
@@ -247,7 +247,7 @@ def test_bad_input(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         assert main(["study", "gradients", *arguments, "--out", str(tmp_path / "out")]) == 2
         return capsys.readouterr().err
 
-    assert "looks: given 0, expected at least 1" in refused("--looks", "0")
+    assert "num-observations: given 0, expected at least 1" in refused("--num-observations", "0")
     assert "projections: given -1" in refused("--projections", "-1")
     assert "has none of reach" in refused("--tasks", "reach", "--demos", str(recording))
     other = demos.RecordingSettings(image_size=16, frame_stride=12, cameras=DEFAULT_CAMERAS[:1])

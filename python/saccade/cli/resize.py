@@ -27,7 +27,7 @@ is not.
 examples:
   saccade resize GR00T-N1.5-3B/ --num-future-tokens 64 --out GR00T-N1.5-3B-64
   saccade resize my-finetune/ --num-future-tokens 64 --perturbation 0.1 --seed 1 --out start-of-training
-  saccade resize my-finetune/ --num-future-tokens 8 --features looks.npz --out my-finetune-8 --json
+  saccade resize my-finetune/ --num-future-tokens 8 --features observations.npz --out my-finetune-8 --json
 """
 
 

@@ -56,9 +56,9 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
     """The recording that the arguments ask for, read and checked; arguments and errors as `source_of`."""
     given = [name for name in ("tasks", "episodes", *refused) if getattr(args, name) is not None]
     if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
         raise InputError(
-            f"{', '.join(f'--{name}' for name in given)}: not with --features, whose observations are all "
-            "measured as they are, without a simulator"
+            f"{flags}: not with --features, whose observations are measured as they are, without a simulator"
         )
     if args.seed < 0:
         raise InputError(f"--seed: given {args.seed}, expected at least 0")

@@ -21,7 +21,7 @@ class Source(ABC):
     """Observations for a checkpoint.
 
     A source is a frozen dataclass: it is pickled, and results are cached by its value. A unit is an episode,
-    named by task and seed, or a row of a file, named by `recording.TASK` and its number.
+    identified by task and seed, or a row of a file, identified by `recording.TASK` and its number.
 
     Attributes:
         closed_loop: Whether episodes can be run, so that success is known.
@@ -32,23 +32,33 @@ class Source(ABC):
     checkpoint: str
 
     @property
+    def config_file(self) -> str | None:
+        """Path of the head's config; None for the one in the checkpoint's directory."""
+        return None
+
+    @property
+    def num_threads(self) -> int | None:
+        """Threads that compute the head. Default: 1, because cells are spread over processes."""
+        return 1
+
+    @property
     def engine_name(self) -> str:
         """What computes the head."""
         return "rust"
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """What a study's settings say of checkpoint and observations, as JSON has it."""
+        """What identifies checkpoint and observations, as JSON values; part of a study's settings."""
 
     @property
     @abstractmethod
     def units(self) -> list[tuple[str, int]]:
-        """All that there are."""
+        """Task and seed of every unit."""
 
     @property
     @abstractmethod
     def config(self) -> HeadConfig:
-        """Of the head."""
+        """Config of the head."""
 
     @abstractmethod
     def head(self, precision: str = "float32") -> ActionHead:
@@ -61,7 +71,7 @@ class Source(ABC):
 
     @abstractmethod
     def observed(self, task: str, seed: int) -> Observation:
-        """What the unchanged head is given: all observations of an episode, or one row of the file.
+        """The input of the unchanged head: all observations of an episode, or one row of the file.
 
         Returns:
             At least one row, with noise.
@@ -79,27 +89,27 @@ class Source(ABC):
 
         Args:
             observation: one row, with noise.
-            intervention: what is changed inside the head.
-            context: of the observation, from `encode`; None computes it.
+            intervention: the change inside the head; None for no change.
+            context: the result of `encode`. Default: it is computed.
         """
 
     @abstractmethod
     def encode(self, observation: Observation) -> Any:
-        """What `actions` takes as `context`."""
+        """The `context` of an observation for `actions`."""
 
     @abstractmethod
     def comparable(self, chunk: Float32Array) -> Float32Array:
-        """Actions of the head as they are compared: those of the robot, or the head's own."""
+        """Converts actions of the head to those that are compared: the robot's, or the head's own."""
 
     @abstractmethod
     def outcome(self, task: str, seed: int, intervention: Intervention | None) -> dict[str, Any]:
-        """Columns of the table: success and length of an episode under an intervention; success is None in an
-        open loop.
+        """Columns of the table: success and length of an episode under an intervention. Success is None
+        without a closed loop.
         """
 
     @abstractmethod
     def labels(self, task: str, seed: int) -> dict[str, Any]:
-        """Columns that say more of a unit than task and seed."""
+        """Columns that describe a unit in addition to task and seed."""
 
 
 def episode_rng(task: str, seed: int) -> np.random.Generator:
@@ -113,7 +123,7 @@ class Unchanged:
 
     Attributes:
         observations: One row each.
-        contexts: Of the observations.
+        contexts: The context of each observation.
         actions: `(observations, draws, horizon, action_dim)`, as they are compared.
     """
 
@@ -124,7 +134,7 @@ class Unchanged:
 
 @functools.lru_cache(maxsize=1)
 def unchanged(source: Source, task: str, seed: int) -> Unchanged:
-    """The unchanged head on a unit; kept for the next arm."""
+    """Runs the unchanged head on a unit. The result is cached for the next arm."""
     rows = list(source.observed(task, seed).rows())
     contexts = [source.encode(one) for one in rows]
     chunks = [source.actions(one, None, context) for one, context in zip(rows, contexts, strict=True)]
@@ -132,7 +142,7 @@ def unchanged(source: Source, task: str, seed: int) -> Unchanged:
 
 
 def changed(source: Source, task: str, seed: int, intervention: Intervention | None) -> Float32Array:
-    """`Unchanged.actions` with something changed inside the head, from equal noise."""
+    """The actions of `unchanged` with an intervention, from equal noise."""
     before = unchanged(source, task, seed)
     if intervention is None:
         return before.actions

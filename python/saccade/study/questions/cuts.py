@@ -31,7 +31,7 @@ arms:
 examples:
   saccade study cuts --episodes 15 --out out/study
   saccade study cuts --arms future-unread future-blind --tasks push --jobs 2 --out out/study
-  saccade study cuts --checkpoint checkpoint/ --features looks.npz --out out/study
+  saccade study cuts --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
 

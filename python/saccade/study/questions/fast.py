@@ -77,8 +77,8 @@ With --features: chunks and time, for any checkpoint on recorded observations. N
 examples:
   saccade study fast --checkpoint out/policy --tasks fork --parts chunks --episodes 20 --out out/study
   saccade study fast --checkpoint out/policy --tasks fork --episodes 300 --out out/study
-  saccade study fast --checkpoint checkpoint/ --features looks.npz --out out/own
-  saccade study fast --features looks.npz --modes int8-euler-4 float32-euler-2 --parts chunks --out out/own
+  saccade study fast --checkpoint checkpoint/ --features observations.npz --out out/own
+  saccade study fast --features observations.npz --modes int8-euler-4 --parts chunks --out out/own
 """
 
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from saccade.study.derivatives import Sensitivity, Shares
     from saccade.study.simulator import Simulator
 
-LOOKS = 3
+NUM_OBSERVATIONS = 3
 
 EPILOG = """\
 Runs the policy in closed loop and takes derivatives of its chunks in torch: by the rows before and after
@@ -50,7 +50,7 @@ the derivative of the training loss by the rows.
 examples:
   saccade study gradients --out out/study
   saccade study gradients --checkpoint out/policy --demos out/demos --tasks push --out out/study
-  saccade study gradients --checkpoint checkpoint/ --features looks.npz --out out/study
+  saccade study gradients --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
 
@@ -61,13 +61,13 @@ class Gradients(Study):
     Attributes:
         source: Checkpoint and observations.
         projections: Random projections of the actions, or draws of time and noise for the loss.
-        looks: Observations taken from each episode, evenly spaced; a file has one in each row.
+        num_observations: Observations taken from each episode, evenly spaced; a file has one in each row.
         demonstrations: Directory of `saccade demos` for the loss, or None: it is then not measured.
     """
 
     source: Source
     projections: int = 16
-    looks: int = LOOKS
+    num_observations: int = NUM_OBSERVATIONS
     demonstrations: str | None = None
     name: ClassVar[str] = "gradients"
 
@@ -76,7 +76,11 @@ class Gradients(Study):
         """See `Study`."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=10)
-        add_integer(parser, "--looks", help=f"observations of each episode, evenly spaced (default: {LOOKS})")
+        add_integer(
+            parser,
+            "--num-observations",
+            help=f"observations of each episode, evenly spaced (default: {NUM_OBSERVATIONS})",
+        )
         add_integer(
             parser,
             "--projections",
@@ -93,11 +97,11 @@ class Gradients(Study):
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Gradients:
         """See `Study`."""
-        source = source_of(args, "looks", "demos")
+        source = source_of(args, "num_observations", "demos")
         if not source.closed_loop:
             return cls(source, args.projections)
         demonstrations = None if args.demos is None else str(args.demos)
-        study = cls(source, args.projections, args.looks or LOOKS, demonstrations)
+        study = cls(source, args.projections, args.num_observations or NUM_OBSERVATIONS, demonstrations)
         if demonstrations is not None:
             check_demonstrations(Path(demonstrations), study.simulator)
         return study
@@ -112,8 +116,9 @@ class Gradients(Study):
 
     def settings(self) -> Mapping[str, Any]:
         """See `Study`."""
-        looks = {"looks": self.looks} if self.source.closed_loop else {}
-        return {**self.source.describe(), **looks, "projections": self.projections}
+        # The key that tables have had from the start.
+        observed = {"looks": self.num_observations} if self.source.closed_loop else {}
+        return {**self.source.describe(), **observed, "projections": self.projections}
 
     def cells(self) -> Sequence[Cell]:
         """The actions in every episode, then the loss on as many demonstrations."""
@@ -145,7 +150,7 @@ class Gradients(Study):
         generator = self.generator(task, seed)
         observed = self.source.observed(task, seed)
         sensitivities, paths = [], []
-        for place in spaced(len(observed), self.looks):
+        for place in spaced(len(observed), self.num_observations):
             observation = observed.row(place).with_draw(0)
             sensitivity, parts = self.of_observation(head, observation, generator)
             sensitivities.append(sensitivity)
@@ -186,7 +191,7 @@ class Gradients(Study):
         return sensitivity, {name: torch.cat([one[name] for one in paths]) for name in paths[0]}
 
     def generator(self, task: str, seed: int) -> torch.Generator:
-        """Of the random projections of a cell."""
+        """The generator of the random projections of a cell."""
         import torch
 
         given = (self.source.seed, seed) if isinstance(self.source, Recording) else (seed, *map(ord, task))
@@ -207,7 +212,7 @@ class Gradients(Study):
         usable = np.flatnonzero(mask[..., 0].any(axis=1))
         names = [camera.name for camera in policy.config.cameras]
         measured = []
-        for frame in usable[spaced(len(usable), self.looks)]:
+        for frame in usable[spaced(len(usable), self.num_observations)]:
             seen = {
                 "images": dict(zip(names, demonstration.images[frame], strict=True)),
                 "proprio": demonstration.proprio[frame],
@@ -260,12 +265,9 @@ def reference_of(source: Source) -> ActionHead:
 
     from saccade.reference import ActionHead
 
-    recording = source if isinstance(source, Recording) else None
-    num_threads = 1 if recording is None else recording.num_threads
-    if num_threads is not None:
-        torch.set_num_threads(num_threads)
-    config = None if recording is None else recording.config_file
-    head = ActionHead.load(source.checkpoint, config=config)
+    if source.num_threads is not None:
+        torch.set_num_threads(source.num_threads)
+    head = ActionHead.load(source.checkpoint, config=source.config_file)
     head.requires_grad_(False)
     return head
 
@@ -274,8 +276,8 @@ def sensitivity_rows(measured: Sequence[Sensitivity], rows: Mapping[str, slice])
     """The mean over several observations, by block and group, and for learned tokens one by one.
 
     Args:
-        measured: of each observation what `action_sensitivity` or `loss_sensitivity` returned.
-        rows: where the groups lie.
+        measured: the results of `action_sensitivity` or `loss_sensitivity`, one for each observation.
+        rows: the slice of each group.
     """
     import torch
 

@@ -40,7 +40,7 @@ kinds of donors:
 examples:
   saccade study patching --episodes 15 --out out/study
   saccade study patching --kinds layout --blocks 1 --steps 0 --tasks push --out out/study
-  saccade study patching --checkpoint checkpoint/ --features looks.npz --out out/study
+  saccade study patching --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
 
