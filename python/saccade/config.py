@@ -114,7 +114,7 @@ class HeadConfig:
             FileNotFoundError: The file does not exist.
             CheckpointError: As :meth:`from_dict`.
         """
-        return cls(**_saccade.parse_config(read_json(path)))
+        return cls(**_saccade.parse_config(read_text(path)))
 
 
 def to_json(config: Mapping[str, Any] | str | os.PathLike[str]) -> str:
@@ -128,15 +128,19 @@ def to_json(config: Mapping[str, Any] | str | os.PathLike[str]) -> str:
         CheckpointError: The mapping contains values that JSON cannot represent, or the file cannot be read.
     """
     if isinstance(config, (str, os.PathLike)):
-        return read_json(config)
+        return read_text(config)
     try:
         return json.dumps(dict(config), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"config: expected a mapping of JSON values, or a path: {error}") from None
 
 
-def read_json(path: str | os.PathLike[str]) -> str:
-    """The text of a config file; raises as :func:`to_json`."""
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The text of a config file.
+
+    Raises:
+        FileNotFoundError, CheckpointError: As :func:`to_json`.
+    """
     try:
         about = Path(path).stat()
         # Reading a pipe might wait forever, and a device might never end.

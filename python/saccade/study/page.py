@@ -17,7 +17,7 @@ from saccade.study.table import Provenance
 
 
 @dataclass(frozen=True)
-class Picture:
+class SavedPicture:
     """A picture that is on disk.
 
     Attributes:
@@ -43,7 +43,7 @@ class Part:
     """
 
     section: Section
-    pictures: Sequence[Picture] = ()
+    pictures: Sequence[SavedPicture] = ()
     measured: bool = True
     provenance: Provenance | None = None
 

@@ -10,7 +10,7 @@ import matplotlib as mpl
 
 from saccade._files import writable_directory, write_atomically
 from saccade.errors import InputError
-from saccade.study.page import Part, Picture, to_html, to_markdown
+from saccade.study.page import Part, SavedPicture, to_html, to_markdown
 from saccade.study.section import Figure, Prose, Section
 from saccade.study.study import STUDIES, load_study
 from saccade.study.table import provenance_path, read_study, table_path
@@ -84,11 +84,13 @@ def attention_part(directory: Path) -> Part:
     pictures = []
     for sheet in sheets:
         file = sheet.relative_to(directory).as_posix()
-        pictures.append(Picture(prose.line("caption", file), file, as_uri("image/png", sheet.read_bytes())))
+        pictures.append(
+            SavedPicture(prose.line("caption", file), file, as_uri("image/png", sheet.read_bytes()))
+        )
     return Part(prose.section(), pictures, measured=bool(sheets))
 
 
-def draw(directory: Path, name: str, figure: Figure) -> Picture:
+def draw(directory: Path, name: str, figure: Figure) -> SavedPicture:
     """Writes the figure as PNG for the Markdown; the HTML gets it as SVG."""
     # With a fixed salt and without dates the same table gives the same files each time.
     with mpl.rc_context({"svg.hashsalt": "saccade"}):
@@ -96,7 +98,7 @@ def draw(directory: Path, name: str, figure: Figure) -> Picture:
             figure.picture.savefig(temporary, dpi=PNG_DOTS_PER_INCH, metadata={"Software": None})
         buffer = io.BytesIO()
         figure.picture.savefig(buffer, format="svg", metadata={"Date": None})
-    return Picture(figure.caption, f"figures/{name}.png", as_uri("image/svg+xml", buffer.getvalue()))
+    return SavedPicture(figure.caption, f"figures/{name}.png", as_uri("image/svg+xml", buffer.getvalue()))
 
 
 def as_uri(kind: str, content: bytes) -> str:
