@@ -321,7 +321,7 @@ def test_arguments_that_mean_nothing(tmp_path: Path, capsys: pytest.CaptureFixtu
         ("n-runtime", ("--seed", "-1"), "--seed: given -1"),
         ("n-runtime", ("--num-future-tokens", "4"), "expected 1 to 3"),
         ("patching", ("--blocks", "4"), "expected 0 to 3"),
-        ("probes", (), "this study needs what only the simulator knows"),
+        ("probes", (), "this study needs the simulator"),
     ):
         assert study(name, checkpoint, file, tmp_path / "out", *arguments) == 2
         assert message in capsys.readouterr().err

@@ -62,12 +62,12 @@ class StoreList(argparse.Action):
     """Stores the items of a list as a tuple, in the order given, each once.
 
     Args:
-        item: makes an item of a word, and raises `ValueError` for one that is not a number.
-        minimum: of items that are numbers.
+        item: converts a word to an item; raises `ValueError` for a word that is not a number.
+        minimum: smallest value, for items that are numbers.
 
     Raises:
-        UsageError: when the argument is parsed; the list is empty, or holds something else than numbers of at
-            least `minimum`.
+        UsageError: when the argument is parsed: the list is empty, or contains something other than numbers
+            of at least `minimum`.
     """
 
     def __init__(
@@ -159,13 +159,13 @@ def add_list(
     """Declares a list, see `StoreList`; `args` then holds a tuple, or `default` where the flag is absent.
 
     Args:
-        parser: of the command.
+        parser: parser of the command.
         flag: its name, in the plural.
-        item: makes an item of a word, such as `int`.
+        item: converts a word to an item, for example `int`.
         metavar: what an item is called.
-        minimum: of items that are numbers.
-        default: for `args`.
-        help: says what the default is.
+        minimum: smallest value, for items that are numbers.
+        default: value of `args` without the flag.
+        help: help text, which must state the default.
     """
     parser.add_argument(
         flag,
@@ -262,7 +262,7 @@ def add_rollout_arguments(parser: Arguments, episodes: int) -> None:
     """Declares which episodes of which policy a study runs, or which recorded observations it reads.
 
     Args:
-        parser: of the study.
+        parser: parser of the study.
         episodes: default number per task. It is kept as `args.default_episodes`, and `args.episodes` is None
             where the flag is absent, because with `--features` the flag may not be given.
     """

@@ -112,9 +112,9 @@ def predict(config: HeadConfig, call: Call, precision: str, machine: Machine) ->
     """Seconds that `encode` and `sample` are expected to take.
 
     Args:
-        config: of the head.
+        config: config of the head.
         call: its sizes.
-        precision: of the head.
+        precision: precision of the head.
         machine: the machine that it runs on.
 
     Returns:

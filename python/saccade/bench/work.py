@@ -50,7 +50,7 @@ class Work:
     """The work of one part of a call.
 
     Attributes:
-        multiply_adds: Of its matrix products.
+        multiply_adds: Number of multiply-adds of its matrix products.
         elements: Weights, or cached keys and values, that it reads at least once for each product.
         rows: Rows of activations, summed over its products.
     """

@@ -1,4 +1,4 @@
-"""Sentences about an inspected checkpoint: what is odd, and what speaks for or against a random start."""
+"""Sentences about an inspected checkpoint: what is unusual, and evidence for and against a random start."""
 
 from __future__ import annotations
 

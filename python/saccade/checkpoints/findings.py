@@ -86,7 +86,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class TokenGeometry:
-    """How future tokens lie to each other."""
+    """Norms of the future tokens, and the angles between them."""
 
     norm: Spread | None
     """Norms of the tokens."""

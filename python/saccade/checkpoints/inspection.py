@@ -1,4 +1,4 @@
-"""Examines a checkpoint: sizes, parts, memory, expected time, embodiments, future tokens, what is odd."""
+"""Examines a checkpoint: sizes, parts, memory, expected time, embodiments, future tokens, anomalies."""
 
 from __future__ import annotations
 

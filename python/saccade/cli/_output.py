@@ -132,8 +132,8 @@ def progress_bar(
     """A progress bar on standard error, if that is a terminal and rich is installed.
 
     Args:
-        description: of the work.
-        total: of its pieces; None if that is not known yet.
+        description: description of the work.
+        total: number of pieces of work; None if it is not known yet.
         in_bytes: show megabytes instead of a count.
         transient: remove the bar at the end.
     """
@@ -156,7 +156,7 @@ def progress_bar(
     shown = console(stderr=True)
     counted = DownloadColumn() if in_bytes else MofNCompleteColumn()
     text = TextColumn("{task.description}", markup=False)
-    # Elsewhere than in a terminal a bar that nobody sees would leave lines behind.
+    # Outside a terminal the bar would only leave lines in the output.
     with Progress(
         text,
         BarColumn(),

@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass
 class Session:
-    """One run of the command: what was asked for, and what is done so far."""
+    """One run of the command: its arguments and the episodes so far."""
 
     policy: Policy
     tasks: list[str]
@@ -107,7 +107,7 @@ class Session:
                     on_episode(episode)
 
     def run_one(self, environment: TaskEnvironment, seed: int) -> Episode:
-        """One episode, with its video if asked for."""
+        """Runs one episode, and writes its video if requested."""
         from saccade.sim.rollout import run_episode
         from saccade.sim.video import VideoWriter
 

@@ -40,7 +40,7 @@ class Camera:
     """The patches of one picture: consecutive positions, row by row from the top left.
 
     Attributes:
-        name: Of the camera.
+        name: Name of the camera.
         start: Position of its first patch.
         rows, columns: Its grid.
     """
@@ -61,7 +61,7 @@ class Token:
     """A token that is not an image patch.
 
     Attributes:
-        position: In T_vl.
+        position: Position in T_vl.
         kind: One of `OTHER_KINDS`. Special tokens (brackets around pictures, registers, turns of a chat)
             are often attention sinks, so their mass is reported separately.
         name: Its text.
@@ -175,9 +175,9 @@ def parse_layout(text: str, num_tokens: int, names: Sequence[str] | None = None)
     remaining positions. NAME is the name of the camera or of the tokens (numbered if there are several).
 
     Args:
-        text: for instance `"text:14,image:16x16=left,special:1=</img>,text:*"`.
+        text: the layout, for instance `"text:14,image:16x16=left,special:1=</img>,text:*"`.
         num_tokens: T_vl.
-        names: of all tokens, instead of generated ones.
+        names: names of all tokens. Default: generated.
 
     Raises:
         InputError: the text does not follow the grammar.

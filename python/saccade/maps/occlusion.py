@@ -52,7 +52,7 @@ class Occlusion:
     Attributes:
         method: How patches were removed.
         cell: Patches along each side of what was removed at once.
-        change: By camera, `(rows, columns)`: mean |change| of the normalised actions, from equal noise.
+        change: Mean |change| of the normalised actions by camera, `(rows, columns)`, from equal noise.
         other_noise: Mean |change| between chunks of the whole observation from different noise, to compare.
     """
 
@@ -71,7 +71,7 @@ class BlankedPixels:
     """Removes patches from the picture: their pixels get the mean colour of the picture.
 
     Args:
-        policy: has the backbone.
+        policy: policy with the backbone.
         seen: observation of the simulator.
         observation: the same as the head takes it; its state and noise are used for all chunks.
     """
@@ -132,7 +132,7 @@ def cell_for(layout: Layout, cell: int | None) -> int:
     """Patches along each side of what is removed at once.
 
     Args:
-        layout: Has the cameras.
+        layout: Layout with the cameras.
         cell: The number given by the user; None chooses the smallest with which no picture has more than
             `MAX_CELLS` x `MAX_CELLS` cells.
 
@@ -174,10 +174,11 @@ def measure(
     """Removes every patch of every camera in turn.
 
     Args:
-        head: computes the chunks.
+        head: head that computes the chunks.
         layout: where the patches are.
-        occluder: removes them.
-        whole: from a number of draws to chunks of the whole observation, `(draws, horizon, action_dim)`.
+        occluder: function that removes them.
+        whole: function from a number of draws to chunks of the whole observation, `(draws, horizon,
+            action_dim)`.
         cell: patches along each side of what is removed at once.
         batch: places at once.
         on_done: called with the number of places done.

@@ -38,7 +38,7 @@ class Selection:
     """Which maps are computed and shown.
 
     Attributes:
-        blocks, steps: Of the DiT and of the Euler loop.
+        blocks, steps: Indices of blocks and of Euler steps.
         heads: Heads over which the mean is taken.
         shown_heads: Those of them that are also shown one by one.
     """
@@ -55,12 +55,12 @@ class Maps:
 
     Attributes:
         checkpoint: Where the head was loaded from, and its hash.
-        config: Of the head.
+        config: Config of the head.
         view: The observation.
         selection: Which maps.
         rows: Slices of the groups; a group without rows is left out.
-        attention: By step and block, `(heads, rows, keys)`, heads in the selection's order.
-        redrawn: The same with random future tokens, only of the future rows; None without future tokens.
+        attention: Maps by step and block, `(heads, rows, keys)`, with the heads in the selection's order.
+        redrawn: Maps of the future rows with random future tokens; None without future tokens.
         occlusion: None if there are no image tokens.
     """
 

@@ -48,9 +48,9 @@ class GroupSummary:
     Attributes:
         tokens: Rows in the group.
         mass: Share of attention by part of the keys, mean over the rows.
-        entropy: Of the rows' maps.
+        entropy: Entropy of the rows' maps.
         overlap: Between the rows' maps; None with fewer than two.
-        shuffled: The same after each map was shuffled by itself, see `shuffle`: the overlap of unrelated maps
+        shuffled: Overlap after each map was shuffled separately, see `shuffle`: the overlap of unrelated maps
             with the same entropies.
     """
 
@@ -121,7 +121,7 @@ def summarize(
         maps: probabilities.
         parts: the keys by what they are, for `mass`.
         shuffled_within: the parts within which keys are shuffled.
-        rng: for the shuffling.
+        rng: generator for the shuffling.
     """
     entropies = entropy(maps)
     mean = np.asarray(maps, dtype=np.float64).mean(axis=0)

@@ -27,11 +27,11 @@ class View:
 
     Attributes:
         title: What it is, on one line.
-        source: The same for JSON.
+        source: Description of the observation for JSON.
         observation: One row, with noise.
         layout: What the positions of T_vl are.
-        images: By camera name, `(H, W, 3)`; empty if there are no pictures to draw on.
-        occluder: Removes patches.
+        images: Images by camera name, `(H, W, 3)`; empty if there are none.
+        occluder: Function that removes patches.
     """
 
     title: str
@@ -110,10 +110,10 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
 
     Args:
         path: `.npz` or `.safetensors`, see `saccade.observation.read_arrays`.
-        config: of the head that will take them.
+        config: config of the head that will take them.
         row: which of the observations of the file.
         options: where its image tokens are.
-        seed: of the noise, if the file has none.
+        seed: seed of the noise, if the file contains none.
 
     Raises:
         FileNotFoundError: there is no such file.

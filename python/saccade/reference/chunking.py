@@ -20,7 +20,7 @@ def continued(start: Tensor, previous: Tensor, chunking: Chunking, config: HeadC
         start: the noise, `(B, T, encoder_action_dim)`.
         previous: the previous chunk, `(B, rows, action_dim)` or `(B, rows, encoder_action_dim)`.
         chunking: how many actions are replaced, and where they are in the previous chunk.
-        config: of the head.
+        config: config of the head.
 
     Returns:
         `(B, T, encoder_action_dim)`.

@@ -126,7 +126,7 @@ class ActionHead(nn.Module):
             config: the config of the checkpoint or of the head, as a dict or a path. Default: the
                 `config.json` in the same directory, or else the `config` entry in the metadata of a single
                 file.
-            dtype: of the parameters. Narrower ones are widened, which is exact.
+            dtype: dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
         Raises:
             FileNotFoundError: a path does not exist.

@@ -103,7 +103,7 @@ class Run:
     """One run of a head over all of its steps: what is changed, and what is recorded.
 
     Args:
-        config: of the head.
+        config: config of the head.
         vl_embs: `(B, S, context_dim)`. The run has its dtype and device.
         num_steps: number of steps.
         in_step: velocity evaluations in each step.
@@ -386,7 +386,7 @@ def forbidden_tokens(
     """The vision-language tokens that no row attends to, for each block.
 
     Args:
-        config: of the head.
+        config: config of the head.
         tokens: `(B, S, context_dim)`.
         drop_vl: bool `(B, S)`, True for tokens that are removed.
         attention_mask: bool `(B, S)`, True where a token is attended; None for all.

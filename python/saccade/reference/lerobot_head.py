@@ -63,7 +63,7 @@ def get_action(
     """Calls `get_action` of the head with the given noise.
 
     Args:
-        head: from `build`.
+        head: the head that `build` returned.
         backbone_features: `(batch, T_vl, context_dim)`.
         state: `(batch, 1, state_dim)`.
         embodiment_id: `(batch,)` long.

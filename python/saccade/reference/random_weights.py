@@ -290,8 +290,8 @@ def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: i
     """Standard normal inputs, one random embodiment per row, and masks if the head needs them.
 
     Args:
-        config: of the head.
-        seed: for all inputs.
+        config: config of the head.
+        seed: seed of all inputs.
         batch: number of observations.
         num_vl_tokens: T_vl.
 

@@ -26,7 +26,7 @@ class BackboneConfig:
     """Sizes of the backbone.
 
     Attributes:
-        width: Of its tokens; the head's `context_dim`.
+        width: Width of its tokens, the `context_dim` of the head.
         num_layers: Transformer blocks.
         num_heads: Attention heads.
         image_size: Pixels along each side of an image.

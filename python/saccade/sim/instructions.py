@@ -31,7 +31,7 @@ class Tokenizer:
     does. With a fixed length, training and inference see the same number of them.
 
     Args:
-        vocabulary: from `build_vocabulary`.
+        vocabulary: the result of `build_vocabulary`.
         length: tokens per instruction; longer instructions are truncated.
     """
 

@@ -120,7 +120,7 @@ class Learner(nn.Module):
             batch: `images (B, cameras, H, W, 3)` uint8, `words (B, text_length)`, `state (B, state_dim)`,
                 `actions (B, T, action_dim)`, `mask (B, T, 1)`, `targets (B, 6)`; numbers are normalised. With
                 alignment also `later_images`, like `images`.
-            generator: for noise and times.
+            generator: generator of noise and times.
             average: the averaged tensors of the policy, whose backbone encodes the later images.
 
         Returns:

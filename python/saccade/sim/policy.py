@@ -154,7 +154,7 @@ class Policy:
     Args:
         config: its config.
         backbone: its backbone.
-        engine: computes its head.
+        engine: engine that computes its head.
         checkpoint: the directory that it was loaded from.
 
     Example:
@@ -189,10 +189,9 @@ class Policy:
         """Loads a policy.
 
         Args:
-            checkpoint: a directory with `config.json` and `model.safetensors`; default the one that is
-            shipped.
+            checkpoint: a directory with `config.json` and `model.safetensors`. Default: the bundled policy.
             engine: `"rust"` or `"torch"`.
-            num_threads: of the head.
+            num_threads: number of threads of the head.
 
         Raises:
             FileNotFoundError: a file is not there.
@@ -239,7 +238,7 @@ class Policy:
 
         Args:
             observation: `images` by camera name `(H, W, 3)` uint8, `proprio (4,)`, `instruction`.
-            noise: from `noise`.
+            noise: the result of `noise`.
             intervention: a change inside the head, see `saccade.Intervention`.
         """
         times = [time.perf_counter()]

@@ -112,7 +112,7 @@ def write_contact_sheet(pictures: Sequence[tuple[Episode, UInt8Array]], path: Pa
 
     Args:
         pictures: episodes, at least one, with pictures `(H, W, 3)`.
-        path: of the PNG.
+        path: path of the PNG.
     """
     tasks = list(dict.fromkeys(episode.task for episode, _ in pictures))
     rows = {task: [pair for pair in pictures if pair[0].task == task] for task in tasks}

@@ -55,8 +55,8 @@ def run_episode(
     """Runs one episode to its first success or to the task's `max_steps`.
 
     Args:
-        environment: with the cameras and image size of the policy, see `environment_for`.
-        policy: computes the chunks.
+        environment: an environment with the cameras and image size of the policy, see `environment_for`.
+        policy: policy that computes the chunks.
         seed: seed of layout, wording and noise, which are the same with every engine.
         instruction_from: a task whose instruction the policy gets instead (a control: it should then fail).
         intervention: a change inside the head at every chunk; or a function that returns it, called with the

@@ -190,7 +190,7 @@ def find_task(name: str) -> Task:
     """The task of that name.
 
     Raises:
-        InputError: there is none; lists those there are.
+        InputError: there is no such task. The message lists all tasks.
     """
     if name not in TASKS:
         raise InputError(f"task: unknown name {name!r}, expected one of {', '.join(TASKS)}")

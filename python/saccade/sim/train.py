@@ -139,7 +139,7 @@ class Batches:
 
     Args:
         samples: the samples to draw from.
-        config: of the policy, for statistics and vocabulary.
+        config: config of the policy, with statistics and vocabulary.
         target_statistics: statistics of the positions.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
@@ -313,7 +313,7 @@ def train(
     Args:
         demonstrations: directory written by `saccade demos`.
         out: directory of the run.
-        settings: of the run.
+        settings: settings of the run.
         on_step: called after each step.
         start: a policy to start from; None for random weights.
 

@@ -28,7 +28,7 @@ class VideoWriter:
     """Writes one episode as MP4, in a `with` block; the file appears when that ends without an error.
 
     Args:
-        path: of the MP4.
+        path: path of the MP4.
 
     Raises:
         OSError: the video cannot be written; names `path`.

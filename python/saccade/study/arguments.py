@@ -1,4 +1,4 @@
-"""The source that the arguments of a study ask for, checked."""
+"""Creates the source of a study from its arguments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def source_of(args: argparse.Namespace, *refused: str) -> Source:
-    """The source that the arguments ask for, checked.
+    """Creates the source from parsed arguments.
 
     Args:
         args: as `saccade._arguments.add_rollout_arguments` declares them.
@@ -34,11 +34,11 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
 
 
 def simulator_of(args: argparse.Namespace) -> Simulator:
-    """The simulator, for studies that need what only it knows; raises as `source_of`."""
+    """Creates a simulator from parsed arguments, for studies that need one; raises as `source_of`."""
     if args.features is not None:
         raise InputError(
-            "--features: this study needs what only the simulator knows; cuts, patching, gradients, "
-            "n-runtime and fast take a file of features"
+            "--features: this study needs the simulator; only cuts, patching, gradients, n-runtime and fast "
+            "take a file of features"
         )
     from saccade.sim import graphics
     from saccade.sim.tasks import check_evaluation_seeds
@@ -53,7 +53,7 @@ def simulator_of(args: argparse.Namespace) -> Simulator:
 
 
 def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
-    """The recording that the arguments ask for, read and checked; arguments and errors as `source_of`."""
+    """Creates a recording from parsed arguments, and reads it; arguments and errors as `source_of`."""
     given = [name for name in ("tasks", "episodes", *refused) if getattr(args, name) is not None]
     if given:
         flags = ", ".join("--" + name.replace("_", "-") for name in given)

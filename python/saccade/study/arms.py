@@ -1,4 +1,4 @@
-"""Studies of arms: the same observations and noise with something changed inside the head, arm by arm."""
+"""Studies of arms: every arm changes the head in one way and runs on the same observations and noise."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ ROUNDING = 1e-3  # a change of an action that an exact identity may make
 
 @dataclass(frozen=True)
 class Arm:
-    """One change inside the head, kept for a whole episode.
+    """One change inside the head, which applies during a whole episode.
 
     Attributes:
-        name: In the table and on the command line.
-        label: In figures; default the name.
-        about: What it changes and what it asks, for the report.
-        intervention: From the learned future tokens `(N, width)` and the random numbers of the episode to the
-            change; None changes nothing.
-        needs_future: Whether it means nothing for a head without future tokens.
-        settings: What else its results depend on, as JSON has it. Change it together with `intervention`, so
-            that cells measured before are measured again.
+        name: Name in the table and on the command line.
+        label: Name in figures. Default: `name`.
+        about: Description for the report.
+        intervention: Function from the learned future tokens `(N, width)` and the random numbers of the
+            episode to the intervention, or to None for no change.
+        needs_future: Whether it requires future tokens.
+        settings: Further JSON values that its results depend on. Change them together with `intervention`,
+            so that cells measured earlier are measured again.
 
     Example:
         An arm of your own:
@@ -54,7 +54,7 @@ class Arm:
         object.__setattr__(self, "label", self.label or self.name)
 
     def why_not(self, num_future_tokens: int) -> str | None:
-        """Why it cannot be measured on a head with N future tokens, or None."""
+        """The reason why a head with N future tokens cannot be measured, or None."""
         if self.needs_future and num_future_tokens == 0:
             return NO_TOKENS
         return None
@@ -66,8 +66,8 @@ class Metric:
 
     Attributes:
         name: Its column in the table.
-        function: From the unchanged chunks and those of the arm, both `(observations, draws, horizon,
-            action_dim)` float32 from equal noise, to a number.
+        function: Function from the unchanged chunks and those of the arm, both `(observations, draws,
+            horizon, action_dim)` float32 from equal noise, to a number.
 
     Example:
         How far the first action of a chunk moves:
@@ -91,8 +91,8 @@ class ArmStudy(Study):
 
     Attributes:
         source: Checkpoint and observations.
-        arms: What is changed; the baseline is always measured too.
-        metrics: Columns of the table.
+        arms: The arms. The baseline is always measured as well.
+        metrics: The measured columns of the table.
 
     Raises:
         InputError: two arms or two metrics have the same name.

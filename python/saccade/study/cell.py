@@ -1,4 +1,4 @@
-"""A cell, the unit of work of a study: what it is, and the name of its file."""
+"""A cell, the unit of work of a study, and the name of its file."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Cell:
     """One unit of work.
 
     Attributes:
-        key: What it is within its study, such as task, seed and arm. The table is sorted by it.
-        settings: What else its result depends on, as JSON has it. A cell with other settings is another cell.
+        key: Identifies it within its study, for example task, seed and arm. The table is sorted by it.
+        settings: Further JSON values that its result depends on. A cell with other settings is another cell.
 
     Example:
         >>> Cell(("reach", 3, "none"), {"engine": "rust"}).name
@@ -38,7 +38,7 @@ class Cell:
 
     @property
     def digest(self) -> str:
-        """Of key and settings; the name of the cell's file."""
+        """Hash of key and settings, which is the name of the cell's file."""
         return digest({"key": list(self.key), "settings": self.settings})
 
 
@@ -54,7 +54,7 @@ def digest(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value as it comes back from JSON: NumPy numbers become Python's, tuples lists, NaN None.
+    """The value as JSON would return it: NumPy numbers become Python numbers, tuples lists, and NaN None.
 
     Raises:
         TypeError: the value cannot be written as JSON.

@@ -70,8 +70,8 @@ def change_section(
     Args:
         study: Its baseline is compared with the other arms, and its control must change nothing.
         prose: Text of the study: `recorded_title`, `about` and `not_shown_of_arms`.
-        labels: Of the arms, in their order; those that are not in the table are skipped.
-        table, provenance: Of the study.
+        labels: Labels of the arms, in their order. Arms that are not in the table are skipped.
+        table, provenance: Table of the study and its provenance.
     """
     found = arm_changes(table, [arm for arm in labels if arm != study.baseline.name])
     text = Prose(
@@ -108,7 +108,7 @@ def recorded(table: pd.DataFrame, measured: pd.DataFrame, provenance: Provenance
     """What the template `recording` says of a recording.
 
     Args:
-        table, provenance: Of the study.
+        table, provenance: Table of the study and its provenance.
         measured: The rows that intervals are computed from.
     """
     settings = provenance.settings

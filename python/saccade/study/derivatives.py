@@ -45,13 +45,13 @@ def path_derivatives(
     """Derivatives of projections of the actions by the vision-language tokens, for each path.
 
     Args:
-        head: computes, in its dtype.
-        vl_embs: of one observation, `(1, T_vl, context_dim)`.
+        head: head that computes, in its dtype.
+        vl_embs: tokens of one observation, `(1, T_vl, context_dim)`.
         state: `(1, state_dim)` or `(1, history, state_dim)`.
         noise: `(1, T, action_dim)`.
         cotangents: `(projections, T, action_dim)`; a projection is the sum of the product with the actions.
-        embodiment_id: of the robot.
-        masks: of `sample`, by name: `drop_vl`, `attention_mask`, `image_mask`, `(1, T_vl)` bool.
+        embodiment_id: embodiment of the robot.
+        masks: masks for `sample` by name: `drop_vl`, `attention_mask`, `image_mask`, `(1, T_vl)` bool.
 
     Returns:
         Each path of `PATHS` and their sum `ALL_PATHS`, `(projections, T_vl, context_dim)`.
@@ -79,8 +79,8 @@ class Shares:
     """The contributions of the paths to a derivative.
 
     Attributes:
-        length: Of each path: its Frobenius norm divided by that of the whole. Lengths do not add up.
-        share: Of each path: its projection on the whole. Shares add up to 1; one may be negative.
+        length: Frobenius norm of each path divided by the norm of the whole. Lengths do not add up.
+        share: Projection of each path on the whole. Shares add up to 1 and may be negative.
         cosine: Between two paths; NaN if one is zero.
     """
 
@@ -120,7 +120,7 @@ class Nudges:
 
     Args:
         head: Its blocks get hooks.
-        batch: Of the calls.
+        batch: Batch size of the calls.
     """
 
     def __init__(self, head: ActionHead, batch: int) -> None:
@@ -212,14 +212,14 @@ def loss_sensitivity(
     """How the flow-matching loss of one observation, averaged over times and noises, depends on the rows.
 
     Args:
-        head: computes, in its dtype.
+        head: head that computes, in its dtype.
         features: backbone features, `(1, T_vl, context_dim)`.
         state: `(1, state_dim)`.
         actions: the demonstrated chunk, `(1, T, action_dim)`, normalised.
         mask: weights of the actions, `(1, T, 1)`.
-        generator: draws times and noises.
+        generator: generator of times and noise.
         draws: number of times and noises.
-        embodiment_id: of the robot.
+        embodiment_id: embodiment of the robot.
 
     Returns:
         As `action_sensitivity`, of the loss.

@@ -30,9 +30,9 @@ def estimates(
     """One row per estimate, from top to bottom: the value as a dot, its interval as a line.
 
     Args:
-        labels: Of the rows.
+        labels: Labels of the rows.
         values: NaN values and unknown intervals are left out.
-        x_label: With the unit.
+        x_label: Label of the axis, with the unit.
         reference: Position of a dotted vertical line, for "no difference".
     """
     picture, (axes,) = new_picture(height=0.9 + 0.28 * len(labels))
@@ -61,8 +61,8 @@ def lines(
 
     Args:
         x: Positions of the estimates; there is a tick at each.
-        series: By name, an estimate for each `x`.
-        x_label, y_label: With units.
+        series: An estimate for each `x`, by name of the series.
+        x_label, y_label: Labels of the axes, with units.
         reference: Position of a dotted horizontal line.
     """
     picture, (axes,) = new_picture()

@@ -168,7 +168,7 @@ def explained(
     """R^2 of all episodes together, and of each bootstrap resample.
 
     Args:
-        errors, spreads: of `held_out_errors`, summed by episode, `(episodes,)`.
+        errors, spreads: results of `held_out_errors`, summed by episode, `(episodes,)`.
         draws: how often each resample contains each episode, `(resamples, episodes)`.
 
     Returns:
@@ -189,7 +189,7 @@ def probe(frames: Frames, dimensions: int) -> list[dict[str, Any]]:
     All probes use the same bootstrap resamples, so differences are paired.
 
     Args:
-        frames: of the scope; the others are compared with the inputs `PROPRIO` and `VL`.
+        frames: frames of the scope. Other inputs are compared with the inputs `PROPRIO` and `VL`.
         dimensions: see `held_out_errors`.
 
     Returns:

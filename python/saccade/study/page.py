@@ -58,7 +58,7 @@ def to_html(markdown: str, pictures: Mapping[str, str]) -> str:
     """The same report as one page.
 
     Args:
-        markdown: From `to_markdown`. HTML in it is shown as text.
+        markdown: The result of `to_markdown`. HTML in it is shown as text.
         pictures: The `data:` URI of each file that the Markdown refers to.
     """
     parser = MarkdownIt("commonmark", {"html": False}).enable("table")

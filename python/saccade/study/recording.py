@@ -27,11 +27,11 @@ class Recording(Source):
     """A checkpoint and a file of features for it. There is no closed loop, so success is unknown.
 
     Attributes:
-        checkpoint: Whatever `ActionHead.load` reads.
-        file: The features, see `saccade.observation.read_arrays`.
-        config_file: Path of the head's config; None takes the one of the checkpoint.
-        seed: Of what is drawn: noise, if the file has none, and random tokens.
-        num_threads: Of the head; None is the engine's default.
+        checkpoint: A checkpoint that `ActionHead.load` reads.
+        file: File of features, see `saccade.observation.read_arrays`.
+        config_file: Path of the head's config. Default: that of the checkpoint.
+        seed: Seed of random tokens, and of the noise if the file contains none.
+        num_threads: Number of threads of the head. Default: that of the engine.
     """
 
     checkpoint: str
@@ -90,7 +90,7 @@ class Recording(Source):
         return self.all.row(seed).with_noise(rng, self.config, NOISES)
 
     def episode_of(self, row: int) -> int:
-        """The episode that a row of the file is of, or the row itself."""
+        """The episode of a row of the file, or the row itself if unknown."""
         return int(self.all.clusters[row])
 
     def rng(self, task: str, seed: int) -> np.random.Generator:
@@ -123,11 +123,11 @@ class Recording(Source):
 
 @functools.lru_cache(maxsize=3)
 def head_of(checkpoint: str, config: str | None, precision: str, num_threads: int | None) -> ActionHead:
-    """A head; one of each precision is kept."""
+    """The head. One of each precision is cached."""
     return ActionHead.load(checkpoint, config=config, precision=precision, num_threads=num_threads)
 
 
 @functools.lru_cache(maxsize=1)
 def read(file: str, config: HeadConfig) -> Observation:
-    """The observations of a file; kept for the next cell."""
+    """The observations of a file, cached for the next cell."""
     return observation.read(Path(file), config)

@@ -114,24 +114,24 @@ def run_cells(
     Args:
         study: name of the table.
         cells: all of them, done or not, with distinct keys.
-        work: from a cell to its rows; values are text, numbers, booleans or None. It runs in other
+        work: function from a cell to its rows; values are text, numbers, booleans or None. It runs in other
             processes, so it must be picklable.
         out: directory of the tables.
-        settings: what all rows depend on, as JSON has it: hashes of checkpoints, engine, and so on; not what
+        settings: JSON values that all rows depend on: hashes of checkpoints, engine, and so on; not what
             only determines which cells there are.
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
         jobs: number of processes; with loky -1 for one per core.
-        on_done: reports progress.
+        on_done: called after each cell.
         expected: number of cells of all stages; the table is complete when that many are done.
 
     Returns:
         The table, as `saccade.study.table.read_table` returns it.
 
     Raises:
-        InputError: an unknown backend, `jobs` out of range, keys that are not distinct, or `out` holds this
-            study with other settings.
+        InputError: an unknown backend, `jobs` out of range, keys that are not distinct, or `out`
+            contains this study with other settings.
         StudyError: cells failed, and the first ones are named with their errors; or a worker process died.
-            Finished cells stay stored.
+            Finished cells remain stored.
     """
     check_workers(backend, jobs)
     if len({cell.key for cell in cells}) != len(cells):
@@ -167,7 +167,7 @@ class Store:
         study, out, settings, cells, expected: as in `run_cells`.
 
     Raises:
-        InputError: `out` holds this study with other settings.
+        InputError: `out` contains this study with other settings.
     """
 
     def __init__(
@@ -205,8 +205,8 @@ class Store:
         if names:
             changes = [f"{name} {before.get(name)!r}, now {self.settings.get(name)!r}" for name in names]
             raise InputError(
-                f"out: {self.out} holds the study {self.study} with other settings ({'; '.join(changes)}); "
-                "expected the same ones or another directory"
+                f"out: {self.out} contains the study {self.study} with other settings "
+                f"({'; '.join(changes)}); expected the same settings or another directory"
             )
 
     def add(self, finished: Finished) -> None:

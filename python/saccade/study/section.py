@@ -21,9 +21,9 @@ class Figure:
     """A picture in a section.
 
     Attributes:
-        name: Of its file, unique in its section: lower-case words separated by hyphens.
-        caption: What is drawn, with units, and what the error bars are.
-        picture: From :mod:`saccade.study.figures`.
+        name: Name of its file, unique in its section: lower-case words separated by hyphens.
+        caption: Description of the drawing, with units, and of the error bars.
+        picture: Drawn by :mod:`saccade.study.figures`.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Grid:
     """A table for readers.
 
     Attributes:
-        caption: What its numbers are.
+        caption: Description of its numbers.
         columns: Headings.
         rows: One text per column in each row.
     """
@@ -52,10 +52,10 @@ class Section:
 
     Attributes:
         title: A few words.
-        summary: Paragraphs: what was measured, on what, and how.
+        summary: Paragraphs that say what was measured, on what, and how.
         figures, grids: The results.
-        concluded: Sentences: what the intervals show.
-        not_shown: Sentences: what the study cannot show, whatever its numbers are.
+        concluded: Sentences that say what the intervals show.
+        not_shown: Sentences that say what the study cannot show.
     """
 
     title: str
@@ -128,7 +128,7 @@ class Prose:
     `points` begins with a hyphen.
 
     Args:
-        name: Of the template.
+        name: Name of the template.
         values: Variables of the template.
 
     Example:

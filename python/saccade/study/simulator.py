@@ -74,7 +74,7 @@ class Simulator(Source):
         return policy_of(self.checkpoint, self.engine)
 
     def head(self, precision: str = "float32") -> ActionHead:
-        """See `Source`; on one thread, because cells are spread over processes."""
+        """See `Source`. Computes on one thread, because cells are spread over processes."""
         return head_of(self.checkpoint, precision)
 
     def recorded(self, task: str, seed: int) -> Recorded:
@@ -90,7 +90,7 @@ class Simulator(Source):
         return episode_rng(task, seed)
 
     def first(self, task: str, seed: int, instruction: str) -> Observation:
-        """The first observation of an episode under other words, without noise."""
+        """The first observation of an episode with another instruction, without noise."""
         environment = environment_of(self.checkpoint, task)
         environment.restart(seed)
         environment.instruction = instruction
@@ -144,9 +144,9 @@ def simulator(
     """Episodes of a policy.
 
     Args:
-        checkpoint: directory of the policy; None is the bundled one.
-        tasks: names; None takes all that the policy was trained on.
-        seeds: of the episodes of each task.
+        checkpoint: directory of the policy. Default: the bundled policy.
+        tasks: names of tasks. Default: all that the policy was trained on.
+        seeds: seeds of the episodes of each task.
         engine: what computes the head.
 
     Raises:
@@ -166,13 +166,13 @@ def simulator(
 
 @dataclass(frozen=True, eq=False)
 class PrivilegedState:
-    """What the simulator knows and the policy is not given, at every observation of an episode.
+    """What the simulator knows and the policy does not, at every observation of an episode.
 
     Attributes:
-        object, goal: Positions `(observations, 3)`, metres; the first and the last ball where a task has
-            balls of its own.
-        hand: Its position `(observations, 3)`, metres.
-        gripper: How far it is open `(observations, 1)`, 0 to 1.
+        object, goal: Positions `(observations, 3)` in metres. In tasks with balls, the first and the last
+            ball.
+        hand: Position of the hand `(observations, 3)` in metres.
+        gripper: Opening of the gripper `(observations, 1)`, 0 to 1.
     """
 
     object: Float32Array
@@ -183,10 +183,10 @@ class PrivilegedState:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """An episode and what the head was given in it.
+    """An episode and the inputs of the head in it.
 
     Attributes:
-        episode: How it went.
+        episode: The outcome.
         observation: A row for each chunk, with its noise.
         privileged: A row for each chunk.
     """
@@ -197,11 +197,11 @@ class Recorded:
 
 
 class Recorder:
-    """A head engine that records what it is given and passes it on to another one.
+    """A head engine that records its inputs and passes them to another engine.
 
     Args:
-        engine: computes.
-        environment: is asked for positions at every observation.
+        engine: engine that computes.
+        environment: environment whose positions are recorded at every observation.
     """
 
     def __init__(self, engine: HeadEngine, environment: TaskEnvironment) -> None:
@@ -234,20 +234,20 @@ class Recorder:
         return self._engine.describe()
 
     def recorded(self, episode: Episode) -> Recorded:
-        """All of it, when the episode is over."""
+        """The recording, when the episode is over."""
         features, state, noise, *known = (np.concatenate(arrays) for arrays in zip(*self._given, strict=True))
         ids = np.full(len(features), EMBODIMENT_ID)
         return Recorded(episode, Observation(features, state, ids, noise), PrivilegedState(*known))
 
 
 def record_episode(environment: TaskEnvironment, policy: Policy, seed: int) -> Recorded:
-    """Runs one episode; recording changes nothing in it."""
+    """Runs and records one episode. Recording does not change it."""
     recorder = Recorder(policy.engine, environment)
     watched = Policy(policy.config, policy.backbone, recorder, policy.checkpoint)
     return recorder.recorded(run_episode(environment, watched, seed))
 
 
-# What a worker process keeps between cells, so that neighbouring cells do not load or compute it again.
+# Caches of a worker process, so that consecutive cells do not load or compute the same things twice.
 
 
 @functools.lru_cache(maxsize=1)

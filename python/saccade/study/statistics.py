@@ -64,7 +64,7 @@ class PairedDifference:
         pairs: Number of episodes that both arms ran.
         both, only_first, only_second, neither: Number of episodes in which both arms succeeded, only one of
             them, or none. Only the discordant pairs (`only_first`, `only_second`) distinguish the arms.
-        p_value: Of McNemar's exact test.
+        p_value: p value of McNemar's exact test.
     """
 
     difference: Estimate

@@ -1,4 +1,4 @@
-"""What a study is: a question put to an action head, measured cell by cell and summarised from its table."""
+"""The base class of studies: a study is measured cell by cell and summarised from its table."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ STUDIES: dict[str, tuple[str, str]] = {
 
 
 class Study(ABC):
-    """A question put to an action head.
+    """A question about an action head, and how it is measured.
 
     A study is a frozen dataclass: its fields say what is measured, and on what. It is pickled, so that
     `measure` can run in other processes.
 
     Attributes:
-        name: Of the study, its command and its table.
+        name: Name of the study, of its command and of its table.
     """
 
     name: ClassVar[str]
@@ -77,23 +77,27 @@ class Study(ABC):
     @classmethod
     @abstractmethod
     def from_arguments(cls, args: argparse.Namespace) -> Study:
-        """The study that the arguments ask for.
+        """Creates the study from parsed arguments.
 
         Raises:
-            SaccadeError, OSError: an argument is wrong, or something that it names is missing.
+            SaccadeError, OSError: an argument is wrong, or a file that it names is missing.
         """
 
     @abstractmethod
     def settings(self) -> Mapping[str, Any]:
-        """What all rows of the table depend on, as JSON has it; a table holds one set of settings only."""
+        """JSON values that all rows of the table depend on. A table has only one set of settings."""
 
     @abstractmethod
     def cells(self) -> Sequence[Cell]:
-        """All units of work, done or not; their keys are distinct."""
+        """All units of work, finished or not, with distinct keys."""
 
     @abstractmethod
     def measure(self, cell: Cell) -> Rows:
-        """Rows of the table: names to text, numbers, booleans or None. May run in another process."""
+        """Measures a cell. May run in another process.
+
+        Returns:
+            Rows of the table: text, numbers, booleans or None by column.
+        """
 
     @classmethod
     @abstractmethod
@@ -101,19 +105,19 @@ class Study(ABC):
         """The study's part of the report, from its table alone."""
 
     def begin(self, out: Path) -> Study:
-        """The study with what it keeps in the directory of the tables, if anything."""
+        """The study, prepared to write its own files to the directory of the tables."""
         return self
 
     @property
     def num_cells(self) -> int:
-        """Cells of all stages, as far as that is known; the table is complete when they are done."""
+        """Number of cells of all stages, as far as it is known. The table is complete when they are done."""
         return len(self.cells())
 
     def then(self, table: pd.DataFrame) -> Study | None:
         """The next stage, for studies whose later cells depend on the results of the first ones.
 
         Args:
-            table: of all cells so far.
+            table: table of all cells so far.
 
         Returns:
             A study with the same name and settings, whose cells include those of this one; None at the end.
@@ -125,8 +129,8 @@ def load_study(name: str) -> type[Study]:
     """The study of that name.
 
     Raises:
-        InputError: there is none; lists those there are.
-        TypeError: what `STUDIES` names is not a study.
+        InputError: there is no such study. The message lists all studies.
+        TypeError: the entry of `STUDIES` is not a study.
     """
     if name not in STUDIES:
         raise InputError(f"study: unknown name {name!r}, expected one of {', '.join(STUDIES)}")

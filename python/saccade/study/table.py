@@ -58,8 +58,8 @@ def read_table(path: Path) -> pd.DataFrame:
     """Reads what `write_table` wrote; empty fields are NaN.
 
     Raises:
-        FileNotFoundError: it does not exist.
-        InputError: it is not CSV.
+        FileNotFoundError: the file does not exist.
+        InputError: the file is not CSV.
     """
     if path.stat().st_size <= 1:  # a table without rows has no columns
         return pd.DataFrame()
@@ -79,8 +79,8 @@ def read_provenance(path: Path) -> Provenance:
     """Reads what `write_provenance` wrote.
 
     Raises:
-        FileNotFoundError: it does not exist.
-        InputError: it has other content.
+        FileNotFoundError: the file does not exist.
+        InputError: the file has other content.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -112,7 +112,7 @@ def truths(column: pd.Series) -> pd.Series:
     """A column of True and False as booleans.
 
     Raises:
-        InputError: it holds something else.
+        InputError: the column contains another value.
     """
     values = column.map({True: True, False: False, "True": True, "False": False})
     if values.isna().any():

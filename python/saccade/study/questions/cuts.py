@@ -189,7 +189,7 @@ class Cuts(ArmStudy):
 
 
 def arms_in(table: pd.DataFrame) -> dict[str, Arm]:
-    """The arms of a table: those of `ARMS` in their order, then arms of the user's own by their names."""
+    """The arms of a table: those of `ARMS` in their order, then other arms by their names."""
     named = dict.fromkeys(str(name) for name in table["arm"])
     known = {name: arm for name, arm in ARMS.items() if name in named}
     return known | {name: Arm(name) for name in named if name not in ARMS}

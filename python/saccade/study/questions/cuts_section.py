@@ -35,12 +35,12 @@ class ArmResult:
     """What the table shows about one arm; None or NaN where it was not measured.
 
     Attributes:
-        name: Of the arm.
+        name: Name of the arm.
         rate, episodes: Success, and the number of episodes.
         pairs: The comparison with the unchanged policy.
         change: Mean |change| of an action.
         note: Why it was not measured.
-        corrected_p: Of McNemar's test, corrected by Holm for all arms except the control.
+        corrected_p: p value of McNemar's test, corrected by Holm for all arms except the control.
     """
 
     name: str
@@ -64,8 +64,8 @@ def section(arms: Mapping[str, Arm], table: pd.DataFrame, provenance: Provenance
     """The study's part of the report on closed-loop episodes.
 
     Args:
-        arms: By name, in the order of the report.
-        table, provenance: Of the study.
+        arms: Arms by name, in the order of the report.
+        table, provenance: Table of the study and its provenance.
     """
     results = arm_results(table, list(arms))
     labels = {name: arm.label for name, arm in arms.items()}

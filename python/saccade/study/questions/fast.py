@@ -88,8 +88,8 @@ class Fast(Study):
 
     Attributes:
         source: Checkpoint and observations.
-        parts: Of `PARTS`; `episodes` is skipped without a closed loop.
-        modes: Names; None takes the default of each part.
+        parts: Names from `PARTS`. `episodes` is skipped without a closed loop.
+        modes: Names of modes. Default: those of each part.
         calibration: What calibrated modes depend on; None until it has been measured.
     """
 
@@ -275,7 +275,7 @@ class Fast(Study):
 
 
 def calibration_units(source: Source) -> list[tuple[str, int]]:
-    """What calibrated modes are fitted on: validation episodes, or rows of the even episodes of a recording.
+    """The units for calibration: validation episodes, or rows of the even episodes of a recording.
 
     Returns:
         Nothing for a recording of a single episode.
@@ -291,7 +291,7 @@ def calibration_units(source: Source) -> list[tuple[str, int]]:
 
 
 def judges_calibrated(source: Source, unit: tuple[str, int]) -> bool:
-    """Whether calibrated modes are measured on this: on odd episodes of a recording, and in the simulator."""
+    """Whether calibrated modes are measured on a unit: in recordings, only on odd episodes."""
     return source.closed_loop or bool(source.labels(*unit)["episode"] % 2)
 
 
@@ -315,10 +315,10 @@ class Reference:
     """An observation, and the chunks that those of a mode are compared with.
 
     Attributes:
-        observation: What the head is given.
-        chunk: Of the baseline, comparable actions `(1, horizon, action_dim)`.
-        exact: For many steps.
-        other: Of the baseline with another noise; None if the recording has only one.
+        observation: Input of the head.
+        chunk: Chunk of the baseline, comparable actions `(1, horizon, action_dim)`.
+        exact: Chunk of many steps.
+        other: Chunk of the baseline from other noise; None if the recording has only one noise.
     """
 
     observation: Observation

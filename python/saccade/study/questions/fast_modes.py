@@ -1,4 +1,4 @@
-"""Ways to compute a chunk faster, by name: precision, steps, integrator, held rows, dropped tokens."""
+"""Ways to compute a chunk faster, by name: precision, integrator, steps, reused rows, dropped tokens."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class Mode:
     """One way to compute a chunk.
 
     Attributes:
-        precision: Of the head.
+        precision: Precision of the head.
         integrator: One of `INTEGRATORS`. `midpoint` and `heun` evaluate the velocity twice per step. `adams`
             (Adams-Bashforth, second order) evaluates it once and extrapolates from the previous value.
             `times` is Euler at step times that are optimised for the checkpoint.
-        num_steps: Of the integrator.
+        num_steps: Number of steps of the integrator.
         refresh: State and future rows are recomputed every `refresh` evaluations; 1 is exact.
         drop: Percentage of the vision-language tokens that are removed, those with the least attention.
 
@@ -196,7 +196,7 @@ def integrate(
     """Integrates a velocity from noise at time 0 to actions at time 1.
 
     Args:
-        velocity: Of the first `action_dim` numbers; the others are not changed.
+        velocity: Velocity of the first `action_dim` numbers. The others are not changed.
         start: `(batch, horizon, encoder_action_dim)`.
         integrator: One of `INTEGRATORS`, except `midpoint`.
         times: Step times from 0 to 1. `adams` needs steps of equal length.
@@ -239,7 +239,7 @@ def best_times(error: Callable[[tuple[float, ...]], float], num_steps: int) -> t
     """Step times with a small error: starting from even ones, one at a time is moved while that helps.
 
     Args:
-        error: Of step times from 0 to 1.
+        error: Function from step times, from 0 to 1, to their error.
         num_steps: At least 2.
     """
     best = even_times(num_steps)

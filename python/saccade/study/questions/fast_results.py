@@ -41,15 +41,15 @@ class ModeResult:
     """What the table shows for one mode; None where it was not measured.
 
     Attributes:
-        name: Of the mode.
+        name: Name of the mode.
         change: Mean |difference| of an action from the baseline's.
         ratio: `change` divided by the difference that another noise makes.
         error: Mean |difference| of an action from many small steps.
         successes, episodes: On the tasks that count.
         pairs: The comparison with the baseline on these tasks.
-        p_loss: Of a loss of `LOSS_THAT_MATTERS`, corrected by Holm; None for modes that are not judged.
-        p_value: Of McNemar's test, corrected by Holm; None for modes that are not judged.
-        times: By size.
+        p_loss: p value of a loss of `LOSS_THAT_MATTERS`, corrected by Holm; None for modes without a verdict.
+        p_value: p value of McNemar's test, corrected by Holm; None for modes without a verdict.
+        times: Times by size.
     """
 
     name: str

@@ -239,7 +239,7 @@ def scattered(
 
     Args:
         measured: Time and value of each name.
-        x_label, y_label: With units.
+        x_label, y_label: Labels of the axes, with units.
         falling: Small values are good, and the vertical axis is logarithmic too.
     """
     picture, (axes,) = figures.new_picture(height=4.6)

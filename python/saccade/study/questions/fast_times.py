@@ -48,7 +48,7 @@ def times_of(
     """Milliseconds of `encode` and `sample` in each mode, in rounds with a random order of modes.
 
     Args:
-        modes: To be timed.
+        modes: Modes to time.
         loaded: The head of each precision.
         calibration: What calibrated modes depend on.
         observation: A single one, with noise.

@@ -238,7 +238,7 @@ class Gradients(Study):
 
 
 def check_demonstrations(directory: Path, source: Simulator) -> None:
-    """Checks that there are demonstrations with the pictures that the policy is given.
+    """Checks that there are demonstrations with the same cameras and image size as the policy.
 
     Raises:
         InputError: there are none for a task, or the pictures differ.

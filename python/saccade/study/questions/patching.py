@@ -1,4 +1,4 @@
-"""`saccade study patching`: rows of one observation patched into another's run; do the actions follow?"""
+"""`saccade study patching`: rows of one observation inserted into the run of another."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class Patching(Study):
         source: The receivers: the first observation of each episode, or each row of a file.
         blocks: Are patched one by one, and all of them at once.
         steps: Euler steps in which they are patched.
-        kinds: Of donors, names of `KINDS`; a file has one kind of its own. In the simulator donors have the
-            seeds that follow those of the receivers.
+        kinds: Kinds of donors, names from `KINDS`; a file has only the kind `FROM_FILE`. In the simulator,
+            donors have the seeds that follow those of the receivers.
     """
 
     source: Source
@@ -166,7 +166,7 @@ def simulated_pair(source: Simulator, kind: str, task: str, seed: int, donor_see
 
 
 def recorded_pair(source: Recording, kind: str, task: str, row: int) -> Pair | str:
-    """A row of a file, and the next one, going round, of another episode with the same embodiment."""
+    """A row of a file, and the next row (cyclically) of another episode with the same embodiment."""
     found = source.all
     others = (np.arange(1, len(found)) + row) % len(found)
     fitting = (found.clusters[others] != found.clusters[row]) & (
@@ -185,10 +185,10 @@ def patched(
     """A row for each group of rows and block: what the donor's rows do in the receiver's run.
 
     Args:
-        head: computes.
+        head: head that computes.
         pair: donor and receiver.
         blocks: after which rows are patched, one by one and all at once.
-        steps: in which they are patched.
+        steps: Euler steps in which they are patched.
         row: columns that all rows have.
     """
     receiver = pair.receiver

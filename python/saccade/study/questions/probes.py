@@ -62,11 +62,11 @@ class Probes(Study):
 
     Attributes:
         source: The episodes.
-        step: The Euler step at which rows are taken. At the first one the action rows start from noise, so
-            that what is found in them was read on the way.
+        step: The Euler step at which rows are taken. At step 0 the action rows start from noise, so all
+            information that is found in them was read from other rows or tokens.
         dimensions: Principal components that a probe reads at most.
-        frames: Directory in which traced episodes are kept; `begin` chooses it.
-        recorded: Whether all episodes are there, so that probes can be fitted.
+        frames: Directory of the traced episodes, which `begin` sets.
+        recorded: Whether all episodes are recorded, so that probes can be fitted.
     """
 
     source: Simulator
@@ -106,7 +106,7 @@ class Probes(Study):
 
     @property
     def scopes(self) -> dict[str, list[str]]:
-        """The tasks that probes are fitted to together: each by itself, and all of them."""
+        """The sets of tasks that probes are fitted to: each task, and all tasks together."""
         scopes = {task: [task] for task in self.source.tasks}
         if len(self.source.tasks) > 1:
             scopes[ALL_TASKS] = list(self.source.tasks)
@@ -118,7 +118,7 @@ class Probes(Study):
         return len(self.source.units) + len(self.scopes)
 
     def cells(self) -> Sequence[Cell]:
-        """The episodes; once they are there, the probes of each scope too."""
+        """The episodes and, when these are done, the probes of each scope."""
         episodes = [Cell(("episode", task, seed)) for task, seed in self.source.units]
         if not self.recorded:
             return episodes
@@ -133,7 +133,7 @@ class Probes(Study):
         return None if self.recorded else replace(self, recorded=True)
 
     def measure(self, cell: Cell) -> Rows:
-        """An episode, whose frames are kept in a file, or all probes of a scope."""
+        """An episode, whose frames are written to a file, or all probes of a scope."""
         if cell.key[0] == "episode":
             _, task, seed = cell.key
             return [self.record(str(task), int(seed))]
@@ -142,7 +142,7 @@ class Probes(Study):
         parts, numbers = [], []
         for task in tasks:
             for seed in self.source.seeds:
-                if not self.path(task, seed).exists():  # tables may have been kept without it
+                if not self.path(task, seed).exists():  # someone may have kept only the table
                     self.record(task, seed)
                 parts.append(load_frames(self.path(task, seed)))
                 numbers.append(tasks.index(task))
@@ -151,12 +151,12 @@ class Probes(Study):
         return [{"kind": "probe", "task": scope, **row} for row in found]
 
     def path(self, task: str, seed: int) -> Path:
-        """Where an episode's frames are kept."""
+        """Path of an episode's frames."""
         assert self.frames is not None
         return self.frames / f"{task}-{seed}.npz"
 
     def record(self, task: str, seed: int) -> dict[str, Any]:
-        """Runs an episode and keeps its frames."""
+        """Runs an episode and writes its frames."""
         recorded = self.source.recorded(task, seed)
         save_frames(frames_of(self.source.head(), recorded, self.step), self.path(task, seed))
         return {
@@ -177,7 +177,7 @@ def frames_of(head: ActionHead, recorded: Recorded, step: int) -> Frames:
     """The observations of one episode, traced at one Euler step.
 
     Args:
-        head: of the policy.
+        head: head of the policy.
         recorded: the episode.
         step: the Euler step at which rows are taken.
     """

@@ -55,7 +55,7 @@ class Planned:
     """A run to be trained.
 
     Attributes:
-        name: Of its directory.
+        name: Name of its directory.
         demonstrations: Directory of `saccade demos`.
         training: Its settings.
     """
@@ -73,10 +73,10 @@ class Sweep(Study):
 
     Attributes:
         runs: Directory of each run, by name.
-        planned: What is trained, by name.
+        planned: The runs that are trained, by name.
         tasks, seeds: The episodes of every policy: each seed in each task.
         stage: `TRAINING`, `EPISODES` or `COST`.
-        varied: What defines a point of the sweep.
+        varied: The settings that define a point of the sweep.
         setting: The training setting whose values are given on the command line.
         values: Its default values.
         other_pictures: Whether runs may be trained on pictures of different sizes or cameras.
@@ -94,7 +94,7 @@ class Sweep(Study):
 
     @classmethod
     def flag(cls) -> str:
-        """Of the values."""
+        """The flag of the values."""
         return f"--{cls.setting.replace('_', '-')}"
 
     @classmethod

@@ -24,7 +24,7 @@ class Varied:
     """What defines a point of a sweep.
 
     Attributes:
-        names: Of training settings, or of sizes of the backbone.
+        names: Names of training settings, or of sizes of the backbone.
         label: A point as text, from their values.
     """
 

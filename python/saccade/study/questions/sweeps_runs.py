@@ -19,7 +19,7 @@ class Run:
     """A trained policy, or one in training.
 
     Attributes:
-        name: Of its directory.
+        name: Name of its directory.
         directory: The run's directory.
         settings: Contents of `settings.json`.
         history: Contents of `history.json`.

@@ -34,9 +34,9 @@ def section(name: str, varied: Varied, table: pd.DataFrame) -> Section:
     """A sweep's part of the report.
 
     Args:
-        name: Of the study.
+        name: Name of the study.
         varied: What defines a point.
-        table: Of the study.
+        table: Table of the study.
     """
     kinds = {str(kind): rows.dropna(axis=1, how="all") for kind, rows in table.groupby("kind")}
     trained = kinds.get("training", pd.DataFrame())
