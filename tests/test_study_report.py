@@ -164,7 +164,7 @@ def test_report_is_one_file_and_says_what_the_numbers_allow(tmp_path: Path) -> N
     assert "0.1450 (" in parsed.text
     assert "actions change by 0.020 (0.020 to 0.020) on average" in parsed.text
 
-    assert "future rows in all blocks: the chunk goes 20.0 %" in parsed.text
+    assert "future rows in all blocks: the chunk moves 20.0 %" in parsed.text
     assert "state rows in all blocks: no effect was found" in parsed.text
     assert "Control, all rows in all blocks: a share of 1.0000, as expected." in parsed.text
     assert "words: not measured, the policy knows no task for it (8 receivers: push)." in parsed.text
