@@ -214,7 +214,7 @@ def test_the_reference_refuses_it_too() -> None:
     reference = random_head(small_config(), 1)
     given_inputs: dict[str, Any] = random_inputs(reference.config, 2, batch=1, num_vl_tokens=3)
     late = patched((1, 0), "state", np.zeros((1, reference.config.width), np.float32))
-    with pytest.raises(saccade.InputError, match="state tokens, expected action tokens"):
+    with pytest.raises(saccade.InputError, match="expected action tokens, got state tokens"):
         reference(**given_inputs, intervention=late, future_refresh=2)
 
 
