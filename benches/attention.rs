@@ -1,4 +1,4 @@
-//! Fused attention at the head's sizes beside the same work as faer products with the scores in memory.
+//! Fused attention at the head's sizes, compared with the same work as faer products with the scores in memory.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};

@@ -1,4 +1,4 @@
-//! Packed linear layers at the head's sizes beside faer, rten-gemm and gemmkit, in float32, bfloat16 and int8, with weights that come from
+//! Packed linear layers at the head's sizes, compared with faer, rten-gemm and gemmkit, in float32, bfloat16 and int8, with weights that come from
 //! memory.
 
 use std::sync::Arc;

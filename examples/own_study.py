@@ -1,10 +1,11 @@
-"""A study with an arm and a metric of your own: what happens without the two longest future tokens?
+"""A study with your own arm and metric: what happens without the two longest future tokens?
 
-python examples/own_study.py                                              the bundled policy, in the simulator
-python examples/own_study.py --checkpoint CHECKPOINT --features LOOKS.npz   any checkpoint, on a recording
+    python examples/own_study.py                                               the bundled policy, simulated
+    python examples/own_study.py --checkpoint CHECKPOINT --features FILE.npz   any checkpoint, on a recording
 
-The arm is compared with the unchanged head on equal episodes and noise. Results are kept in --out: run again
-with more episodes, the script measures only those. `saccade study report OUT` makes a page of them.
+The arm is compared with the unchanged head on the same episodes and noise. Results are kept in --out, so a
+later run with more episodes measures only the new ones. `saccade study report OUT` writes a report. Needs the
+extra `study`.
 """
 
 import argparse
@@ -26,13 +27,13 @@ REMOVED = 2
 
 
 def without_longest(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
-    """The learned future tokens `(N, width)` without the longest ones."""
+    """An intervention that removes the longest of the learned future tokens, `(N, width)`."""
     kept = np.sort(np.argsort(np.linalg.norm(tokens, axis=1))[:-REMOVED])
     return Intervention(future_tokens=tokens[kept])
 
 
 def first_action(before: Float32Array, after: Float32Array) -> float:
-    """How far the first action of a chunk moves; both are `(observations, draws, horizon, action_dim)`."""
+    """Mean change of the first action; both arrays are `(observations, draws, horizon, action_dim)`."""
     return float(np.abs(after - before)[:, :, 0].mean())
 
 
@@ -41,12 +42,12 @@ ARM = Arm(
     label=f"without the {REMOVED} longest future tokens",
     about="The future tokens with the largest norm are removed; the others stay as they are.",
     intervention=without_longest,
-    settings={"removed": REMOVED},  # part of the cell's name: another number is measured again
+    settings={"removed": REMOVED},  # part of the cell's name, so another number is a new measurement
 )
 
 
 def source_of(args: argparse.Namespace) -> Source:
-    """A recording if there is one, else episodes of a policy in the simulator."""
+    """The recording if one is given, otherwise episodes of a policy in the simulator."""
     if args.features is not None:
         return Recording(str(args.checkpoint), str(args.features))
     from saccade.study.simulator import simulator  # needs the extra `sim` and OpenGL
@@ -55,7 +56,7 @@ def source_of(args: argparse.Namespace) -> Source:
 
 
 def main() -> None:
-    """Measures the arm and prints what can be concluded."""
+    """Measures the arm and prints the conclusions."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--checkpoint", type=Path, help="default: the bundled policy")
     parser.add_argument("--features", type=Path, help="recorded observations for the checkpoint")
@@ -70,7 +71,7 @@ def main() -> None:
     for line in Cuts.summarise(table, read_provenance(provenance_path(args.out, Cuts.name))).concluded:
         print(f"- {line}")
     moved = table[table["arm"] == ARM.name]["first_action"]
-    print(f"The first action moves by {moved.mean():.4f} on average (per episode up to {moved.max():.4f}).")
+    print(f"The first action moves by {moved.mean():.4f} on average (at most {moved.max():.4f}).")
 
 
 if __name__ == "__main__":

@@ -242,6 +242,29 @@ def test_a_head_without_future_tokens(name: str, tmp_path: Path, capsys: pytest.
     assert main(["study", "report", str(tmp_path / "out")]) == 0
 
 
+def test_every_arm_that_needs_no_future_tokens_is_measured_without_them(tmp_path: Path) -> None:
+    checkpoint, file = write_case(tmp_path, num_future_tokens=0)
+    assert study("cuts", checkpoint, file, tmp_path / "out") == 0
+    assert study("patching", checkpoint, file, tmp_path / "out") == 0
+    table = read_table(tmp_path / "out" / "cuts.csv")
+    measured = table[table["note"].isna()]
+    assert set(measured["arm"]) == {"none", "action-blind", "all-blind"}
+    head, arrays = saccade.ActionHead.load(checkpoint), np.load(file)
+    state, embodiment = arrays["state"], arrays["embodiment_id"]
+    noise = np.stack(
+        [np.random.default_rng([0, row]).standard_normal((4, 5, 3), dtype=np.float32) for row in range(5)]
+    )
+    seen = np.asarray(head(arrays["backbone_features"], state, embodiment, noise=noise, num_samples=4))
+    other = head(-arrays["backbone_features"], state, embodiment, noise=noise, num_samples=4)
+    cut = saccade.Intervention(cut=[("state", "vl"), ("action", "vl")])
+    context = head.encode(-arrays["backbone_features"])
+    unseen = head.sample(context, state, embodiment, noise=noise, num_samples=4, intervention=cut)
+    assert np.abs(np.asarray(other) - seen).max() > 1e-3  # the features matter, unless they are cut
+    change = np.abs(np.asarray(unseen) - seen).mean(axis=(1, 2, 3))
+    found = measured[measured["arm"] == "all-blind"].sort_values("seed")["chunk_change"]
+    np.testing.assert_allclose(found, change, rtol=1e-5)
+
+
 def spoiled(name: str, value: float) -> Callable[[dict[str, Any]], np.ndarray]:
     def change(arrays: dict[str, Any]) -> np.ndarray:
         array: np.ndarray = arrays[name].copy()

@@ -177,12 +177,18 @@ def test_resize_refuses_the_observations_that_study_refuses(
 def test_an_arm_that_the_head_cannot_have_is_not_measured(tmp_path: Path) -> None:
     checkpoint, file = write_case(tmp_path, without=())
     arms = (
+        Arm(
+            "nowhere",  # block 1 is a self-attention block, which reads no vision-language tokens
+            intervention=lambda tokens, rng: Intervention(cut=[("action", "vl")], blocks=[1]),
+        ),
         Arm("late", intervention=lambda tokens, rng: Intervention(cut=[("action", "future")], blocks=[99])),
         ARMS["future-zeroed"],
     )
     table = run(Cuts(Recording(str(checkpoint), str(file)), arms), tmp_path / "out")
     assert table[table["arm"] == "late"]["note"].str.contains("blocks: expected 0 to 3, got 99").all()
-    assert table[table["arm"] != "late"]["note"].isna().all()
+    nowhere = table[table["arm"] == "nowhere"]["note"]
+    assert nowhere.str.contains("cut: action reads vl in cross-attention blocks only").all()
+    assert table[table["arm"].isin(["none", "future-zeroed"])]["note"].isna().all()
     section = Cuts.summarise(table, read_provenance(tmp_path / "out" / "cuts.json"))
     assert any(line.startswith("late: not measured, intervention: blocks") for line in section.concluded)
 

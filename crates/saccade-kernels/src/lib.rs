@@ -1,8 +1,11 @@
-//! Packed linear layers, fused attention, norms and the private thread pool: the numerics of saccade, knowing nothing of GR00T.
+//! The numerics of saccade: packed linear layers, fused attention, norms, rotary embedding and a private thread pool. It knows no model.
 //!
-//! Every kernel is written once over a small vector type and compiled for each instruction set ([`Isa`]); this is the only crate of saccade
-//! with `unsafe` code. What all kernels promise: a row's result has the same bits whatever the number of rows, its place among
-//! them, and the number of threads.
+//! Every kernel is written once over a small vector type and compiled for each instruction set ([`Isa`]). This is the only crate of saccade
+//! with `unsafe` code. All kernels promise that the bits of a row's result depend neither on the number of rows, nor on its place among
+//! them, nor on the number of threads.
+//!
+//! Memory whose size the caller decides is claimed with an error, [`AllocError`], where there is none. Long calls can be stopped with
+//! [`interruptible`].
 
 mod activation;
 mod aligned;

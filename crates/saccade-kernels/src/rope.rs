@@ -55,7 +55,7 @@ pub fn rotary_embedding(
     if rows == 0 || width == 0 || pairs == 0 {
         return;
     }
-    let job = Job {
+    let call = Rotation {
         x_stride: x.row_stride(),
         x: x.as_mut_ptr(),
         width,
@@ -71,15 +71,15 @@ pub fn rotary_embedding(
     };
     parallel_for(threads, tasks, &|task| {
         let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        isa.run(Part {
-            job: &job,
+        isa.run(RotationRows {
+            call: &call,
             first,
             end,
         });
     });
 }
 
-struct Job<'a> {
+struct Rotation<'a> {
     x: *mut f32,
     x_stride: usize,
     width: usize,
@@ -89,25 +89,25 @@ struct Job<'a> {
 }
 
 // SAFETY: tasks read and write different rows of `x`, which is borrowed for the whole call.
-unsafe impl Sync for Job<'_> {}
+unsafe impl Sync for Rotation<'_> {}
 
-struct Part<'a> {
-    job: &'a Job<'a>,
+struct RotationRows<'a> {
+    call: &'a Rotation<'a>,
     first: usize,
     end: usize,
 }
 
-impl Kernel for Part<'_> {
+impl Kernel for RotationRows<'_> {
     type Output = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) {
-        let job = self.job;
+        let call = self.call;
         for row in self.first..self.end {
-            let (cos, sin) = (job.cos.row(row), job.sin.row(row));
-            for head in (0..job.width).step_by(job.head_dim) {
+            let (cos, sin) = (call.cos.row(row), call.sin.row(row));
+            for head in (0..call.width).step_by(call.head_dim) {
                 // SAFETY: rows are within the view, heads within rows, and pairs within heads.
-                unsafe { rotate::<S::Vector>(job.x.add(row * job.x_stride + head), cos, sin) };
+                unsafe { rotate::<S::Vector>(call.x.add(row * call.x_stride + head), cos, sin) };
             }
         }
     }

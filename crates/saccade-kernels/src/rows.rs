@@ -81,7 +81,7 @@ impl Shape {
     #[track_caller]
     fn row(&self, row: usize) -> Range<usize> {
         assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
-        // Rows without elements may lie beyond the data.
+        // Rows without elements may be beyond the end of the data.
         let first = if self.num_columns == 0 {
             0
         } else {

@@ -43,7 +43,7 @@ fn usable_cores() -> NonZeroUsize {
     NonZeroUsize::new(logical).unwrap_or(NonZeroUsize::MIN)
 }
 
-/// What the kernel tells about this process, in files. Anything that cannot be read or understood sets no limit.
+/// What the operating system says about this process, read from files. Anything that cannot be read or understood sets no limit.
 #[cfg(target_os = "linux")]
 mod linux {
     use std::collections::BTreeSet;

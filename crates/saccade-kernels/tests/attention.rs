@@ -257,7 +257,7 @@ fn bits_do_not_depend_on_threads_nor_on_other_queries() {
     }
 }
 
-/// Rounded to bfloat16 where they lie.
+/// Rounded to bfloat16 in place.
 fn round(matrix: &mut Strided) {
     for row in 0..matrix.rows {
         for element in matrix.view_mut().row_mut(row) {

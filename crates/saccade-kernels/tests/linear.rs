@@ -60,7 +60,7 @@ fn weights(part: &Part, inputs: usize, seed: u64) -> Weights {
     }
 }
 
-/// `data` as `(outputs, inputs)`: as it lies, or as the transpose of what lies there.
+/// `data` as `(outputs, inputs)`: as stored, or transposed.
 fn view<'a, T: Copy>(data: &'a [T], part: &Part, inputs: usize) -> Matrix<'a, T> {
     if part.transposed {
         Matrix::from(Rows::strided(data, inputs, part.outputs, part.outputs)).transpose()

@@ -41,7 +41,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// One test in this file, so that no other runs beside it.
+/// One test in this file, so that no other test runs at the same time.
 #[test]
 fn the_second_call_of_a_shape_allocates_nothing() {
     const WIDTH: usize = 384;

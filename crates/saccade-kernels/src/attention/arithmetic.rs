@@ -12,7 +12,7 @@ use crate::simd::{Dots, Simd, Vector};
 ///
 /// # Safety
 /// Every method is called within [`Simd::run`] of `S`, with pointers that are valid for all that it names.
-pub(super) trait Arithmetic<S: Simd> {
+pub(super) trait TileArithmetic<S: Simd> {
     /// Elements of the summed dimension in a word of keys or values.
     const STEP: usize;
     /// Factors that meet it, one after the other.
@@ -51,9 +51,9 @@ pub(super) trait Stored {
 }
 
 /// float32.
-pub(super) struct Plain;
+pub(super) struct HeldF32;
 
-impl Stored for Plain {
+impl Stored for HeldF32 {
     const STEP: usize = 1;
 
     #[inline(always)]
@@ -64,9 +64,9 @@ impl Stored for Plain {
 }
 
 /// Pairs of bfloat16, widened in registers: the bits of float32 with the same keys and values.
-pub(super) struct Widened;
+pub(super) struct HeldBf16;
 
-impl Stored for Widened {
+impl Stored for HeldBf16 {
     const STEP: usize = 2;
 
     #[inline(always)]
@@ -86,7 +86,7 @@ impl Stored for Widened {
 /// Products of float32, of keys and values held as `H`.
 pub(super) struct Float32<H>(PhantomData<H>);
 
-impl<S: Simd<Vector = V>, V: Vector, H: Stored> Arithmetic<S> for Float32<H> {
+impl<S: Simd<Vector = V>, V: Vector, H: Stored> TileArithmetic<S> for Float32<H> {
     const STEP: usize = H::STEP;
     const FACTORS: usize = H::STEP;
     type Operand = V;
@@ -146,7 +146,7 @@ impl<S: Simd<Vector = V>, V: Vector, H: Stored> Arithmetic<S> for Float32<H> {
 /// Products of pairs of bfloat16 in one instruction, summed in float32: queries and probabilities are rounded too.
 pub(super) struct Pairs;
 
-impl<S: Simd<Vector = V>, V: Vector> Arithmetic<S> for Pairs {
+impl<S: Simd<Vector = V>, V: Vector> TileArithmetic<S> for Pairs {
     const STEP: usize = 2;
     const FACTORS: usize = 1;
     type Operand = V::Ints;
@@ -192,7 +192,7 @@ impl<S: Simd<Vector = V>, V: Vector> Arithmetic<S> for Pairs {
     #[inline(always)]
     unsafe fn widen(from: *const u32, part: usize) -> V {
         // SAFETY: as above.
-        unsafe { Widened::widen(from, part) }
+        unsafe { HeldBf16::widen(from, part) }
     }
 
     #[inline(always)]

@@ -17,7 +17,7 @@ use crate::rows::{Rows, RowsMut};
 use crate::weights::Element;
 pub use keys_values::PackedKeyValues;
 pub use mask::{LogitBias, Mask};
-use tile::{Bf16Tile, FloatTile, Job, Tile};
+use tile::{Bf16Tile, Call, FloatTile, QueryTile};
 
 /// Multiply-adds from which a second thread pays: some 10 us of one core.
 const MACS_FOR_THREADS: usize = 1 << 19;
@@ -82,7 +82,7 @@ pub fn attention(
         return;
     }
     mask.check(num_heads, rows, kv.len());
-    let job = Job {
+    let call = Call {
         kv,
         heads_per_kv_head: num_heads / kv.num_kv_heads(),
         queries: queries.as_ptr(),
@@ -105,8 +105,8 @@ pub fn attention(
         let (head, tile) = (task / tiles, task % tiles);
         // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
         let (first, end) = (rows * tile / tiles, rows * (tile + 1) / tiles);
-        let tile = Tile {
-            job: &job,
+        let tile = QueryTile {
+            call: &call,
             head,
             first,
             rows: end - first,

@@ -36,7 +36,7 @@ impl Kernel for WordHead<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) -> bool {
         // SAFETY: called within `Simd::run`.
-        unsafe { self.0.pack::<S, S::Vector, Words>() }
+        unsafe { self.0.pack::<S, S::Vector, WordLayout>() }
     }
 }
 
@@ -47,7 +47,7 @@ impl Kernel for PairHead<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) -> bool {
         // SAFETY: called within `Simd::run`.
-        unsafe { self.0.pack::<S, S::Vector, Pairs>() }
+        unsafe { self.0.pack::<S, S::Vector, PairLayout>() }
     }
 }
 
@@ -55,7 +55,7 @@ impl Kernel for PairHead<'_> {
 ///
 /// # Safety
 /// Every method is called within [`Simd::run`] of `S`, with pointers to as many elements as it names, and room for a vector of words.
-trait Store<S: Simd> {
+trait Layout<S: Simd> {
     /// Elements in a word.
     const STEP: usize;
 
@@ -71,9 +71,9 @@ trait Store<S: Simd> {
 }
 
 /// float32.
-struct Words;
+struct WordLayout;
 
-impl<S: Simd<Vector = V>, V: Vector> Store<S> for Words {
+impl<S: Simd<Vector = V>, V: Vector> Layout<S> for WordLayout {
     const STEP: usize = 1;
 
     #[inline(always)]
@@ -86,7 +86,7 @@ impl<S: Simd<Vector = V>, V: Vector> Store<S> for Words {
     unsafe fn across(rows: [Option<*const f32>; 2], count: usize, _: u32, to: *mut u32) {
         if let Some(row) = rows[0] {
             // SAFETY: as above.
-            unsafe { <Self as Store<S>>::along(row, count, to) }
+            unsafe { <Self as Layout<S>>::along(row, count, to) }
         }
     }
 
@@ -96,10 +96,10 @@ impl<S: Simd<Vector = V>, V: Vector> Store<S> for Words {
     }
 }
 
-/// Pairs of bfloat16.
-struct Pairs;
+/// PairLayout of bfloat16.
+struct PairLayout;
 
-impl<S: Simd<Vector = V>, V: Vector> Store<S> for Pairs {
+impl<S: Simd<Vector = V>, V: Vector> Layout<S> for PairLayout {
     const STEP: usize = 2;
 
     #[inline(always)]
@@ -147,7 +147,7 @@ impl Head<'_> {
     /// # Safety
     /// Called within [`Simd::run`] of `S`.
     #[inline(always)]
-    unsafe fn pack<S: Simd<Vector = V>, V: Vector, W: Store<S>>(mut self) -> bool {
+    unsafe fn pack<S: Simd<Vector = V>, V: Vector, W: Layout<S>>(mut self) -> bool {
         // SAFETY: the caller's promise.
         unsafe {
             self.pack_keys::<S, V, W>();
@@ -158,7 +158,7 @@ impl Head<'_> {
     /// # Safety
     /// As [`Self::pack`].
     #[inline(always)]
-    unsafe fn pack_keys<S: Simd<Vector = V>, V: Vector, W: Store<S>>(&mut self) {
+    unsafe fn pack_keys<S: Simd<Vector = V>, V: Vector, W: Layout<S>>(&mut self) {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
         let len = first + self.job.keys.num_rows();
         let steps = head_dim.div_ceil(W::STEP);
@@ -166,7 +166,7 @@ impl Head<'_> {
             let keys = panel * V::LANES..(panel + 1) * V::LANES;
             // Lanes before the first key given stay.
             let (start, end) = (first.saturating_sub(keys.start), V::LANES.min(len - keys.start));
-            // Words of as many keys, a row a key, to be turned over; zeros for keys beyond the last one.
+            // WordLayout of as many keys, a row a key, to be turned over; zeros for keys beyond the last one.
             let mut square = [[0; MAX_LANES]; MAX_LANES];
             for step in (0..steps).step_by(V::LANES) {
                 for (lane, to) in square.iter_mut().enumerate().take(end).skip(start) {
@@ -190,7 +190,7 @@ impl Head<'_> {
     /// # Safety
     /// As [`Self::pack`].
     #[inline(always)]
-    unsafe fn pack_values<S: Simd<Vector = V>, V: Vector, W: Store<S>>(&mut self) -> bool {
+    unsafe fn pack_values<S: Simd<Vector = V>, V: Vector, W: Layout<S>>(&mut self) -> bool {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
         let len = first + self.job.values.num_rows();
         let width = head_dim.next_multiple_of(V::LANES);

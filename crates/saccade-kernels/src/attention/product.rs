@@ -2,12 +2,12 @@
 
 use std::marker::PhantomData;
 
-use super::arithmetic::{Arithmetic, Float32, Pairs, Stored};
+use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
 use super::mask::Mask;
 use crate::simd::{Kernel, Simd, Vector};
 
 /// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
-pub(super) struct Product {
+pub(super) struct TileProduct {
     pub rows: usize,
     /// `a`, as factors.
     pub factors: *const f32,
@@ -27,16 +27,16 @@ pub(super) struct Product {
     pub add: bool,
 }
 
-/// An [`Arithmetic`] whose products are a piece of code of their own: their tiles are many, and compilers take minutes over them.
-pub(super) trait Multiply<S: Simd>: Arithmetic<S> {
+/// An [`TileArithmetic`] whose products are a piece of code of their own: their tiles are many, and compilers take minutes over them.
+pub(super) trait Multiply<S: Simd>: TileArithmetic<S> {
     /// # Safety
-    /// As [`Product::run`].
-    unsafe fn multiply(simd: S, product: &Product);
+    /// As [`TileProduct::run`].
+    unsafe fn multiply(simd: S, product: &TileProduct);
 }
 
 impl<S: Simd, H: Stored> Multiply<S> for Float32<H> {
     #[inline(always)]
-    unsafe fn multiply(simd: S, product: &Product) {
+    unsafe fn multiply(simd: S, product: &TileProduct) {
         let held = PhantomData::<H>;
         simd.run(FloatProduct { product, held });
     }
@@ -44,13 +44,13 @@ impl<S: Simd, H: Stored> Multiply<S> for Float32<H> {
 
 impl<S: Simd> Multiply<S> for Pairs {
     #[inline(always)]
-    unsafe fn multiply(simd: S, product: &Product) {
+    unsafe fn multiply(simd: S, product: &TileProduct) {
         simd.run(PairProduct(product));
     }
 }
 
 struct FloatProduct<'a, H> {
-    product: &'a Product,
+    product: &'a TileProduct,
     held: PhantomData<H>,
 }
 
@@ -64,7 +64,7 @@ impl<H: Stored> Kernel for FloatProduct<'_, H> {
     }
 }
 
-struct PairProduct<'a>(&'a Product);
+struct PairProduct<'a>(&'a TileProduct);
 
 impl Kernel for PairProduct<'_> {
     type Output = ();
@@ -76,14 +76,14 @@ impl Kernel for PairProduct<'_> {
     }
 }
 
-impl Product {
+impl TileProduct {
     /// All of it.
     ///
     /// # Safety
     /// The pointers are valid for all rows, at most `TILE_ROWS`, for `depth` elements in whole steps and for all vectors; called within
     /// [`Simd::run`] of `S`.
     #[inline(always)]
-    unsafe fn run<S: Simd, A: Arithmetic<S>>(&self) {
+    unsafe fn run<S: Simd, A: TileArithmetic<S>>(&self) {
         // SAFETY: the caller's promise.
         unsafe {
             match self.rows {
@@ -105,7 +105,7 @@ impl Product {
     /// # Safety
     /// As [`Self::run`].
     #[inline(always)]
-    unsafe fn all<S: Simd, A: Arithmetic<S>, const MR: usize>(&self) {
+    unsafe fn all<S: Simd, A: TileArithmetic<S>, const MR: usize>(&self) {
         let most = S::Vector::TILE_VECTORS;
         let groups = self.vectors.div_ceil(most);
         for group in 0..groups {
@@ -129,7 +129,7 @@ impl Product {
     /// # Safety
     /// As [`Self::run`].
     #[inline(always)]
-    unsafe fn tile<S: Simd<Vector = V>, V: Vector, A: Arithmetic<S>, const MR: usize, const NV: usize>(
+    unsafe fn tile<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>, const MR: usize, const NV: usize>(
         &self,
         first: usize,
     ) {
@@ -176,7 +176,7 @@ impl Product {
     /// # Safety
     /// As [`Self::run`].
     #[inline(always)]
-    pub(super) unsafe fn without_removed<S: Simd<Vector = V>, V: Vector, A: Arithmetic<S>>(
+    pub(super) unsafe fn without_removed<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>>(
         &self,
         removed: &Removed<'_>,
     ) {

@@ -1,6 +1,6 @@
 //! The stable softmax of one query over blocks of keys, with a running maximum and sum.
 
-use super::arithmetic::Arithmetic;
+use super::arithmetic::TileArithmetic;
 use super::mask::Mask;
 use crate::simd::{Simd, Vector, load};
 
@@ -32,7 +32,7 @@ impl Row<'_> {
     /// # Safety
     /// `scores` points to the block's scores in whole pairs of vectors, the last of which may be missing; called within [`Simd::run`] of `S`.
     #[inline(always)]
-    pub(super) unsafe fn softmax<S: Simd<Vector = V>, V: Vector, A: Arithmetic<S>>(
+    pub(super) unsafe fn softmax<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>>(
         &self,
         scores: *mut f32,
         running: &mut Running,
@@ -93,7 +93,7 @@ impl Row<'_> {
     /// # Safety
     /// `factors` are what [`Self::softmax`] left; `weights` points to an element for every key; called within [`Simd::run`] of `S`.
     #[inline(always)]
-    pub(super) unsafe fn keep_weights<S: Simd, A: Arithmetic<S>>(
+    pub(super) unsafe fn keep_weights<S: Simd, A: TileArithmetic<S>>(
         &self,
         factors: *const f32,
         rescale: f32,

@@ -1,11 +1,12 @@
 //! A few queries of one head: scores, softmax and the value product, block of keys by block of keys, on the stack and in registers.
 
 use std::mem::MaybeUninit;
+use std::ops::Range;
 
-use super::arithmetic::{Arithmetic, Float32, Pairs, Plain, Widened};
+use super::arithmetic::{Float32, HeldBf16, HeldF32, Pairs, TileArithmetic};
 use super::keys_values::PackedKeyValues;
 use super::mask::Mask;
-use super::product::{Multiply, Product, Removed};
+use super::product::{Multiply, Removed, TileProduct};
 use super::softmax::{Row, Running};
 use crate::simd::{Dot, Dots, Kernel, MAX_TILE_ROWS, Simd, Vector, load, store};
 
@@ -18,7 +19,7 @@ const MAX_VALUES: usize = 256;
 /// Elements of the queries that are on the stack at a time: an even number of whole vectors. Wider heads take more passes.
 const MAX_DEPTH: usize = 256;
 
-pub(super) struct Job<'a> {
+pub(super) struct Call<'a> {
     pub kv: &'a PackedKeyValues,
     /// Consecutive heads of queries that share a head of keys and values.
     pub heads_per_kv_head: usize,
@@ -33,21 +34,21 @@ pub(super) struct Job<'a> {
 }
 
 // SAFETY: tasks read the queries and write different (head, query) parts of `out` and `weights`; all views are borrowed for the whole call.
-unsafe impl Sync for Job<'_> {}
+unsafe impl Sync for Call<'_> {}
 
 /// A few queries of one head.
-pub(super) struct Tile<'a> {
-    pub job: &'a Job<'a>,
+pub(super) struct QueryTile<'a> {
+    pub call: &'a Call<'a>,
     pub head: usize,
     pub first: usize,
     pub rows: usize,
 }
 
 /// A tile of float32 keys and values.
-pub(super) struct FloatTile<'a>(pub Tile<'a>);
+pub(super) struct FloatTile<'a>(pub QueryTile<'a>);
 
 /// A tile of bfloat16 keys and values.
-pub(super) struct Bf16Tile<'a>(pub Tile<'a>);
+pub(super) struct Bf16Tile<'a>(pub QueryTile<'a>);
 
 impl Kernel for FloatTile<'_> {
     type Output = ();
@@ -55,7 +56,7 @@ impl Kernel for FloatTile<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self, simd: S) {
         // SAFETY: called within `Simd::run`; keys and values are float32.
-        unsafe { self.0.run_as::<S, Float32<Plain>>(simd) }
+        unsafe { self.0.run_as::<S, Float32<HeldF32>>(simd) }
     }
 }
 
@@ -70,24 +71,24 @@ impl Kernel for Bf16Tile<'_> {
             if S::Dots::HAS_BF16 {
                 self.0.run_as::<S, Pairs>(simd);
             } else {
-                self.0.run_as::<S, Float32<Widened>>(simd);
+                self.0.run_as::<S, Float32<HeldBf16>>(simd);
             }
         }
     }
 }
 
-impl Tile<'_> {
+impl QueryTile<'_> {
     /// # Safety
     /// Called within [`Simd::run`] of `S`; keys and values are held as `A` reads them.
     #[inline(always)]
     unsafe fn run_as<S: Simd, A: Multiply<S>>(&self, simd: S) {
-        let dims = self.job.kv.head_dim();
+        let dims = self.call.kv.head_dim();
         for first in (0..dims).step_by(MAX_VALUES) {
             let columns = Columns {
                 first,
                 count: MAX_VALUES.min(dims - first),
             };
-            // SAFETY: the rows and columns are in the job's views; the rest is the caller's promise.
+            // SAFETY: the rows and columns are in the call's views; the rest is the caller's promise.
             unsafe { attend::<S, S::Vector, A>(simd, self, &columns) }
         }
     }
@@ -117,14 +118,14 @@ impl<const N: usize> Scratch<N> {
 /// Attention of a tile's queries.
 ///
 /// # Safety
-/// The tile's rows and the columns are in the job's views; called within [`Simd::run`] of `S`; keys and values are held as `A` reads them.
+/// The tile's rows and the columns are in the call's views; called within [`Simd::run`] of `S`; keys and values are held as `A` reads them.
 #[inline(always)]
 unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
     simd: S,
-    tile: &Tile<'_>,
+    tile: &QueryTile<'_>,
     columns: &Columns,
 ) {
-    let (job, kv) = (tile.job, tile.job.kv);
+    let (call, kv) = (tile.call, tile.call.kv);
     let (len, padded) = (kv.len(), columns.count.next_multiple_of(V::LANES));
     let value_width = kv.value_width();
     let mut factors = Scratch::<{ MAX_TILE_ROWS * MAX_DEPTH }>::new();
@@ -138,17 +139,12 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
         sum: 0.0,
     }; MAX_TILE_ROWS];
     let running = &mut running[..tile.rows];
-    let block = match (job.mask, len.div_ceil(KEY_BLOCK)) {
-        // Where a block ends must not depend on how many keys follow.
-        (Mask::Causal { .. }, _) | (_, 0) => KEY_BLOCK,
-        // Blocks of equal size, so that the last one is not a small rest.
-        (_, blocks) => len.div_ceil(blocks).next_multiple_of(V::LANES),
-    };
+    let block = keys_of_block(&call.mask, len, V::LANES);
     // Keys beyond are seen by none of these queries.
-    let visible = job.mask.visible(tile.first + tile.rows - 1, len);
-    let kv_head = tile.head / job.heads_per_kv_head;
-    // SAFETY: the scratch holds as many rows as a tile may have, of MAX_DEPTH factors, KEY_BLOCK probabilities and `padded` sums; blocks end at the last key, whose
-    // vector is padded in the keys; everything else is the caller's promise.
+    let visible = call.mask.visible(tile.first + tile.rows - 1, len);
+    let kv_head = tile.head / call.heads_per_kv_head;
+    // SAFETY: the scratch holds as many rows as a tile may have, of MAX_DEPTH factors, KEY_BLOCK probabilities and `padded` sums; blocks end
+    // at the last key or before it, and its vector is padded in the keys; everything else is the caller's promise.
     unsafe {
         for i in (0..tile.rows * padded).step_by(V::LANES) {
             V::splat(0.0).store(sums.add(i));
@@ -157,31 +153,10 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
         let values = kv.head_values(kv_head).as_ptr();
         for first in (0..visible).step_by(block) {
             let count = block.min(visible - first);
-            for from in (0..kv.head_dim()).step_by(MAX_DEPTH) {
-                let depth = MAX_DEPTH.min(kv.head_dim() - from);
-                // The queries stay for all blocks, unless they are too wide.
-                if first == 0 || kv.head_dim() > MAX_DEPTH {
-                    tile.queries::<S, V, A>(from, depth, factors);
-                }
-                let steps = kv.head_dim().div_ceil(A::STEP);
-                let product = Product {
-                    rows: tile.rows,
-                    factors,
-                    factors_stride: MAX_DEPTH,
-                    b: keys.add(first * steps + from / A::STEP * V::LANES),
-                    b_step: V::LANES,
-                    b_vector: V::LANES * steps,
-                    depth,
-                    out: probabilities,
-                    out_stride: KEY_BLOCK,
-                    vectors: count.div_ceil(V::LANES),
-                    add: from > 0,
-                };
-                A::multiply(simd, &product);
-            }
+            tile.scores::<S, V, A>(simd, keys, first..first + count, factors, probabilities);
             for (r, running) in running.iter_mut().enumerate() {
                 let row = Row {
-                    mask: &job.mask,
+                    mask: &call.mask,
                     head: tile.head,
                     query: tile.first + r,
                     len,
@@ -191,7 +166,7 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
                 let probabilities = probabilities.add(r * KEY_BLOCK);
                 let rescale = row.softmax::<S, V, A>(probabilities, running);
                 if columns.first == 0
-                    && let Some(weights) = job.weights(tile.head, tile.first + r)
+                    && let Some(weights) = call.weights(tile.head, tile.first + r)
                 {
                     row.keep_weights::<S, A>(probabilities, rescale, weights);
                 }
@@ -200,7 +175,7 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
                     V::load(at).mul(V::splat(rescale)).store(at);
                 }
             }
-            let product = Product {
+            let product = TileProduct {
                 rows: tile.rows,
                 factors: probabilities,
                 factors_stride: KEY_BLOCK,
@@ -213,11 +188,11 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
                 vectors: padded / V::LANES,
                 add: true,
             };
-            if kv.is_finite() || matches!(job.mask, Mask::None) {
+            if kv.is_finite() || matches!(call.mask, Mask::None) {
                 A::multiply(simd, &product);
             } else {
                 let removed = Removed {
-                    mask: &job.mask,
+                    mask: &call.mask,
                     head: tile.head,
                     first_query: tile.first,
                     first_key: first,
@@ -226,50 +201,121 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
                 product.without_removed::<S, V, A>(&removed);
             }
         }
+        tile.results::<V>(columns, running, sums, padded);
+    }
+}
+
+/// Keys between two updates of the running maximum.
+fn keys_of_block(mask: &Mask<'_>, len: usize, lanes: usize) -> usize {
+    match (mask, len.div_ceil(KEY_BLOCK)) {
+        // Where a block ends must not depend on how many keys follow.
+        (Mask::Causal { .. }, _) | (_, 0) => KEY_BLOCK,
+        // Blocks of equal size, so that the last one is not a small rest.
+        (_, blocks) => len.div_ceil(blocks).next_multiple_of(lanes),
+    }
+}
+
+impl QueryTile<'_> {
+    /// The scores of the keys in `block`, in rows of [`KEY_BLOCK`]; `factors` is memory for the queries.
+    ///
+    /// # Safety
+    /// As [`attend`]. `keys` points to those of the head; `factors` and `scores` have room for the tile.
+    #[inline(always)]
+    unsafe fn scores<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
+        &self,
+        simd: S,
+        keys: *const u32,
+        block: Range<usize>,
+        factors: *mut f32,
+        scores: *mut f32,
+    ) {
+        let head_dim = self.call.kv.head_dim();
+        for from in (0..head_dim).step_by(MAX_DEPTH) {
+            let depth = MAX_DEPTH.min(head_dim - from);
+            // SAFETY: the caller's promise.
+            unsafe {
+                // The queries stay for all blocks, unless they are too wide.
+                if block.start == 0 || head_dim > MAX_DEPTH {
+                    self.queries::<S, V, A>(from, depth, factors);
+                }
+                let steps = head_dim.div_ceil(A::STEP);
+                let product = TileProduct {
+                    rows: self.rows,
+                    factors,
+                    factors_stride: MAX_DEPTH,
+                    b: keys.add(block.start * steps + from / A::STEP * V::LANES),
+                    b_step: V::LANES,
+                    b_vector: V::LANES * steps,
+                    depth,
+                    out: scores,
+                    out_stride: KEY_BLOCK,
+                    vectors: block.len().div_ceil(V::LANES),
+                    add: from > 0,
+                };
+                A::multiply(simd, &product);
+            }
+        }
+    }
+
+    /// Divides the sums, in rows of `padded` elements, by those of the probabilities, and the probabilities as well if they are wanted.
+    ///
+    /// # Safety
+    /// As [`attend`]. `sums` holds the tile.
+    #[inline(always)]
+    unsafe fn results<V: Vector>(
+        &self,
+        columns: &Columns,
+        running: &[Running],
+        sums: *const f32,
+        padded: usize,
+    ) {
+        let (call, len) = (self.call, self.call.kv.len());
+        let visible = call.mask.visible(self.first + self.rows - 1, len);
         for (r, running) in running.iter().enumerate() {
             // Nothing was added where no key is left: zeros divided by one.
             let divisor = if running.sum == 0.0 { 1.0 } else { running.sum };
-            let out = job.out.offset((tile.first + r) as isize * job.out_stride);
-            let out = out.add(tile.head * kv.head_dim() + columns.first);
-            for i in (0..columns.count).step_by(V::LANES) {
-                let value = V::load(sums.add(r * padded + i)).div(V::splat(divisor));
-                store(value, out.add(i), V::LANES.min(columns.count - i));
-            }
-            if columns.first == 0
-                && let Some(weights) = job.weights(tile.head, tile.first + r)
-            {
-                weights.add(visible).write_bytes(0, len - visible);
-                for i in (0..visible).step_by(V::LANES) {
-                    let (at, lanes) = (weights.add(i), V::LANES.min(visible - i));
-                    store(load::<V>(at, lanes).div(V::splat(divisor)), at, lanes);
+            // SAFETY: the caller's promise; a row of the weights has an element for every key.
+            unsafe {
+                let out = call.out.offset((self.first + r) as isize * call.out_stride);
+                let out = out.add(self.head * call.kv.head_dim() + columns.first);
+                for i in (0..columns.count).step_by(V::LANES) {
+                    let value = V::load(sums.add(r * padded + i)).div(V::splat(divisor));
+                    store(value, out.add(i), V::LANES.min(columns.count - i));
+                }
+                if columns.first == 0
+                    && let Some(weights) = call.weights(self.head, self.first + r)
+                {
+                    weights.add(visible).write_bytes(0, len - visible);
+                    for i in (0..visible).step_by(V::LANES) {
+                        let (at, lanes) = (weights.add(i), V::LANES.min(visible - i));
+                        store(load::<V>(at, lanes).div(V::splat(divisor)), at, lanes);
+                    }
                 }
             }
         }
     }
-}
 
-impl Tile<'_> {
     /// The scaled queries, columns `from .. from + depth` of the head, as factors in rows of [`MAX_DEPTH`]; zeros follow to whole pairs of
     /// vectors.
     ///
     /// # Safety
-    /// The tile's rows and the columns are in the job's views; called within [`Simd::run`] of `S`.
+    /// The tile's rows and the columns are in the call's views; called within [`Simd::run`] of `S`.
     #[inline(always)]
-    unsafe fn queries<S: Simd<Vector = V>, V: Vector, A: Arithmetic<S>>(
+    unsafe fn queries<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>>(
         &self,
         from: usize,
         depth: usize,
         factors: *mut f32,
     ) {
-        let scale = self.job.scale;
+        let scale = self.call.scale;
         for r in 0..self.rows {
             // SAFETY: the caller's promise; no more lanes are read than the row has.
             unsafe {
                 let row = self
-                    .job
+                    .call
                     .queries
-                    .offset((self.first + r) as isize * self.job.queries_stride)
-                    .add(self.head * self.job.kv.head_dim() + from);
+                    .offset((self.first + r) as isize * self.call.queries_stride)
+                    .add(self.head * self.call.kv.head_dim() + from);
                 let scaled = |i: usize| {
                     let lanes = V::LANES.min(depth.saturating_sub(i));
                     load::<V>(row.wrapping_add(i), lanes).mul(V::splat(scale))
@@ -287,7 +333,7 @@ impl Tile<'_> {
     }
 }
 
-impl Job<'_> {
+impl Call<'_> {
     /// Where a row's weights begin, if they are wanted.
     #[inline(always)]
     fn weights(&self, head: usize, query: usize) -> Option<*mut f32> {

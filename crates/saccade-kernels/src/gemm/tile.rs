@@ -124,7 +124,7 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
             let (first, end) = (block.tiles.first_row(number), block.tiles.first_row(number + 1));
             // SAFETY: the caller's promise; the tile is within the rows, and its sums within the block's.
             unsafe {
-                let tile = Tile {
+                let tile = RowTile {
                     row: first,
                     sums: block.sums.add((first - first_row) * NV * V::LANES),
                     tile: number - tiles.start,
@@ -147,7 +147,7 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
 }
 
 /// A tile: its first row, where its sums go, and its number among those of the block.
-struct Tile {
+struct RowTile {
     row: usize,
     sums: *mut u32,
     tile: usize,
@@ -162,7 +162,7 @@ struct Tile {
 unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize, const MR: usize>(
     block: &Block<'_>,
     part: &Range<usize>,
-    tile: &Tile,
+    tile: &RowTile,
 ) {
     // SAFETY: the caller's promise for all pointers below; prefetching is allowed at any address.
     unsafe {
@@ -192,7 +192,7 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
         loop {
             let end = part.end.min(first + P::PART_STEPS);
             let mut acc = [[P::zero(); NV]; MR];
-            // Rows that are read where they lie may end within the last step.
+            // Rows that are not converted may end within the last step.
             let whole = end.min(block.in_features / P::STEP);
             // Few rows leave little time: a step's share is then longer than a cache line. The loops are apart because one register more
             // for the general case makes the common one spill.

@@ -94,7 +94,7 @@ impl Finish<'_> {
     /// # Safety
     /// As [`Self::of`].
     #[inline(always)]
-    unsafe fn each<V: Vector, M: Sums, R: Result>(&self) {
+    unsafe fn each<V: Vector, M: Sums, R: Finishing>(&self) {
         for vector in 0..self.width.div_ceil(V::LANES) {
             let column = vector * V::LANES;
             let lanes = V::LANES.min(self.width - column);
@@ -189,7 +189,7 @@ impl Sums for Int8Sums {
 }
 
 /// What an [`Epilogue`] makes of a vector of sums with their bias.
-trait Result {
+trait Finishing {
     /// # Safety
     /// Called within [`Simd::run`] with the vectors of `V`; `out` points to `lanes` elements.
     unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V;
@@ -200,14 +200,14 @@ struct Activated<A>(PhantomData<A>);
 struct Add;
 struct Mul;
 
-impl Result for Store {
+impl Finishing for Store {
     #[inline(always)]
     unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
         value
     }
 }
 
-impl<A: Activation> Result for Activated<A> {
+impl<A: Activation> Finishing for Activated<A> {
     #[inline(always)]
     unsafe fn of<V: Vector>(value: V, _: *const f32, _: usize) -> V {
         // SAFETY: the caller's promise.
@@ -215,7 +215,7 @@ impl<A: Activation> Result for Activated<A> {
     }
 }
 
-impl Result for Add {
+impl Finishing for Add {
     #[inline(always)]
     unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V {
         // SAFETY: the caller's promise.
@@ -223,7 +223,7 @@ impl Result for Add {
     }
 }
 
-impl Result for Mul {
+impl Finishing for Mul {
     #[inline(always)]
     unsafe fn of<V: Vector>(value: V, out: *const f32, lanes: usize) -> V {
         // SAFETY: the caller's promise.

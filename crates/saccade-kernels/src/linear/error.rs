@@ -37,7 +37,7 @@ pub enum KernelError {
         /// Its scales.
         given: usize,
     },
-    /// A sum of so many products could overflow.
+    /// A sum of that many products could overflow.
     #[error("int8 arithmetic takes at most {MAX_INT8_INPUTS} in_features, got {given}")]
     TooManyInputs {
         /// Of the parts.

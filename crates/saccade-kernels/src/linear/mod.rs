@@ -254,7 +254,7 @@ impl PackedLinear {
     /// Runs the tiles in `range` through panel number `panel`; this thread will probably take the one `ahead` of it next.
     fn run_panel(&self, call: &Call<'_>, range: Range<usize>, columns: usize, panel: usize, ahead: usize) {
         #[repr(align(64))]
-        struct Sums([MaybeUninit<u32>; MAX_SUMS]);
+        struct SumBuffer([MaybeUninit<u32>; MAX_SUMS]);
 
         let size = self.gemm.panel_words(self.in_features);
         let first = panel * columns;
@@ -264,7 +264,7 @@ impl PackedLinear {
             "a block of {} rows and {columns} columns",
             rows.len()
         );
-        let mut sums = Sums([const { MaybeUninit::uninit() }; MAX_SUMS]);
+        let mut sums = SumBuffer([const { MaybeUninit::uninit() }; MAX_SUMS]);
         let sums = sums.0.as_mut_ptr().cast::<u32>();
         let out = call.out.wrapping_add(first);
         let block = Block {

@@ -66,7 +66,7 @@ impl LinearScratch {
         } else {
             threads
         };
-        let job = Job(Source {
+        let source = SharedSource(Source {
             x: x.as_ptr(),
             x_stride: x.row_stride() as isize,
             in_features: width,
@@ -74,10 +74,10 @@ impl LinearScratch {
             quantized: self.quantized.as_mut_ptr(),
         });
         parallel_for(threads, tasks, &|task| {
-            let job = &job;
+            let source = &source;
             let first = |task| rows.min(groups * task / tasks * shape.row_group);
             // SAFETY: tasks have different groups of rows, for which there is room.
-            unsafe { gemm.convert(&job.0, first(task)..first(task + 1)) };
+            unsafe { gemm.convert(&source.0, first(task)..first(task + 1)) };
         });
         Ok(Converted {
             words: self.words.as_ptr(),
@@ -92,7 +92,7 @@ impl Default for LinearScratch {
     }
 }
 
-struct Job(Source);
+struct SharedSource(Source);
 
 // SAFETY: tasks read `x` and write different rows of the scratch, both borrowed for the whole call.
-unsafe impl Sync for Job {}
+unsafe impl Sync for SharedSource {}

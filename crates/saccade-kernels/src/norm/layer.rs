@@ -47,7 +47,7 @@ pub fn layer_norm(
     if rows == 0 || width == 0 {
         return;
     }
-    let job = Job {
+    let call = LayerNorm {
         x: x.as_ptr(),
         x_stride: x.row_stride() as isize,
         out_stride: out.row_stride() as isize,
@@ -59,15 +59,15 @@ pub fn layer_norm(
     let (threads, tasks) = split(threads, rows, width);
     parallel_for(threads, tasks, &|task| {
         let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        isa.run(Part {
-            job: &job,
+        isa.run(LayerNormRows {
+            call: &call,
             first,
             end,
         });
     });
 }
 
-struct Job<'a> {
+struct LayerNorm<'a> {
     x: *const f32,
     x_stride: isize,
     out: *mut f32,
@@ -78,15 +78,15 @@ struct Job<'a> {
 }
 
 // SAFETY: tasks read `x` and write different rows of `out`; both views are borrowed for the whole call.
-unsafe impl Sync for Job<'_> {}
+unsafe impl Sync for LayerNorm<'_> {}
 
-struct Part<'a> {
-    job: &'a Job<'a>,
+struct LayerNormRows<'a> {
+    call: &'a LayerNorm<'a>,
     first: usize,
     end: usize,
 }
 
-impl Kernel for Part<'_> {
+impl Kernel for LayerNormRows<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -94,37 +94,37 @@ impl Kernel for Part<'_> {
         for row in self.first..self.end {
             // SAFETY: rows are within the views; the caller has the instruction set.
             unsafe {
-                let x = self.job.x.offset(row as isize * self.job.x_stride);
-                let out = self.job.out.offset(row as isize * self.job.out_stride);
-                norm_row::<S::Vector>(self.job, x, out);
+                let x = self.call.x.offset(row as isize * self.call.x_stride);
+                let out = self.call.out.offset(row as isize * self.call.out_stride);
+                norm_row::<S::Vector>(self.call, x, out);
             }
         }
     }
 }
 
 /// # Safety
-/// `x` and `out` point to `job.width` elements; the CPU has the instruction set of `V`.
+/// `x` and `out` point to `call.width` elements; the CPU has the instruction set of `V`.
 #[inline(always)]
-unsafe fn norm_row<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
-    let width = job.width;
+unsafe fn norm_row<V: Vector>(call: &LayerNorm<'_>, x: *const f32, out: *mut f32) {
+    let width = call.width;
     let columns = width as f32;
-    // SAFETY: vectors lie within the first `width` elements, the last one is partial; scale and shift are as long.
+    // SAFETY: vectors are within the first `width` elements, the last one is partial; scale and shift are as long.
     unsafe {
         let (total, _) = sums::<V>(x, width, 0.0);
         let mean = total / columns;
-        // What the distances from the mean add up to is the error of the mean, which matters where it is large beside them.
+        // What the distances from the mean add up to is the error of the mean, which matters where the mean is large compared with them.
         let (distances, squares) = sums::<V>(x, width, mean);
         let error = distances / columns;
         let variance = (squares - distances * error) / columns;
         let row = Normed {
             mean: V::splat(mean),
             error: V::splat(error),
-            factor: V::splat(1.0 / (variance + job.eps).sqrt()),
+            factor: V::splat(1.0 / (variance + call.eps).sqrt()),
         };
         for i in (0..width).step_by(V::LANES) {
             let lanes = V::LANES.min(width - i);
             let y = row.of(load::<V>(x.add(i), lanes));
-            let y = match job.scale_shift {
+            let y = match call.scale_shift {
                 Some((scale, shift)) => {
                     let scale = load::<V>(scale.as_ptr().add(i), lanes);
                     y.fma(scale, load(shift.as_ptr().add(i), lanes))

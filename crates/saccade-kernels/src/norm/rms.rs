@@ -29,7 +29,7 @@ pub fn rms_norm(isa: Isa, threads: usize, x: Rows<'_>, eps: f32, weight: &[f32],
         (x.num_rows(), x.num_columns()),
         "out: expected the shape of x"
     );
-    let job = Job {
+    let call = RmsNorm {
         x: x.as_ptr(),
         x_stride: x.row_stride(),
         out_stride: out.row_stride(),
@@ -38,7 +38,7 @@ pub fn rms_norm(isa: Isa, threads: usize, x: Rows<'_>, eps: f32, weight: &[f32],
         eps,
         weight,
     };
-    run(isa, threads, x.num_rows(), &job);
+    run(isa, threads, x.num_rows(), &call);
 }
 
 /// [`rms_norm`] where the results replace the rows.
@@ -47,7 +47,7 @@ pub fn rms_norm(isa: Isa, threads: usize, x: Rows<'_>, eps: f32, weight: &[f32],
 /// As [`rms_norm`].
 pub fn rms_norm_in_place(isa: Isa, threads: usize, mut x: RowsMut<'_>, eps: f32, weight: &[f32]) {
     let to = x.as_mut_ptr();
-    let job = Job {
+    let call = RmsNorm {
         x: to,
         x_stride: x.row_stride(),
         out_stride: x.row_stride(),
@@ -56,10 +56,10 @@ pub fn rms_norm_in_place(isa: Isa, threads: usize, mut x: RowsMut<'_>, eps: f32,
         eps,
         weight,
     };
-    run(isa, threads, x.num_rows(), &job);
+    run(isa, threads, x.num_rows(), &call);
 }
 
-struct Job<'a> {
+struct RmsNorm<'a> {
     /// May be `out`.
     x: *const f32,
     x_stride: usize,
@@ -72,45 +72,45 @@ struct Job<'a> {
 }
 
 // SAFETY: tasks read and write different rows; the views are borrowed for the whole call.
-unsafe impl Sync for Job<'_> {}
+unsafe impl Sync for RmsNorm<'_> {}
 
-fn run(isa: Isa, threads: usize, rows: usize, job: &Job<'_>) {
+fn run(isa: Isa, threads: usize, rows: usize, call: &RmsNorm<'_>) {
     isa.check();
-    if rows == 0 || job.width == 0 {
+    if rows == 0 || call.width == 0 {
         return;
     }
     assert!(
-        job.width.is_multiple_of(job.weight.len()),
+        call.width.is_multiple_of(call.weight.len()),
         "weight: expected {} elements, or a divisor of that, got {}",
-        job.width,
-        job.weight.len()
+        call.width,
+        call.weight.len()
     );
-    let (threads, tasks) = split(threads, rows, job.width);
+    let (threads, tasks) = split(threads, rows, call.width);
     parallel_for(threads, tasks, &|task| {
         let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        isa.run(Part { job, first, end });
+        isa.run(RmsNormRows { call, first, end });
     });
 }
 
-struct Part<'a> {
-    job: &'a Job<'a>,
+struct RmsNormRows<'a> {
+    call: &'a RmsNorm<'a>,
     first: usize,
     end: usize,
 }
 
-impl Kernel for Part<'_> {
+impl Kernel for RmsNormRows<'_> {
     type Output = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) {
-        let job = self.job;
+        let call = self.call;
         for row in self.first..self.end {
-            for head in (0..job.width).step_by(job.weight.len()) {
+            for head in (0..call.width).step_by(call.weight.len()) {
                 // SAFETY: rows are within the views, heads within rows.
                 unsafe {
-                    let x = job.x.add(row * job.x_stride + head);
-                    let out = job.out.add(row * job.out_stride + head);
-                    norm_head::<S::Vector>(job, x, out);
+                    let x = call.x.add(row * call.x_stride + head);
+                    let out = call.out.add(row * call.out_stride + head);
+                    norm_head::<S::Vector>(call, x, out);
                 }
             }
         }
@@ -121,13 +121,13 @@ impl Kernel for Part<'_> {
 /// Called within [`Simd::run`] with the vectors of `V`. `x` and `out` point to as many elements as the weight has; they are the same, or do
 /// not overlap.
 #[inline(always)]
-unsafe fn norm_head<V: Vector>(job: &Job<'_>, x: *const f32, out: *mut f32) {
-    let width = job.weight.len();
-    let weight = job.weight.as_ptr();
-    // SAFETY: vectors lie within the first `width` elements, the last one is partial. Each is read before it is written.
+unsafe fn norm_head<V: Vector>(call: &RmsNorm<'_>, x: *const f32, out: *mut f32) {
+    let width = call.weight.len();
+    let weight = call.weight.as_ptr();
+    // SAFETY: vectors are within the first `width` elements, the last one is partial. Each is read before it is written.
     unsafe {
         let mean = squares::<V>(x, width) / width as f32;
-        let factor = V::splat(1.0 / (mean + job.eps).sqrt());
+        let factor = V::splat(1.0 / (mean + call.eps).sqrt());
         for i in (0..width).step_by(V::LANES) {
             let lanes = V::LANES.min(width - i);
             let y = load::<V>(x.add(i), lanes).mul(factor);

@@ -1,13 +1,14 @@
 //! The private thread pool: one loop over tasks, shared by the caller and by workers that live as long as the process.
 //!
-//! Nothing is started until a call wants more than one thread. A call puts a [`Job`] that lives on its own stack into one of a few slots,
-//! wakes workers, and takes tasks itself; tasks are dealt from one counter, so that whoever is free takes the next. The caller never
-//! waits for a worker that has not begun: it needs only itself to finish, then closes the slot and waits for those that are inside.
+//! No thread is started until a call wants more than one. A call puts a [`Job`] on its own stack, offers it in one of a few slots, wakes
+//! workers, and takes tasks itself. Tasks are dealt from one counter: whichever thread is free takes the next. The caller never waits for a
+//! worker that has not begun. When no task is left it closes the slot, and waits only for the workers that are still inside.
 //!
-//! On a machine with more to run than cores a worker can lose its core within a task, and then the caller waits for a scheduler's tick (4 ms
-//! here). It sleeps meanwhile, as idle workers do: on Linux a thread that sleeps keeps what is due to it, and one that is woken runs soon,
-//! so that caller and workers come to run at the same time and to pause at the same time. Measured on 2 cores with 2 busy processes, 328 tasks of
-//! 60 us in 5 loops: 2.12 times as long as alone, where 2.0 is the fair share; 2.5 with a caller that spins and yields.
+//! On a machine with more runnable threads than cores, a worker can lose its core within a task; the caller then waits for a tick of the
+//! scheduler (4 ms here). It sleeps while it waits, as idle workers do. On Linux a sleeping thread keeps its share of processor time, and
+//! runs soon after it is woken, so that caller and workers tend to run at the same time and to pause at the same time. Measured on 2 cores with 2
+//! busy processes, 328 tasks of 60 us in 5 loops: 2.12 times as long as alone, where 2.0 is the fair share; 2.5 with a caller that spins and
+//! yields.
 
 mod interrupt;
 mod place;
@@ -26,20 +27,20 @@ use interrupt::Scope;
 use place::Place;
 use slot::{Job, Slot, lock};
 
-/// Calls that can have workers at the same time; more of them run on their own thread only.
+/// Calls that can have workers at the same time. A call beyond them runs on its own thread only.
 const SLOTS: usize = 8;
 
 /// How long a worker without work spins before it sleeps: about the longest pause between two loops of one forward pass.
 /// Waking a sleeping thread costs some 5 us of the caller's time, and as much again until it runs.
 const SPIN: Duration = Duration::from_micros(50);
 
-/// How long a caller spins at most for workers inside, whatever its tasks took: some hundredths of a scheduler's slice.
+/// The longest time that a caller spins for workers that are inside: a few hundredths of a scheduler's time slice.
 const LONGEST_WAIT: Duration = Duration::from_micros(500);
 
-/// Upper bound of threads a call can have; a guard against nonsense, not a limit that anyone meets.
+/// The most threads that a call can have: a guard against absurd requests.
 const MAX_THREADS: usize = 1024;
 
-/// Address space that must be left for a thread to be started: more than the allocator may still hold from before.
+/// Address space that must be free before a thread is started: more than the allocator keeps of what was freed before.
 const THREAD_ROOM: usize = 80 << 20;
 
 struct Pool {
@@ -68,7 +69,7 @@ impl Pool {
         }
     }
 
-    /// Sees to it that there are this many workers, as far as the system grants them.
+    /// Starts workers until there are `wanted`, or the system refuses one.
     fn start_workers(&'static self, wanted: usize) {
         while self.workers.load(Ordering::Relaxed) < wanted {
             let take = |count: usize| (count < wanted).then_some(count + 1);
@@ -78,18 +79,18 @@ impl Pool {
             else {
                 return;
             };
-            // Where the system grants a stack and little more, the standard library aborts the process as the thread begins.
+            // If the system grants a stack and little more, the standard library aborts the process when the thread begins.
             let has_room = Vec::<u8>::new().try_reserve_exact(THREAD_ROOM).is_ok();
             let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));
             if !has_room || thread.spawn(|| self.work()).is_err() {
-                // The caller manages with those that there are; a later call tries again.
+                // The call uses the threads that there are; a later call tries again.
                 self.workers.fetch_sub(1, Ordering::Relaxed);
                 return;
             }
         }
     }
 
-    /// What a worker does all its life.
+    /// What a worker does, for as long as the process runs.
     fn work(&self) -> ! {
         INSIDE.set(true);
         let mut place = Place::new();
@@ -218,11 +219,11 @@ fn pool() -> &'static Pool {
 
 /// Runs `f(task)` for every `task` in `0..tasks`, on up to `threads` threads of which the caller is one.
 ///
-/// Tasks are dealt one by one to whoever is free. With one thread, one task, or within a task of another loop, everything runs on the
+/// Tasks are dealt one by one to threads that are free. With one thread, one task, or within a task of another loop, everything runs on the
 /// calling thread and nothing is started. The pool belongs to the process and may be used from many threads at once, after `fork`, and
 /// with more threads than there are cores. Once its threads run, a call allocates nothing.
 ///
-/// Within [`interruptible`] some tasks may not run: then the result is not used.
+/// Within [`interruptible`], once it is to stop, the remaining tasks do not run.
 ///
 /// # Panics
 /// If a task panics: with the first panic, once all other tasks are done.

@@ -1,7 +1,7 @@
 //! Where a worker runs: not on the processor of the thread that it helps.
 //!
-//! When every processor is busy, Linux likes to put a thread that is woken beside the one that woke it. Caller and worker then take turns on
-//! one processor while other programs have the rest. Measured on 2 cores with 2 busy processes: 40 % of the time so, until a worker that
+//! When every processor is busy, Linux tends to put a thread that is woken on the processor of the thread that woke it. Caller and worker then
+//! take turns on one processor while other programs have the rest. Measured on 2 cores with 2 busy processes: 40 % of the time so, until a worker that
 //! finds itself there asks to be moved; then under 1 %.
 
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 /// A worker asks at most this often: where it is not granted, asking costs no more than a hundredth of the time.
 const PATIENCE: Duration = Duration::from_millis(1);
 
-/// The processor that runs the calling thread, where the system tells.
+/// The processor that runs the calling thread, if the system reports it.
 pub(super) fn processor() -> Option<usize> {
     #[cfg(target_os = "linux")]
     {
@@ -60,7 +60,7 @@ mod linux {
 
     /// The processors that the calling thread may use. None on a machine with more of them than the set can hold.
     pub(super) fn allowed() -> Option<cpu_set_t> {
-        // SAFETY: a set of bits, for which zeros are valid; it lives during the call, which is told its size.
+        // SAFETY: a set of bits, for which zeros are valid; it lives during the call, which gets its size.
         unsafe {
             let mut set: cpu_set_t = std::mem::zeroed();
             (sched_getaffinity(0, size_of::<cpu_set_t>(), &raw mut set) == 0).then_some(set)
@@ -68,7 +68,7 @@ mod linux {
     }
 
     fn allow(set: &cpu_set_t) -> bool {
-        // SAFETY: the set lives during the call, which is told its size.
+        // SAFETY: the set lives during the call, which gets its size.
         unsafe { sched_setaffinity(0, size_of::<cpu_set_t>(), set) == 0 }
     }
 

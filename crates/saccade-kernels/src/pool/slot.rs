@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::place::Place;
 
-/// One call of [`parallel_for`], on the caller's stack.
+/// One call of [`parallel_for`](crate::parallel_for), on the caller's stack.
 pub(super) struct Job<'a> {
     pub f: &'a (dyn Fn(usize) + Sync),
     pub tasks: usize,

@@ -160,7 +160,7 @@ pub(crate) enum Dot {
     Int8,
 }
 
-/// Sums of products of narrow elements, several of which lie in a lane.
+/// Sums of products of narrow elements, several of which share a lane.
 ///
 /// # Safety
 /// Every method needs a CPU that has the instruction set of `V` and the dot products of the implementation.

@@ -28,7 +28,7 @@ unsafe impl Simd for Portable {
     }
 }
 
-/// Adding it rounds to a whole number, which then lies in the low bits: 1.5 * 2^23.
+/// Adding it rounds to a whole number, which is then in the low bits: 1.5 * 2^23.
 const ROUND: f32 = 12_582_912.0;
 
 #[inline(always)]

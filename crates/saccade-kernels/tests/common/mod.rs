@@ -69,7 +69,7 @@ impl Strided {
             values.extend_from_slice(row);
             assert!(
                 gap.iter().all(|value| value.is_nan()),
-                "something was written beside the rows"
+                "something was written between the rows"
             );
         }
         values

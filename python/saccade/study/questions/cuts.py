@@ -40,6 +40,11 @@ def cut(*pairs: tuple[str, str]) -> Callable[[Float32Array, np.random.Generator]
     return lambda tokens, rng: Intervention(cut=pairs)
 
 
+def blind(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
+    """No row sees the vision-language tokens; future rows only if the head has them."""
+    return Intervention(cut=[(row, "vl") for row in ROW_GROUPS if row != "future" or len(tokens)])
+
+
 def shuffled(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
     """The learned tokens in another order."""
     return Intervention(future_tokens=tokens[rng.permutation(len(tokens))])
@@ -102,7 +107,7 @@ ALL_ARMS = (
         "{state, future, action} <- vl cut",
         "No row sees the vision-language tokens. A control that must fail: it shows how well these tasks can "
         "be done without vision.",
-        cut(*((row, "vl") for row in ROW_GROUPS)),
+        blind,
         needs_future=False,
     ),
     Arm(

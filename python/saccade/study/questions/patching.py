@@ -209,10 +209,11 @@ def patched(
         if "future" in members and head.config.num_future_tokens == 0 and members != ROW_GROUPS:
             found.append({**row, "group": group, "note": NO_TOKENS})
             continue
+        present = [name for name in members if name != "future" or head.config.num_future_tokens]
         for block in (None, *blocks):
             places = [(step, one) for step in steps for one in blocks if block in (None, one)]
             patch: dict[tuple[int, int], dict[Tokens, npt.NDArray[np.float32]]] = {
-                place: {name: hidden[place][trace.rows[name]] for name in members} for place in places
+                place: {name: hidden[place][trace.rows[name]] for name in present} for place in places
             }
             change = chunk(Intervention(patch=patch)) - before
             found.append(

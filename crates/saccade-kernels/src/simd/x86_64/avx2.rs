@@ -65,7 +65,7 @@ unsafe impl Vector for __m256 {
     const TILE_VECTORS: usize = 2;
     type Ints = __m256i;
     // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates. The other ways out cost more: 7 bits in the weights
-    // lose as much (0.018 instead of 0.011 of the result, beside 0.017), 16-bit products take the time of float32.
+    // lose as much (0.018 of the result instead of 0.011; this way, 0.017), 16-bit products take the time of float32.
     const MAX_BYTE: u8 = 129;
 
     #[inline(always)]
