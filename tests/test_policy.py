@@ -203,7 +203,7 @@ def test_arguments_that_do_not_fit() -> None:
     given = features(head)
     with pytest.raises(saccade.ShapeError, match="the Normalizer of 'new_embodiment' expected"):
         policy(given, draw(2, 12))
-    with pytest.raises(saccade.ShapeError, match=r"(?s)state: .*Normalizer turns a robot's state into that"):
+    with pytest.raises(saccade.ShapeError, match=r"state: .*as the checkpoint's normaliser does, got"):
         head(given, draw(2, 7), 31)
     with pytest.raises(saccade.InputError, match="out: expected none"):
         policy(given, draw(2, 7), out=np.empty((2, 16, 8), np.float32))

@@ -1,6 +1,7 @@
 //! Memory whose size a caller decides: asked for, never assumed.
 
 use crate::error::{Error, Result};
+use crate::ops::check_interrupted;
 
 /// Makes room for `len` elements in all.
 ///
@@ -21,8 +22,22 @@ pub(crate) fn reserve<T>(what: &'static str, buffer: &mut Vec<T>, len: usize) ->
 pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Result<Vec<T>> {
     let mut buffer = Vec::new();
     reserve(what, &mut buffer, len)?;
-    buffer.resize(len, value);
+    fill(&mut buffer, len, value)?;
     Ok(buffer)
+}
+
+/// Elements that are written between two looks at whether the call is to stop: the system hands out pages as they are first touched, some
+/// four gigabytes in a second.
+const TOGETHER: usize = 1 << 24;
+
+/// Sets the length of a buffer that has room for it.
+fn fill<T: Clone>(buffer: &mut Vec<T>, len: usize, value: T) -> Result<()> {
+    while buffer.len() + TOGETHER < len {
+        check_interrupted()?;
+        buffer.resize(buffer.len() + TOGETHER, value.clone());
+    }
+    buffer.resize(len, value);
+    Ok(())
 }
 
 /// The elements of `values`, of which there are `len`.
@@ -46,7 +61,7 @@ pub(crate) fn collected<T>(
 /// [`Error::Memory`] if the system refuses it.
 pub(crate) fn sized(buffer: &mut Vec<f32>, len: usize) -> Result<&mut [f32]> {
     reserve("activations", buffer, len)?;
-    buffer.resize(len, 0.0);
+    fill(buffer, len, 0.0)?;
     Ok(buffer)
 }
 
@@ -80,6 +95,17 @@ mod tests {
         ));
         assert_eq!(buffer, [1.0; 3], "left as it was");
         assert_eq!(sized(&mut buffer, 2).unwrap(), [1.0; 2]);
+    }
+
+    #[test]
+    fn filling_stops_when_asked_to() {
+        let len = 3 * TOGETHER + 5;
+        assert_eq!(filled("features", len, 1_u8).unwrap().len(), len);
+        let stopped = crate::interruptible(&|| true, || {
+            std::thread::sleep(std::time::Duration::from_millis(30));
+            filled("features", len, 1_u8)
+        });
+        assert!(matches!(stopped, Err(Error::Interrupted)));
     }
 
     #[test]

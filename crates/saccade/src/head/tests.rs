@@ -17,7 +17,7 @@ use crate::precision::Precision;
 use crate::recognise::Published;
 use crate::sampling::tables::action_time;
 
-/// A released head; its config stands in the file's metadata.
+/// A released head, with the config in the file's metadata.
 fn released(name: &str) -> ActionHead {
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../../tests/data")

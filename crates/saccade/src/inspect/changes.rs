@@ -22,7 +22,7 @@ pub(crate) struct Changes<'a> {
     patches: Vec<PatchedRows<'a>>,
 }
 
-/// What is added to the logits of one kind of block, `(heads, rows, keys)`; one head stands for all if it is the same for all of them.
+/// What is added to the logits of one kind of block, `(heads, rows, keys)`; a single head if it is the same for all of them.
 pub(super) struct DenseBias {
     values: Vec<f32>,
     heads: usize,

@@ -46,7 +46,7 @@ impl Group {
 pub struct Tokens {
     /// The group.
     pub group: Group,
-    /// Indices within the group; none stands for all of it.
+    /// Indices within the group; `None` means the whole group.
     pub indices: Option<Vec<usize>>,
 }
 

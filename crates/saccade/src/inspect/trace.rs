@@ -148,7 +148,7 @@ impl TraceOptions {
         }
     }
 
-    /// Of these blocks only; none stands for all.
+    /// Of these blocks only; `None` means all.
     #[must_use]
     pub fn with_blocks(self, blocks: impl Into<Option<Vec<usize>>>) -> Self {
         Self {
@@ -157,7 +157,7 @@ impl TraceOptions {
         }
     }
 
-    /// Of these Euler steps only; none stands for all.
+    /// Of these Euler steps only; `None` means all.
     #[must_use]
     pub fn with_steps(self, steps: impl Into<Option<Vec<usize>>>) -> Self {
         Self {
