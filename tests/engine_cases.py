@@ -29,7 +29,7 @@ TAME = (
 def configs(draw: st.DrawFn) -> dict[str, Any]:
     """Sizes from the smallest up to a little more than a kernel's tile, odd ones among them."""
     num_heads, vl_num_heads = draw(st.integers(1, 4)), draw(st.integers(1, 3))
-    # The table beside the action tokens is half sines and half cosines, so the width is even.
+    # The time embedding of the action encoder is half sines and half cosines, so the width is even.
     # A LayerNorm over two or three values can blow up rounding, so norms are a little wider than that.
     head_dims = [6, 10, 16, 48] if num_heads % 2 else [3, 4, 7, 16, 20]
     vl_head_dims = [7, 8, 64] if vl_num_heads == 1 else [3, 8, 17]

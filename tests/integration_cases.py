@@ -142,7 +142,7 @@ def assert_same(ours: Outcome, theirs: Outcome, tolerance: float) -> float:
 
 
 def error(got: Tensor, expected: Tensor) -> float:
-    """The difference beside the size: root mean squares."""
+    """Root mean square of the difference, relative to that of the expected values."""
     size = torch.linalg.vector_norm(expected.float())
     return float(torch.linalg.vector_norm(got.float() - expected.float()) / size.clamp_min(1e-30))
 

@@ -116,7 +116,7 @@ def n1_head() -> Config:
 
 
 def n17_head() -> Config:
-    """GR00T N1.7, as it stands in the flat `config.json`."""
+    """GR00T N1.7 in the flat `config.json`."""
     return {
         "action_horizon": 40,
         "add_pos_embed": True,
@@ -301,7 +301,7 @@ def head_tensors(
 
 
 def backbone_tensors(seed: int) -> dict[str, Tensor]:
-    """Something beside the head, in bfloat16 as frozen language models are kept."""
+    """Tensors outside the head, in bfloat16 as frozen language models are stored."""
     generator = torch.Generator().manual_seed(seed + 1)
     names = (
         "eagle_model.language_model.model.layers.0.mlp.up_proj.weight",
@@ -412,7 +412,7 @@ def save(folder: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def write_nvidia(folder: Path, config: Config, head: dict[str, Tensor], seed: int) -> None:
-    """N1 and N1.5: `config.json` with `action_head_cfg`, `backbone.*` beside `action_head.*`, statistics in
+    """N1 and N1.5: `config.json` with `action_head_cfg`, `backbone.*` and `action_head.*`, statistics in
     `experiment_cfg/metadata.json`."""
     model_type = config.pop("model_type")
     architecture = {"gr00t_n1": "GR00T_N1", "gr00t_n1_5": "GR00T_N1_5"}[model_type]
@@ -576,7 +576,7 @@ def modality_config() -> Config:
 
 def write_lerobot(folder: Path, config: Config, head: dict[str, Tensor], seed: int) -> None:
     """lerobot up to 0.5.1 and the forks of it: one file under `_groot_model.`, the policy's own `config.json`
-    without a size of the head, statistics beside the processors."""
+    without a size of the head, statistics next to the processors."""
     is_fork = bool(config.get("use_multi_action_heads"))
     chunk_size = 32 if is_fork else 50
     policy = lerobot_policy("nvidia/GR00T-N1.5-3B") | {

@@ -21,7 +21,7 @@ def published(layout: str, seed: int = 0) -> Path:
 
 
 def sidecars(folder: Path, layout: str, seed: int = 0) -> None:
-    """Copies what the checkpoint brings beside its weights into `folder`."""
+    """Copies the other files of the checkpoint into `folder`."""
     shutil.copytree(
         published(layout, seed), folder, ignore=shutil.ignore_patterns("model*"), dirs_exist_ok=True
     )

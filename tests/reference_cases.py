@@ -120,7 +120,7 @@ def variant_config(
 
 
 def decoders(kind: str, action_dim: int, encoder_action_dim: int | None) -> dict[str, Any]:
-    """What a fork's config has beside that of N1.5."""
+    """The keys that a fork's config adds to that of N1.5."""
     encoded = action_dim + 2 if encoder_action_dim is None else encoder_action_dim
     config: dict[str, Any] = {
         "use_multi_action_heads": True,

@@ -21,7 +21,7 @@ VARIANTS = ("n17_tiny", "n17_rtc", "fork_two_decoders")
 
 @dataclass(frozen=True)
 class Released:
-    """One file: a checkpoint in the published layout with inputs and outputs beside the weights."""
+    """One file: a checkpoint in the published layout with inputs and outputs next to the weights."""
 
     name: str
     path: Path  # what ActionHead.load takes as its source, with `config`

@@ -1,4 +1,4 @@
-"""What the binding promises whatever the core does: no panic gets out, no thread waits for another."""
+"""Promises of the binding: no panic reaches Python, and no thread waits for another."""
 
 from __future__ import annotations
 

@@ -200,6 +200,6 @@ def test_what_does_not_fit_the_head_is_refused(kind: str) -> None:
 def test_it_differs_from_what_starts_anew(isa: str) -> None:
     """The free actions see the frozen ones: they go on from them."""
     head, _, inputs, previous = one_call("n1.5")
-    anew = np.asarray(head(**inputs))
+    independent = np.asarray(head(**inputs))
     on = np.asarray(head(**inputs, previous_chunk=previous, chunking=Chunking(3, 3)))
-    assert not same(on[:, 3:], anew[:, 3:])
+    assert not same(on[:, 3:], independent[:, 3:])

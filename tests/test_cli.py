@@ -1,4 +1,4 @@
-"""The `saccade` command itself; what a single command does is tested beside that command's parts."""
+"""The `saccade` command itself. Single commands are tested with the modules that they use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configs of every version: what is read, what stands for a key that is left out, what contradicts itself."""
+"""Configs of every version: values that are read, defaults of missing keys, contradictions."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def tree_of_architecture() -> set[Path]:
-    """The files and folders that the tree in ARCHITECTURE.md names; an entry lies in the last folder above it
+    """The files and folders that the tree in ARCHITECTURE.md names; each belongs to the last folder above it
     that is indented less.
     """
     text = (ROOT / "ARCHITECTURE.md").read_text()

@@ -331,7 +331,7 @@ def test_tensors_without_elements(good: Path) -> None:
 
 
 def test_links_are_followed(good: Path, tmp_path: Path) -> None:
-    # As a cache of models lies on the disk.
+    # Like a cache of models.
     view = tmp_path / "view"
     view.mkdir()
     for path in good.iterdir():

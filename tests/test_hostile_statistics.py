@@ -1,6 +1,4 @@
-"""What lies beside the weights, changed at one place to something that nobody expects there: an answer or one
-clear error, whatever it is.
-"""
+"""The files next to the weights, changed at one place to an unexpected value: a result or one clear error."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ import saccade
 from saccade.checkpoints import describe
 from saccade.errors import SaccadeError
 
-# Layouts and the files beside their weights.
+# Layouts and the files next to their weights.
 FILES = [
     ("nvidia", "config.json"),
     ("nvidia", "experiment_cfg/metadata.json"),
@@ -62,7 +60,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def read(layout: str, folder: Path) -> None:
-    """All that reads what lies beside the weights, which must answer or say what is wrong, in a few words."""
+    """Everything that reads these files. It must return a result or say in a few words what is wrong."""
     calls: list[Callable[[], object]] = [
         lambda: describe(folder),
         lambda: use(saccade.Normalizer.load(folder, EMBODIMENTS.get(layout))),

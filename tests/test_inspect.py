@@ -1,4 +1,4 @@
-"""saccade inspect: its numbers beside independent computations, what it calls odd, and what it prints."""
+"""saccade inspect: its numbers compared with independent computations, unusual findings, and its output."""
 
 from __future__ import annotations
 
@@ -91,15 +91,15 @@ def test_memory_on_every_instruction_set_and_of_an_int8_checkpoint(
 
 def test_the_report_of_a_checkpoint(base: Path) -> None:
     tensors = layouts.read(base, "action_head.")
-    told: list[tuple[int, int]] = []
-    report = inspect(base, num_vl_tokens=9, progress=lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int]] = []
+    report = inspect(base, num_vl_tokens=9, progress=lambda done, total: reported.append((done, total)))
     assert report.parameters == sum(tensor.numel() for tensor in tensors.values())
     assert sum(part.tensors for part in report.parts.values()) == len(tensors)
     assert sum(part.nbytes for part in report.parts.values()) == sum(t.nbytes for t in tensors.values())
     assert report.parts["VL self-attention"].dtypes == {"BF16": 32}
     assert report.outside == {"backbone": Counts(tensors=2, nbytes=2 * 6 * 8 * 2)}
-    assert told[-1][0] == told[-1][1] == sum(tensor.nbytes for tensor in tensors.values())
-    assert len(told) == len(tensors)
+    assert reported[-1][0] == reported[-1][1] == sum(tensor.nbytes for tensor in tensors.values())
+    assert len(reported) == len(tensors)
     assert report.odd == []
     assert report.machine is not None
     assert report.seconds is not None

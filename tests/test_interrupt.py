@@ -1,4 +1,4 @@
-"""A signal ends a call that is under way, whatever its size, and the head can be used afterwards."""
+"""A signal ends a running call of any size, and the head can be used afterwards."""
 
 from __future__ import annotations
 

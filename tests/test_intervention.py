@@ -347,7 +347,7 @@ def test_a_dropped_position_is_a_cut_key_where_positions_do_not_mix(isa: str) ->
     actions = head(**given_arrays, drop_vl=dropped)
     absent = given_arrays | {"backbone_features": given_arrays["backbone_features"][:, [0, 2, 3, 5]]}
     assert equal(head(**absent), actions)
-    # A removed key still stands among those that are summed over, so that only rounding differs (I9).
+    # A removed key is still one of those that are summed over, so that only rounding differs (I9).
     assert close(head(**given_arrays, intervention=cut), actions)
     assert equal(head(**given_arrays, intervention=removed), head(**given_arrays, intervention=cut))
 

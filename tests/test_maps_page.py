@@ -64,7 +64,7 @@ class Page:
         return self.driver.find_element(By.ID, name).text
 
     def bars(self, name: str) -> dict[str, float]:
-        """Values by the names beside them; of equal names the last one."""
+        """Values by their labels; the last one for equal labels."""
         values = self.driver.find_elements(By.CSS_SELECTOR, f"#{name} [data-value]")
         return {str(v.get_attribute("data-name")): float(str(v.get_attribute("data-value"))) for v in values}
 

@@ -1,4 +1,4 @@
-"""A robot's units to the head's and back, beside lerobot's own steps and what Isaac-GR00T's code computes."""
+"""A robot's units to the head's and back, compared with lerobot's steps and Isaac-GR00T's code."""
 
 from __future__ import annotations
 
@@ -341,7 +341,7 @@ def test_n17_clips_scales_and_cuts_the_chunk(percentiles: bool, clip: bool, tmp_
     assert normalizer.embodiment_id == 5
     robot = as_array(normalizer.actions(chunk))
     assert robot.shape == (3, 4, 4)
-    # Coming back is clipped whatever the switch says.
+    # Values from the head are clipped with either setting.
     back = (chunk[:, :4, :3].clip(-1, 1) + 1) / 2 * (high - low) + low
     assert np.allclose(robot[..., :3], back, atol=1e-6)
 

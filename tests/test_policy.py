@@ -41,7 +41,7 @@ def features(head: ActionHead, batch: int = 2) -> Array:
 
 
 def masks(head: ActionHead, batch: int = 2) -> dict[str, Any]:
-    """What `encode` needs to be told besides the features."""
+    """The arguments of `encode` besides the features."""
     image = np.zeros((batch, 5), bool)
     image[:, 1:3] = True
     return {"image_mask": image} if head.config.mask_mode == "alternate" else {}
@@ -137,7 +137,7 @@ def test_what_is_relative_to_the_state_stays_where_it_is_in_the_room(tmp_path: P
     before = np.asarray(policy.sample(context, older, seed=0))
     chunking = saccade.Chunking(overlap=8, frozen=8)
     after = np.asarray(policy.sample(context, newer, seed=1, previous_chunk=before, chunking=chunking))
-    # What lies further than 3 from the newer state is beyond the statistics, and cut off as in training.
+    # Values further than 3 from the newer state are beyond the statistics, and are clipped as in training.
     near = np.abs(before[:, 8:, :5] - newer[:, None, :5]) < 3
     assert near.mean() > 0.5
     assert np.allclose(after[:, :8, :5][near], before[:, 8:, :5][near], atol=1e-5)

@@ -76,7 +76,7 @@ def test_errors_are_those_of_the_rounding(
 ) -> None:
     """As far from float64 as the same rounding in torch is, within a factor of 2 over many numbers.
 
-    Not number by number: where an input lies between two steps of a grid, its last float32 bit decides on
+    Not number by number: if an input is between two steps of a grid, its last float32 bit decides on
     which one it falls. Some instruction sets without an int8 dot product have half the steps for activations.
     """
     reference = random_head(config, 1).double()
@@ -264,7 +264,7 @@ def test_a_row_of_zeros_and_one_of_huge_numbers(isa: str, precision: str) -> Non
     tokens[0, 2] = 1e-42
     out = np.asarray(attention(np.ones((1, 2, 64), np.float32), attention.project(tokens[:, [0, 2]])))
     assert np.isfinite(out).all()
-    attention.project(tokens)  # whatever comes of 1e30, nothing crashes
+    attention.project(tokens)  # 1e30 must not crash, with any result
 
 
 def test_weights_of_zeros_and_of_one_outlier(isa: str, precision: str) -> None:
@@ -275,7 +275,7 @@ def test_weights_of_zeros_and_of_one_outlier(isa: str, precision: str) -> None:
     attention = saccade.CrossAttention(tensors, 4, precision=precision)
     tokens = np.ones((1, 3, 32), np.float32)
     out = np.asarray(attention(np.ones((1, 2, 64), np.float32), attention.project(tokens)))
-    # Values are to_v's bias, whatever the keys.
+    # Values are to_v's bias for all keys.
     expected = tensors["to_out.0.weight"] @ tensors["to_v.bias"] + tensors["to_out.0.bias"]
     np.testing.assert_allclose(out[0, 0], expected, rtol=2e-2, atol=2e-2)
 

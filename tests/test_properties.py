@@ -1,4 +1,4 @@
-"""Properties that hold exactly for this architecture, whatever the weights.
+"""Properties that hold exactly for this architecture with any weights.
 
 Each is the ground of something that the engine saves or that an experiment with future tokens relies on. All
 in float64, so that what is left is rounding.

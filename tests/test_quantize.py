@@ -193,7 +193,7 @@ def test_the_source_is_never_replaced(source: Path) -> None:
 
 
 def test_files_that_the_source_links_to_are_never_replaced(source: Path, tmp_path: Path) -> None:
-    view = tmp_path / "view"  # as a cache of models lies on the disk: names that link to files elsewhere
+    view = tmp_path / "view"  # like a cache of models: names that link to files elsewhere
     view.mkdir()
     for path in source.iterdir():
         (view / path.name).symlink_to(path.resolve())

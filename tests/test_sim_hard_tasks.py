@@ -54,7 +54,7 @@ def go_to(environment: TaskEnvironment, target: Float64Array, steps: int = 150) 
 
 
 def eye_and_forward(camera: Camera) -> tuple[Float64Array, Float64Array]:
-    """Where a camera stands and the direction in which it looks."""
+    """Position and viewing direction of a camera."""
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     forward = np.cos(elevation) * level + [0.0, 0.0, np.sin(elevation)]
@@ -203,7 +203,7 @@ def test_layouts_are_as_described() -> None:
             )
             chosen.append(environment.scenario.chosen)
             nearer.append(np.argmin(ways))
-    # Sixty fair coins: less than one in a thousand such samples lies outside.
+    # Sixty fair coins: less than one in a thousand such samples is outside.
     assert 17 <= sum(chosen) <= 43
     assert 17 <= np.equal(chosen, nearer).sum() <= 43
 

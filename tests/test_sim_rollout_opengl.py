@@ -17,7 +17,7 @@ def run_without_opengl(folder: Path, *command: str, backend: str = "egl") -> sub
     """Runs Python where OpenGL cannot be loaded.
 
     PyOpenGL looks for the libraries while it is imported, which `import mujoco` does: a machine without them
-    fails there. A package that raises stands in for such a machine.
+    fails there. A package that raises simulates such a machine.
     """
     (folder / "OpenGL").mkdir(exist_ok=True)
     (folder / "OpenGL" / "__init__.py").write_text("raise ImportError('Unable to load the library')")

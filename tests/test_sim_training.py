@@ -152,7 +152,7 @@ def test_training_resumes_to_the_same_weights(
         assert torch.equal(tensor, parts[name]), name
     assert any(not torch.equal(stopped[name], whole[name]) for name in whole)
     ends = [torch.load(tmp_path / name / "training.pt", weights_only=True) for name in ("whole", "parts")]
-    for name, tensor in ends[0]["learner"].items():  # what is trained beside the policy, too
+    for name, tensor in ends[0]["learner"].items():  # including what is trained besides the policy
         assert torch.equal(tensor, ends[1]["learner"][name]), name
 
 
@@ -328,7 +328,7 @@ def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Pa
     assert tokens.grad is not None
     assert bool((tokens.grad.abs().sum(dim=1) > 0).all())
     decoder = run.learner.action_head.get_submodule("action_decoder")
-    # Only the first block lies before the rows, and the targets' side must not move.
+    # Only the first block comes before the rows, and the targets' side must not move.
     assert all(parameter.grad is None for parameter in decoder.parameters())
     assert all(tensor.grad is None and not tensor.requires_grad for tensor in run.average.values())
 

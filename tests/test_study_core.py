@@ -25,7 +25,7 @@ SETTINGS = {"checkpoint": "abc", "width": 0.1}
 
 @dataclass(frozen=True)
 class Square:
-    """Squares a cell's number, writes down that it did, and fails or dies where it is told to."""
+    """Squares a cell's number, records the call, and fails or dies at the given cells."""
 
     log: Path
     fails: tuple[int, ...] = ()

@@ -216,7 +216,7 @@ def test_patching_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_block_zero_of_the_future_rows_holds_vision_alone() -> None:
-    """I7: told the same words about the same picture there is nothing to follow."""
+    """I7: with the same instruction and the same picture there is nothing to follow."""
     source = Simulator(CHECKPOINT, ("reach",), range(1))
     seen = source.first("reach", 0, "reach the green ball")
     receiver = seen.with_noise(np.random.default_rng(0), source.config)

@@ -1,4 +1,4 @@
-"""The torch module beside diffusers' Attention, under torch's compilers, and when its weights change."""
+"""The torch module compared with diffusers' Attention, under torch's compilers, and with changed weights."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def test_trace_equals_the_reference(isa: str, case: Case) -> None:
     with torch.no_grad():
         vl_embs, expected = run()
     kept = np.asarray(context.vl_embs).copy()
-    kept[case.masks["drop_vl"]] = 0  # what stands there means nothing
+    kept[case.masks["drop_vl"]] = 0  # dropped positions have no meaning
     given_numbers = numbers(kept, trace)
     assert error_of(case, given_numbers, numbers(vl_embs, expected), lambda: numbers(*run())) <= TOLERANCE
     assert trace.rows == expected.rows
