@@ -109,6 +109,23 @@ def test_what_is_out_of_range_is_refused(words: list[str], message: str) -> None
         parsed(*words)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--num-future-tokens", "-3"), "--num-future-tokens: given -3, expected at least 0"),
+        (
+            ("--num-future-tokens", "3", "--perturbation", "nan"),
+            "--perturbation: given nan, expected at least 0",
+        ),
+    ],
+)
+def test_resize_names_the_flag(
+    options: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["resize", "checkpoint", "--out", "out", *options]) == 2
+    assert capsys.readouterr().err == f"saccade: {message}\n"
+
+
 def test_indices() -> None:
     assert arguments.indices("--blocks", None, 3) == (0, 1, 2)
     with pytest.raises(InputError, match="--blocks: given 0, 4, expected 0 to 3"):

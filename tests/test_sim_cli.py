@@ -194,6 +194,8 @@ def test_an_output_that_cannot_be_written_is_named(
     (tmp_path / "file").write_text("")
     assert main([command, "--tasks", "reach", "--out", str(tmp_path / "file" / "out")]) == 2
     assert "file" in capsys.readouterr().err
+    assert main([command, "--tasks", "reach", "--out", str(tmp_path / "file")]) == 2
+    assert capsys.readouterr().err == f"saccade: {tmp_path / 'file'}: exists and is not a directory\n"
 
 
 def test_missing_opengl_is_found_before_anything_is_written(

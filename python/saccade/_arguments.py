@@ -110,7 +110,13 @@ def split_list(words: Iterable[str]) -> list[str]:
 
 
 def add_integer(
-    parser: Arguments, flag: str, *, minimum: int = 1, default: int | None = None, help: str
+    parser: Arguments,
+    flag: str,
+    *,
+    minimum: int = 1,
+    default: int | None = None,
+    required: bool = False,
+    help: str,
 ) -> None:
     """Declares a whole number of at least `minimum`; the help text ends with the default, if there is one."""
     parser.add_argument(
@@ -119,6 +125,7 @@ def add_integer(
         action=StoreNumber,
         minimum=minimum,
         default=default,
+        required=required,
         metavar="N",
         help=help if default is None else f"{help} (default: {default})",
     )

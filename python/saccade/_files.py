@@ -1,5 +1,6 @@
 """Files: written so that a reader never sees half of one, and hashed."""
 
+import errno
 import hashlib
 import os
 from collections.abc import Iterator
@@ -43,9 +44,12 @@ def writable_directory(path: Path) -> Path:
     """Creates the directory if it does not exist, and checks that files can be written to it.
 
     Raises:
-        OSError: it cannot be created or written to.
+        OSError: it cannot be created or written to, or is not a directory.
     """
-    path.mkdir(parents=True, exist_ok=True)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(errno.ENOTDIR, "exists and is not a directory", str(path)) from None
     probe = path / f".writable.{os.getpid()}"
     probe.touch()
     probe.unlink()

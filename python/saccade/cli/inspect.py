@@ -152,7 +152,7 @@ def sizes(report: Inspection) -> Section:
         ["width of a state", str(config.state_dim)],
         ["embodiments", str(config.num_embodiments)],
         ["blocks", f"{config.num_layers}, {config.num_heads} heads of {config.head_dim}"],
-        ["VL self-attention", f"{config.vl_num_layers} blocks" if config.vl_num_layers else "none"],
+        ["blocks of VL self-attention", str(config.vl_num_layers)],
         ["width of VL tokens", str(config.context_dim)],
         ["Euler steps", str(config.num_steps)],
     ]

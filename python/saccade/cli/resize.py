@@ -35,20 +35,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
     add_copy_arguments(parser)
-    parser.add_argument(
+    arguments.add_integer(
+        parser,
         "--num-future-tokens",
-        type=int,
+        minimum=0,
         required=True,
-        metavar="N",
         help="number of future tokens of the new checkpoint",
     )
-    parser.add_argument(
+    arguments.add_number(
+        parser,
         "--perturbation",
-        type=float,
+        minimum=0,
         default=0.0,
-        metavar="X",
         help="add noise of X times the tokens' root mean square to the copies, so that training can "
-        "distinguish them (default: 0)",
+        "distinguish them",
     )
     arguments.add_seed(parser, "seed of that noise and of random observations")
     arguments.add_features(
@@ -91,12 +91,14 @@ def run(args: argparse.Namespace) -> int:
 
 def print_report(args: argparse.Namespace, report: ResizeReport, changes: ActionChanges) -> None:
     """Prints what was written, and how far actions move."""
-    merged = sum(len(group) > 1 for group in report.sources)
-    copied = max(0, report.num_after - report.num_before)
-    print(
-        f"{args.out}: {report.num_after} future tokens (was {report.num_before}); {copied} copies added, "
-        f"{merged} merged from several"
-    )
+    if report.num_after < report.num_before:
+        merged = sum(len(group) > 1 for group in report.sources)
+        how = f"{merged} of them merged from several"
+    elif report.num_after > report.num_before:
+        how = f"{report.num_after - report.num_before} of them copies"
+    else:
+        how = "unchanged"
+    print(f"{args.out}: {report.num_after} future tokens (was {report.num_before}), {how}")
     if report.perturbation_rms:
         print(f"added noise with root mean square {report.perturbation_rms:.3g} to the copies")
     if report.is_widened:
@@ -104,7 +106,7 @@ def print_report(args: argparse.Namespace, report: ResizeReport, changes: Action
     observations = "random observations" if args.features is None else f"observations of {args.features}"
     print(
         f"change of actions on {changes.observations} {observations}, in float32 (root mean square of "
-        f"actions {changes.actions_rms:.3g}; mean change by another noise {changes.of_other_noise.mean:.3g}):"
+        f"actions {changes.actions_rms:.3g}; mean change from other noise {changes.of_other_noise.mean:.3g}):"
     )
     for where, change in (("saccade", changes.in_saccade), ("other programs", changes.in_other_programs)):
         print(f"  in {where:14}  mean {change.mean:.3g}, largest {change.largest:.3g}")

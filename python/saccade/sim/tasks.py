@@ -208,7 +208,7 @@ def check_evaluation_seeds(first: int, count: int) -> range:
     seeds = range(first, first + count)
     if seeds[0] not in EVALUATION_SEEDS or seeds[-1] not in EVALUATION_SEEDS:
         raise InputError(
-            f"seed: {seeds[0]} to {seeds[-1]} leaves the evaluation seeds "
-            f"{EVALUATION_SEEDS.start} to {EVALUATION_SEEDS.stop - 1}; later ones are used for training"
+            f"seed: given {seeds[0]} to {seeds[-1]}, expected evaluation seeds, {EVALUATION_SEEDS.start} to "
+            f"{EVALUATION_SEEDS.stop - 1}; larger ones are used for training"
         )
     return seeds
