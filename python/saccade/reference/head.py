@@ -386,7 +386,11 @@ class ActionHead(nn.Module):
         return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
 
     def run_of(self, vl_embs: Tensor, num_steps: int | None, **options: Unpack[RunOptions]) -> Run:
-        """A run with this number of steps, or that of the config."""
+        """A run with this number of steps, or that of the config.
+
+        Raises:
+            InputError: The number of steps is out of range, or an option does not fit the head.
+        """
         config = self.config
         num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
         if not 1 <= num_steps <= config.num_timestep_buckets:
@@ -503,7 +507,12 @@ class ActionHead(nn.Module):
         return torch.tensor(array, dtype=self.dtype, device=self.device)  # copies: the array may be read-only
 
     def as_embodiment(self, embodiment_id: int | Tensor | np.ndarray, batch: int) -> int | Tensor:
-        """Checks embodiment ids. One id stays an int, so that one matrix product serves the whole batch."""
+        """Checks embodiment ids. One id stays an int, so that one matrix product serves the whole batch.
+
+        Raises:
+            InputError: They are not integers, or the head has no such embodiment.
+            ShapeError: There is not one id for each row.
+        """
         ids = embodiment_id if isinstance(embodiment_id, Tensor) else torch.tensor(embodiment_id)
         if ids.ndim > 0:
             check_shape("embodiment_id", ids, (batch,))

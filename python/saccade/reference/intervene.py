@@ -272,7 +272,12 @@ class Run:
         return bias[None, None, None]
 
     def replaced_tokens(self, interventions: Sequence[Intervention]) -> Tensor | None:
-        """The future tokens of the only intervention that has any, `(N', width)`, or None."""
+        """The future tokens of the only intervention that has any, `(N', width)`, or None.
+
+        Raises:
+            InputError: Several interventions have future tokens.
+            ShapeError: The tokens have another width than the head.
+        """
         given = [one.future_tokens for one in interventions if one.future_tokens is not None]
         if len(given) > 1:
             raise InputError(f"future_tokens: expected in at most one intervention, got {len(given)}")
@@ -283,7 +288,12 @@ class Run:
         return tokens
 
     def check(self, edit: Edit) -> None:
-        """Refuses an intervention that does not fit the sizes of this run, or that can act nowhere."""
+        """Checks an intervention.
+
+        Raises:
+            InputError: It does not fit the sizes of this run, or applies nowhere.
+            ShapeError: An array has the wrong shape.
+        """
         check_indices("blocks", edit.blocks, self.config.num_layers)
         check_indices("steps", edit.steps, self.num_steps)
         check_indices("heads", edit.heads, self.config.num_heads)
@@ -365,7 +375,11 @@ def is_cross(config: HeadConfig, block: int) -> bool:
 
 
 def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
-    """Pairs (reader, source) as the normalised cut of an intervention."""
+    """Pairs (reader, source) as the normalised cut of an intervention.
+
+    Raises:
+        InputError: A pair is not one that `Intervention.cut` takes.
+    """
     try:
         return Intervention(cut=pairs)
     except InputError as error:

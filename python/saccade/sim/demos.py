@@ -169,7 +169,11 @@ def record_task(
 
 
 def claim_directory(path: Path, settings: RecordingSettings) -> None:
-    """Writes the settings, or checks that they are those of an earlier recording."""
+    """Writes the settings, or checks that they are those of an earlier recording.
+
+    Raises:
+        InputError: The directory contains a recording with other settings.
+    """
     if not path.exists():
         write_json(path, settings.to_dict())
     elif json.loads(path.read_text()) != json.loads(json.dumps(settings.to_dict())):

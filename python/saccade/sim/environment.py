@@ -127,7 +127,14 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._steps = 0
 
     def advance(self, action: npt.ArrayLike) -> StepOutcome:
-        """Like `step`, without drawing an observation, which policies need only once per chunk."""
+        """Like `step`, without drawing an observation, which policies need only once per chunk.
+
+        Args:
+            action: `(4,)`, clipped to [-1, 1].
+
+        Raises:
+            ShapeError, InputError: `action` has another shape, or is not finite.
+        """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (ACTION_DIM,):
             raise ShapeError(f"action: given shape {action.shape}, expected ({ACTION_DIM},)")

@@ -225,7 +225,11 @@ class Policy:
             return self.backbone(images, self._tokenizer(observation["instruction"])[None])
 
     def state(self, observation: Mapping[str, Any]) -> Float32Array:
-        """Normalised proprioception, `(1, state_dim)`."""
+        """Normalised proprioception, `(1, state_dim)`.
+
+        Raises:
+            ShapeError: `observation["proprio"]` has another shape than in training.
+        """
         proprio = np.asarray(observation["proprio"], dtype=np.float32)
         if proprio.shape != (len(self.config.state.mean),):
             raise ShapeError(f"proprio: shape {proprio.shape}, expected ({len(self.config.state.mean)},)")

@@ -57,7 +57,11 @@ def write_report(directory: Path) -> tuple[Path, Path]:
 
 
 def make_part(directory: Path, name: str) -> Part:
-    """A study's part of the report; one without results if the study was not run."""
+    """A study's part of the report, without results if the study was not run.
+
+    Raises:
+        InputError: The table was not written by this study.
+    """
     absent = Section(STUDIES[name][1][0].upper() + STUDIES[name][1][1:])
     if not provenance_path(directory, name).exists():
         return Part(absent, measured=False)
