@@ -322,22 +322,30 @@ def check_copies(case: Case) -> None:
     handle.restore()
 
 
+def refused(head: nn.Module, match: str) -> None:
+    """Checks that `accelerate` refuses the head and leaves it as it is."""
+    with pytest.raises(saccade.InputError, match=match):
+        accelerate(head)
+    assert "get_action" not in vars(head)
+
+
 def check_refusals(case: Case) -> None:
-    """What would silently be something else is an error, before and after."""
+    """Uses that saccade cannot follow are errors, before and after `accelerate`."""
+    check_modes_that_are_refused(case)
+    check_changes_that_are_refused(case)
+
+
+def check_modes_that_are_refused(case: Case) -> None:
+    """Training mode, hooks, gradients, and another `get_action`."""
     head, given = case.head, inputs(case)
     block = head.model.transformer_blocks[0]
-
-    def refused(match: str) -> None:
-        with pytest.raises(saccade.InputError, match=match):
-            accelerate(head)
-        assert "get_action" not in vars(head)
 
     handle = accelerate(head)
     head.train()
     with pytest.raises(saccade.InputError, match="training mode"):
         call(case, given)
     handle.restore()
-    refused("training mode")
+    refused(head, "training mode")
     head.eval()
 
     handle = accelerate(head)
@@ -345,7 +353,7 @@ def check_refusals(case: Case) -> None:
     with pytest.raises(saccade.InputError, match="hooks"):
         call(case, given)
     handle.restore()
-    refused("hooks")
+    refused(head, "hooks")
     hook.remove()
 
     with accelerate(head) as handle:
@@ -359,7 +367,7 @@ def check_refusals(case: Case) -> None:
             call(case, wanting)
         with pytest.raises(TypeError):
             head.get_action(*given, options={}, other=1)
-        # Somebody else takes the place.
+        # Other code replaces `get_action`.
         head.get_action = lambda *arguments: handle(*arguments)
         with pytest.raises(saccade.InputError, match="replaced since"):
             handle.restore()
@@ -371,8 +379,14 @@ def check_refusals(case: Case) -> None:
         accelerate(head)
     del head.get_action
 
+
+def check_changes_that_are_refused(case: Case) -> None:
+    """A replaced or compiled module, another dtype, and other code under the same names."""
+    head = case.head
+    block = head.model.transformer_blocks[0]
+
     block.forward = lambda *arguments: None
-    refused("forward of model.transformer_blocks.0")
+    refused(head, "forward of model.transformer_blocks.0")
     del block.forward
 
     handle = accelerate(head)
@@ -389,18 +403,18 @@ def check_refusals(case: Case) -> None:
 
     compiled = torch.compile(block)
     head.model.transformer_blocks[0] = compiled
-    refused("torch.compile")
+    refused(head, "torch.compile")
     head.model.transformer_blocks[0] = block
 
     head.double()
-    refused("float64")
+    refused(head, "float64")
     head.float()
 
-    # Other code under the same names and shapes: only running it tells.
+    # Other code under the same names and shapes is found by running it.
     activation = type(block.ff.net[0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(activation, "gelu", lambda self, gate: torch.relu(gate))
-        refused("its actions differ")
+        refused(head, "its actions differ")
     drawn = type(head).process_backbone_output
 
     def drawing(self: nn.Module, backbone_output: Any) -> Any:
@@ -409,7 +423,7 @@ def check_refusals(case: Case) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(head), "process_backbone_output", drawing)
-        refused("random numbers")
+        refused(head, "random numbers")
     accelerate(head).restore()
 
 

@@ -16,15 +16,14 @@ from saccade.sim.rendering import Renderer, prepare_model
 from saccade.sim.scenarios import StepOutcome
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 
-Observation = dict[
-    str, Any
-]  # {"images": {camera: (H, W, 3) uint8}, "proprio": (4,) float32, "instruction": str}
+#: ``{"images": {camera: (H, W, 3) uint8}, "proprio": (4,) float32, "instruction": str}``
+SimulatedObservation = dict[str, Any]
 
 VIDEO_SIZE = 360
 SIMULATION_HZ = 80  # control steps in a second of simulated time
 
 
-class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32]]):
     """One task as a language-conditioned pixel task.
 
     An observation contains what a real robot would have: images, proprioception and the instruction. It does
@@ -96,19 +95,19 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         prepare_model(self._world.model, draws_goal=self.task.draws_goal)
         self._full_state = np.zeros(39)
         self._steps = 0
-        self.last_observation: Observation = {}
+        self.last_observation: SimulatedObservation = {}
         self._renderer: Renderer | None = None
         self._video_renderer: Renderer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[SimulatedObservation, dict[str, Any]]:
         """Starts an episode; without a seed, one of the evaluation seeds is drawn."""
         super().reset(seed=seed)
         self.restart(int(self.np_random.integers(1_000_000)) if seed is None else seed)
         return self.observe(), {"success": False, "task": self.task.name}
 
-    def step(self, action: npt.ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: npt.ArrayLike) -> tuple[SimulatedObservation, float, bool, bool, dict[str, Any]]:
         """Applies one action `(4,)`, clipped to [-1, 1]; `info["success"]` says whether the task is done."""
         outcome = self.advance(action)
         truncated = self._steps >= self.task.max_steps and not outcome.success
@@ -144,7 +143,7 @@ class TaskEnvironment(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._steps += 1
         return self.scenario.outcome(float(reward), bool(info["success"]))
 
-    def observe(self) -> Observation:
+    def observe(self) -> SimulatedObservation:
         """The current observation; also stored as `last_observation`."""
         self.last_observation = {
             "images": {camera.name: self._picture(camera) for camera in self.cameras},
