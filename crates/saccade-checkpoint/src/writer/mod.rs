@@ -310,7 +310,10 @@ mod tests {
             let b = match second.finish() {
                 Ok(_) => Elements::F32(vec![f32::from_le_bytes([1; 4]); 3]),
                 Err(error) => {
-                    assert!(error.to_string().ends_with("exists already; force replaces it"), "{error}");
+                    assert!(
+                        error.to_string().ends_with("exists already; force replaces it"),
+                        "{error}"
+                    );
                     Elements::F32(vec![0.0; 3])
                 }
             };
