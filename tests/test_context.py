@@ -26,15 +26,20 @@ def context(head: saccade.ActionHead) -> saccade.Context:
 
 
 @pytest.fixture(scope="module")
-def key_values() -> saccade.KeyValues:
+def cross_attention() -> saccade.CrossAttention:
     tensors: dict[str, Any] = {
         f"{name}.weight": np.ones((4, 4), np.float32) for name in ("to_q", "to_k", "to_v", "to_out.0")
     }
     tensors |= {f"{name}.bias": np.ones(4, np.float32) for name in ("to_q", "to_k", "to_v", "to_out.0")}
-    return saccade.CrossAttention(tensors, 2).project(np.ones((1, 3, 4), np.float32))
+    return saccade.CrossAttention(tensors, 2)
 
 
-@pytest.mark.parametrize("name", ["context", "key_values"])
+@pytest.fixture(scope="module")
+def key_values(cross_attention: saccade.CrossAttention) -> saccade.KeyValues:
+    return cross_attention.project(np.ones((1, 3, 4), np.float32))
+
+
+@pytest.mark.parametrize("name", ["context", "cross_attention", "key_values"])
 def test_copies_are_the_object_itself(name: str, request: pytest.FixtureRequest) -> None:
     one = request.getfixturevalue(name)
     assert copy.copy(one) is one
@@ -42,7 +47,12 @@ def test_copies_are_the_object_itself(name: str, request: pytest.FixtureRequest)
 
 
 @pytest.mark.parametrize(
-    ("name", "what_to_do"), [("context", "pickle the backbone features"), ("key_values", "pickle the tokens")]
+    ("name", "what_to_do"),
+    [
+        ("context", "pickle the backbone features"),
+        ("cross_attention", "pickle the tensors"),
+        ("key_values", "pickle the tokens"),
+    ],
 )
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_pickling_says_what_to_do(

@@ -19,6 +19,7 @@ from released import load_released
 from safetensors.numpy import load_file, save_file
 
 import saccade
+from saccade._arrays import does_not_fit
 from saccade.checkpoints import read_tensors
 
 TINY = load_released("n15_tiny")
@@ -495,6 +496,23 @@ def test_keys_and_values_of_another_layer() -> None:
 def test_embodiment_ids_are_a_sequence(ids: Any) -> None:
     with pytest.raises(Input, match=r"embodiment_ids: expected a sequence of integers, such as \[0\], got"):
         saccade.ActionHead.load(TINY.path, config=TINY.config, embodiment_ids=ids)
+
+
+@pytest.mark.parametrize("ids", [range(2**30), range(2**62), range(2**70)])
+def test_a_long_range_of_embodiment_ids_is_not_written_out(ids: range) -> None:
+    with pytest.raises(Input, match="embodiment_ids: expected at most 1048576 integers, got range"):
+        saccade.ActionHead.load(TINY.path, config=TINY.config, embodiment_ids=ids)
+
+
+def test_a_small_result_that_does_not_fit_is_not_said_to_have_no_size() -> None:
+    assert (
+        str(does_not_fit("noise", (20000, 16, 4)))
+        == "noise of shape (20000, 16, 4) (5.1 MB) does not fit in memory"
+    )
+    assert (
+        str(does_not_fit("noise", (2**40, 4)))
+        == f"noise of shape ({2**40}, 4) (17,592.2 GB) does not fit in memory"
+    )
 
 
 def test_names_that_are_not_valid_unicode() -> None:

@@ -185,8 +185,13 @@ def optional_integers(name: str, values: Sequence[int] | None) -> list[int] | No
         return None
     try:
         is_empty = len(values) == 0
+    except OverflowError:  # a range of more numbers than 64 bits count
+        raise InputError(f"{name}: expected at most {LARGEST_RANGE} integers, got {values!r}") from None
     except TypeError:
         raise InputError(f"{name}: expected a sequence of integers, such as [0], got {values!r}") from None
+    # NumPy would write a range out, however long it is.
+    if isinstance(values, range) and len(values) > LARGEST_RANGE:
+        raise InputError(f"{name}: expected at most {LARGEST_RANGE} integers, got {values!r}")
     # NumPy takes an empty list for one of floats.
     return [] if is_empty else int64(name, values).reshape(-1).tolist()
 
@@ -275,8 +280,9 @@ def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:
 
 def does_not_fit(what: str, shape: tuple[int, ...]) -> MemoryError:
     """The error for a float32 array that cannot be allocated."""
-    gigabytes = 4 * math.prod(shape) / 1e9
-    return MemoryError(f"{what} of shape {shape} ({gigabytes:,.1f} GB) does not fit in memory")
+    nbytes = 4 * math.prod(shape)
+    size = f"{nbytes / 1e9:,.1f} GB" if nbytes >= 1e9 else f"{nbytes / 1e6:.1f} MB"
+    return MemoryError(f"{what} of shape {shape} ({size}) does not fit in memory")
 
 
 def apart(array: Float32Array, output: Float32Array) -> Float32Array:

@@ -67,7 +67,8 @@ class CrossAttention:
     """Multi-head cross-attention with its projections: ``to_out(softmax(q k^T / sqrt(head_dim)) v)``.
 
     Attention heads are contiguous slices of the width, as in the released head (``Attention`` of diffusers).
-    An instance is immutable and may be called by any number of threads at the same time.
+    An instance is immutable and may be called by any number of threads at the same time. ``copy.copy`` and
+    ``copy.deepcopy`` return the instance itself. It cannot be pickled.
 
     Args:
         tensors: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
@@ -108,6 +109,18 @@ class CrossAttention:
             if not np.isfinite(array).all():
                 raise InputError(f"tensors[{name!r}]: expected finite values")
         self._attention = _saccade.CrossAttention(arrays, integer("num_heads", num_heads), precision)
+
+    def __copy__(self) -> CrossAttention:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> CrossAttention:
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise DtypeError(
+            "a CrossAttention cannot be pickled, because its weights are packed for this machine: pickle the "
+            "tensors and create it again"
+        )
 
     @property
     def num_heads(self) -> int:

@@ -53,8 +53,6 @@ struct Region {
 /// A checkpoint that is being written; dropped before [`CheckpointWriter::finish`], it leaves nothing.
 pub struct CheckpointWriter {
     out: PathBuf,
-    /// Whether something has that name already, which the checkpoint may replace.
-    replaces: bool,
     force: bool,
     companions: BTreeSet<PathBuf>,
     temporary: TemporaryDirectory,
@@ -79,7 +77,7 @@ impl CheckpointWriter {
         // Behind a link, what it leads to is replaced and not the link.
         let out = &out.canonicalize().unwrap_or_else(|_| out.to_owned());
         let carried = companions.all_paths();
-        let replaces = check_replaceable(out, &carried, force)?;
+        check_replaceable(out, &carried, force)?;
         let temporary = TemporaryDirectory::next_to(out)?;
         // Wide elements first, as the format's own writer does: each tensor then starts at a multiple of its element size.
         planned.sort_by(|a, b| (b.dtype.bitsize(), &a.name).cmp(&(a.dtype.bitsize(), &b.name)));
@@ -96,7 +94,6 @@ impl CheckpointWriter {
         }
         let mut writer = Self {
             out: out.to_owned(),
-            replaces,
             force,
             companions: carried,
             temporary,
@@ -232,8 +229,8 @@ impl CheckpointWriter {
     /// If a planned tensor was not written whole.
     ///
     /// # Errors
-    /// [`Error::Output`] if the disk is full or the name cannot be given; what had the name then still has it. [`Error::Stranded`] if neither
-    /// could get the name; both are then kept.
+    /// [`Error::Input`] if something has taken the name that may not be replaced; [`Error::Output`] if the disk is full or the name cannot be
+    /// given; what had the name then still has it. [`Error::Stranded`] if neither could get the name; both are then kept.
     pub fn finish(self) -> Result<Vec<String>> {
         assert!(
             self.regions
@@ -246,9 +243,8 @@ impl CheckpointWriter {
                 .map_err(|error| Error::writing(&self.temporary.path().join(name), error))?;
         }
         let files = self.shards.iter().map(|(name, _)| name.clone()).collect();
-        if self.replaces {
-            // It may hold more by now.
-            check_replaceable(&self.out, &self.companions, self.force)?;
+        // Another writer may have taken the name by now, or added to what has it.
+        if check_replaceable(&self.out, &self.companions, self.force)? {
             replace(&Disk, self.temporary, &self.out)?;
         } else {
             place(&Disk, self.temporary, &self.out)?;
@@ -271,12 +267,12 @@ mod tests {
     }
 
     /// A checkpoint of two tensors, half written, at `out`.
-    fn half_written(out: &Path, max_shard_bytes: u64) -> CheckpointWriter {
+    fn half_written(out: &Path, max_shard_bytes: u64, force: bool) -> CheckpointWriter {
         let metadata = BTreeMap::from([("key".to_owned(), "value".to_owned())]);
         let companions = Companions::of(Path::new("none.safetensors"), std::iter::empty()).unwrap();
         let tensors = vec![planned("a", &[2]), planned("b", &[3])];
         let mut writer =
-            CheckpointWriter::create(out, tensors, &metadata, &companions, max_shard_bytes, false).unwrap();
+            CheckpointWriter::create(out, tensors, &metadata, &companions, max_shard_bytes, force).unwrap();
         writer.file("config.json", "{}").unwrap();
         for value in [1.0f32, 2.0] {
             writer.tensor("a", &value.to_le_bytes()).unwrap();
@@ -289,7 +285,7 @@ mod tests {
         for (max_shard_bytes, num_files) in [(u64::MAX, 1), (10, 2)] {
             let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
             let out = parent.join("out");
-            let mut writer = half_written(&out, max_shard_bytes);
+            let mut writer = half_written(&out, max_shard_bytes, false);
             writer.zeros("b", 12);
             assert_eq!(writer.finish().unwrap().len(), num_files);
             let checkpoint = Checkpoint::open(&out).unwrap();
@@ -303,9 +299,35 @@ mod tests {
     }
 
     #[test]
+    fn of_two_writers_of_a_new_name_the_later_replaces_the_earlier_only_with_force() {
+        for force in [false, true] {
+            let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
+            let out = parent.join("out");
+            let [mut first, mut second] = [(); 2].map(|()| half_written(&out, u64::MAX, force));
+            first.zeros("b", 12);
+            first.finish().unwrap();
+            second.tensor("b", &[1; 12]).unwrap();
+            let b = match second.finish() {
+                Ok(_) => Elements::F32(vec![f32::from_le_bytes([1; 4]); 3]),
+                Err(error) => {
+                    assert!(
+                        error.to_string().ends_with("exists already; force replaces it"),
+                        "{error}"
+                    );
+                    Elements::F32(vec![0.0; 3])
+                }
+            };
+            assert_eq!(b != Elements::F32(vec![0.0; 3]), force);
+            assert_eq!(Checkpoint::open(&out).unwrap().read("b").unwrap(), b);
+            assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 1);
+            std::fs::remove_dir_all(parent).unwrap();
+        }
+    }
+
+    #[test]
     fn what_is_not_finished_leaves_nothing() {
         let parent = std::env::temp_dir().join(format!("saccade-writer-{}", temporary::unique()));
-        drop(half_written(&parent.join("out"), u64::MAX));
+        drop(half_written(&parent.join("out"), u64::MAX, false));
         assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 0);
         std::fs::remove_dir_all(parent).unwrap();
     }

@@ -46,7 +46,7 @@ pub(super) fn perturb(
         .find(|value| value.is_nan() || f64::from(value.abs()) > bound)
     {
         return Err(Error::Input(format!(
-            "perturbation: {amount} gives a token with an element of {large:e}; a layer norm of {width} float32 elements overflows above {bound:.1e}"
+            "perturbation: {amount:?} gives a token with an element of {large:e}; a layer norm of {width} float32 elements overflows above {bound:.1e}"
         )));
     }
     Ok((added / ((count - before) * width) as f64).sqrt())
