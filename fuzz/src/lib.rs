@@ -76,7 +76,7 @@ pub fn use_config(text: &str) {
 
 fn use_head_config(config: &HeadConfig) {
     assert!(config.num_rows() > config.action_horizon);
-    for (name, shape) in tensor_shapes(config) {
+    for (name, shape) in tensor_shapes(config).expect("nothing stops it") {
         let size = shape
             .iter()
             .try_fold(4usize, |product, &size| product.checked_mul(size));

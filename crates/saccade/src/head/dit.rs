@@ -9,7 +9,7 @@ use super::context::Context;
 use crate::alloc::sized;
 use crate::config::{HeadConfig, Reads};
 use crate::engine::Engine;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::inspect::changes::Changes;
 use crate::inspect::groups::{Group, Groups};
 use crate::inspect::trace::{Recorded, StepBlock};
@@ -202,7 +202,7 @@ impl Dit {
         let mut row = |layer: &Linear, x: &[f32], epilogue| {
             let mut out = vec![0.0; layer.out_features()];
             layer.apply(engine, x, epilogue, &mut out, &mut scratch)?;
-            Ok::<_, crate::Error>(out)
+            Ok::<_, Error>(out)
         };
         let mut table = [0.0; TIME_CHANNELS];
         embedding_time(timestep, &mut table);
@@ -218,7 +218,7 @@ impl Dit {
             } else {
                 (second, first)
             };
-            Ok::<_, crate::Error>(Modulation {
+            Ok::<_, Error>(Modulation {
                 scale: scale.iter().map(|scale| 1.0 + scale).collect(),
                 shift: shift.to_vec(),
             })

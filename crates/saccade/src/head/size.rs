@@ -18,7 +18,7 @@ impl Published {
     pub fn nbytes(&self, precision: Precision, num_embodiments: usize) -> Result<usize> {
         let engine = Engine::new(precision, Some(1))?;
         let dtype = |name: &str| Ok(self.checkpoint.dtype(&format!("{}{name}", self.prefix))?);
-        let sizer = Sizer::new(engine, dtype)?;
+        let sizer = Sizer::new(engine, dtype);
         let builder = Builder::new(&sizer, engine);
         let ids: Vec<usize> = (0..num_embodiments).collect();
         let embodiments = Embodiments {

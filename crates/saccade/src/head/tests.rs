@@ -236,6 +236,7 @@ fn the_plan_has_the_tensors_of_the_released_files() {
             .join(name);
         let checkpoint = crate::Checkpoint::open(&path).unwrap();
         let mut planned: Vec<_> = tensor_shapes(&head.config)
+            .unwrap()
             .into_iter()
             .map(|(tensor, _)| format!("action_head.{tensor}"))
             .collect();

@@ -32,7 +32,7 @@ pub(crate) fn kept_embodiments(checkpoint: &Checkpoint) -> Result<Option<Vec<i64
 /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, of the wrong shape or of another type.
 pub(crate) fn check(checkpoint: &Checkpoint, prefix: &str, config: &HeadConfig) -> Result<()> {
     let is_unused = |name: &str, shape: &[usize]| is_unused(config, name, shape);
-    let problems = checkpoint.problems(prefix, &tensor_specs(config), is_unused);
+    let problems = checkpoint.problems(prefix, &tensor_specs(config)?, is_unused);
     if problems.is_empty() {
         return Ok(());
     }
