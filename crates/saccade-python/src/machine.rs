@@ -83,20 +83,18 @@ pub(crate) fn available_isas() -> Vec<String> {
 pub(crate) fn selected_isa() -> PyResult<String> {
     Isa::from_env()
         .map(|isa| isa.to_string())
-        .map_err(|error| raise(Error::Input(error.to_string())))
+        .map_err(|error| raise(error.into()))
 }
 
 #[pyfunction]
 pub(crate) fn dot_products() -> PyResult<Vec<&'static str>> {
     Isa::from_env()
         .map(Isa::dot_products)
-        .map_err(|error| raise(Error::Input(error.to_string())))
+        .map_err(|error| raise(error.into()))
 }
 
 #[pyfunction]
 pub(crate) fn default_num_threads() -> PyResult<usize> {
     let threads = saccade::default_num_threads();
-    threads
-        .map(usize::from)
-        .map_err(|error| raise(Error::Input(error.to_string())))
+    threads.map(usize::from).map_err(|error| raise(error.into()))
 }

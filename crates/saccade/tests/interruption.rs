@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use saccade::{
-    ActionHead, ConvertOptions, Error, HeadConfig, LoadOptions, ResizeOptions, Result, RewriteOptions, convert,
-    files::Checkpoint, interruptible, merge_future_tokens, quantize, resize, tensor_shapes,
+    ActionHead, ConvertOptions, Error, HeadConfig, LoadOptions, ResizeOptions, Result, RewriteOptions,
+    convert, files::Checkpoint, interruptible, merge_future_tokens, quantize, resize, tensor_shapes,
 };
 
 /// A released head and its config, which is in the file's metadata.
@@ -31,7 +31,10 @@ fn planning_stops_without_a_panic() {
     let config = HeadConfig::from_json(&text).unwrap();
     assert!(!tensor_shapes(&config).unwrap().is_empty());
     assert!(stops(|| tensor_shapes(&config)));
-    assert!(stops(|| ActionHead::load(&path, &LoadOptions::default().with_config(text))));
+    assert!(stops(|| ActionHead::load(
+        &path,
+        &LoadOptions::default().with_config(text)
+    )));
 }
 
 /// Asked to stop once the work has come as far as writing tensors.

@@ -155,7 +155,9 @@ impl PackedLinear {
         let columns = gemm.shape().columns;
         // A bias for each column; for int8 also a scale and a sum.
         let words_of_column = if product == Product::Int8 { 3 } else { 1 };
-        let panel = gemm.panel_words(in_features).saturating_add(columns * words_of_column);
+        let panel = gemm
+            .panel_words(in_features)
+            .saturating_add(columns * words_of_column);
         let words = out_features.div_ceil(columns).saturating_mul(panel);
         Ok(words.saturating_mul(size_of::<u32>()))
     }

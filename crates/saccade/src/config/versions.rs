@@ -124,6 +124,11 @@ impl Version {
         RELEASES.iter().map(|release| release.version)
     }
 
+    /// The version of this [`name`](Self::name).
+    pub(crate) fn named(name: &str) -> Option<Self> {
+        Self::all().find(|version| version.name() == name)
+    }
+
     fn release(self) -> &'static Release {
         const TABLE: &[Release] = &RELEASES;
         let found = TABLE.iter().find(|release| release.version == self);

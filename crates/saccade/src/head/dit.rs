@@ -15,7 +15,7 @@ use crate::inspect::groups::{Group, Groups};
 use crate::inspect::trace::{Recorded, StepBlock};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys, Held, SelfKeys, Subset};
 use crate::nn::linear::Linear;
-use crate::nn::mlp::FeedForward;
+use crate::nn::mlp::{DIFFUSERS, FeedForward};
 use crate::nn::weights::Weights;
 use crate::ops::{self, check_interrupted};
 use crate::precision::Role;
@@ -155,7 +155,12 @@ impl Block {
             modulation: Linear::new(&weights.at("norm1.linear"), width, 2 * width, Role::Time)?,
             attention: Attention::new(&attention, width, context_dim, config.num_heads, kv_part)?,
             reads,
-            feed_forward: FeedForward::new(&weights.at("ff"), width, 4 * width, Epilogue::GeluTanh)?,
+            feed_forward: FeedForward::new(
+                &weights.at("ff"),
+                DIFFUSERS,
+                [width, 4 * width],
+                Epilogue::GeluTanh,
+            )?,
         })
     }
 }

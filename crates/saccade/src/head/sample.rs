@@ -4,7 +4,7 @@ use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::{ActiveRows, Pass};
 use super::workspace::Workspace;
-use crate::alloc::sized;
+use crate::alloc::{reserve, sized};
 use crate::array::{Array, ArrayMut, unravel};
 use crate::error::{Error, Result, show_shape};
 use crate::inspect::changes::Changes;
@@ -196,6 +196,7 @@ impl ActionHead {
             let bucket = bucket(evaluation, count, self.config.num_timestep_buckets);
             let times = &mut workspace.dit.times;
             times.clear();
+            reserve("activations", times, pass.context.batch)?;
             times.resize(pass.context.batch, self.layers.dit.time(self.engine, bucket)?);
             let rows = if !refreshes(evaluation) {
                 ActiveRows::Actions

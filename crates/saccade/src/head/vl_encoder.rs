@@ -11,7 +11,7 @@ use crate::engine::Engine;
 use crate::error::Result;
 use crate::inspect::trace::{Keep, Recorded, Shapes};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, SelfKeys};
-use crate::nn::mlp::FeedForward;
+use crate::nn::mlp::{DIFFUSERS, FeedForward};
 use crate::nn::norm::LayerNorm;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
@@ -84,7 +84,12 @@ impl VlBlock {
             norm1: LayerNorm::new(&weights.at("norm1"), width, EPS)?,
             attention: Attention::new(&weights.at("attn1"), width, width, heads, Part::ToKv)?,
             norm3: LayerNorm::new(&weights.at("norm3"), width, EPS)?,
-            feed_forward: FeedForward::new(&weights.at("ff"), width, 4 * width, Epilogue::GeluTanh)?,
+            feed_forward: FeedForward::new(
+                &weights.at("ff"),
+                DIFFUSERS,
+                [width, 4 * width],
+                Epilogue::GeluTanh,
+            )?,
         })
     }
 }

@@ -286,11 +286,15 @@ fn own_config(directory: &Path) -> Result<Option<Value>> {
     if !path.exists() {
         return Ok(None);
     }
-    let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
-    let own: Value = serde_json::from_str(&read_text("source", &path)?)
-        .map_err(|error| bad(format!("not valid JSON: {error}")))?;
+    let own = serde_json::from_str(&read_text("source", &path)?).map_err(|source| Error::Json {
+        what: format!("source: {}", path.display()),
+        source,
+    })?;
     match own {
         Value::Object(_) => Ok(Some(own)),
-        _ => Err(bad("expected a JSON object".to_owned())),
+        _ => Err(Error::Checkpoint(format!(
+            "source: {}: expected a JSON object",
+            path.display()
+        ))),
     }
 }

@@ -4,6 +4,7 @@
 
 use saccade_checkpoint::{granted, reserve};
 
+use crate::alloc::filled;
 use crate::error::{Error, Result};
 use crate::ops::check_interrupted;
 
@@ -48,7 +49,7 @@ pub fn merge_future_tokens(
         )));
     }
     let count = tokens.len() / width;
-    let zeros = vec![0.0; count];
+    let zeros = filled("key_bias", count, 0.0)?;
     let key_bias = key_bias.unwrap_or(&zeros);
     if key_bias.len() != count {
         return Err(Error::Shape(format!(

@@ -6,15 +6,16 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 
 use super::json_edit::{Found, entry, find, span};
-use crate::config::HeadConfig;
+use crate::config::{Feature, HEAD_KEY, HeadConfig, OWN_KEY, Version};
 use crate::error::{Error, Result};
 
 /// Merging compares every token with every other, and a chunk takes time in proportion to their number.
 const MAX_TOKENS: usize = 4096;
 
-/// The key of the number of future tokens in published configs, and that of saccade's own.
+/// The key of the number of future tokens in published configs.
 const COUNT_KEY: &str = "num_target_vision_tokens";
-const OWN_KEY: &str = "saccade";
+
+/// The key of their biases in saccade's own part of a config.
 const BIAS_KEY: &str = "future_key_bias";
 
 /// The text of a config, which holds the head's, for `num_future_tokens` tokens without biases; all else is as it is written.
@@ -53,7 +54,8 @@ struct HeadObject {
 pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Plan> {
     let bad = |problem: String| Err(Error::Checkpoint(problem));
     let before = config.num_future_tokens;
-    if config.version != "n1.5" {
+    let version = Version::named(&config.version);
+    if !version.is_some_and(|version| version.has(Feature::FutureTokens)) {
         return bad(format!(
             "source: GR00T {} has no future tokens, so there is no number of them to change",
             config.version.to_uppercase()
@@ -75,8 +77,10 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
         ));
     }
     let mut found = Vec::new();
-    let whole: &RawValue = serde_json::from_str(given)
-        .map_err(|error| Error::Checkpoint(format!("config: not valid JSON: {error}")))?;
+    let whole: &RawValue = serde_json::from_str(given).map_err(|source| Error::Json {
+        what: "config".to_owned(),
+        source,
+    })?;
     find("", whole, &mut found)?;
     let counts: Vec<&Found<'_>> = found.iter().filter(|place| place.key == COUNT_KEY).collect();
     let others: Vec<String> = counts
@@ -92,14 +96,14 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
     }
     let head = found
         .iter()
-        .find(|place| place.path == "action_head_cfg")
+        .find(|place| place.path == HEAD_KEY)
         .map(|place| place.value)
         .or_else(|| (!found.iter().any(|place| place.path == "type")).then_some(whole));
     let in_head = |key: &str, head: &RawValue| {
         let path = if std::ptr::eq(head, whole) {
             key.to_owned()
         } else {
-            format!("action_head_cfg.{key}")
+            format!("{HEAD_KEY}.{key}")
         };
         found.iter().find(|place| place.path == path)
     };
