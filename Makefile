@@ -46,9 +46,11 @@ test: setup-test
 	$(MAKE) test-rust
 	$(MAKE) test-python
 
-# The default members and their examples. Benches have no tests, and their dependencies are slow to build.
+# The default members; then their examples, which a test run only builds. Benches have no tests, and their dependencies are slow to build.
 test-rust:
 	cargo test --locked --quiet
+	cargo run --locked --quiet -p saccade-groot --example sample >/dev/null
+	cargo run --locked --quiet -p saccade-groot --example look_inside >/dev/null
 
 # One worker per core. Each starts with a contiguous part of the tests, so few module fixtures are built twice. The
 # workers fill the cores; more OpenMP threads in torch and NumPy would only compete for them.

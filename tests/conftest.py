@@ -10,6 +10,9 @@ from released import NAMES, Released, load_released
 
 from saccade import _saccade
 
+# pytest-xdist tells its workers the width of the terminal. The programs under test see no terminal.
+os.environ.pop("COLUMNS", None)
+
 # No deadline: the machine may be shared. On CI every run draws the same examples, so a failure is caused by
 # the change and not by the draw.
 hypothesis.settings.register_profile(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import threading
 
+import numpy as np
 import pytest
 from released import load_released
 
+import saccade
 from saccade import _saccade
-from saccade.errors import CheckpointError, SaccadeError
+from saccade.errors import CheckpointError, InputError, SaccadeError, ShapeError
 
 
 def test_a_panic_in_the_core_is_an_error_that_asks_for_a_report() -> None:
@@ -41,3 +43,14 @@ def test_readers_and_getters_of_one_checkpoint_do_not_wait_for_each_other() -> N
         thread.join(timeout=60)
     assert not any(thread.is_alive() for thread in threads)
     assert len(failed) == 600
+
+
+def test_messages_name_what_python_users_can_call() -> None:
+    released = load_released("n15_tiny")
+    head = saccade.ActionHead.load(released.path, config=released.config)
+    mask = np.zeros(released.backbone_features.shape[:2], bool)
+    with pytest.raises(InputError, match=r"attention_mask: .*drop_vl=~attention_mask"):
+        head.encode(released.backbone_features, attention_mask=mask)
+    context = head.encode(released.backbone_features)
+    with pytest.raises(ShapeError, match=r"state: .*saccade\.Normalizer"):
+        head.sample(context, released.state[:, :, :-1], released.embodiment_id, noise=released.noise)

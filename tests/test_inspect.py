@@ -360,10 +360,7 @@ def test_the_command_prints_json(base: Path, capsys: pytest.CaptureFixture[str])
     assert (report["version"], report["layout"], report["seconds"]) == ("n1.5", "nvidia", None)
 
 
-def test_the_command_prints_tables(
-    base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delenv("COLUMNS", raising=False)  # pytest-xdist sets it
+def test_the_command_prints_tables(base: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(fine_tuned(base, tmp_path / "fork"), "--reference", base) == 0
     printed = capsys.readouterr().out
     for words in (

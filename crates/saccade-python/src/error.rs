@@ -8,12 +8,24 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::PyType;
 use saccade::{Error, ErrorKind};
 
+/// What Python users can do about an error of the core, by how its message begins. The core's own words are for every language.
+const HINTS: [(&str, &str); 2] = [
+    ("state: expected ", "saccade.Normalizer converts a robot's state"),
+    (
+        "attention_mask: expected no false entry",
+        "in Python: attention_mask=None, or drop_vl=~attention_mask",
+    ),
+];
+
 /// The exception of `saccade.errors` for an error of the core.
 pub(crate) fn raise(error: Error) -> PyErr {
     static SHAPE: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     static INPUT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     static CHECKPOINT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
-    let message = error.to_string();
+    let mut message = error.to_string();
+    if let Some((_, hint)) = HINTS.iter().find(|(start, _)| message.starts_with(start)) {
+        message = format!("{message}; {hint}");
+    }
     match error.kind() {
         ErrorKind::NotFound => PyFileNotFoundError::new_err(message),
         ErrorKind::Memory => PyMemoryError::new_err(message),
