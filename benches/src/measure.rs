@@ -143,7 +143,7 @@ fn now(clock: Clock) -> Duration {
     )
 }
 
-/// The value below which `part` of the samples lie.
+/// The value below which `part` of the samples are.
 #[must_use]
 #[expect(
     clippy::cast_possible_truncation,

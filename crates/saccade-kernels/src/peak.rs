@@ -40,7 +40,7 @@ pub enum PeakError {
 /// The most multiply-accumulates a second that the kernels of `isa` and `arithmetic` could do on `threads` threads, measured in a few
 /// hundredths of a second: independent chains of the instruction that they are made of, without any memory.
 ///
-/// bfloat16 without an instruction of its own is float32 once it is widened, and has its peak.
+/// Where there is no instruction for bfloat16, it is widened to float32 and has the same peak.
 ///
 /// # Errors
 /// [`PeakError::Thread`] if the system refuses a thread.

@@ -15,7 +15,7 @@ use std::ops::Range;
 pub struct Rows<'a, T = f32> {
     /// From the first element on; ends at the last one or later.
     data: &'a [T],
-    shape: Shape,
+    shape: RowShape,
 }
 
 /// [`Rows`] that can be written to.
@@ -31,18 +31,18 @@ pub struct Rows<'a, T = f32> {
 pub struct RowsMut<'a, T = f32> {
     /// As in [`Rows`].
     data: &'a mut [T],
-    shape: Shape,
+    shape: RowShape,
 }
 
 /// How many rows and columns, and elements from one row to the next.
 #[derive(Clone, Copy, Debug)]
-struct Shape {
+struct RowShape {
     num_rows: usize,
     num_columns: usize,
     row_stride: usize,
 }
 
-impl Shape {
+impl RowShape {
     /// Of `len` elements as rows of `num_columns`.
     #[track_caller]
     fn contiguous(len: usize, num_columns: usize) -> Self {
@@ -143,7 +143,7 @@ impl<'a, T> Rows<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn new(data: &'a [T], num_columns: usize) -> Self {
-        let shape = Shape::contiguous(data.len(), num_columns);
+        let shape = RowShape::contiguous(data.len(), num_columns);
         Self { data, shape }
     }
 
@@ -154,7 +154,7 @@ impl<'a, T> Rows<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn strided(data: &'a [T], num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
-        let shape = Shape::strided(data.len(), num_rows, num_columns, row_stride);
+        let shape = RowShape::strided(data.len(), num_rows, num_columns, row_stride);
         Self { data, shape }
     }
 
@@ -229,7 +229,7 @@ impl<'a, T> RowsMut<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn new(data: &'a mut [T], num_columns: usize) -> Self {
-        let shape = Shape::contiguous(data.len(), num_columns);
+        let shape = RowShape::contiguous(data.len(), num_columns);
         Self { data, shape }
     }
 
@@ -240,7 +240,7 @@ impl<'a, T> RowsMut<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn strided(data: &'a mut [T], num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
-        let shape = Shape::strided(data.len(), num_rows, num_columns, row_stride);
+        let shape = RowShape::strided(data.len(), num_rows, num_columns, row_stride);
         assert!(
             num_rows <= 1 || num_columns <= row_stride,
             "row_stride: expected at least the {num_columns} elements of a row, got {row_stride}"

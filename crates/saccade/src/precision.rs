@@ -7,7 +7,7 @@ use saccade_kernels::{Arithmetic, Element};
 
 use crate::error::{Error, Result};
 
-/// What a layer is to a model's cost, which decides how precisely it is worth computing.
+/// A layer's share of the cost, which decides how precisely it is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
     /// Attention and feed-forward of the blocks: nearly all of the work.

@@ -51,7 +51,7 @@ impl ActionHead {
         )))
     }
 
-    /// The number of samples an observation.
+    /// Checks the noise; returns the number of samples per observation.
     pub(super) fn check_noise(
         &self,
         noise: Array<'_>,
@@ -138,7 +138,7 @@ impl ActionHead {
         Error::Input(format!("embodiment_id: expected 0 to {last}, got {id}"))
     }
 
-    /// What a call on `context` is over.
+    /// The sizes of a call on `context`.
     pub(super) fn extent<'a>(
         &'a self,
         interventions: &'a [Intervention],

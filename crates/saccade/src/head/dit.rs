@@ -82,7 +82,7 @@ pub(crate) enum ActiveRows {
     Needed,
     /// As [`Self::Needed`], and what the self-attention blocks read of them is held.
     NeededAndHeld,
-    /// Those of the actions. The self-attention blocks read the held keys and values of the others.
+    /// The action rows. The self-attention blocks read the held keys and values of the other rows.
     Actions,
 }
 
@@ -123,7 +123,7 @@ pub(crate) struct DitBuffers {
     y_all: Vec<f32>,
     hidden: Vec<f32>,
     attention: AttentionBuffers,
-    /// By block, empty for cross-attention.
+    /// Keys and values by block; empty for cross-attention.
     held: Vec<Vec<PackedKeyValues>>,
 }
 
@@ -188,7 +188,7 @@ impl Dit {
         })
     }
 
-    /// By block: the attention over the vision-language tokens and what it sees of them, if it is one.
+    /// For each block that attends to the vision-language tokens: its attention and which of the tokens it sees.
     pub(crate) fn cross_attentions(&self) -> Vec<Option<(Reads, &Attention)>> {
         self.blocks
             .iter()

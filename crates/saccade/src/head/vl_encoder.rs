@@ -43,7 +43,7 @@ struct VlBlock {
 }
 
 /// What is encoded, and for whom.
-pub(crate) struct Tokens<'a> {
+pub(crate) struct VlTokens<'a> {
     /// `(batch, num_vl_tokens, context_dim)`.
     pub features: &'a [f32],
     pub num_vl_tokens: usize,
@@ -51,7 +51,7 @@ pub(crate) struct Tokens<'a> {
     pub removed: Option<&'a [f32]>,
     /// What each kind of cross-attention block sees.
     pub seen: &'a [Seen],
-    /// By block of the transformer: the attention over these tokens and what it sees of them, if it is one.
+    /// For each block of the transformer that attends to these tokens: its attention and which of the tokens it sees.
     pub cross: &'a [Option<(Reads, &'a Attention)>],
 }
 
@@ -132,11 +132,11 @@ impl VlEncoder {
     pub(crate) fn encode(
         &self,
         engine: Engine,
-        tokens: &Tokens<'_>,
+        tokens: &VlTokens<'_>,
         recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,
     ) -> Result<Encoded> {
-        let Tokens {
+        let VlTokens {
             features,
             num_vl_tokens,
             ..
@@ -170,7 +170,7 @@ impl VlEncoder {
     fn project(
         &self,
         engine: Engine,
-        tokens: &Tokens<'_>,
+        tokens: &VlTokens<'_>,
         elements: Range<usize>,
         vl: &[f32],
         keys_values: &mut [Vec<PackedKeyValues>],
@@ -200,7 +200,7 @@ impl VlEncoder {
     fn tokens(
         &self,
         engine: Engine,
-        tokens: &Tokens<'_>,
+        tokens: &VlTokens<'_>,
         elements: Range<usize>,
         recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,

@@ -36,7 +36,7 @@ pub(crate) struct Projections {
 pub(crate) struct GroupedAttention {
     qkv: Linear,
     out: Linear,
-    /// Of each head of the queries and the keys; none leaves them as they are.
+    /// The norms of each head of the queries and of the keys, if the model has them.
     norms: Option<[RmsNorm; 2]>,
     sizes: GroupedSizes,
 }

@@ -1,5 +1,5 @@
-//! lerobot's checkpoints, whose `config.json` is a policy's and holds no size of the head: sizes come from the tensors, and what no shape
-//! tells is as in the published models.
+//! lerobot's checkpoints, whose `config.json` describes a policy and holds no size of the head. Sizes come from the tensors; what no shape
+//! determines is taken from the published models.
 
 use std::path::Path;
 
@@ -176,7 +176,7 @@ fn from_tensors(
     )))
 }
 
-/// Adds both transformers' configs, and to `problems` what the tensors do not tell.
+/// Adds both transformers' configs, and to `problems` what the tensors do not determine.
 fn add_transformers(
     head: &mut Object,
     version: Version,
@@ -280,7 +280,7 @@ fn chunk_of_processors(directory: &Path) -> Option<u64> {
         .find_map(|step| step.get("config")?.get("action_horizon")?.as_u64())
 }
 
-/// Saccade's own part of the head's config: in a file of its own, since lerobot refuses a `config.json` with keys that it does not know.
+/// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with keys that it does not know.
 fn own_config(directory: &Path) -> Result<Option<Value>> {
     let path = directory.join(OWN_CONFIG);
     if !path.exists() {

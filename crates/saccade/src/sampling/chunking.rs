@@ -13,7 +13,7 @@ pub struct Chunking<'a> {
     pub previous_chunk: Array<'a>,
     /// Actions that are taken over, up to `horizon`.
     pub overlap: usize,
-    /// Of these, the first that do not change: those that are carried out before the new chunk is there.
+    /// How many of these do not change: the robot executes them before the new chunk is available.
     pub frozen: usize,
     /// How soon the rest become free: above 0, and 6 in released code.
     pub ramp_rate: f64,

@@ -25,11 +25,13 @@ const BIAS_KEY: &str = "future_key_bias";
 /// number out of range.
 pub fn resized_config(config_json: &str, num_future_tokens: usize) -> Result<String> {
     let config = HeadConfig::from_json(config_json)?;
-    Ok(plan(&config, config_json, num_future_tokens)?.config(None).0)
+    Ok(config_edit(&config, config_json, num_future_tokens)?
+        .config(None)
+        .0)
 }
 
 /// What changes in a checkpoint's config: what can be said without its tensors.
-pub(super) struct Plan {
+pub(super) struct ConfigEdit {
     given: String,
     count: usize,
     /// Where the number of future tokens is.
@@ -51,7 +53,7 @@ struct HeadObject {
 /// # Errors
 /// [`Error::Checkpoint`] for a version without future tokens, a head that has none, and numbers that contradict each other;
 /// [`Error::Input`] for a count out of range.
-pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Plan> {
+pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Result<ConfigEdit> {
     let bad = |problem: String| Err(Error::Checkpoint(problem));
     let before = config.num_future_tokens;
     let version = Version::named(&config.version);
@@ -107,7 +109,7 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
         };
         found.iter().find(|place| place.path == path)
     };
-    Ok(Plan {
+    Ok(ConfigEdit {
         given: given.to_owned(),
         count,
         counts: counts.iter().map(|place| span(given, place.value)).collect(),
@@ -122,7 +124,7 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
     })
 }
 
-impl Plan {
+impl ConfigEdit {
     /// The text of the new `config.json`, and that of a file of saccade's own if the bias has no place in it.
     pub(super) fn config(&self, bias: Option<&[f32]>) -> (String, Option<String>) {
         let count = self.count.to_string();
@@ -183,13 +185,13 @@ mod tests {
   "model_type": "gr00t_n1_5", "extra": [{"num_target_vision_tokens": 4}]
 }"#;
 
-    fn planned(given: &str, count: usize) -> Result<Plan> {
-        plan(&HeadConfig::from_json(given)?, given, count)
+    fn edit_of(given: &str, count: usize) -> Result<ConfigEdit> {
+        config_edit(&HeadConfig::from_json(given)?, given, count)
     }
 
     #[test]
     fn all_of_a_config_but_the_number_stays_as_it_is_written() {
-        let (text, own_file) = planned(CONFIG, 9).unwrap().config(None);
+        let (text, own_file) = edit_of(CONFIG, 9).unwrap().config(None);
         assert_eq!(
             text,
             CONFIG.replace("num_target_vision_tokens\": 4", "num_target_vision_tokens\": 9")
@@ -199,18 +201,18 @@ mod tests {
 
     #[test]
     fn a_bias_comes_and_goes() {
-        let (with, _) = planned(CONFIG, 2).unwrap().config(Some(&[0.5, -1.0]));
+        let (with, _) = edit_of(CONFIG, 2).unwrap().config(Some(&[0.5, -1.0]));
         let config = HeadConfig::from_json(&with).unwrap();
         assert_eq!(
             (config.num_future_tokens, config.future_key_bias),
             (2, Some(vec![0.5, -1.0]))
         );
-        let (other, _) = planned(&with, 1).unwrap().config(Some(&[0.25]));
+        let (other, _) = edit_of(&with, 1).unwrap().config(Some(&[0.25]));
         assert_eq!(
             HeadConfig::from_json(&other).unwrap().future_key_bias,
             Some(vec![0.25])
         );
-        let (back, _) = planned(&other, 4).unwrap().config(None);
+        let (back, _) = edit_of(&other, 4).unwrap().config(None);
         assert_eq!(back, CONFIG);
         // Wherever the key is.
         for written in [
@@ -223,7 +225,7 @@ mod tests {
                 "\"interleave_self_attention\": true}\n, \"saccade\": {}",
             ),
         ] {
-            let (back, _) = planned(&written, 4).unwrap().config(None);
+            let (back, _) = edit_of(&written, 4).unwrap().config(None);
             let value: Value = serde_json::from_str(&back).unwrap();
             assert_eq!(value, serde_json::from_str::<Value>(CONFIG).unwrap(), "{back}");
         }
@@ -235,7 +237,7 @@ mod tests {
         let config = HeadConfig::from_json(&given).unwrap();
         assert_eq!(config.num_future_tokens, 32);
         let given = given.replace("{\"num_target_vision_tokens\": 4}", "");
-        let (text, _) = plan(&config, &given, 40).unwrap().config(None);
+        let (text, _) = config_edit(&config, &given, 40).unwrap().config(None);
         assert_eq!(HeadConfig::from_json(&text).unwrap().num_future_tokens, 40);
     }
 
@@ -245,7 +247,7 @@ mod tests {
             "[{\"num_target_vision_tokens\": 4}]",
             "[{\"num_target_vision_tokens\": 32}]",
         );
-        let error = planned(&given, 9).err().unwrap().to_string();
+        let error = edit_of(&given, 9).err().unwrap().to_string();
         assert!(
             error.contains("extra[0].num_target_vision_tokens is 32"),
             "{error}"
@@ -257,9 +259,9 @@ mod tests {
     fn a_config_without_a_head_is_left_alone() {
         let config = HeadConfig::from_json(CONFIG).unwrap();
         let given = "{\"type\": \"groot\", \"chunk_size\": 50}";
-        let plan = plan(&config, given, 8).unwrap();
-        assert_eq!(plan.config(None), (given.to_owned(), None));
-        let (text, own_file) = plan.config(Some(&[0.5]));
+        let edit = config_edit(&config, given, 8).unwrap();
+        assert_eq!(edit.config(None), (given.to_owned(), None));
+        let (text, own_file) = edit.config(Some(&[0.5]));
         assert_eq!(text, given);
         let own_file: Value = serde_json::from_str(&own_file.unwrap()).unwrap();
         assert_eq!(own_file, serde_json::json!({"future_key_bias": [0.5]}));
