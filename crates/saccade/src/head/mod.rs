@@ -13,8 +13,8 @@ pub(crate) mod encode;
 mod layers;
 pub(crate) mod load;
 pub(crate) mod plan;
+mod published;
 pub(crate) mod sample;
-mod size;
 #[cfg(test)]
 mod tests;
 mod trace;

@@ -57,9 +57,6 @@ fn plan(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
     Ok(planner.into_plan())
 }
 
-/// The name, without a prefix, of the future tokens.
-pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
-
 /// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
 /// logarithms of loss weights, what N1.6 puts in place of a state that it hides, how often N1.7 hides one.
 pub(crate) fn is_unused(config: &HeadConfig, name: &str, shape: &[usize]) -> bool {

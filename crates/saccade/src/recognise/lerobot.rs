@@ -7,10 +7,9 @@ use saccade_checkpoint::{OWN_CONFIG, read_text};
 use serde_json::{Map, Value, json};
 
 use super::layout::{CheckpointLayout, Clues, Evidence};
-use super::sizes::{self, BLOCKS, HeadShapes, add_decoders, proved};
+use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
 use crate::config::{Feature, OWN_KEY, Object, Version, WholeConfig};
 use crate::error::{Error, Result};
-use crate::head::plan::FUTURE_TOKENS;
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
 pub(super) struct Lerobot;

@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
 use crate::ops::check_interrupted;
-use crate::recognise::contents::{KEPT_EMBODIMENTS, kept_embodiments};
+use crate::recognise::kept::{KEPT_EMBODIMENTS, kept_embodiments};
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 

@@ -14,7 +14,7 @@ use std::path::Path;
 use saccade_checkpoint::{OWN_CONFIG, reserve};
 
 use crate::error::{Error, Result};
-use crate::head::plan::FUTURE_TOKENS;
+use crate::recognise::sizes::FUTURE_TOKENS;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 use config_edit::config_edit;
