@@ -102,7 +102,7 @@ fn main() {
     report.end(&options);
 }
 
-/// As many copies of what takes `bytes` as stand for weights larger than the caches.
+/// Copies of `bytes` bytes, enough of them to exceed the caches, as the weights of a model do.
 fn copies<T>(bytes: usize, make: impl Fn() -> T) -> Vec<T> {
     (0..(WEIGHT_BYTES / bytes).max(2)).map(|_| make()).collect()
 }

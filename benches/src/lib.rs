@@ -1,4 +1,4 @@
-//! Interleaved measurements: contenders take turns in one run, beside the CPU's own peak, so that what disturbs one disturbs all.
+//! Interleaved measurements: contenders and the CPU's peak take turns in one run, so that a disturbance affects all of them.
 
 pub mod measure;
 pub mod options;

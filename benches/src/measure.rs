@@ -28,13 +28,16 @@ impl Contender<'_> {
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a count of operations")]
     pub fn peak(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Self {
+        let run = |isa, arithmetic, threads| {
+            multiply_accumulate(isa, arithmetic, threads).expect("the threads can be started")
+        };
         Self {
             name: Self::peak_name(isa, arithmetic),
             threads,
-            work: multiply_accumulate(isa, arithmetic, threads) as f64,
+            work: run(isa, arithmetic, threads) as f64,
             relative_to: None,
             run: Box::new(move || {
-                multiply_accumulate(isa, arithmetic, threads);
+                run(isa, arithmetic, threads);
             }),
         }
     }
@@ -140,7 +143,7 @@ fn now(clock: Clock) -> Duration {
     )
 }
 
-/// The value below which `part` of the samples lie.
+/// The value below which `part` of the samples are.
 #[must_use]
 #[expect(
     clippy::cast_possible_truncation,

@@ -94,7 +94,7 @@ fn summary(samples: &[f64]) -> Value {
     json!({ "median": quantile(samples, 0.5), "p10": quantile(samples, 0.1), "p90": quantile(samples, 0.9), "samples": samples.len() })
 }
 
-/// The CPU's name, where the system tells it.
+/// The CPU's name, if the system provides it.
 #[must_use]
 pub fn cpu() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();

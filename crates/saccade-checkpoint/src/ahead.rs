@@ -6,8 +6,12 @@ use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::Builder;
 
 use crate::elements::Elements;
-use crate::error::Result;
+use crate::error::{Result, granted};
 use crate::reader::Checkpoint;
+
+/// Address space that must be free before a thread is started: with little more than a stack, the standard library aborts the process when
+/// the thread begins.
+const THREAD_ROOM: usize = 80 << 20;
 
 /// A tensor to read, or some slices of its first axis.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -47,13 +51,21 @@ impl Checkpoint {
         let (spare, used) = channel();
         std::thread::scope(|scope| {
             let read = move || read_all(self, wanted, &sender, &used);
-            let thread = Builder::new()
-                .name("saccade-read".to_owned())
-                .spawn_scoped(scope, read);
+            let thread = match granted("source", THREAD_ROOM) {
+                Ok(()) => Builder::new()
+                    .name("saccade-read".to_owned())
+                    .spawn_scoped(scope, read)
+                    .ok(),
+                // Its channels end with it: nothing is sent to a thread that is not there.
+                Err(_) => {
+                    drop(read);
+                    None
+                }
+            };
             // The receiver is dropped with these tensors, before the scope waits for the thread: work that fails stops the reading.
             work(&ReadAhead {
                 checkpoint: self,
-                ahead: thread.is_ok().then_some(receiver),
+                ahead: thread.is_some().then_some(receiver),
                 next: Cell::new(None),
                 spare,
             })

@@ -23,18 +23,9 @@ pub enum Elements {
 impl Elements {
     /// The elements as float32: exactly, except that int8 times its scale is rounded.
     ///
-    /// # Panics
-    /// If there is no memory for them; [`Elements::try_into_f32`] says so instead.
-    #[must_use]
-    pub fn into_f32(self) -> Vec<f32> {
-        self.try_into_f32().expect("there is memory for a tensor")
-    }
-
-    /// The elements as float32, as [`Elements::into_f32`] gives them.
-    ///
     /// # Errors
     /// [`Error::Memory`](crate::Error::Memory) if there is no memory for them.
-    pub fn try_into_f32(self) -> Result<Vec<f32>> {
+    pub fn into_f32(self) -> Result<Vec<f32>> {
         let mut wide = Vec::new();
         match self {
             Self::F32(values) => return Ok(values),

@@ -125,7 +125,7 @@ impl Checkpoint {
     pub fn read_f32(&self, name: &str) -> Result<Vec<f32>> {
         let elements: usize = self.entry(name)?.info.shape.iter().product();
         granted("source", elements.saturating_mul(size_of::<f32>()))?;
-        self.read(name)?.try_into_f32()
+        self.read(name)?.into_f32()
     }
 
     /// Reads the slices `wanted` of the first axis of tensor `name`.
@@ -287,7 +287,7 @@ impl Checkpoint {
             self.read_plain(name, entry, 0, entry.info.shape.iter().product(), Vec::new())?;
         let scales = self
             .read_elements(&scale, self.entry(&scale)?, 0, rows, None)?
-            .into_f32();
+            .into_f32()?;
         check_int8(name, &values, &scale, &scales)
             .map_err(|problem| Error::Checkpoint(format!("source: {problem}")))?;
         Ok(Elements::Int8 { values, scales })

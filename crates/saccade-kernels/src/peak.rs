@@ -1,12 +1,16 @@
 //! What this CPU can do at most: multiply-accumulates from registers, the clock they run at, and reading memory. Kernels are compared with it.
 
 use std::hint::black_box;
-use std::sync::Barrier;
+use std::io;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Barrier, PoisonError, RwLock};
+use std::thread::Builder;
 use std::time::Instant;
 
 use crate::aligned::{AlignedBuffer, AllocError};
 use crate::gemm::Product;
 use crate::isa::Isa;
+use crate::pool::has_room_for_thread;
 use crate::simd::{Kernel, Simd, Vector};
 use crate::weights::Arithmetic;
 
@@ -16,28 +20,49 @@ const CALLS: usize = 10;
 /// What is read to measure reading: several times any cache.
 const MEMORY: usize = 256 << 20;
 
+/// Why a peak was not measured.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PeakError {
+    /// There is not enough memory.
+    #[error(transparent)]
+    Alloc(#[from] AllocError),
+    /// The system has refused a thread.
+    #[error("cannot start {threads} threads: {source}")]
+    Thread {
+        /// How many were asked for.
+        threads: usize,
+        /// Why.
+        source: io::Error,
+    },
+}
+
 /// The most multiply-accumulates a second that the kernels of `isa` and `arithmetic` could do on `threads` threads, measured in a few
 /// hundredths of a second: independent chains of the instruction that they are made of, without any memory.
 ///
-/// bfloat16 without an instruction of its own is float32 once it is widened, and has its peak.
+/// Where there is no instruction for bfloat16, it is widened to float32 and has the same peak.
+///
+/// # Errors
+/// [`PeakError::Thread`] if the system refuses a thread.
 ///
 /// # Panics
 /// If this CPU lacks `isa`, or `threads` is 0.
-#[must_use]
-pub fn macs_per_second(isa: Isa, arithmetic: Arithmetic, threads: usize) -> f64 {
-    let rate = |_| {
+pub fn macs_per_second(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Result<f64, PeakError> {
+    fastest(|| {
         let start = Instant::now();
-        let macs = multiply_accumulate(isa, arithmetic, threads);
-        macs as f64 / start.elapsed().as_secs_f64()
-    };
-    (0..CALLS).map(rate).fold(0.0, f64::max)
+        let macs = multiply_accumulate(isa, arithmetic, threads)?;
+        Ok(macs as f64 / start.elapsed().as_secs_f64())
+    })
 }
 
 /// One sample of [`macs_per_second`], for programs that measure by turns: returns how many multiply-accumulates it has done.
 ///
+/// # Errors
+/// As [`macs_per_second`].
+///
 /// # Panics
 /// As [`macs_per_second`].
-pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> usize {
+pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Result<usize, PeakError> {
     let gemm = isa.gemm(match arithmetic {
         Arithmetic::Float32 => Product::Float32,
         Arithmetic::Bfloat16 => Product::Bf16,
@@ -49,23 +74,27 @@ pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> 
 /// Bytes a second that `threads` threads read from memory together; takes a few tenths of a second.
 ///
 /// # Errors
-/// [`AllocError`] if there is not enough memory: 256 MiB are read.
+/// [`PeakError`] if there is not enough memory, of which 256 MiB are read, or the system refuses a thread.
 ///
 /// # Panics
 /// If `threads` is 0.
-pub fn read_bytes_per_second(threads: usize) -> Result<f64, AllocError> {
+pub fn read_bytes_per_second(threads: usize) -> Result<f64, PeakError> {
     let mut memory = AlignedBuffer::<u32>::zeroed(MEMORY / size_of::<u32>())?;
     // Pages that were never written may all be the same page of zeros.
     memory.fill(1);
-    let rate = |_| {
+    fastest(|| {
         let start = Instant::now();
         let words = on_threads(threads, &|thread| {
             let part = memory.len() / threads;
             Isa::best().run(Read(&memory[thread * part..][..part]))
-        });
-        (words * size_of::<u32>()) as f64 / start.elapsed().as_secs_f64()
-    };
-    Ok((0..CALLS).map(rate).fold(0.0, f64::max))
+        })?;
+        Ok((words * size_of::<u32>()) as f64 / start.elapsed().as_secs_f64())
+    })
+}
+
+/// The largest of several rates.
+fn fastest(rate: impl Fn() -> Result<f64, PeakError>) -> Result<f64, PeakError> {
+    (0..CALLS).try_fold(0.0, |largest, _| Ok(f64::max(largest, rate()?)))
 }
 
 /// Cycles a second, from a chain of dependent multiplications that take three cycles each on every x86-64 CPU since 2008; `None` where it is
@@ -124,28 +153,42 @@ impl Kernel for Read<'_> {
 }
 
 /// Runs `work` on `threads` threads that begin together; returns the sum of the results.
-fn on_threads(threads: usize, work: &(dyn Fn(usize) -> usize + Sync)) -> usize {
+///
+/// # Errors
+/// [`PeakError::Thread`] if the system refuses a thread; then none of them runs `work`.
+fn on_threads(threads: usize, work: &(dyn Fn(usize) -> usize + Sync)) -> Result<usize, PeakError> {
     assert!(threads > 0, "threads: expected at least 1");
     if threads == 1 {
-        return work(0);
+        return Ok(work(0));
     }
-    let barrier = Barrier::new(threads);
+    let (start_together, is_refused) = (Barrier::new(threads), AtomicBool::new(false));
+    // Write-locked until all threads are started or one is refused: the barrier opens for all of them only.
+    let gate = RwLock::new(());
+    let run = |thread| {
+        drop(gate.read().unwrap_or_else(PoisonError::into_inner));
+        if is_refused.load(Ordering::Acquire) {
+            return 0;
+        }
+        start_together.wait();
+        work(thread)
+    };
+    let run = &run;
     std::thread::scope(|scope| {
-        let others: Vec<_> = (1..threads)
-            .map(|thread| {
-                let barrier = &barrier;
-                scope.spawn(move || {
-                    barrier.wait();
-                    work(thread)
-                })
+        let closed = gate.write().unwrap_or_else(PoisonError::into_inner);
+        let others: Result<Vec<_>, io::Error> = (1..threads)
+            .map(|thread| match has_room_for_thread() {
+                true => Builder::new().spawn_scoped(scope, move || run(thread)),
+                false => Err(io::ErrorKind::OutOfMemory.into()),
             })
             .collect();
-        barrier.wait();
-        let own = work(0);
+        is_refused.store(others.is_err(), Ordering::Release);
+        drop(closed);
+        let others = others.map_err(|source| PeakError::Thread { threads, source })?;
+        let own = run(0);
         let joined = others
             .into_iter()
             .map(|other| other.join().expect("a peak loop does not panic"));
-        own + joined.sum::<usize>()
+        Ok(own + joined.sum::<usize>())
     })
 }
 
@@ -157,7 +200,7 @@ mod tests {
     fn every_peak_counts_its_work() {
         for isa in Isa::available() {
             let [float, bf16, int8] = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8]
-                .map(|arithmetic| multiply_accumulate(isa, arithmetic, 1));
+                .map(|arithmetic| multiply_accumulate(isa, arithmetic, 1).unwrap());
             assert_eq!(
                 bf16 / float,
                 if isa.dot_products().contains(&"bf16") {
@@ -169,11 +212,11 @@ mod tests {
             );
             assert_eq!(int8 / float, 4, "{isa}");
             assert_eq!(
-                multiply_accumulate(isa, Arithmetic::Float32, 2),
+                multiply_accumulate(isa, Arithmetic::Float32, 2).unwrap(),
                 2 * float,
                 "{isa}"
             );
-            assert!(macs_per_second(isa, Arithmetic::Int8, 1) > 0.0);
+            assert!(macs_per_second(isa, Arithmetic::Int8, 1).unwrap() > 0.0);
         }
         assert!(clock_hz().is_none_or(|clock| clock > 1e8));
     }

@@ -15,7 +15,7 @@ use std::ops::Range;
 pub struct Rows<'a, T = f32> {
     /// From the first element on; ends at the last one or later.
     data: &'a [T],
-    shape: Shape,
+    shape: RowShape,
 }
 
 /// [`Rows`] that can be written to.
@@ -31,18 +31,18 @@ pub struct Rows<'a, T = f32> {
 pub struct RowsMut<'a, T = f32> {
     /// As in [`Rows`].
     data: &'a mut [T],
-    shape: Shape,
+    shape: RowShape,
 }
 
 /// How many rows and columns, and elements from one row to the next.
 #[derive(Clone, Copy, Debug)]
-struct Shape {
+struct RowShape {
     num_rows: usize,
     num_columns: usize,
     row_stride: usize,
 }
 
-impl Shape {
+impl RowShape {
     /// Of `len` elements as rows of `num_columns`.
     #[track_caller]
     fn contiguous(len: usize, num_columns: usize) -> Self {
@@ -59,29 +59,32 @@ impl Shape {
         }
     }
 
-    /// Checks that `len` elements hold all rows.
+    /// Of `len` elements, which must hold all rows.
     #[track_caller]
-    fn check(&self, len: usize) {
-        let end = match self.num_rows.checked_sub(1) {
-            Some(last) if self.num_columns > 0 => last
-                .checked_mul(self.row_stride)
-                .and_then(|last| last.checked_add(self.num_columns)),
+    fn strided(len: usize, num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
+        let end = match num_rows.checked_sub(1) {
+            Some(last) if num_columns > 0 => last
+                .checked_mul(row_stride)
+                .and_then(|last| last.checked_add(num_columns)),
             _ => Some(0),
         };
         assert!(
             end.is_some_and(|end| end <= len),
-            "data: expected room for {} rows of {} elements, {} apart, got {len} elements",
-            self.num_rows,
-            self.num_columns,
-            self.row_stride
+            "data: expected room for {num_rows} rows of {num_columns} elements, {row_stride} apart, got {len} elements"
         );
+        Self {
+            num_rows,
+            num_columns,
+            // Rows without elements are all at the beginning, wherever that is: no pointer to one is outside the data.
+            row_stride: if num_columns == 0 { 0 } else { row_stride },
+        }
     }
 
     /// The elements of row `row`.
     #[track_caller]
     fn row(&self, row: usize) -> Range<usize> {
         assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
-        // Rows without elements may be beyond the end of the data.
+        // The data may end before a row without elements.
         let first = if self.num_columns == 0 {
             0
         } else {
@@ -140,7 +143,7 @@ impl<'a, T> Rows<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn new(data: &'a [T], num_columns: usize) -> Self {
-        let shape = Shape::contiguous(data.len(), num_columns);
+        let shape = RowShape::contiguous(data.len(), num_columns);
         Self { data, shape }
     }
 
@@ -151,12 +154,7 @@ impl<'a, T> Rows<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn strided(data: &'a [T], num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
-        let shape = Shape {
-            num_rows,
-            num_columns,
-            row_stride,
-        };
-        shape.check(data.len());
+        let shape = RowShape::strided(data.len(), num_rows, num_columns, row_stride);
         Self { data, shape }
     }
 
@@ -231,7 +229,7 @@ impl<'a, T> RowsMut<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn new(data: &'a mut [T], num_columns: usize) -> Self {
-        let shape = Shape::contiguous(data.len(), num_columns);
+        let shape = RowShape::contiguous(data.len(), num_columns);
         Self { data, shape }
     }
 
@@ -242,12 +240,7 @@ impl<'a, T> RowsMut<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn strided(data: &'a mut [T], num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
-        let shape = Shape {
-            num_rows,
-            num_columns,
-            row_stride,
-        };
-        shape.check(data.len());
+        let shape = RowShape::strided(data.len(), num_rows, num_columns, row_stride);
         assert!(
             num_rows <= 1 || num_columns <= row_stride,
             "row_stride: expected at least the {num_columns} elements of a row, got {row_stride}"
@@ -358,8 +351,11 @@ mod tests {
         let none: [f32; 0] = [];
         assert_eq!(Rows::new(&none, 7).num_rows(), 0);
         assert_eq!(Rows::new(&none, 0).num_rows(), 0);
-        let x = Rows::strided(&none, 3, 0, 0);
-        assert_eq!((x.num_rows(), x.row(2)), (3, &none[..]));
+        for row_stride in [0, 5] {
+            let x = Rows::strided(&none, 3, 0, row_stride);
+            assert_eq!((x.num_rows(), x.row(2)), (3, &none[..]));
+            assert_eq!(x.row_stride(), 0, "no pointer to a row leaves the data");
+        }
     }
 
     #[test]

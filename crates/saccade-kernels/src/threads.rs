@@ -36,7 +36,7 @@ fn parse(given: &str) -> Result<NonZeroUsize, NumThreadsError> {
 }
 
 fn usable_cores() -> NonZeroUsize {
-    // Already heeds the affinity mask and, rounded down, the quota of the control group.
+    // Already takes into account the affinity mask and, rounded down, the quota of the control group.
     let logical = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
     #[cfg(target_os = "linux")]
     let logical = linux::physical_cores().unwrap_or(logical);

@@ -1,4 +1,4 @@
-//! Weights as they are stored, the arithmetics that they are multiplied in, and their quantisation to int8.
+//! Weights as they are stored, the arithmetic that multiplies them, and their quantisation to int8.
 
 use std::ops::Range;
 

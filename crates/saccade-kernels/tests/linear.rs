@@ -424,3 +424,44 @@ fn an_output_of_another_shape_panics() {
         )
         .unwrap();
 }
+
+#[test]
+fn the_size_of_a_packed_layer_is_known_before_packing() {
+    for isa in Isa::available() {
+        for (outputs, inputs) in [(0, 5), (1, 0), (1, 1), (47, 33), (48, 64), (49, 515), (200, 7)] {
+            let f32 = vec![0.5; outputs * inputs];
+            let bf16 = vec![bf16::ONE; outputs * inputs];
+            let f32 = WeightRef::F32(Matrix::from(Rows::strided(&f32, outputs, inputs, inputs)));
+            let bf16 = WeightRef::Bf16(Matrix::from(Rows::strided(&bf16, outputs, inputs, inputs)));
+            for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+                for (weight, element) in [(f32, Element::F32), (bf16, Element::Bf16)] {
+                    let layer = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
+                    let nbytes = PackedLinear::packed_nbytes(isa, arithmetic, element, (outputs, inputs));
+                    let what = format!("{isa}, {arithmetic:?} of {element:?}, {outputs} x {inputs}");
+                    assert_eq!(layer.nbytes(), nbytes.unwrap(), "{what}");
+                }
+            }
+        }
+        let wide = PackedLinear::packed_nbytes(isa, Arithmetic::Int8, Element::F32, (1, 65537));
+        assert!(matches!(wide, Err(KernelError::TooManyInputs { given: 65537 })));
+    }
+}
+
+#[test]
+fn a_layer_without_inputs_gives_its_bias() {
+    let weight = WeightRef::F32(Matrix::from(Rows::strided(&[], 3, 0, 0)));
+    // Rows without elements, as far apart as they like.
+    let x = Rows::strided(&[], 4, 0, 1 << 40);
+    for isa in Isa::available() {
+        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+            let parts = [(weight, Some(&[1.0, 2.0, 3.0][..]))];
+            let layer = PackedLinear::pack(isa, arithmetic, 1, &parts).unwrap();
+            let mut out = vec![7.0; 12];
+            let scratch = &mut LinearScratch::new();
+            layer
+                .apply(2, x, Epilogue::Store, rows_mut(&mut out, 3), scratch)
+                .unwrap();
+            assert_eq!(out, [1.0, 2.0, 3.0].repeat(4), "{isa}, {arithmetic:?}");
+        }
+    }
+}

@@ -5,7 +5,7 @@ mod common;
 use common::attention::{Case, REMOVED, assert_close, kinds};
 use common::{bits, numbers, rows, rows_mut};
 use proptest::prelude::*;
-use saccade_kernels::{LogitBias, Mask, PackedKeyValues, attention};
+use saccade_kernels::{Element, Isa, LogitBias, Mask, PackedKeyValues, Rows, attention};
 
 /// The logit of a causal mask, as a bias.
 fn causal(offset: usize) -> impl Fn(usize, usize, usize) -> f32 + Copy {
@@ -210,4 +210,14 @@ fn wide_heads_without_keys_give_zeros() {
 fn heads_that_cannot_be_grouped_panic() {
     let case = Case::grouped(6, [1, 3], [3, 2], 8, 0);
     case.run(common::attention::best(), 1, Mask::None, None);
+}
+
+#[test]
+fn more_keys_than_can_be_counted_are_refused() {
+    let row = [1.0; 4];
+    let mut held = PackedKeyValues::new(Isa::Portable, Element::F32, 1, 4);
+    held.pack(1, Rows::new(&row, 4), Rows::new(&row, 4)).unwrap();
+    let endless = Rows::strided(&row, usize::MAX, 4, 0);
+    assert!(held.append(1, endless, endless).is_err());
+    assert_eq!(held.len(), 1, "what was held stays");
 }

@@ -107,6 +107,14 @@ fn measuring_memory_without_memory_is_an_error() {
     assert!(limited(MORE, || peak::read_bytes_per_second(1).is_err()));
 }
 
+#[test]
+fn peaks_of_threads_that_cannot_be_started_are_errors() {
+    let peak = |threads| peak::macs_per_second(Isa::Portable, Arithmetic::Float32, threads);
+    for more in [1 << 20, 100 << 20, 400 << 20] {
+        assert!(limited(more, || peak(500).is_err() && peak(1).is_ok()));
+    }
+}
+
 /// A thread needs address space for its stack.
 #[test]
 fn threads_that_cannot_be_started_are_done_without() {

@@ -78,7 +78,12 @@ pub(crate) fn tensor_views<'a>(held: &'a [(String, PyTensor<'_>)]) -> PyResult<T
                 let bits = array.as_slice()?;
                 let elements = match dtype.as_str() {
                     "bfloat16" => ElementsRef::Bf16(bits),
-                    _ => ElementsRef::F16(bits),
+                    "float16" => ElementsRef::F16(bits),
+                    _ => {
+                        return Err(raise(Error::Input(format!(
+                            "tensors: expected float32, bfloat16 or float16, got {dtype}"
+                        ))));
+                    }
                 };
                 TensorView::new(array.shape(), elements).map_err(raise)?
             }

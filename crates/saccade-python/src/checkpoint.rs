@@ -101,7 +101,7 @@ impl Published {
                 None => checkpoint.read(name),
                 Some(index) => checkpoint.read_slices(name, index..index.saturating_add(1)),
             };
-            Ok(elements?.try_into_f32()?)
+            Ok(elements?.into_f32()?)
         })?;
         let shape = checkpoint.shape(name).expect("a tensor that was read is there");
         to_numpy(py, data, &shape[usize::from(index.is_some())..])

@@ -58,5 +58,5 @@ pub(crate) fn parse_config<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'
 /// Name, without a prefix, and shape of every tensor of a head with this config.
 #[pyfunction]
 pub(crate) fn tensor_shapes(py: Python<'_>, text: &str) -> PyResult<Vec<(String, Vec<usize>)>> {
-    call(py, || Ok(saccade::tensor_shapes(&HeadConfig::from_json(text)?)))
+    call(py, || saccade::tensor_shapes(&HeadConfig::from_json(text)?))
 }

@@ -120,7 +120,7 @@ impl ActionHead {
             .with_attention_mask(optional_view(&attention_mask)?)
             .with_image_mask(optional_view(&image_mask)?)
             .with_drop_vl(optional_view(&drop_vl)?)
-            .with_record(Keep { attention, hidden });
+            .with_record(Keep::default().with_attention(attention).with_hidden(hidden));
         let mut context = call(py, || self.0.encode(&features))?;
         let kept = recorded(py, context.take_recorded())?;
         Ok((Context(Arc::new(context)), kept))
@@ -147,12 +147,8 @@ impl ActionHead {
         let shape = out.shape().to_vec();
         let (context, out) = (&context.0, view_mut(&mut out, &shape)?);
         let chunking = optional_view(&previous_chunk)?.zip(chunking).map(
-            |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
-                previous_chunk,
-                overlap,
-                frozen,
-                ramp_rate,
-                horizon,
+            |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| {
+                Chunking::new(previous_chunk, overlap, frozen, ramp_rate).with_horizon(horizon)
             },
         );
         let interventions = interventions(intervention)?;
@@ -191,7 +187,8 @@ impl ActionHead {
         let sampling = Sampling::default()
             .with_num_steps(num_steps)
             .with_interventions(&interventions);
-        let options = TraceOptions::new(Keep { attention, hidden })
+        let record = Keep::default().with_attention(attention).with_hidden(hidden);
+        let options = TraceOptions::new(record)
             .with_blocks(blocks)
             .with_steps(steps)
             .with_max_bytes(max_bytes);

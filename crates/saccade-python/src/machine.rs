@@ -3,7 +3,8 @@
 use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{Arithmetic, Error, Isa, Part, Profile, peak};
+use saccade::peak::{self, PeakError};
+use saccade::{Arithmetic, Error, Isa, Part, Profile};
 
 use crate::detached::call;
 use crate::error::raise;
@@ -24,18 +25,27 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
             ("bfloat16", Arithmetic::Bfloat16),
             ("int8", Arithmetic::Int8),
         ] {
-            let rate = call(py, || Ok(peak::macs_per_second(isa, arithmetic, num_threads)))?;
+            let rate = peak_or_raise(call(py, || {
+                Ok(peak::macs_per_second(isa, arithmetic, num_threads))
+            })?)?;
             of_isa.set_item(name, rate)?;
         }
         rates.set_item(isa.to_string(), of_isa)?;
     }
     let peaks = PyDict::new(py);
     peaks.set_item("macs_per_second", rates)?;
-    let read = call(py, || Ok(peak::read_bytes_per_second(num_threads)))?;
-    let read = read.map_err(|error| PyMemoryError::new_err(error.to_string()))?;
+    let read = peak_or_raise(call(py, || Ok(peak::read_bytes_per_second(num_threads)))?)?;
     peaks.set_item("read_bytes_per_second", read)?;
     peaks.set_item("clock_hz", call(py, || Ok(peak::clock_hz()))?)?;
     Ok(peaks)
+}
+
+/// The rate, or the exception for it: for memory that the system refused, or threads.
+fn peak_or_raise(measured: Result<f64, PeakError>) -> PyResult<f64> {
+    measured.map_err(|error| match error {
+        PeakError::Alloc(error) => PyMemoryError::new_err(error.to_string()),
+        error => raise(Error::Input(format!("num_threads: {error}"))),
+    })
 }
 
 /// Begins to count where the time of this thread's calls goes.
@@ -73,20 +83,18 @@ pub(crate) fn available_isas() -> Vec<String> {
 pub(crate) fn selected_isa() -> PyResult<String> {
     Isa::from_env()
         .map(|isa| isa.to_string())
-        .map_err(|error| raise(Error::Input(error.to_string())))
+        .map_err(|error| raise(error.into()))
 }
 
 #[pyfunction]
 pub(crate) fn dot_products() -> PyResult<Vec<&'static str>> {
     Isa::from_env()
         .map(Isa::dot_products)
-        .map_err(|error| raise(Error::Input(error.to_string())))
+        .map_err(|error| raise(error.into()))
 }
 
 #[pyfunction]
 pub(crate) fn default_num_threads() -> PyResult<usize> {
     let threads = saccade::default_num_threads();
-    threads
-        .map(usize::from)
-        .map_err(|error| raise(Error::Input(error.to_string())))
+    threads.map(usize::from).map_err(|error| raise(error.into()))
 }

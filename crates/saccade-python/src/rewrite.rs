@@ -129,7 +129,7 @@ pub(crate) fn resize<'py>(
     Ok(dict)
 }
 
-/// The rows, the tokens that each stands for, and the biases of their keys.
+/// The rows, the tokens that each represents, and the biases of their keys.
 type PyMergedTokens<'py> = (Bound<'py, PyArrayDyn<f32>>, Vec<Vec<usize>>, Option<Vec<f32>>);
 
 /// Merges `tokens (count, width)` by the rule of `resize`.

@@ -74,10 +74,7 @@ fn main() -> Result<()> {
             Array::new(&embodiment, &[1])?,
             Array::new(&noise, &noise_shape)?,
             &Sampling::default().with_interventions(interventions),
-            &TraceOptions::new(Keep {
-                attention: true,
-                hidden: false,
-            }),
+            &TraceOptions::new(Keep::default().with_attention(true)),
         )
     };
 

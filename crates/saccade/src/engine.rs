@@ -22,7 +22,7 @@ impl Engine {
     /// # Errors
     /// [`Error::Input`] for a number of threads out of range, and for what the environment names but this machine lacks.
     pub(crate) fn new(precision: Precision, num_threads: Option<usize>) -> Result<Self> {
-        let isa = Isa::from_env().map_err(|error| Error::Input(error.to_string()))?;
+        let isa = Isa::from_env()?;
         let threads = match num_threads {
             Some(threads) if (1..=MAX_THREADS).contains(&threads) => threads,
             Some(threads) => {
@@ -30,9 +30,7 @@ impl Engine {
                     "num_threads: expected 1 to {MAX_THREADS}, got {threads}"
                 )));
             }
-            None => saccade_kernels::default_num_threads()
-                .map_err(|error| Error::Input(error.to_string()))?
-                .get(),
+            None => saccade_kernels::default_num_threads()?.get(),
         };
         Ok(Self {
             isa,

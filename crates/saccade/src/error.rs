@@ -2,6 +2,7 @@
 
 pub(crate) use saccade_checkpoint::show_shape;
 use saccade_checkpoint::{printable, show_bytes};
+use saccade_kernels::{IsaError, KernelError, NumThreadsError};
 
 /// The result of everything in this crate that can fail.
 pub type Result<T> = std::result::Result<T, Error>;
@@ -19,6 +20,23 @@ pub enum Error {
     /// A checkpoint or its configuration is broken, incomplete or of another kind; all problems are listed.
     #[error("{}", printable(.0))]
     Checkpoint(String),
+    /// Text that is not JSON.
+    #[error("{}: not valid JSON: {}", printable(what), printable(&source.to_string()))]
+    Json {
+        /// What should be JSON.
+        what: String,
+        /// Where and why it is not.
+        source: serde_json::Error,
+    },
+    /// `SACCADE_ISA` names an instruction set that is unknown or that this CPU lacks.
+    #[error(transparent)]
+    Isa(#[from] IsaError),
+    /// `SACCADE_NUM_THREADS` is not a positive whole number.
+    #[error(transparent)]
+    NumThreads(#[from] NumThreadsError),
+    /// Weights that cannot be packed.
+    #[error("source: {0}")]
+    Packing(#[source] KernelError),
     /// Memory that the system refused.
     #[error("{what}: cannot allocate {}", show_bytes(*bytes))]
     Memory {
@@ -62,12 +80,38 @@ impl Error {
         use saccade_checkpoint::Error as File;
         match self {
             Self::Shape(_) => ErrorKind::Shape,
-            Self::Input(_) | Self::File(File::Input(_)) => ErrorKind::Input,
+            Self::Input(_) | Self::Isa(_) | Self::NumThreads(_) | Self::File(File::Input(_)) => {
+                ErrorKind::Input
+            }
             Self::Memory { .. } | Self::File(File::Memory { .. }) => ErrorKind::Memory,
             Self::Interrupted => ErrorKind::Interrupted,
             Self::File(File::NotFound { .. }) => ErrorKind::NotFound,
             Self::File(File::Output { .. } | File::Stranded { .. }) => ErrorKind::Output,
-            Self::Checkpoint(_) | Self::File(_) => ErrorKind::Checkpoint,
+            Self::Checkpoint(_) | Self::Json { .. } | Self::Packing(_) | Self::File(_) => {
+                ErrorKind::Checkpoint
+            }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::error::Error as _;
+
+    use super::*;
+    use crate::ops::packing_error;
+
+    #[test]
+    fn causes_are_kept() {
+        let error = crate::config::HeadConfig::from_json("{").unwrap_err();
+        assert!(error.source().unwrap().is::<serde_json::Error>());
+        assert_eq!(error.kind(), ErrorKind::Checkpoint);
+        assert!(
+            error.to_string().starts_with("config: not valid JSON: "),
+            "{error}"
+        );
+        let error = packing_error(KernelError::TooManyInputs { given: 70_000 });
+        assert!(error.source().unwrap().is::<KernelError>());
+        assert_eq!(error.kind(), ErrorKind::Checkpoint);
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! An observation is encoded once ([`ActionHead::encode`]): the vision-language tokens pass their norm and self-attention, and every
 //! cross-attention block's keys and values are held in a [`Context`]. Chunks of actions are then sampled from it
-//! ([`ActionHead::sample`]) as often as wanted. What happens inside can be changed ([`Intervention`]) and kept ([`ActionHead::trace`]).
+//! ([`ActionHead::sample`]), any number of times. What happens inside can be changed ([`Intervention`]) and kept ([`ActionHead::trace`]).
 //!
 //! Where an equation comes from is said by its number in the GR00T action head's specification, as in "spec 1.6".
 

@@ -57,7 +57,7 @@ pub(crate) fn packing_error(error: KernelError) -> Error {
     match error {
         KernelError::Alloc(error) => refused("weights")(error),
         KernelError::Interrupted(_) => Error::Interrupted,
-        other => Error::Checkpoint(format!("source: {other}")),
+        other => Error::Packing(other),
     }
 }
 

@@ -7,7 +7,7 @@ use saccade_kernels::{Arithmetic, Element};
 
 use crate::error::{Error, Result};
 
-/// What a layer is to a model's cost, which decides how precisely it is worth computing.
+/// A layer's share of the cost, which decides how precisely it is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
     /// Attention and feed-forward of the blocks: nearly all of the work.
@@ -21,6 +21,7 @@ pub(crate) enum Role {
 /// What weights are held in, and what the inputs of linear layers are rounded to. The residual stream, norms, softmax and all sums of
 /// floating-point products are float32 in each.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Precision {
     /// Weights as they are stored, bf16 or float32, and float32 arithmetic.
     #[default]

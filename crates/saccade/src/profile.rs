@@ -25,7 +25,7 @@ pub enum Part {
     FeedForwardOut,
     /// Layer norms, with what they scale and shift by.
     Norm,
-    /// The layers that embodiments have of their own: encoders of state and actions, decoder of actions.
+    /// The layers with separate weights for each embodiment: encoders of state and actions, decoder of actions.
     Embodiment,
     /// The projection after the last block.
     Output,

@@ -68,13 +68,7 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let shape = [2, horizon, width];
         let mut out = vec![0.0; 2 * 3 * horizon * config.action_dim];
         let mut sample = |future_refresh: Option<usize>, is_chunked: bool| {
-            let chunking = Chunking {
-                previous_chunk: Array::new(&previous_chunk, &shape).unwrap(),
-                overlap: 4,
-                frozen: 1,
-                ramp_rate: 6.0,
-                horizon: None,
-            };
+            let chunking = Chunking::new(Array::new(&previous_chunk, &shape).unwrap(), 4, 1, 6.0);
             let sampling = Sampling::default()
                 .with_num_samples(3)
                 .with_future_refresh(future_refresh)

@@ -9,7 +9,7 @@ use super::temporary::{TemporaryDirectory, parent_of, unique};
 use crate::companions::{OWN_CONFIG, is_processor};
 use crate::error::{Error, Result};
 
-/// What a checkpoint may hold besides its weights and companions.
+/// What a checkpoint may hold in addition to its weights and companions.
 const OWN_FILES: [&str; 3] = ["config.json", "model.safetensors.index.json", OWN_CONFIG];
 
 /// Checks whether something has the name `out`, and whether a checkpoint with these companions may replace it.

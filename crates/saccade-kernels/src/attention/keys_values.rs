@@ -92,8 +92,8 @@ impl PackedKeyValues {
         let width = self.num_kv_heads * self.head_dim;
         let rows = keys.num_rows();
         assert_eq!(
-            first + rows,
-            self.len,
+            first.checked_add(rows),
+            Some(self.len),
             "keys: expected all that are held from number {first} on"
         );
         assert_eq!(
@@ -162,9 +162,12 @@ impl PackedKeyValues {
     /// # Panics
     /// If a shape does not fit.
     pub fn append(&mut self, threads: usize, keys: Rows<'_>, values: Rows<'_>) -> Result<(), AllocError> {
-        let (first, len) = (self.len, self.len + keys.num_rows());
+        let first = self.len;
+        let len = first
+            .checked_add(keys.num_rows())
+            .ok_or(AllocError { bytes: usize::MAX })?;
         if len > self.capacity {
-            self.reserve(len.max(2 * self.capacity))?;
+            self.reserve(len.max(self.capacity.saturating_mul(2)))?;
         }
         self.len = len;
         self.pack_from(threads, first, keys, values);

@@ -61,7 +61,9 @@ impl Mask<'_> {
     /// If a bias is too short for these logits, of which there is at least one.
     pub(super) fn check(&self, num_heads: usize, queries: usize, len: usize) {
         if let Self::Bias(bias) = self {
-            let needed = (num_heads - 1) * bias.head_stride + (queries - 1) * bias.query_stride + len;
+            let heads = (num_heads - 1).saturating_mul(bias.head_stride);
+            let queries = (queries - 1).saturating_mul(bias.query_stride);
+            let needed = heads.saturating_add(queries).saturating_add(len);
             assert!(
                 bias.values.len() >= needed,
                 "bias: expected {needed} elements, got {}",

@@ -34,7 +34,7 @@ pub(crate) enum Product {
 pub(crate) struct Shape {
     /// Output columns of a panel of weights, at most [`MAX_COLUMNS`].
     pub columns: usize,
-    /// Rows of the largest tile.
+    /// Rows of the largest tile, a multiple of `row_group`.
     pub tile_rows: usize,
     /// Rows that are converted together: tiles begin at multiples of it.
     pub row_group: usize,

@@ -118,9 +118,9 @@ impl Finish<'_> {
     }
 }
 
-/// What sums stand for.
+/// How the words of a sum become float32.
 trait Sums {
-    /// What is known of a vector of columns.
+    /// What the columns of a vector have in common for all rows.
     type Columns<V: Vector>: Copy;
 
     /// # Safety
@@ -133,10 +133,10 @@ trait Sums {
     -> V;
 }
 
-/// Themselves.
+/// Sums that are float32 already.
 struct FloatSums;
 
-/// Multiples of the product of two scales.
+/// int32 sums, to be multiplied by the scales of their row and column.
 struct Int8Sums;
 
 impl Sums for FloatSums {

@@ -109,18 +109,10 @@ impl PackedLinear {
                 .filter(|&sum| sum <= isize::MAX as usize)
                 .ok_or(AllocError { bytes: usize::MAX })?;
         }
-        if arithmetic == Arithmetic::Int8 && in_features > MAX_INT8_INPUTS {
-            return Err(KernelError::TooManyInputs { given: in_features });
-        }
-        let all_bf16 = parts
+        let are_bf16 = parts
             .iter()
             .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
-        let (product, element) = match arithmetic {
-            Arithmetic::Float32 if all_bf16 => (Product::WidenedBf16, Element::Bf16),
-            Arithmetic::Float32 => (Product::Float32, Element::F32),
-            Arithmetic::Bfloat16 => (Product::Bf16, Element::Bf16),
-            Arithmetic::Int8 => (Product::Int8, Element::Int8),
-        };
+        let (product, element) = product_of(arithmetic, are_bf16, in_features)?;
         let gemm = isa.gemm(product);
         let columns = gemm.shape().columns;
         let mut bias = AlignedBuffer::zeroed(out_features.next_multiple_of(columns))?;
@@ -142,6 +134,32 @@ impl PackedLinear {
             panels,
             bias,
         })
+    }
+
+    /// The bytes that a layer of `(out_features, in_features)` holds when it is packed. `weights` is [`Element::Bf16`] if all its parts are
+    /// bf16; every other element is packed as [`Element::F32`] is.
+    ///
+    /// # Errors
+    /// [`KernelError::TooManyInputs`] as [`Self::pack`].
+    ///
+    /// # Panics
+    /// If this CPU lacks `isa`.
+    pub fn packed_nbytes(
+        isa: Isa,
+        arithmetic: Arithmetic,
+        weights: Element,
+        (out_features, in_features): (usize, usize),
+    ) -> Result<usize, KernelError> {
+        let (product, _) = product_of(arithmetic, weights == Element::Bf16, in_features)?;
+        let gemm = isa.gemm(product);
+        let columns = gemm.shape().columns;
+        // A bias for each column; for int8 also a scale and a sum.
+        let words_of_column = if product == Product::Int8 { 3 } else { 1 };
+        let panel = gemm
+            .panel_words(in_features)
+            .saturating_add(columns * words_of_column);
+        let words = out_features.div_ceil(columns).saturating_mul(panel);
+        Ok(words.saturating_mul(size_of::<u32>()))
     }
 
     /// Width of the input rows.
@@ -297,6 +315,23 @@ impl PackedLinear {
             out,
             out_stride: call.out_stride,
         });
+    }
+}
+
+/// What multiplies weights, which `are_bf16` or are not, and the elements that they are packed as.
+fn product_of(
+    arithmetic: Arithmetic,
+    are_bf16: bool,
+    in_features: usize,
+) -> Result<(Product, Element), KernelError> {
+    match arithmetic {
+        Arithmetic::Float32 if are_bf16 => Ok((Product::WidenedBf16, Element::Bf16)),
+        Arithmetic::Float32 => Ok((Product::Float32, Element::F32)),
+        Arithmetic::Bfloat16 => Ok((Product::Bf16, Element::Bf16)),
+        Arithmetic::Int8 if in_features > MAX_INT8_INPUTS => {
+            Err(KernelError::TooManyInputs { given: in_features })
+        }
+        Arithmetic::Int8 => Ok((Product::Int8, Element::Int8)),
     }
 }
 

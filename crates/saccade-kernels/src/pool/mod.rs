@@ -15,6 +15,7 @@ mod place;
 mod slot;
 
 use std::cell::Cell;
+use std::hint::black_box;
 use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicPtr, AtomicU32, AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex, PoisonError};
@@ -42,6 +43,16 @@ const MAX_THREADS: usize = 1024;
 
 /// Address space that must be free before a thread is started: more than the allocator keeps of what was freed before.
 const THREAD_ROOM: usize = 80 << 20;
+
+/// Whether a thread can be started. If the system grants a stack and little more, the standard library aborts the process when the thread
+/// begins.
+pub(crate) fn has_room_for_thread() -> bool {
+    let mut memory = Vec::<u8>::new();
+    let is_granted = memory.try_reserve_exact(THREAD_ROOM).is_ok();
+    // A compiler may leave out memory that is not used, and then takes it for granted.
+    black_box(&memory);
+    is_granted
+}
 
 struct Pool {
     /// Where its workers live. A child of `fork` has this memory but not the threads.
@@ -79,10 +90,8 @@ impl Pool {
             else {
                 return;
             };
-            // If the system grants a stack and little more, the standard library aborts the process when the thread begins.
-            let has_room = Vec::<u8>::new().try_reserve_exact(THREAD_ROOM).is_ok();
             let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));
-            if !has_room || thread.spawn(|| self.work()).is_err() {
+            if !has_room_for_thread() || thread.spawn(|| self.work()).is_err() {
                 // The call uses the threads that there are; a later call tries again.
                 self.workers.fetch_sub(1, Ordering::Relaxed);
                 return;

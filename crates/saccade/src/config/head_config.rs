@@ -35,7 +35,7 @@ pub struct HeadConfig {
     /// Learned query rows between state and actions (`num_target_vision_tokens`).
     pub num_future_tokens: usize,
     /// What is added to the logits of each future key in every self-attention block: the logarithm of the number of tokens that it
-    /// stands for (spec I2). Only saccade reads it.
+    /// represents (spec I2). Only saccade reads it.
     pub future_key_bias: Option<Vec<f32>>,
     /// Actions in a chunk.
     pub action_horizon: usize,

@@ -9,4 +9,4 @@ mod whole;
 pub use head_config::HeadConfig;
 pub(crate) use head_config::Reads;
 pub(crate) use versions::{Feature, Version};
-pub(crate) use whole::{OWN_KEY, Object, WholeConfig};
+pub(crate) use whole::{HEAD_KEY, OWN_KEY, Object, WholeConfig};

@@ -19,7 +19,7 @@ pub(crate) enum Version {
 pub(crate) enum Feature {
     /// Learned tokens between state and actions (`num_target_vision_tokens`, `future_tokens`).
     FutureTokens,
-    /// Action decoders side by side (`use_multi_action_heads`, `action_arm_decoder`).
+    /// Several action decoders (`use_multi_action_heads`, `action_arm_decoder`).
     SeveralDecoders,
     /// A norm of the vision-language tokens (`use_vlln`, `vlln`).
     VlNorm,
@@ -42,7 +42,7 @@ struct Release {
     features: &'static [Feature],
     /// Whether its config names `max_action_dim` and chooses its transformer by `use_alternate_vl_dit`.
     is_flat: bool,
-    /// Sizes that its class takes for keys that the config leaves out, besides [`COMMON_SIZES`].
+    /// Sizes that its class takes for keys that the config leaves out, in addition to [`COMMON_SIZES`].
     sizes: &'static [(&'static str, usize)],
 }
 
@@ -122,6 +122,11 @@ impl Version {
     /// Every version, in the order of their release.
     pub(crate) fn all() -> impl Iterator<Item = Self> {
         RELEASES.iter().map(|release| release.version)
+    }
+
+    /// The version of this [`name`](Self::name).
+    pub(crate) fn named(name: &str) -> Option<Self> {
+        Self::all().find(|version| version.name() == name)
     }
 
     fn release(self) -> &'static Release {

@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 pub(crate) type Object = Map<String, Value>;
 
 /// The key of the head's config in a whole checkpoint's.
-const HEAD_KEY: &str = "action_head_cfg";
+pub(crate) const HEAD_KEY: &str = "action_head_cfg";
 
 /// The key of saccade's own part of the head's config.
 pub(crate) const OWN_KEY: &str = "saccade";
@@ -31,13 +31,18 @@ pub(crate) struct Declared {
 
 impl WholeConfig {
     /// # Errors
-    /// [`Error::Checkpoint`] for text that is no JSON object, and if the head's config in it is none or has saccade's key next to it.
+    /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object, and if the head's config in it is none or has saccade's key next to it.
     pub(crate) fn parse(text: &str) -> Result<Self> {
         let bad = |problem: String| Err(Error::Checkpoint(format!("config: {problem}")));
         let mut top = match serde_json::from_str(text) {
             Ok(Value::Object(top)) => top,
             Ok(_) => return bad("expected a JSON object".to_owned()),
-            Err(error) => return bad(format!("not valid JSON: {error}")),
+            Err(source) => {
+                return Err(Error::Json {
+                    what: "config".to_owned(),
+                    source,
+                });
+            }
         };
         let nested = match top.remove(HEAD_KEY) {
             None => None,

@@ -98,7 +98,7 @@ impl ActionHead {
         kinds
     }
 
-    /// Lends a workspace to `call`. The list is never waited for: a thread that finds its lock taken makes a workspace of its own, so that
+    /// Runs `call` with a workspace. The list is never waited for: a thread that finds its lock taken makes a workspace of its own, so that
     /// callers never stop each other, and a fork that copies a taken lock leaves the child slower, not stuck.
     pub(super) fn with_workspace<R>(&self, call: impl FnOnce(&mut Workspace) -> Result<R>) -> Result<R> {
         let kept = self.workspaces.try_lock().ok().and_then(|mut kept| kept.pop());

@@ -1,4 +1,4 @@
-//! Layers that each embodiment has of its own (`CategorySpecificLinear` and `CategorySpecificMLP` of the released code).
+//! Layers with separate weights for each embodiment (`CategorySpecificLinear` and `CategorySpecificMLP` of the released code).
 
 use saccade_kernels::{Epilogue, LinearScratch};
 

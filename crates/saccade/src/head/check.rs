@@ -3,6 +3,7 @@
 use super::action_head::ActionHead;
 use super::context::Context;
 use super::sample::Sampling;
+use crate::alloc::reserve;
 use crate::array::{Array, ArrayMut};
 use crate::error::{Error, Result, show_shape};
 use crate::inspect::extent::Extent;
@@ -50,7 +51,7 @@ impl ActionHead {
         )))
     }
 
-    /// The number of samples an observation.
+    /// Checks the noise; returns the number of samples per observation.
     pub(super) fn check_noise(
         &self,
         noise: Array<'_>,
@@ -112,6 +113,7 @@ impl ActionHead {
         checked: &mut Vec<usize>,
     ) -> Result<()> {
         checked.clear();
+        reserve("embodiment_id", checked, batch)?;
         if !ids.shape().is_empty() {
             ids.check_shape("embodiment_id", "(batch,)", &[batch])?;
         }
@@ -136,7 +138,7 @@ impl ActionHead {
         Error::Input(format!("embodiment_id: expected 0 to {last}, got {id}"))
     }
 
-    /// What a call on `context` is over.
+    /// The sizes of a call on `context`.
     pub(super) fn extent<'a>(
         &'a self,
         interventions: &'a [Intervention],
@@ -153,7 +155,8 @@ impl ActionHead {
             timestep.check_shape("timestep", "(batch,)", &[batch])?;
         }
         let last = self.config.num_timestep_buckets - 1;
-        let mut buckets = Vec::with_capacity(batch);
+        let mut buckets = Vec::new();
+        reserve("timestep", &mut buckets, batch)?;
         for &given in timestep.data() {
             let bucket = usize::try_from(given).ok().filter(|bucket| *bucket <= last);
             buckets.push(bucket.ok_or_else(|| {

@@ -15,7 +15,7 @@ pub struct Context {
     pub(crate) batch: usize,
     pub(crate) num_vl_tokens: usize,
     pub(crate) vl_embs: Vec<f32>,
-    /// By block, empty for self-attention; within it by batch element. Of the positions that are seen there only.
+    /// Keys and values by block, and within a block by batch element, of the positions that the block sees. Empty for self-attention.
     pub(crate) keys_values: Vec<Vec<PackedKeyValues>>,
     /// One for each kind of cross-attention block.
     pub(crate) seen: Vec<Seen>,

@@ -235,7 +235,7 @@ impl CrossAttention {
         result.map(drop).inspect_err(|_| out.fill(0.0))
     }
 
-    /// Lends buffers to `call`; their list is never waited for.
+    /// Runs `call` with buffers; never waits for the lock of their list.
     fn with_buffers(&self, call: impl FnOnce(&mut AttentionBuffers) -> Result<()>) -> Result<()> {
         let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
         let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);

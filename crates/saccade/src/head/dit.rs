@@ -9,13 +9,13 @@ use super::context::Context;
 use crate::alloc::sized;
 use crate::config::{HeadConfig, Reads};
 use crate::engine::Engine;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::inspect::changes::Changes;
 use crate::inspect::groups::{Group, Groups};
 use crate::inspect::trace::{Recorded, StepBlock};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys, Held, SelfKeys, Subset};
 use crate::nn::linear::Linear;
-use crate::nn::mlp::FeedForward;
+use crate::nn::mlp::{DIFFUSERS, FeedForward};
 use crate::nn::weights::Weights;
 use crate::ops::{self, check_interrupted};
 use crate::precision::Role;
@@ -82,7 +82,7 @@ pub(crate) enum ActiveRows {
     Needed,
     /// As [`Self::Needed`], and what the self-attention blocks read of them is held.
     NeededAndHeld,
-    /// Those of the actions. The self-attention blocks read the held keys and values of the others.
+    /// The action rows. The self-attention blocks read the held keys and values of the other rows.
     Actions,
 }
 
@@ -123,7 +123,7 @@ pub(crate) struct DitBuffers {
     y_all: Vec<f32>,
     hidden: Vec<f32>,
     attention: AttentionBuffers,
-    /// By block, empty for cross-attention.
+    /// Keys and values by block; empty for cross-attention.
     held: Vec<Vec<PackedKeyValues>>,
 }
 
@@ -155,7 +155,12 @@ impl Block {
             modulation: Linear::new(&weights.at("norm1.linear"), width, 2 * width, Role::Time)?,
             attention: Attention::new(&attention, width, context_dim, config.num_heads, kv_part)?,
             reads,
-            feed_forward: FeedForward::new(&weights.at("ff"), width, 4 * width, Epilogue::GeluTanh)?,
+            feed_forward: FeedForward::new(
+                &weights.at("ff"),
+                DIFFUSERS,
+                [width, 4 * width],
+                Epilogue::GeluTanh,
+            )?,
         })
     }
 }
@@ -183,7 +188,7 @@ impl Dit {
         })
     }
 
-    /// By block: the attention over the vision-language tokens and what it sees of them, if it is one.
+    /// For each block that attends to the vision-language tokens: its attention and which of the tokens it sees.
     pub(crate) fn cross_attentions(&self) -> Vec<Option<(Reads, &Attention)>> {
         self.blocks
             .iter()
@@ -202,7 +207,7 @@ impl Dit {
         let mut row = |layer: &Linear, x: &[f32], epilogue| {
             let mut out = vec![0.0; layer.out_features()];
             layer.apply(engine, x, epilogue, &mut out, &mut scratch)?;
-            Ok::<_, crate::Error>(out)
+            Ok::<_, Error>(out)
         };
         let mut table = [0.0; TIME_CHANNELS];
         embedding_time(timestep, &mut table);
@@ -218,7 +223,7 @@ impl Dit {
             } else {
                 (second, first)
             };
-            Ok::<_, crate::Error>(Modulation {
+            Ok::<_, Error>(Modulation {
                 scale: scale.iter().map(|scale| 1.0 + scale).collect(),
                 shift: shift.to_vec(),
             })

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 /// The embodiments of a checkpoint, of which some are in use.
 #[derive(Clone, Copy)]
 pub(crate) struct Embodiments<'a> {
-    /// Those in use, ascending.
+    /// The ids in use, ascending.
     pub ids: &'a [usize],
     /// How many there are.
     pub count: usize,

@@ -2,7 +2,7 @@
 
 use super::action_head::ActionHead;
 use super::context::{Context, Seen};
-use super::vl_encoder::Tokens;
+use super::vl_encoder::VlTokens;
 use crate::alloc::{collected, reserve};
 use crate::array::Array;
 use crate::config::Reads;
@@ -106,7 +106,7 @@ impl ActionHead {
         };
         let vl = &self.layers.vl;
         let mut recorded = vl.recorded(features.record, batch, num_vl_tokens)?;
-        let tokens = Tokens {
+        let tokens = VlTokens {
             features: features.backbone_features.data(),
             num_vl_tokens,
             removed: removed.as_deref(),

@@ -98,7 +98,7 @@ impl ActionHead {
             config,
             ..
         } = published;
-        let wanted = reading_order(&config, &embodiment_ids);
+        let wanted = reading_order(&config, &embodiment_ids)?;
         FileSource::read_ahead(&checkpoint, prefix, wanted, |tensors| {
             Self::build(tensors, engine, config, embodiment_ids)
         })
@@ -120,7 +120,7 @@ impl ActionHead {
         let config = HeadConfig::from_json(config)?;
         let embodiment_ids =
             chosen_embodiments(options.embodiment_ids.as_deref(), None, config.num_embodiments)?;
-        let problems = memory::problems(tensors, &tensor_specs(&config), |name, shape| {
+        let problems = memory::problems(tensors, &tensor_specs(&config)?, |name, shape| {
             is_unused(&config, name, shape)
         });
         if !problems.is_empty() {

@@ -1,4 +1,4 @@
-//! The action head: encode an observation once, sample chunks of actions from it as often as wanted.
+//! The action head: encode an observation once, then sample any number of action chunks from it.
 
 mod action_encoder;
 pub(crate) mod action_head;
@@ -13,8 +13,8 @@ pub(crate) mod encode;
 mod layers;
 pub(crate) mod load;
 pub(crate) mod plan;
+mod published;
 pub(crate) mod sample;
-mod size;
 #[cfg(test)]
 mod tests;
 mod trace;

@@ -7,34 +7,42 @@ use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
 use crate::config::HeadConfig;
 use crate::engine::Engine;
+use crate::error::Result;
 use crate::nn::planner::{Plan, Planner};
 use crate::nn::weights::Builder;
 use crate::precision::Precision;
 
 /// Name, without a prefix, and shape of every tensor that a head's checkpoint must hold.
-#[must_use]
-pub fn tensor_shapes(config: &HeadConfig) -> Vec<(String, Vec<usize>)> {
-    let tensors = tensor_specs(config);
-    tensors
-        .into_iter()
+///
+/// # Errors
+/// [`Error::Interrupted`](crate::Error::Interrupted) if the call was stopped by [`interruptible`](crate::interruptible).
+pub fn tensor_shapes(config: &HeadConfig) -> Result<Vec<(String, Vec<usize>)>> {
+    let tensors = tensor_specs(config)?.into_iter();
+    Ok(tensors
         // A head without future tokens may come with an empty tensor of them, and need not.
         .filter(|tensor| !tensor.shape.contains(&0))
         .map(|tensor| (tensor.name, tensor.shape))
-        .collect()
+        .collect())
 }
 
 /// Every tensor that a checkpoint of a head of this config must hold, by its name without a prefix.
-pub(crate) fn tensor_specs(config: &HeadConfig) -> Vec<TensorSpec> {
+///
+/// # Errors
+/// As [`tensor_shapes`].
+pub(crate) fn tensor_specs(config: &HeadConfig) -> Result<Vec<TensorSpec>> {
     // Any embodiment: they have the same tensors.
-    plan(config, &[0]).specs
+    Ok(plan(config, &[0])?.specs)
 }
 
 /// What a head with these embodiments reads, in the order in which it is built.
-pub(crate) fn reading_order(config: &HeadConfig, embodiment_ids: &[usize]) -> Vec<Wanted> {
-    plan(config, embodiment_ids).wanted
+///
+/// # Errors
+/// As [`tensor_shapes`].
+pub(crate) fn reading_order(config: &HeadConfig, embodiment_ids: &[usize]) -> Result<Vec<Wanted>> {
+    Ok(plan(config, embodiment_ids)?.wanted)
 }
 
-fn plan(config: &HeadConfig, ids: &[usize]) -> Plan {
+fn plan(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
     let planner = Planner::default();
     let engine = Engine {
         isa: Isa::best(),
@@ -45,13 +53,9 @@ fn plan(config: &HeadConfig, ids: &[usize]) -> Plan {
         ids,
         count: config.num_embodiments,
     };
-    HeadLayers::new(&Builder::new(&planner, engine).weights(), config, embodiments)
-        .expect("a planner refuses nothing");
-    planner.into_plan()
+    HeadLayers::new(&Builder::new(&planner, engine).weights(), config, embodiments)?;
+    Ok(planner.into_plan())
 }
-
-/// The name, without a prefix, of the future tokens.
-pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
 
 /// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
 /// logarithms of loss weights, what N1.6 puts in place of a state that it hides, how often N1.7 hides one.

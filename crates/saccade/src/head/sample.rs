@@ -4,7 +4,7 @@ use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::{ActiveRows, Pass};
 use super::workspace::Workspace;
-use crate::alloc::sized;
+use crate::alloc::{reserve, sized};
 use crate::array::{Array, ArrayMut, unravel};
 use crate::error::{Error, Result, show_shape};
 use crate::inspect::changes::Changes;
@@ -31,8 +31,8 @@ pub struct Sampling<'a> {
     /// Chunks for each observation; none adds no axis to noise and result.
     pub num_samples: Option<usize>,
     /// The rows of state and future tokens run at every `future_refresh`-th evaluation of the velocity, beginning with the first. At the
-    /// others only the action rows run, and self-attention reads the others' keys and values as they last were. None and 1: at all of them,
-    /// which is exact.
+    /// others only the action rows run, and self-attention uses the keys and values that the other rows last had. `None` and 1 run all rows
+    /// at every evaluation, which is exact.
     pub future_refresh: Option<usize>,
     /// The previous chunk, and how this one begins with its end; none starts from noise alone.
     pub chunking: Option<Chunking<'a>>,
@@ -196,6 +196,7 @@ impl ActionHead {
             let bucket = bucket(evaluation, count, self.config.num_timestep_buckets);
             let times = &mut workspace.dit.times;
             times.clear();
+            reserve("activations", times, pass.context.batch)?;
             times.resize(pass.context.batch, self.layers.dit.time(self.engine, bucket)?);
             let rows = if !refreshes(evaluation) {
                 ActiveRows::Actions
@@ -249,7 +250,7 @@ impl ActionHead {
     }
 }
 
-/// At every how many evaluations all rows run.
+/// The number of evaluations from one that runs all rows to the next.
 pub(super) fn check_refresh(future_refresh: Option<usize>) -> Result<usize> {
     match future_refresh {
         Some(0) => Err(Error::Input(

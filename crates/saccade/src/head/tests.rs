@@ -140,7 +140,12 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
         let tensor = checkpoint
             .read_slices(&format!("action_head.action_encoder.{name}"), id..id + 1)
             .unwrap();
-        tensor.into_f32().into_iter().map(f64::from).collect::<Vec<_>>()
+        tensor
+            .into_f32()
+            .unwrap()
+            .into_iter()
+            .map(f64::from)
+            .collect::<Vec<_>>()
     };
     let linear = |layer: &str, x: &[f64]| {
         let (weight, mut out) = (slice(&format!("{layer}.W")), slice(&format!("{layer}.b")));
@@ -236,6 +241,7 @@ fn the_plan_has_the_tensors_of_the_released_files() {
             .join(name);
         let checkpoint = crate::Checkpoint::open(&path).unwrap();
         let mut planned: Vec<_> = tensor_shapes(&head.config)
+            .unwrap()
             .into_iter()
             .map(|(tensor, _)| format!("action_head.{tensor}"))
             .collect();

@@ -7,7 +7,7 @@ use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::{ActiveRows, Pass};
 use super::workspace::Workspace;
-use crate::alloc::sized;
+use crate::alloc::{reserve, sized};
 use crate::array::{Array, ArrayMut};
 use crate::error::Result;
 use crate::inspect::changes::Changes;
@@ -55,6 +55,7 @@ impl ActionHead {
             self.encode_state(state, workspace)?;
             sized(&mut workspace.x, actions.data().len())?.copy_from_slice(actions.data());
             workspace.dit.times.clear();
+            reserve("activations", &mut workspace.dit.times, batch)?;
             for &bucket in &timesteps {
                 let time = self.layers.dit.time(self.engine, bucket)?;
                 workspace.dit.times.push(time);

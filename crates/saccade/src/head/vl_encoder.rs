@@ -11,7 +11,7 @@ use crate::engine::Engine;
 use crate::error::Result;
 use crate::inspect::trace::{Keep, Recorded, Shapes};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, SelfKeys};
-use crate::nn::mlp::FeedForward;
+use crate::nn::mlp::{DIFFUSERS, FeedForward};
 use crate::nn::norm::LayerNorm;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
@@ -43,7 +43,7 @@ struct VlBlock {
 }
 
 /// What is encoded, and for whom.
-pub(crate) struct Tokens<'a> {
+pub(crate) struct VlTokens<'a> {
     /// `(batch, num_vl_tokens, context_dim)`.
     pub features: &'a [f32],
     pub num_vl_tokens: usize,
@@ -51,7 +51,7 @@ pub(crate) struct Tokens<'a> {
     pub removed: Option<&'a [f32]>,
     /// What each kind of cross-attention block sees.
     pub seen: &'a [Seen],
-    /// By block of the transformer: the attention over these tokens and what it sees of them, if it is one.
+    /// For each block of the transformer that attends to these tokens: its attention and which of the tokens it sees.
     pub cross: &'a [Option<(Reads, &'a Attention)>],
 }
 
@@ -84,7 +84,12 @@ impl VlBlock {
             norm1: LayerNorm::new(&weights.at("norm1"), width, EPS)?,
             attention: Attention::new(&weights.at("attn1"), width, width, heads, Part::ToKv)?,
             norm3: LayerNorm::new(&weights.at("norm3"), width, EPS)?,
-            feed_forward: FeedForward::new(&weights.at("ff"), width, 4 * width, Epilogue::GeluTanh)?,
+            feed_forward: FeedForward::new(
+                &weights.at("ff"),
+                DIFFUSERS,
+                [width, 4 * width],
+                Epilogue::GeluTanh,
+            )?,
         })
     }
 }
@@ -127,11 +132,11 @@ impl VlEncoder {
     pub(crate) fn encode(
         &self,
         engine: Engine,
-        tokens: &Tokens<'_>,
+        tokens: &VlTokens<'_>,
         recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,
     ) -> Result<Encoded> {
-        let Tokens {
+        let VlTokens {
             features,
             num_vl_tokens,
             ..
@@ -165,7 +170,7 @@ impl VlEncoder {
     fn project(
         &self,
         engine: Engine,
-        tokens: &Tokens<'_>,
+        tokens: &VlTokens<'_>,
         elements: Range<usize>,
         vl: &[f32],
         keys_values: &mut [Vec<PackedKeyValues>],
@@ -195,7 +200,7 @@ impl VlEncoder {
     fn tokens(
         &self,
         engine: Engine,
-        tokens: &Tokens<'_>,
+        tokens: &VlTokens<'_>,
         elements: Range<usize>,
         recorded: &mut Recorded<usize>,
         buffers: &mut EncodeBuffers,

@@ -11,7 +11,7 @@ pub(crate) struct Workspace {
     pub dit: DitBuffers,
     /// By batch element.
     pub embodiment_ids: Vec<usize>,
-    /// Of the state encoder's hidden layer, `(batch, hidden_dim)`.
+    /// The state encoder's hidden layer, `(batch, hidden_dim)`.
     pub state_hidden: Vec<f32>,
     /// State rows, `(batch, width)`.
     pub state: Vec<f32>,
@@ -21,14 +21,14 @@ pub(crate) struct Workspace {
     pub start: Vec<f32>,
     /// What the velocity of each action of a chunk is multiplied by.
     pub strength: Vec<f32>,
-    /// Of the action encoder's hidden layer, `(batch, samples, action_horizon, width)`.
+    /// The action encoder's hidden layer, `(batch, samples, action_horizon, width)`.
     pub tokens: Vec<f32>,
     /// Action rows, `(batch, samples, action_horizon, width)`.
     pub encoded: Vec<f32>,
-    /// Of the transformer, `(batch, samples, action_horizon, hidden_dim)`.
+    /// The transformer's output rows, `(batch, samples, action_horizon, hidden_dim)`.
     pub output: Vec<f32>,
     pub decoder_hidden: Vec<f32>,
-    /// Of one decoder, `(batch, samples, action_horizon, its width)`.
+    /// One decoder's output, `(batch, samples, action_horizon, width of the decoder)`.
     pub decoded: Vec<f32>,
     /// `(batch, samples, action_horizon, action_dim)`.
     pub velocity: Vec<f32>,

@@ -9,7 +9,7 @@ use super::check::{check, check_not_empty, is_read};
 use super::extent::Extent;
 use super::groups::{Group, Groups, check_indices};
 use super::intervention::{Intervention, Patch};
-use crate::alloc::filled;
+use crate::alloc::{filled, product, reserve};
 use crate::error::{Error, Result, show_shape};
 
 /// All interventions of one call, in the form in which blocks use them.
@@ -93,6 +93,8 @@ impl<'a> Changes<'a> {
     fn find_biases(&mut self, interventions: &[Intervention]) -> Result<()> {
         let mut known: BTreeMap<(bool, Vec<usize>), usize> = BTreeMap::new();
         let config = self.extent.config;
+        let count = product("intervention", &[self.extent.num_steps, config.num_layers])?;
+        reserve("intervention", &mut self.acting, count)?;
         for step in 0..self.extent.num_steps {
             for block in 0..config.num_layers {
                 let is_cross = config.is_cross(block);
@@ -205,10 +207,13 @@ fn acts(intervention: &Intervention, step: usize, block: usize, is_cross: bool) 
 impl DenseBias {
     /// Adds the cuts and biases of an intervention.
     fn add(&mut self, intervention: &Intervention, groups: &Groups, is_cross: bool) {
-        let heads: Vec<usize> = match &intervention.heads {
-            Some(heads) => heads.clone(),
-            None => (0..self.heads).collect(),
+        let is_chosen = |head: &usize| {
+            intervention
+                .heads
+                .as_ref()
+                .is_none_or(|heads| heads.contains(head))
         };
+        let heads: Vec<usize> = (0..self.heads).filter(is_chosen).collect();
         let everyone: Vec<usize> = (0..self.rows).collect();
         let mut add = |readers: &[usize], keys: &[usize], values: &dyn Fn(usize) -> f32| {
             for &head in &heads {

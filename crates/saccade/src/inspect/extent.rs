@@ -1,11 +1,11 @@
-//! What one call is over: how many observations, steps and tokens.
+//! The sizes of one call: observations, steps and tokens.
 
 use super::groups::Groups;
 use super::intervention::Intervention;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, show_shape};
 
-/// What one call is over.
+/// The sizes of one call.
 #[derive(Clone, Copy)]
 pub(crate) struct Extent<'a> {
     pub config: &'a HeadConfig,

@@ -6,6 +6,7 @@ use crate::error::{Error, Result};
 
 /// A group of tokens.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Group {
     /// The one state row.
     State,

@@ -137,6 +137,20 @@ fn biases_of_several_add_up_where_they_act_together() {
 }
 
 #[test]
+fn a_head_that_is_listed_twice_gets_its_bias_once() {
+    let config = config();
+    let interventions = [Intervention {
+        key_bias: vec![(all(Group::Future), OwnedArray::new(vec![0.25], &[]).unwrap())],
+        heads: Some(vec![1, 1]),
+        ..Intervention::default()
+    }];
+    let changes = changes(&config, &interventions).unwrap();
+    let bias = changes.bias(0, 1, 0).unwrap();
+    assert_eq!(row(bias, 0, 0, 6), [0.0; 6]);
+    assert_eq!(row(bias, 1, 0, 6), [0.0, 0.25, 0.25, 0.25, 0.0, 0.0]);
+}
+
+#[test]
 fn the_configs_own_bias_is_in_every_self_attention_block_and_under_all_others() {
     let config = HeadConfig {
         future_key_bias: Some(vec![0.5, -1.0, 2.0]),

@@ -10,11 +10,26 @@ use crate::ops::check_interrupted;
 
 /// What to keep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Keep {
     /// Attention probabilities.
     pub attention: bool,
     /// The rows after a block.
     pub hidden: bool,
+}
+
+impl Keep {
+    /// Whether to keep attention probabilities.
+    #[must_use]
+    pub fn with_attention(self, attention: bool) -> Self {
+        Self { attention, ..self }
+    }
+
+    /// Whether to keep the rows after a block.
+    #[must_use]
+    pub fn with_hidden(self, hidden: bool) -> Self {
+        Self { hidden, ..self }
+    }
 }
 
 /// What [`ActionHead::trace`](crate::ActionHead::trace) keeps, and how much of it at most.

@@ -34,9 +34,9 @@ pub(crate) struct AttentionBuffers {
 
 /// Keys and values of a self-attention that outlive the call.
 pub(crate) struct Held<'a> {
-    /// One for each sequence that ever was.
+    /// One for each sequence; calls with fewer sequences leave the rest unused.
     pub sequences: &'a mut Vec<PackedKeyValues>,
-    /// Those before this number stay as they are, the others are made from the rows given.
+    /// The number of keys that stay as they are; the others are computed from the given rows.
     pub first: usize,
 }
 
@@ -153,8 +153,8 @@ impl Bias<'_> {
 }
 
 impl Attention {
-    /// From `to_q`, `to_k`, `to_v` and `to_out.0`, as diffusers names them. Keys and values come from rows of `context_dim`; `kv_part` is under
-    /// what that work is counted.
+    /// From `to_q`, `to_k`, `to_v` and `to_out.0`, as diffusers names them. Keys and values come from rows of `context_dim`; their work is
+    /// counted under `kv_part`.
     pub(crate) fn new(
         weights: &Weights<'_>,
         width: usize,

@@ -1,4 +1,4 @@
-//! Self-attention of language models: fewer heads of keys than of queries, norms of both, rotary positions, a causal mask.
+//! Self-attention of language and vision models: fewer heads of keys than of queries, norms of both, rotary positions, a causal mask.
 
 use saccade_kernels::{Epilogue, LinearScratch, Mask, PackedKeyValues};
 
@@ -23,11 +23,20 @@ pub(crate) struct GroupedSizes {
     pub head_dim: usize,
 }
 
+/// The four projections of an attention: how a model names them, and which of them have a bias.
+#[derive(Clone, Copy)]
+pub(crate) struct Projections {
+    /// Of queries, keys, values and the output.
+    pub names: [&'static str; 4],
+    pub qkv_bias: bool,
+    pub out_bias: bool,
+}
+
 /// `o_proj(softmax(q k^T / sqrt(head_dim)) v)` with `q = rotate(norm(q_proj y))`, `k = rotate(norm(k_proj y))` and `v = v_proj y`.
 pub(crate) struct GroupedAttention {
     qkv: Linear,
     out: Linear,
-    /// Of each head of the queries and the keys; none leaves them as they are.
+    /// The norms of each head of the queries and of the keys, if the model has them.
     norms: Option<[RmsNorm; 2]>,
     sizes: GroupedSizes,
 }
@@ -41,12 +50,11 @@ pub(crate) struct GroupedBuffers {
 }
 
 impl GroupedAttention {
-    /// From `q_proj`, `k_proj`, `v_proj`, `o_proj`, and with `norm_eps` `q_norm` and `k_norm`, as Qwen names them. The first three have a bias if
-    /// `has_bias`.
+    /// From the projections, and with `norm_eps` `q_norm` and `k_norm`, as Qwen names them.
     pub(crate) fn new(
         weights: &Weights<'_>,
         sizes: GroupedSizes,
-        has_bias: bool,
+        projections: Projections,
         norm_eps: Option<f32>,
     ) -> Result<Self> {
         let GroupedSizes {
@@ -56,10 +64,12 @@ impl GroupedAttention {
             head_dim,
         } = sizes;
         let (queries, keys) = (num_heads * head_dim, num_kv_heads * head_dim);
-        let parts = [("q_proj", queries), ("k_proj", keys), ("v_proj", keys)];
+        let [q_proj, k_proj, v_proj, o_proj] = projections.names;
+        let parts = [(q_proj, queries), (k_proj, keys), (v_proj, keys)];
         let parts = parts.map(|(name, outputs)| (weights.at(name), outputs));
-        let qkv = Linear::stacked(&parts, width, Role::Block, has_bias)?;
-        let out = Linear::stacked(&[(weights.at("o_proj"), width)], queries, Role::Block, false)?;
+        let qkv = Linear::stacked(&parts, width, Role::Block, projections.qkv_bias)?;
+        let out = [(weights.at(o_proj), width)];
+        let out = Linear::stacked(&out, queries, Role::Block, projections.out_bias)?;
         let norms = match norm_eps {
             Some(eps) => Some([
                 RmsNorm::new(&weights.at("q_norm"), head_dim, eps)?,

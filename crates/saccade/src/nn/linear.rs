@@ -12,7 +12,7 @@ use crate::profile::Part;
 /// A linear layer: `weight (out_features, in_features)` and, if it has one, `bias (out_features)`.
 pub(crate) struct Linear {
     packed: PackedLinear,
-    /// Under what its work is counted; none leaves it out.
+    /// The part that its work is counted under; `None` does not count it.
     part: Option<Part>,
 }
 

@@ -10,6 +10,9 @@ use crate::error::Result;
 use crate::precision::Role;
 use crate::profile::Part;
 
+/// The names of the two layers in diffusers.
+pub(crate) const DIFFUSERS: [&str; 2] = ["net.0.proj", "net.2"];
+
 /// `W2 activation(W1 y + b1) + b2`.
 pub(crate) struct FeedForward {
     proj: Linear,
@@ -18,15 +21,15 @@ pub(crate) struct FeedForward {
 }
 
 impl FeedForward {
-    /// From `net.0.proj` and `net.2`, as diffusers names them.
+    /// From the two layers of these names, the first of which makes `hidden` elements of `width`.
     pub(crate) fn new(
         weights: &Weights<'_>,
-        width: usize,
-        hidden: usize,
+        [proj, out]: [&str; 2],
+        [width, hidden]: [usize; 2],
         activation: Epilogue,
     ) -> Result<Self> {
-        let proj = Linear::new(&weights.at("net.0.proj"), width, hidden, Role::Block)?;
-        let out = Linear::new(&weights.at("net.2"), hidden, width, Role::Block)?;
+        let proj = Linear::new(&weights.at(proj), width, hidden, Role::Block)?;
+        let out = Linear::new(&weights.at(out), hidden, width, Role::Block)?;
         Ok(Self {
             proj: proj.counted(Part::FeedForwardIn),
             out: out.counted(Part::FeedForwardOut),

@@ -1,13 +1,15 @@
-//! Layers against plain loops in float64.
+//! Layers against plain loops in float64, and those of released models against the code that they were released with.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
+use saccade_checkpoint::Checkpoint;
 use saccade_kernels::{Epilogue, Isa, LinearScratch, LogitBias, Mask};
 
 use super::gated_mlp::GatedMlp;
-use super::grouped_attention::{GroupedAttention, GroupedBuffers, GroupedSizes};
+use super::grouped_attention::{GroupedAttention, GroupedBuffers, GroupedSizes, Projections};
 use super::linear::Linear;
-use super::mlp::FeedForward;
+use super::mlp::{DIFFUSERS, FeedForward};
 use super::rms_norm::RmsNorm;
 use super::rotary::Rotation;
 use super::weights::{Builder, Weights};
@@ -172,7 +174,9 @@ fn feed_forwards_of_any_hidden_width_and_activation() {
             .iter_mut()
             .zip(&x)
             .for_each(|(sum, x)| *sum += f64::from(*x));
-        for (engine, layer) in named.layers(|weights| FeedForward::new(weights, 6, 11, activation)) {
+        for (engine, layer) in
+            named.layers(|weights| FeedForward::new(weights, DIFFUSERS, [6, 11], activation))
+        {
             let (mut out, scratch) = (x.clone(), &mut LinearScratch::new());
             layer.add(engine, &y, &mut Vec::new(), scratch, &mut out).unwrap();
             assert_close(&out, &expected, &format!("{} {activation:?}", engine.isa));
@@ -218,6 +222,13 @@ fn rms_norms_of_rows() {
         assert_close(&out, &expected, &engine.isa.to_string());
     }
 }
+
+/// Qwen's names, with the biases of its second version.
+const QWEN_WITH_BIAS: Projections = Projections {
+    names: ["q_proj", "k_proj", "v_proj", "o_proj"],
+    qkv_bias: true,
+    out_bias: false,
+};
 
 /// Softmax over the keys that each row sees, in float64.
 fn attention(sizes: GroupedSizes, qkv: &[f64], bias: impl Fn(usize, usize) -> f64) -> Vec<f64> {
@@ -313,7 +324,9 @@ fn grouped_attention_with_norms_rotation_and_masks() {
             }),
         };
         let eps = has_norms.then_some(1e-6);
-        for (engine, layer) in named.layers(|weights| GroupedAttention::new(weights, sizes, true, eps)) {
+        for (engine, layer) in
+            named.layers(|weights| GroupedAttention::new(weights, sizes, QWEN_WITH_BIAS, eps))
+        {
             let (mut out, rotation) = (x.clone(), is_rotated.then_some(&rotation));
             let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
             layer.add(engine, &y, rotation, mask, memory, &mut out).unwrap();
@@ -324,4 +337,94 @@ fn grouped_attention_with_norms_rotation_and_masks() {
             );
         }
     }
+}
+
+/// A layer of a released model as transformers has it: its tensors, an `input`, and its `output` in float64.
+fn released(name: &str) -> Named {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/backbone_layers.safetensors");
+    let checkpoint = Checkpoint::open(&path).unwrap();
+    let prefix = format!("{name}.");
+    let tensors = checkpoint.names().filter_map(|full| {
+        let name = full.strip_prefix(&prefix)?.to_owned();
+        let shape = checkpoint.shape(full)?.to_vec();
+        Some((name, (shape, checkpoint.read_f32(full).unwrap())))
+    });
+    Named(tensors.collect())
+}
+
+/// Checks `add(engine, layer, input, out)`, which adds the result to `out`, on each instruction set.
+fn assert_released<L>(
+    name: &str,
+    build: impl Fn(&Weights<'_>) -> Result<L>,
+    add: impl Fn(Engine, &L, &[f32], &mut [f32]) -> Result<()>,
+) {
+    let named = released(name);
+    let (input, expected) = (&named.0["input"].1, named.get("output"));
+    for (engine, layer) in named.layers(build) {
+        let mut out = vec![0.0; expected.len()];
+        add(engine, &layer, input, &mut out).unwrap();
+        assert_close(&out, &expected, &format!("{name} {}", engine.isa));
+    }
+}
+
+#[test]
+fn the_layers_of_qwen_are_those_of_transformers() {
+    let sizes = GroupedSizes {
+        width: 20,
+        num_heads: 6,
+        num_kv_heads: 2,
+        head_dim: 8,
+    };
+    let projections = Projections {
+        qkv_bias: false,
+        ..QWEN_WITH_BIAS
+    };
+    let positions: Vec<usize> = (5..16).collect();
+    let rotation = Rotation::new(8, 1e6, &positions).unwrap();
+    assert_released(
+        "qwen3.self_attn",
+        |weights| GroupedAttention::new(weights, sizes, projections, Some(1e-6)),
+        |engine, layer, y, x| {
+            let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
+            layer.add(engine, y, Some(&rotation), Mask::Causal { offset: 0 }, memory, x)
+        },
+    );
+    assert_released(
+        "qwen3.mlp",
+        |weights| GatedMlp::new(weights, 20, 28, Epilogue::Silu, false),
+        |engine, layer, y, x| layer.add(engine, y, &mut Vec::new(), &mut LinearScratch::new(), x),
+    );
+    assert_released(
+        "qwen3.norm",
+        |weights| RmsNorm::new(weights, 20, 1e-6),
+        |engine, layer, y, x| layer.apply(engine, y, x),
+    );
+}
+
+#[test]
+fn the_layers_of_siglip_are_those_of_transformers() {
+    let sizes = GroupedSizes {
+        width: 24,
+        num_heads: 3,
+        num_kv_heads: 3,
+        head_dim: 8,
+    };
+    let projections = Projections {
+        names: ["q_proj", "k_proj", "v_proj", "out_proj"],
+        qkv_bias: true,
+        out_bias: true,
+    };
+    assert_released(
+        "siglip.self_attn",
+        |weights| GroupedAttention::new(weights, sizes, projections, None),
+        |engine, layer, y, x| {
+            let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
+            layer.add(engine, y, None, Mask::None, memory, x)
+        },
+    );
+    assert_released(
+        "siglip.mlp",
+        |weights| FeedForward::new(weights, ["fc1", "fc2"], [24, 36], Epilogue::GeluTanh),
+        |engine, layer, y, x| layer.add(engine, y, &mut Vec::new(), &mut LinearScratch::new(), x),
+    );
 }

@@ -76,7 +76,7 @@ impl Tensor {
     /// The elements as float32; none of an outline.
     pub(crate) fn into_f32(self) -> Result<Vec<f32>> {
         Ok(match self {
-            Self::Held(elements) => elements.try_into_f32()?,
+            Self::Held(elements) => elements.into_f32()?,
             Self::Outline(_) => Vec::new(),
         })
     }
@@ -204,7 +204,7 @@ pub(crate) struct Weights<'a> {
 }
 
 impl Weights<'_> {
-    /// Those below `name`.
+    /// The weights below `name`.
     pub(crate) fn at(&self, name: impl std::fmt::Display) -> Self {
         Self {
             builder: self.builder,
@@ -238,7 +238,7 @@ impl Weights<'_> {
         weight.held_as(self.engine(), role)
     }
 
-    /// The vector `name`, which will be part of a packed layer. Empty where there is but its outline.
+    /// The vector `name`, which will be part of a packed layer. Empty if the source gives an outline.
     pub(crate) fn bias(&self, name: &str, len: usize) -> Result<Vec<f32>> {
         let bias = self.read(Request {
             spec: TensorSpec::plain(&self.name(name), &[len]),
@@ -248,13 +248,13 @@ impl Weights<'_> {
         bias.into_f32()
     }
 
-    /// The vector `name`, kept as float32. Empty where there is but its outline.
+    /// The vector `name`, kept as float32. Empty if the source gives an outline.
     pub(crate) fn vector(&self, name: &str, len: usize) -> Result<Vec<f32>> {
         self.count(4 * len);
         self.bias(name, len)
     }
 
-    /// The first `count` rows of the table `weight`, kept as float32. Empty where there is but its outline.
+    /// The first `count` rows of the table `weight`, kept as float32. Empty if the source gives an outline.
     pub(crate) fn table(&self, shape: [usize; 2], count: usize) -> Result<Vec<f32>> {
         self.count(4 * count * shape[1]);
         let table = self.read(Request {

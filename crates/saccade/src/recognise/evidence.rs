@@ -3,10 +3,9 @@
 use serde_json::Value;
 
 use super::layout::{CheckpointLayout, Clues, Evidence};
-use super::sizes::DECODERS;
+use super::sizes::{DECODERS, FUTURE_TOKENS};
 use crate::config::{Feature, Version};
 use crate::error::{Error, Result};
-use crate::head::plan::FUTURE_TOKENS;
 
 /// The one version that all evidence fits, and the evidence, a sentence each.
 ///

@@ -6,7 +6,7 @@ use super::sizes::{self, HeadShapes};
 use crate::config::{Object, Version, WholeConfig};
 use crate::error::Result;
 
-/// What is known of a checkpoint before its version is.
+/// What is known about a checkpoint before its version is recognised.
 pub(super) struct Clues<'a> {
     pub config: &'a WholeConfig,
     /// Whether the config holds the head's.

@@ -1,5 +1,5 @@
-//! lerobot's checkpoints, whose `config.json` is a policy's and holds no size of the head: sizes come from the tensors, and what no shape
-//! tells is as in the published models.
+//! lerobot's checkpoints, whose `config.json` describes a policy and holds no size of the head. Sizes come from the tensors; what no shape
+//! determines is taken from the published models.
 
 use std::path::Path;
 
@@ -7,10 +7,9 @@ use saccade_checkpoint::{OWN_CONFIG, read_text};
 use serde_json::{Map, Value, json};
 
 use super::layout::{CheckpointLayout, Clues, Evidence};
-use super::sizes::{self, BLOCKS, HeadShapes, add_decoders, proved};
+use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
 use crate::config::{Feature, OWN_KEY, Object, Version, WholeConfig};
 use crate::error::{Error, Result};
-use crate::head::plan::FUTURE_TOKENS;
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
 pub(super) struct Lerobot;
@@ -176,7 +175,7 @@ fn from_tensors(
     )))
 }
 
-/// Adds both transformers' configs, and to `problems` what the tensors do not tell.
+/// Adds both transformers' configs, and to `problems` what the tensors do not determine.
 fn add_transformers(
     head: &mut Object,
     version: Version,
@@ -280,17 +279,21 @@ fn chunk_of_processors(directory: &Path) -> Option<u64> {
         .find_map(|step| step.get("config")?.get("action_horizon")?.as_u64())
 }
 
-/// Saccade's own part of the head's config: in a file of its own, since lerobot refuses a `config.json` with keys that it does not know.
+/// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with keys that it does not know.
 fn own_config(directory: &Path) -> Result<Option<Value>> {
     let path = directory.join(OWN_CONFIG);
     if !path.exists() {
         return Ok(None);
     }
-    let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
-    let own: Value = serde_json::from_str(&read_text("source", &path)?)
-        .map_err(|error| bad(format!("not valid JSON: {error}")))?;
+    let own = serde_json::from_str(&read_text("source", &path)?).map_err(|source| Error::Json {
+        what: format!("source: {}", path.display()),
+        source,
+    })?;
     match own {
         Value::Object(_) => Ok(Some(own)),
-        _ => Err(bad("expected a JSON object".to_owned())),
+        _ => Err(Error::Checkpoint(format!(
+            "source: {}: expected a JSON object",
+            path.display()
+        ))),
     }
 }

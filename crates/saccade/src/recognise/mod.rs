@@ -3,13 +3,13 @@
 //! Every command and [`ActionHead::load`](crate::ActionHead::load) start here. Sizes that published configs leave out are taken from the
 //! shapes of the tensors. Where config and tensors disagree, one error lists everything.
 
-pub(crate) mod contents;
 mod evidence;
+pub(crate) mod kept;
 mod layout;
 mod layouts;
 mod lerobot;
 mod nvidia;
-mod sizes;
+pub(crate) mod sizes;
 
 use std::path::Path;
 
@@ -18,8 +18,8 @@ use serde_json::Value;
 
 use crate::config::{HeadConfig, WholeConfig};
 use crate::error::{Error, Result};
-use contents::{check, kept_embodiments};
 use evidence::recognise_version;
+use kept::kept_embodiments;
 use layout::Clues;
 use layouts::{has_head_config, head_prefix, layout_of};
 use sizes::HeadShapes;
@@ -107,14 +107,6 @@ impl Published {
                 nbytes: checkpoint.nbytes(name).ok()?,
             })
         })
-    }
-
-    /// Checks that exactly the head's tensors are under the prefix, each of the right shape and a readable type.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
-    pub fn check(&self) -> Result<()> {
-        check(&self.checkpoint, self.prefix, &self.config)
     }
 
     /// The embodiments whose layers were kept when others were removed; none if all are there.

@@ -5,7 +5,9 @@ use serde_json::{Value, json};
 
 use crate::config::{Feature, Object, Version};
 use crate::error::show_shape;
-use crate::head::plan::FUTURE_TOKENS;
+
+/// The name, without a prefix, of the future tokens.
+pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
 
 const DECODER: &str = "action_decoder";
 const ARM: &str = "action_arm_decoder";

@@ -9,7 +9,8 @@ use saccade_checkpoint::{CheckpointWriter, Dtype, PlannedTensor};
 use crate::error::{Error, Result};
 use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
-use crate::recognise::contents::{KEPT_EMBODIMENTS, kept_embodiments};
+use crate::ops::check_interrupted;
+use crate::recognise::kept::{KEPT_EMBODIMENTS, kept_embodiments};
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
@@ -91,7 +92,7 @@ pub fn convert(
         kept = Some(ids.iter().copied().collect::<BTreeSet<usize>>());
         report.embodiment_ids = Some(ids);
     }
-    let specs = tensor_specs(&source.config);
+    let specs = tensor_specs(&source.config)?;
     let per_embodiment: BTreeSet<String> = specs
         .iter()
         .filter(|spec| spec.per_embodiment)
@@ -117,9 +118,12 @@ pub fn convert(
             if is_kept {
                 source
                     .checkpoint
-                    .read_byte_range(name, start..start + nbytes, |bytes| match change {
-                        None => Ok(writer.tensor(name, bytes)?),
-                        Some((from, to)) => rounding.write(name, bytes, from, to, writer),
+                    .read_byte_range(name, start..start + nbytes, |bytes| {
+                        check_interrupted()?;
+                        match change {
+                            None => Ok(writer.tensor(name, bytes)?),
+                            Some((from, to)) => rounding.write(name, bytes, from, to, writer),
+                        }
                     })?;
             } else {
                 let nbytes = change.map_or(nbytes, |(from, to)| nbytes / from.size() * to.size());

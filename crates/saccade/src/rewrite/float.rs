@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 
 /// A type that weights are stored in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Float {
     /// float32.
     F32,

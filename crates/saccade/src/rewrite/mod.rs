@@ -12,6 +12,7 @@ use saccade_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTensor
 
 use crate::config::HeadConfig;
 use crate::error::{Error, Result};
+use crate::ops::check_interrupted;
 use crate::recognise::Published;
 
 /// Published checkpoints are cut into files of this size.
@@ -109,9 +110,10 @@ impl SourceCheckpoint {
 
     /// Copies tensor `name` bit for bit.
     pub(crate) fn copy(&self, name: &str, writer: &mut CheckpointWriter) -> Result<()> {
-        Ok(self
-            .checkpoint
-            .read_bytes(name, |bytes| writer.tensor(name, bytes))?)
+        self.checkpoint.read_bytes(name, |bytes| {
+            check_interrupted()?;
+            Ok(writer.tensor(name, bytes)?)
+        })
     }
 
     /// Writes a checkpoint to the directory `out`: the `small` files by name and contents (`config.json` is one), the other files next to the

@@ -7,9 +7,11 @@ use saccade_checkpoint::spec::SCALE_SUFFIX;
 use saccade_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec, reserve};
 use saccade_kernels::quantize_rows;
 
+use crate::alloc::filled;
 use crate::error::{Error, Result};
 use crate::head::plan::tensor_specs;
 use crate::nn::weights::weight_view;
+use crate::ops::check_interrupted;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
@@ -46,7 +48,7 @@ pub fn quantize(
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<QuantizeReport> {
     let source = SourceCheckpoint::open(source, options.config.as_deref())?;
-    let specs = tensor_specs(&source.config);
+    let specs = tensor_specs(&source.config)?;
     let weights: BTreeSet<String> = specs
         .iter()
         .map(|spec| format!("{}{}", source.prefix, spec.name))
@@ -116,11 +118,12 @@ fn write_quantized(
     let [out_features, in_features] = *spec.shape else {
         unreachable!("a linear layer's weight has two axes")
     };
+    check_interrupted()?;
     let weight = checkpoint.read(name)?;
     let mut values: Vec<i8> = Vec::new();
     reserve("source", &mut values, out_features * in_features)?;
     values.resize(out_features * in_features, 0);
-    let mut scales = vec![0.0; out_features];
+    let mut scales = filled("source", out_features, 0.0)?;
     quantize_rows(
         weight_view(&weight, out_features, in_features),
         &mut values,
@@ -143,6 +146,7 @@ fn copy_finite(checkpoint: &Checkpoint, name: &str, writer: &mut CheckpointWrite
     };
     let mut values = Vec::new();
     checkpoint.read_bytes(name, |bytes| {
+        check_interrupted()?;
         float.read(bytes, &mut values);
         if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
             return Err(Error::Checkpoint(format!(

@@ -7,12 +7,13 @@ use crate::error::{Error, Result, show_shape};
 /// The chunk before, and how it is taken over. Of its first `horizon` actions the last `overlap` become the first ones of the new chunk, without
 /// noise: the first `frozen` of these stay as they are, the rest follow the velocity the more, the later they come.
 #[derive(Clone, Copy, Debug)]
+#[non_exhaustive]
 pub struct Chunking<'a> {
     /// `(batch, rows, encoder_action_dim)` with at least `horizon` rows, as they left the head; or `action_dim` wide.
     pub previous_chunk: Array<'a>,
     /// Actions that are taken over, up to `horizon`.
     pub overlap: usize,
-    /// Of these, the first that do not change: those that are carried out before the new chunk is there.
+    /// How many of these do not change: the robot executes them before the new chunk is available.
     pub frozen: usize,
     /// How soon the rest become free: above 0, and 6 in released code.
     pub ramp_rate: f64,
@@ -34,6 +35,27 @@ pub(crate) struct Seam<'a> {
 }
 
 impl<'a> Chunking<'a> {
+    /// Continues `previous_chunk`, all of whose `action_horizon` actions count.
+    #[must_use]
+    pub fn new(previous_chunk: Array<'a>, overlap: usize, frozen: usize, ramp_rate: f64) -> Self {
+        Self {
+            previous_chunk,
+            overlap,
+            frozen,
+            ramp_rate,
+            horizon: None,
+        }
+    }
+
+    /// With this number of actions of the previous chunk.
+    #[must_use]
+    pub fn with_horizon(self, horizon: impl Into<Option<usize>>) -> Self {
+        Self {
+            horizon: horizon.into(),
+            ..self
+        }
+    }
+
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for numbers or a chunk that do not fit the head.
     pub(crate) fn check(&self, config: &HeadConfig, batch: usize) -> Result<Seam<'a>> {

@@ -5,6 +5,7 @@ use crate::error::{Error, Result};
 
 /// How the velocity is followed from noise to actions in one step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Integrator {
     /// `x + dt v(x, t)`, as the released sampler does.
     #[default]

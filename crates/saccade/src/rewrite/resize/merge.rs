@@ -4,7 +4,9 @@
 
 use saccade_checkpoint::{granted, reserve};
 
+use crate::alloc::filled;
 use crate::error::{Error, Result};
+use crate::ops::check_interrupted;
 
 /// A smaller bias is rounding error of the logarithms and is written as no bias.
 const NO_BIAS: f64 = 1e-6;
@@ -47,7 +49,7 @@ pub fn merge_future_tokens(
         )));
     }
     let count = tokens.len() / width;
-    let zeros = vec![0.0; count];
+    let zeros = filled("key_bias", count, 0.0)?;
     let key_bias = key_bias.unwrap_or(&zeros);
     if key_bias.len() != count {
         return Err(Error::Shape(format!(
@@ -83,7 +85,7 @@ pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) 
     } else {
         // As float64, while they are compared.
         granted("future tokens", tokens.len().saturating_mul(size_of::<f64>()))?;
-        merged(tokens, width, bias, count)
+        merged(tokens, width, bias, count)?
     };
     let row = |index: usize| &tokens[index * width..(index + 1) * width];
     let is_equal = |group: &Vec<usize>| group.iter().all(|&one| row(one) == row(group[0]));
@@ -162,14 +164,21 @@ impl Cluster {
 
 /// Which tokens are merged so that `count` are left: always the two groups whose merging costs least, ties in the order of their first
 /// tokens. Directions count and lengths do not, since each block normalises its rows.
-fn merged(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Vec<Vec<usize>> {
+///
+/// # Errors
+/// [`Error::Interrupted`] if the call is to stop.
+fn merged(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Result<Vec<Vec<usize>>> {
     if count == 0 {
-        return Vec::new();
+        return Ok(Vec::new());
     }
     let mut groups = single_tokens(tokens, width, bias);
-    let mut best: Vec<Option<(f64, usize)>> =
-        (0..groups.len()).map(|index| cheapest(&groups, index)).collect();
+    let mut best: Vec<Option<(f64, usize)>> = Vec::with_capacity(groups.len());
+    for index in 0..groups.len() {
+        check_interrupted()?;
+        best.push(cheapest(&groups, index));
+    }
     for _ in count..groups.len() {
+        check_interrupted()?;
         let found = best
             .iter()
             .enumerate()
@@ -186,6 +195,7 @@ fn merged(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Vec<Vec<u
         for index in 0..groups.len() {
             let is_stale = best[index].is_some_and(|(_, other)| other == first || other == second);
             if is_stale || index == first {
+                check_interrupted()?;
                 best[index] = cheapest(&groups, index);
             } else if index < first
                 && let (Some(one), Some(changed)) = (&groups[index], &groups[first])
@@ -197,7 +207,7 @@ fn merged(tokens: &[f32], width: usize, bias: &[f32], count: usize) -> Vec<Vec<u
             }
         }
     }
-    groups.into_iter().flatten().map(|group| group.members).collect()
+    Ok(groups.into_iter().flatten().map(|group| group.members).collect())
 }
 
 /// A group for each token.

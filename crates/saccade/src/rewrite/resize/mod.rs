@@ -4,25 +4,25 @@
 //! by one if log(n) is added (spec I2). No published layout has a place for such a bias, so it is written under a key of saccade's own: the
 //! result is exact in saccade, while other programs see plain copies.
 
+mod config_edit;
 mod json_edit;
 mod merge;
 mod perturb;
-mod plan;
 
 use std::path::Path;
 
 use saccade_checkpoint::{OWN_CONFIG, reserve};
 
 use crate::error::{Error, Result};
-use crate::head::plan::FUTURE_TOKENS;
+use crate::recognise::sizes::FUTURE_TOKENS;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
+use config_edit::config_edit;
 use merge::resized;
 use perturb::perturb;
-use plan::plan;
 
+pub use config_edit::resized_config;
 pub use merge::{MergedTokens, merge_future_tokens};
-pub use plan::resized_config;
 
 /// How a checkpoint is resized.
 #[derive(Clone, Debug)]
@@ -90,9 +90,9 @@ pub fn resize(
 ) -> Result<ResizeReport> {
     let source = SourceCheckpoint::open(source, options.rewrite.config.as_deref())?;
     let config = &source.config;
-    let plan = plan(config, &source.given_config, options.num_future_tokens)?;
+    let edit = config_edit(config, &source.given_config, options.num_future_tokens)?;
     let name = format!("{}{FUTURE_TOKENS}", source.prefix);
-    let tokens = source.checkpoint.read(&name)?.try_into_f32()?;
+    let tokens = source.checkpoint.read(&name)?.into_f32()?;
     if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
         return Err(Error::Checkpoint(format!(
             "source: {name} holds {bad}, expected finite numbers"
@@ -125,7 +125,7 @@ pub fn resize(
         }
     }
     planned.push(stored);
-    let (config_text, own) = plan.config(resized.key_bias.as_deref());
+    let (config_text, own) = edit.config(resized.key_bias.as_deref());
     let small = [
         ("config.json", Some(config_text.as_str())),
         (OWN_CONFIG, own.as_deref()),

@@ -6,15 +6,16 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 
 use super::json_edit::{Found, entry, find, span};
-use crate::config::HeadConfig;
+use crate::config::{Feature, HEAD_KEY, HeadConfig, OWN_KEY, Version};
 use crate::error::{Error, Result};
 
 /// Merging compares every token with every other, and a chunk takes time in proportion to their number.
 const MAX_TOKENS: usize = 4096;
 
-/// The key of the number of future tokens in published configs, and that of saccade's own.
+/// The key of the number of future tokens in published configs.
 const COUNT_KEY: &str = "num_target_vision_tokens";
-const OWN_KEY: &str = "saccade";
+
+/// The key of their biases in saccade's own part of a config.
 const BIAS_KEY: &str = "future_key_bias";
 
 /// The text of a config, which holds the head's, for `num_future_tokens` tokens without biases; all else is as it is written.
@@ -24,11 +25,13 @@ const BIAS_KEY: &str = "future_key_bias";
 /// number out of range.
 pub fn resized_config(config_json: &str, num_future_tokens: usize) -> Result<String> {
     let config = HeadConfig::from_json(config_json)?;
-    Ok(plan(&config, config_json, num_future_tokens)?.config(None).0)
+    Ok(config_edit(&config, config_json, num_future_tokens)?
+        .config(None)
+        .0)
 }
 
 /// What changes in a checkpoint's config: what can be said without its tensors.
-pub(super) struct Plan {
+pub(super) struct ConfigEdit {
     given: String,
     count: usize,
     /// Where the number of future tokens is.
@@ -50,10 +53,11 @@ struct HeadObject {
 /// # Errors
 /// [`Error::Checkpoint`] for a version without future tokens, a head that has none, and numbers that contradict each other;
 /// [`Error::Input`] for a count out of range.
-pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Plan> {
+pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Result<ConfigEdit> {
     let bad = |problem: String| Err(Error::Checkpoint(problem));
     let before = config.num_future_tokens;
-    if config.version != "n1.5" {
+    let version = Version::named(&config.version);
+    if !version.is_some_and(|version| version.has(Feature::FutureTokens)) {
         return bad(format!(
             "source: GR00T {} has no future tokens, so there is no number of them to change",
             config.version.to_uppercase()
@@ -75,8 +79,10 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
         ));
     }
     let mut found = Vec::new();
-    let whole: &RawValue = serde_json::from_str(given)
-        .map_err(|error| Error::Checkpoint(format!("config: not valid JSON: {error}")))?;
+    let whole: &RawValue = serde_json::from_str(given).map_err(|source| Error::Json {
+        what: "config".to_owned(),
+        source,
+    })?;
     find("", whole, &mut found)?;
     let counts: Vec<&Found<'_>> = found.iter().filter(|place| place.key == COUNT_KEY).collect();
     let others: Vec<String> = counts
@@ -92,18 +98,18 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
     }
     let head = found
         .iter()
-        .find(|place| place.path == "action_head_cfg")
+        .find(|place| place.path == HEAD_KEY)
         .map(|place| place.value)
         .or_else(|| (!found.iter().any(|place| place.path == "type")).then_some(whole));
     let in_head = |key: &str, head: &RawValue| {
         let path = if std::ptr::eq(head, whole) {
             key.to_owned()
         } else {
-            format!("action_head_cfg.{key}")
+            format!("{HEAD_KEY}.{key}")
         };
         found.iter().find(|place| place.path == path)
     };
-    Ok(Plan {
+    Ok(ConfigEdit {
         given: given.to_owned(),
         count,
         counts: counts.iter().map(|place| span(given, place.value)).collect(),
@@ -118,7 +124,7 @@ pub(super) fn plan(config: &HeadConfig, given: &str, count: usize) -> Result<Pla
     })
 }
 
-impl Plan {
+impl ConfigEdit {
     /// The text of the new `config.json`, and that of a file of saccade's own if the bias has no place in it.
     pub(super) fn config(&self, bias: Option<&[f32]>) -> (String, Option<String>) {
         let count = self.count.to_string();
@@ -179,13 +185,13 @@ mod tests {
   "model_type": "gr00t_n1_5", "extra": [{"num_target_vision_tokens": 4}]
 }"#;
 
-    fn planned(given: &str, count: usize) -> Result<Plan> {
-        plan(&HeadConfig::from_json(given)?, given, count)
+    fn edit_of(given: &str, count: usize) -> Result<ConfigEdit> {
+        config_edit(&HeadConfig::from_json(given)?, given, count)
     }
 
     #[test]
     fn all_of_a_config_but_the_number_stays_as_it_is_written() {
-        let (text, own_file) = planned(CONFIG, 9).unwrap().config(None);
+        let (text, own_file) = edit_of(CONFIG, 9).unwrap().config(None);
         assert_eq!(
             text,
             CONFIG.replace("num_target_vision_tokens\": 4", "num_target_vision_tokens\": 9")
@@ -195,18 +201,18 @@ mod tests {
 
     #[test]
     fn a_bias_comes_and_goes() {
-        let (with, _) = planned(CONFIG, 2).unwrap().config(Some(&[0.5, -1.0]));
+        let (with, _) = edit_of(CONFIG, 2).unwrap().config(Some(&[0.5, -1.0]));
         let config = HeadConfig::from_json(&with).unwrap();
         assert_eq!(
             (config.num_future_tokens, config.future_key_bias),
             (2, Some(vec![0.5, -1.0]))
         );
-        let (other, _) = planned(&with, 1).unwrap().config(Some(&[0.25]));
+        let (other, _) = edit_of(&with, 1).unwrap().config(Some(&[0.25]));
         assert_eq!(
             HeadConfig::from_json(&other).unwrap().future_key_bias,
             Some(vec![0.25])
         );
-        let (back, _) = planned(&other, 4).unwrap().config(None);
+        let (back, _) = edit_of(&other, 4).unwrap().config(None);
         assert_eq!(back, CONFIG);
         // Wherever the key is.
         for written in [
@@ -219,7 +225,7 @@ mod tests {
                 "\"interleave_self_attention\": true}\n, \"saccade\": {}",
             ),
         ] {
-            let (back, _) = planned(&written, 4).unwrap().config(None);
+            let (back, _) = edit_of(&written, 4).unwrap().config(None);
             let value: Value = serde_json::from_str(&back).unwrap();
             assert_eq!(value, serde_json::from_str::<Value>(CONFIG).unwrap(), "{back}");
         }
@@ -231,7 +237,7 @@ mod tests {
         let config = HeadConfig::from_json(&given).unwrap();
         assert_eq!(config.num_future_tokens, 32);
         let given = given.replace("{\"num_target_vision_tokens\": 4}", "");
-        let (text, _) = plan(&config, &given, 40).unwrap().config(None);
+        let (text, _) = config_edit(&config, &given, 40).unwrap().config(None);
         assert_eq!(HeadConfig::from_json(&text).unwrap().num_future_tokens, 40);
     }
 
@@ -241,7 +247,7 @@ mod tests {
             "[{\"num_target_vision_tokens\": 4}]",
             "[{\"num_target_vision_tokens\": 32}]",
         );
-        let error = planned(&given, 9).err().unwrap().to_string();
+        let error = edit_of(&given, 9).err().unwrap().to_string();
         assert!(
             error.contains("extra[0].num_target_vision_tokens is 32"),
             "{error}"
@@ -253,9 +259,9 @@ mod tests {
     fn a_config_without_a_head_is_left_alone() {
         let config = HeadConfig::from_json(CONFIG).unwrap();
         let given = "{\"type\": \"groot\", \"chunk_size\": 50}";
-        let plan = plan(&config, given, 8).unwrap();
-        assert_eq!(plan.config(None), (given.to_owned(), None));
-        let (text, own_file) = plan.config(Some(&[0.5]));
+        let edit = config_edit(&config, given, 8).unwrap();
+        assert_eq!(edit.config(None), (given.to_owned(), None));
+        let (text, own_file) = edit.config(Some(&[0.5]));
         assert_eq!(text, given);
         let own_file: Value = serde_json::from_str(&own_file.unwrap()).unwrap();
         assert_eq!(own_file, serde_json::json!({"future_key_bias": [0.5]}));
