@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import collections
 import importlib.resources
+import itertools
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 import saccade
+from saccade import _saccade
 
 DEMO = str(importlib.resources.files("saccade") / "sim" / "demo")
 
@@ -131,3 +136,15 @@ def test_only_the_main_threads_calls_are_stopped(head: saccade.ActionHead, state
     worker.join()
     expected = head.sample(context, state, 0, seed=1, num_samples=50, num_steps=50)
     np.testing.assert_array_equal(results[0], expected)
+
+
+def test_reading_many_small_tensors_is_stopped(tmp_path: Path) -> None:
+    """None of them takes long enough to ask whether to go on, so that the loop over them must."""
+    path = tmp_path / "model.safetensors"
+    save_file({f"tensor.{index}": np.zeros(1, np.float32) for index in range(2000)}, path)
+    paths = iter([str(path)] * 200)
+    # The interpreter looks for signals between bytecodes, not between the calls of `map`.
+    calls = map(_saccade.read_tensors, paths, itertools.repeat(""))
+    with pytest.raises(Stopped), stopped_after(0.05):
+        collections.deque(calls, maxlen=0)
+    assert list(paths)

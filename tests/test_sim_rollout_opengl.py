@@ -114,3 +114,23 @@ def test_a_renderer_whose_construction_is_interrupted_is_silent(interrupted: str
         [sys.executable, "-c", code, interrupted], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
+def test_a_fork_of_a_process_with_an_open_renderer_ends() -> None:
+    """It has no threads of Mesa's: closing its copy of the context would wait for them."""
+    code = (
+        "import os, sys, gymnasium, saccade.sim\n"
+        "environment = gymnasium.make('saccade/reach-v0')\n"
+        "environment.reset(seed=0)\n"
+        "child = os.fork()\n"
+        "if child == 0: sys.exit(3)\n"
+        "print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+        "environment.close()"
+    )
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120
+        )
+    except subprocess.TimeoutExpired:
+        pytest.fail("the fork did not end")
+    assert (done.returncode, done.stdout) == (0, "3\n")

@@ -22,6 +22,8 @@ pub(crate) fn read_tensors<'py>(
     let checkpoint = call(py, || Ok(Checkpoint::open(&source)?))?;
     let dict = PyDict::new(py);
     for name in checkpoint.names().filter(|name| name.starts_with(prefix)) {
+        // Reading one tensor asks nobody whether to go on, and there may be a thousand.
+        py.check_signals()?;
         let data = call(py, || Ok(checkpoint.read_f32(name)?))?;
         let shape = checkpoint
             .shape(name)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import functools
+import os
 import weakref
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -150,10 +151,14 @@ def close_all_at_exit() -> None:
     MuJoCo registers the end of EGL when it creates its first context, and functions registered later run
     earlier: this must be called after that.
     """
-    atexit.register(close_all)
+    atexit.register(close_all, os.getpid())
 
 
-def close_all() -> None:
-    """Closes every open renderer."""
-    for renderer in list(open_renderers):
-        renderer.close()
+def close_all(process: int) -> None:
+    """Closes every open renderer if this is the process that opened them.
+
+    A fork has copies of the contexts but not Mesa's threads, and would wait for them without end.
+    """
+    if os.getpid() == process:
+        for renderer in list(open_renderers):
+            renderer.close()
