@@ -31,6 +31,7 @@ __all__ = [
     "panic_in_core",
     "parse_config",
     "quantize",
+    "read_stored",
     "read_tensors",
     "resize",
     "selected_isa",
@@ -189,6 +190,7 @@ class Published:
     def nbytes(self, precision: str, num_embodiments: int) -> int: ...
 
 def parse_config(text: str) -> dict[str, Any]: ...
+def read_stored(source: str) -> dict[str, tuple[str, list[int], bytes]]: ...  # dtype, shape, content
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
 def quantize(rewrite: dict[str, Any]) -> dict[str, Any]: ...
 def convert(

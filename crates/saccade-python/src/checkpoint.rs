@@ -1,10 +1,11 @@
 //! `saccade._saccade.Published`: an open checkpoint and what it is.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyBytes, PyDict};
 use saccade::{Checkpoint, TensorFacts};
 
 use crate::arrays::to_numpy;
@@ -31,6 +32,32 @@ pub(crate) fn read_tensors<'py>(
         dict.set_item(&name[prefix.len()..], to_numpy(py, data, shape)?)?;
     }
     Ok(dict)
+}
+
+/// Type, shape and bytes of a tensor, as stored.
+type PyStoredTensor<'py> = (String, Vec<usize>, Bound<'py, PyBytes>);
+
+/// Every tensor as it is stored, of whatever type, by name. For small files.
+#[pyfunction]
+pub(crate) fn read_stored<'py>(
+    py: Python<'py>,
+    source: PathBuf,
+) -> PyResult<BTreeMap<String, PyStoredTensor<'py>>> {
+    let checkpoint = call(py, || Ok(Checkpoint::open(&source)?))?;
+    let mut tensors = BTreeMap::new();
+    for name in checkpoint.names() {
+        let mut bytes = Vec::new();
+        let dtype = call(py, || {
+            checkpoint.read_bytes(name, |piece| {
+                bytes.extend_from_slice(piece);
+                Ok::<_, saccade::Error>(())
+            })?;
+            Ok(format!("{:?}", checkpoint.dtype(name)?))
+        })?;
+        let shape = checkpoint.shape(name).unwrap_or_default().to_vec();
+        tensors.insert(name.to_owned(), (dtype, shape, PyBytes::new(py, &bytes)));
+    }
+    Ok(tensors)
 }
 
 /// Name, type, shape and bytes in the file of a tensor.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import stat
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import saccade._saccade as _saccade
 from saccade.errors import CheckpointError, printable
 
 #: A larger file is refused, since it is read at once. No robot's statistics are larger.
@@ -56,33 +56,29 @@ def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
         CheckpointError: It is damaged.
     """
     try:
-        content = _bytes(path)
-        start = 8 + int.from_bytes(content[:8], "little")
-        if len(content) < 8 or start > len(content):
-            raise ValueError("the header is longer than the file")
+        _check_small(path)
         tensors = {}
-        for name, about in json.loads(content[8:start]).items():
-            if name == "__metadata__":
-                continue
-            first, last = about["data_offsets"]
-            shape, kind = tuple(about["shape"]), np.dtype(DTYPES[about["dtype"]])
-            data = content[start + first : start + last]
-            if min(first, last, *shape, 0) < 0 or len(data) != math.prod(shape) * kind.itemsize:
-                raise ValueError(f"{name}: data_offsets {first} to {last} do not contain {shape} of {kind}")
-            tensors[name] = np.frombuffer(data, kind).reshape(shape)
+        for name, (dtype, shape, content) in _saccade.read_stored(str(path)).items():
+            if dtype not in DTYPES:
+                raise ValueError(f"{name} is {dtype}, expected one of {', '.join(DTYPES)}")
+            tensors[name] = np.frombuffer(content, DTYPES[dtype]).reshape(shape)
     except FileNotFoundError:
         raise FileNotFoundError(printable(f"{path}: no such file")) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: cannot be read as safetensors: {error}") from None
     return tensors
 
 
 def _bytes(path: Path) -> bytes:
     """The content of a small file."""
+    _check_small(path)
+    return path.read_bytes()
+
+
+def _check_small(path: Path) -> None:
     about = path.stat()
     # Reading a pipe might wait forever, and a device might never end.
     if not stat.S_ISREG(about.st_mode):
         raise ValueError("not a regular file")
     if about.st_size > MOST_BYTES:
         raise ValueError(f"more than {MOST_BYTES} bytes")
-    return path.read_bytes()
