@@ -392,7 +392,7 @@ def test_two_at_once_do_not_take_each_others_files(source: Path, tmp_path: Path)
             convert(source, out)
             assert mine.exists()
 
-    with pytest.raises(CheckpointError, match="cannot be written"):
+    with pytest.raises(InputError, match="exists already; force replaces it"):
         convert(source, out, progress=other)
     assert equal(tensors_of(source), tensors_of(out))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "source"]
