@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::chains::FloatChains;
-use super::tile::{SUM_PART, Step, float_sums, multiply};
+use super::tile::{SUM_PART, Step, float_sums, multiply, shape};
 use super::{Block, Gemm, PanelMut, Shape, Source, odd_lines, panel};
 use crate::simd::{Kernel, Simd, Vector, load};
 use crate::weights::WeightRef;
@@ -122,15 +122,6 @@ unsafe impl<S: Simd> Gemm for RoundedRows<S> {
 
     fn chains(&self) -> usize {
         Widened(self.0).chains()
-    }
-}
-
-fn shape<S: Simd, P: Step<S>>() -> Shape {
-    Shape {
-        columns: S::Vector::TILE_VECTORS * S::Vector::LANES,
-        tile_rows: P::TILE_ROWS,
-        row_group: 1,
-        rows_beyond: 0,
     }
 }
 

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::chains::Bf16Chains;
-use super::tile::{SUM_PART, Step, float_sums, multiply};
+use super::tile::{SUM_PART, Step, float_sums, multiply, shape};
 use super::{Block, Gemm, PanelMut, Shape, Source, odd_lines, panel};
 use crate::simd::{Dots, Kernel, Simd, Vector, load};
 use crate::weights::WeightRef;
@@ -18,12 +18,7 @@ unsafe impl<S: Simd> Gemm for DotBf16<S> {
     }
 
     fn shape(&self) -> Shape {
-        Shape {
-            columns: S::Vector::TILE_VECTORS * S::Vector::LANES,
-            tile_rows: <PairStep as Step<S>>::TILE_ROWS,
-            row_group: 1,
-            rows_beyond: 0,
-        }
+        shape::<S, PairStep>()
     }
 
     fn panel_words(&self, in_features: usize) -> usize {

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::chains::Int8Chains;
-use super::tile::{Step, multiply};
+use super::tile::{Step, multiply, shape};
 use super::{Block, Gemm, PanelMut, Quantized, Shape, Source, odd_lines, panel};
 use crate::simd::{Dots, Kernel, Simd, Vector, load};
 use crate::weights::WeightRef;
@@ -18,12 +18,7 @@ unsafe impl<S: Simd> Gemm for DotInt8<S> {
     }
 
     fn shape(&self) -> Shape {
-        Shape {
-            columns: S::Vector::TILE_VECTORS * S::Vector::LANES,
-            tile_rows: <QuadStep as Step<S>>::TILE_ROWS,
-            row_group: 1,
-            rows_beyond: 0,
-        }
+        shape::<S, QuadStep>()
     }
 
     fn panel_words(&self, in_features: usize) -> usize {

@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use super::Block;
+use super::{Block, Shape};
 use crate::simd::{Simd, Vector};
 
 /// One running float32 sum over the 8192 inputs of a feed-forward loses five times as much as parts of 512 do (measured on the full head).
@@ -92,6 +92,16 @@ macro_rules! float_sums {
     };
 }
 pub(super) use float_sums;
+
+/// The sizes of a product with these steps: a panel as wide as the largest tile, rows one by one.
+pub(super) fn shape<S: Simd, P: Step<S>>() -> Shape {
+    Shape {
+        columns: S::Vector::TILE_VECTORS * S::Vector::LANES,
+        tile_rows: P::TILE_ROWS,
+        row_group: 1,
+        rows_beyond: 0,
+    }
+}
 
 /// What [`Gemm::multiply`](super::Gemm::multiply) does, as a part of a kernel.
 ///
