@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._saccade import __version__
 from saccade.attention import CrossAttention, KeyValues
+from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig
 from saccade.context import Context
@@ -31,6 +32,7 @@ from saccade.trace import Record, Trace
 
 __all__ = [
     "ActionHead",
+    "BackboneInputs",
     "CheckpointError",
     "Chunking",
     "Context",
