@@ -132,7 +132,10 @@ def _name_cameras(folder: Path, layout: str) -> None:
     elif layout in ("n16", "n17"):
 
         def processor(config: Config) -> None:
-            for modalities in config["processor_kwargs"]["modality_configs"].values():
+            kwargs = config["processor_kwargs"]
+            kwargs |= {"shortest_image_edge": 256, "crop_fraction": 0.95, "use_albumentations": True}
+            kwargs |= {"letter_box_transform": False, "formalize_language": True}
+            for modalities in kwargs["modality_configs"].values():
                 modalities["video"]["modality_keys"] = list(CAMERAS)
 
         _edit(folder / "processor_config.json", processor)

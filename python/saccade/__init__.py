@@ -27,6 +27,7 @@ from saccade.errors import (
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.policy import Policy
+from saccade.policy_context import PolicyContext
 from saccade.robots.normalizer import Normalizer
 from saccade.trace import Record, Trace
 
@@ -45,6 +46,7 @@ __all__ = [
     "MissingExtraError",
     "Normalizer",
     "Policy",
+    "PolicyContext",
     "Record",
     "SaccadeError",
     "ShapeError",
@@ -59,6 +61,7 @@ _SUBMODULES = (
     "checkpoints",
     "cli",
     "comparison",
+    "dialects",
     "integrations",
     "maps",
     "observation",

@@ -22,7 +22,7 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::checkpoint::{Published, read_stored, read_tensors};
+    use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
     use crate::config::{parse_config, tensor_shapes};
     #[pymodule_export]
