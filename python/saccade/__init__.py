@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._saccade import __version__
 from saccade.attention import CrossAttention, KeyValues
+from saccade.backbone import Backbone
+from saccade.backbone_config import BackboneConfig
+from saccade.backbone_features import BackboneFeatures, BackboneRecord
 from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig
@@ -33,7 +36,11 @@ from saccade.trace import Record, Trace
 
 __all__ = [
     "ActionHead",
+    "Backbone",
+    "BackboneConfig",
+    "BackboneFeatures",
     "BackboneInputs",
+    "BackboneRecord",
     "CheckpointError",
     "Chunking",
     "Context",

@@ -13,10 +13,14 @@ _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
 
 _Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
+# rows by layer, and by observation and view the patches and the tokens
+_BackboneRecorded = tuple[list[_Float32], list[list[_Float32]], list[list[_Float32]]]
 _Intervention = dict[str, Any]  # the fields of saccade.Intervention, mappings as lists of their items
 
 __all__ = [
     "ActionHead",
+    "Backbone",
+    "BackboneFeatures",
     "Context",
     "CrossAttention",
     "KeyValues",
@@ -134,6 +138,39 @@ class ActionHead:
         intervention: list[_Intervention],
         out: _Float32,
     ) -> None: ...
+
+@final
+class BackboneFeatures:
+    @property
+    def nbytes(self) -> int: ...
+    def features(self) -> _Float32: ...
+    def views(self) -> list[list[_Int64]]: ...
+
+@final
+class Backbone:
+    @staticmethod
+    def load(source: str, config: str | None, precision: str, num_threads: int | None) -> Backbone: ...
+    @staticmethod
+    def from_tensors(
+        tensors: dict[str, StoredTensor], config: str | None, precision: str, num_threads: int | None
+    ) -> Backbone: ...
+    def config(self) -> dict[str, Any]: ...
+    @property
+    def num_threads(self) -> int: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def isa(self) -> str: ...
+    @property
+    def nbytes(self) -> int: ...
+    def encode(
+        self,
+        inputs: list[dict[str, Any]],  # the fields of saccade.BackboneInputs, pixel_values as a list
+        previous: list[BackboneFeatures],
+        hidden: bool,
+        vision: bool,
+        image_tokens: bool,
+    ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
 
 @final
 class KeyValues:

@@ -5,6 +5,7 @@
 
 mod arrays;
 mod attention;
+mod backbone;
 mod checkpoint;
 mod config;
 mod context;
@@ -21,6 +22,8 @@ use pyo3::prelude::*;
 mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
+    #[pymodule_export]
+    use crate::backbone::{Backbone, BackboneFeatures};
     #[pymodule_export]
     use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
