@@ -27,6 +27,7 @@ from saccade.errors import (
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.policy import Policy
+from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer
 from saccade.trace import Record, Trace
 
@@ -45,6 +46,7 @@ __all__ = [
     "MissingExtraError",
     "Normalizer",
     "Policy",
+    "Processor",
     "Record",
     "SaccadeError",
     "ShapeError",
