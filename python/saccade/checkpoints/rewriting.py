@@ -53,8 +53,8 @@ class QuantizeReport(Written):
     backbone_bytes_after: int
     """Size of the backbone's tensors in the copy, scales included, in bytes."""
     backbone_copied: str | None
-    """Why the tensors outside the head were copied bit for bit; None if they are those of a backbone that was
-    quantised, or if there are none."""
+    """Why the tensors outside the head were copied bit for bit; None if they are those of a backbone that
+    was quantised, or if there are none."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ def quantize(
 ) -> QuantizeReport:
     """Writes a copy of a checkpoint with int8 weights: a quarter of the size of float32, half of bfloat16.
 
-    The weights of the attention and feed-forward layers of all blocks become int8, those of the head and those
-    of a backbone that :class:`saccade.Backbone` loads. These are the weights that precision ``"int8"``
+    The weights of the attention and feed-forward layers of all blocks become int8: those of the head, and
+    those of a backbone that :class:`saccade.Backbone` loads. These are the weights that precision ``"int8"``
     computes with in int8. Such a weight is stored as row-major int8 ``X.weight
     (out_features, in_features)`` with values from -127 to 127, and float32 ``X.weight_scale
     (out_features,)``. A row represents its integers times its scale, which is the largest magnitude of the
