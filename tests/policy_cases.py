@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,16 +20,16 @@ IMAGE, TOKENS = 300, 4
 
 
 class StandInProcessor:
-    """A token for each byte of the instruction, and a few for each view. Remembers what it was given."""
+    """A token for each byte of the instruction, and a few for each view. Remembers the instructions."""
 
     def __init__(self) -> None:
-        self.seen: list[tuple[list[str], str]] = []
+        self.seen: list[str] = []
 
-    def __call__(self, frames: Mapping[str, NDArray[np.uint8]], instruction: str) -> BackboneInputs:
-        self.seen.append((list(frames), instruction))
-        pixels = np.stack([np.resize(view, (3, 4, 4)) / np.float32(255) for view in frames.values()])
+    def __call__(self, frames: Sequence[NDArray[np.uint8]], instruction: str) -> BackboneInputs:
+        self.seen.append(instruction)
+        pixels = np.stack([np.resize(view, (3, 4, 4)) / np.float32(255) for view in frames])
         ids = np.concatenate([np.full(TOKENS * len(frames), IMAGE), list(instruction.encode())])
-        return BackboneInputs(pixels.astype(np.float32), ids[None], view_names=list(frames))
+        return BackboneInputs(pixels.astype(np.float32), ids[None])
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class StandInBackbone:
         self.table = np.random.default_rng(0).standard_normal((IMAGE + 1, width), np.float32)
         self.previous: list[Any] = []
 
-    def ragged(
-        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] | None = None
+    def _ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()
     ) -> list[StandInFeatures]:
         self.previous.append(previous)
         return [self._features(one) for one in inputs]

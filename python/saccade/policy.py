@@ -228,9 +228,9 @@ class Policy:
 
                 Or a sequence of observations, which need not agree in form, size or length. They are computed
                 together, and each has the bits that it has alone.
-            previous: The context of earlier observations, one for each of these. Vision tokens of views with
-                the same frames, and the unchanged beginning of the prompt, are taken from it. The result has
-                the same bits without.
+            previous: The context of earlier observations of this policy. Vision tokens of views with the same
+                frames, and the unchanged beginning of a prompt, are taken from it. The result has the same
+                bits without.
 
         Raises:
             InputError, ShapeError, DtypeError: The observation does not fit the robot; the message lists what
@@ -263,14 +263,9 @@ class Policy:
             InputError: This policy has no backbone, or ``previous`` does not fit.
         """
         backbone = self._whole("features", self.backbone)
-        held = None
-        if previous is not None:
-            if not isinstance(previous, PolicyContext):
-                raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
-            if previous.batch != len(inputs):
-                raise InputError(f"previous: expected {len(inputs)} observations, got {previous.batch}")
-            held = previous.features
-        return tuple(backbone.ragged(inputs, previous=held))
+        if previous is not None and not isinstance(previous, PolicyContext):
+            raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
+        return tuple(backbone._ragged(inputs, previous=() if previous is None else previous.features))
 
     def context(self, features: Sequence[Features]) -> PolicyContext:
         """What the head encodes of features of any lengths.
@@ -363,11 +358,14 @@ class Policy:
 
     def _inputs(self, readings: Sequence[Reading]) -> list[BackboneInputs]:
         processor = self._whole("inputs", self.processor)
-        return [
-            processor(frames, instruction)
-            for reading in readings
-            for frames, instruction in zip(reading.frames, reading.instructions, strict=True)
-        ]
+        found = []
+        for reading in readings:
+            for frames, instruction in zip(reading.frames, reading.instructions, strict=True):
+                # Without their names, by which lerobot's processor would sort them: they are in order.
+                inputs = processor(list(frames.values()), instruction)
+                inputs.view_names = tuple(frames)
+                found.append(inputs)
+        return found
 
     def _encoded(self, readings: Sequence[Reading], previous: PolicyContext | None) -> PolicyContext:
         return self.context(self.features(self._inputs(readings), previous=previous))

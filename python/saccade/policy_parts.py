@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -70,8 +70,8 @@ class Features(Protocol):
 class Backbone(Protocol):
     """What a policy uses of its backbone, which is a :class:`saccade.Backbone`."""
 
-    def ragged(
-        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] | None = None
+    def _ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()
     ) -> Sequence[Features]:
         """The features of observations of any lengths, each with the bits that it has alone."""
 
@@ -79,7 +79,7 @@ class Backbone(Protocol):
 class Processor(Protocol):
     """What a policy uses of its processor, which is a :class:`saccade.Processor`."""
 
-    def __call__(self, frames: Mapping[str, UInt8Array], instruction: str) -> BackboneInputs:
+    def __call__(self, frames: Sequence[UInt8Array], instruction: str) -> BackboneInputs:
         """See :class:`saccade.Processor`."""
 
 
