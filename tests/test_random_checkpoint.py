@@ -109,7 +109,7 @@ def test_pieces_are_small_and_their_moments_right() -> None:
 
 @pytest.mark.parametrize("version", RELEASED)
 def test_outliers_are_where_trained_models_have_them(version: str, tmp_path: Path) -> None:
-    """In the residual stream of the vision tower and before down projections: the largest over the typical."""
+    """The largest value over the typical one, in the tower's residual stream and before down projections."""
     ratios = {}
     for outliers in (False, True):
         backbone = Backbone.load(small(tmp_path / str(outliers), version, outliers=outliers))
