@@ -13,10 +13,14 @@ _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
 
 _Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
+# rows by layer, and by observation and view the patches and the tokens
+_BackboneRecorded = tuple[list[_Float32], list[list[_Float32]], list[list[_Float32]]]
 _Intervention = dict[str, Any]  # the fields of saccade.Intervention, mappings as lists of their items
 
 __all__ = [
     "ActionHead",
+    "Backbone",
+    "BackboneFeatures",
     "Context",
     "CrossAttention",
     "KeyValues",
@@ -136,6 +140,39 @@ class ActionHead:
     ) -> None: ...
 
 @final
+class BackboneFeatures:
+    @property
+    def nbytes(self) -> int: ...
+    def features(self) -> _Float32: ...
+    def views(self) -> list[list[_Int64]]: ...
+
+@final
+class Backbone:
+    @staticmethod
+    def load(source: str, config: str | None, precision: str, num_threads: int | None) -> Backbone: ...
+    @staticmethod
+    def from_tensors(
+        tensors: dict[str, StoredTensor], config: str | None, precision: str, num_threads: int | None
+    ) -> Backbone: ...
+    def config(self) -> dict[str, Any]: ...
+    @property
+    def num_threads(self) -> int: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def isa(self) -> str: ...
+    @property
+    def nbytes(self) -> int: ...
+    def encode(
+        self,
+        inputs: list[dict[str, Any]],  # the fields of saccade.BackboneInputs, pixel_values as a list
+        previous: list[BackboneFeatures],
+        hidden: bool,
+        vision: bool,
+        image_tokens: bool,
+    ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
+
+@final
 class KeyValues:
     @property
     def batch(self) -> int: ...
@@ -192,6 +229,7 @@ class Published:
 def parse_config(text: str) -> dict[str, Any]: ...
 def read_stored(source: str) -> dict[str, tuple[str, list[int], bytes]]: ...  # dtype, shape, content
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
+def tensor_names(source: str) -> list[str]: ...
 def quantize(rewrite: dict[str, Any]) -> dict[str, Any]: ...
 def convert(
     rewrite: dict[str, Any], embodiment_ids: list[int] | None, dtype: str | None

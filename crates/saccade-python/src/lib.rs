@@ -5,6 +5,7 @@
 
 mod arrays;
 mod attention;
+mod backbone;
 mod checkpoint;
 mod config;
 mod context;
@@ -22,7 +23,9 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::checkpoint::{Published, read_stored, read_tensors};
+    use crate::backbone::{Backbone, BackboneFeatures};
+    #[pymodule_export]
+    use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
     use crate::config::{parse_config, tensor_shapes};
     #[pymodule_export]

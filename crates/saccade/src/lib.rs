@@ -10,6 +10,7 @@
 
 mod alloc;
 mod array;
+mod backbone;
 mod config;
 mod engine;
 mod error;
@@ -23,8 +24,13 @@ mod profile;
 mod recognise;
 mod rewrite;
 mod sampling;
+mod workspaces;
 
 pub use array::{Array, ArrayMut, OwnedArray};
+pub use backbone::{
+    Backbone, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep, BackboneLoadOptions,
+    BackboneRecord, LanguageConfig, VisionConfig,
+};
 pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};
 pub use head::action_head::ActionHead;
