@@ -14,6 +14,7 @@ mod error;
 mod head;
 mod intervention;
 mod machine;
+mod processor;
 mod rewrite;
 
 use pyo3::prelude::*;
@@ -39,6 +40,8 @@ mod _saccade {
         available_isas, default_num_threads, dot_products, measure_peaks, selected_isa, start_profile,
         take_profile,
     };
+    #[pymodule_export]
+    use crate::processor::Processor;
     #[pymodule_export]
     use crate::rewrite::{convert, merge_future_tokens, quantize, resize};
 
