@@ -174,6 +174,7 @@ class Backbone:
         image_tokens: bool,
     ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
 
+@final
 class Processor:
     def __new__(
         cls,
