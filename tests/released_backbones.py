@@ -55,7 +55,8 @@ class ReleasedBackbone:
 
     @property
     def features(self) -> NDArray[np.float64]:
-        return self.arrays["_out.backbone_features"]
+        features: NDArray[np.float64] = self.arrays["_out.backbone_features"]
+        return features
 
     @property
     def tolerance(self) -> NDArray[np.float64]:

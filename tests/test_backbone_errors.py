@@ -222,11 +222,12 @@ def test_sizes_in_the_config_of_a_checkpoint(tmp_path: Path) -> None:
     rewritten(tmp_path, dict)
     expected = released.load()(released.inputs()).backbone_features
     sizes = {key: about[key] for key in ("text_config", "vision_config")}
-    nested = {
-        "model_type": "gr00t_n1_5",
-        "backbone_cfg": {"eagle_config": {**sizes, "eagle": about["eagle"]}},
+    of_backbone = {
+        "select_layer": 3,
+        "project_to_dim": None,
+        "eagle_config": {**sizes, "eagle": about["eagle"]},
     }
-    nested["backbone_cfg"] |= {"select_layer": 3, "project_to_dim": None}
+    nested = {"model_type": "gr00t_n1_5", "backbone_cfg": of_backbone}
     plain = {"backbone_cfg": {"select_layer": 3, "eagle_config": {**sizes, **about["eagle"]}}}
     whole = {"backbone_cfg": {"eagle_config": about}}
     for config in (nested, plain, whole):
