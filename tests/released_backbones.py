@@ -55,8 +55,7 @@ class ReleasedBackbone:
 
     @property
     def features(self) -> NDArray[np.float64]:
-        features: NDArray[np.float64] = self.arrays["_out.backbone_features"]
-        return features
+        return self.arrays["_out.backbone_features"].astype(np.float64)
 
     @property
     def tolerance(self) -> NDArray[np.float64]:

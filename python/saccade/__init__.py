@@ -30,6 +30,8 @@ from saccade.errors import (
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.policy import Policy
+from saccade.policy_context import PolicyContext
+from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer
 from saccade.trace import Record, Trace
 
@@ -52,6 +54,8 @@ __all__ = [
     "MissingExtraError",
     "Normalizer",
     "Policy",
+    "PolicyContext",
+    "Processor",
     "Record",
     "SaccadeError",
     "ShapeError",
@@ -66,6 +70,7 @@ _SUBMODULES = (
     "checkpoints",
     "cli",
     "comparison",
+    "dialects",
     "integrations",
     "maps",
     "observation",

@@ -1,0 +1,351 @@
+"""Writes a random whole checkpoint in NVIDIA's layout: backbone, head, statistics, tokenizer. NumPy only.
+
+    python -m saccade.checkpoints.random_checkpoint OUT                    N1.5 at its published size, 4.8 GB
+    python -m saccade.checkpoints.random_checkpoint OUT --small            a few MB
+    python -m saccade.checkpoints.random_checkpoint OUT --version n1.7
+
+Everything that loads the published checkpoint loads this one, so installation, memory and speed can be tried
+before it is downloaded. Its actions mean nothing. Weights are scaled so that activations stay of order one;
+`--outliers` plants channels as large as trained models have. A tensor is drawn and written in pieces, so
+memory stays below 0.2 GB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import saccade._saccade as _saccade
+from saccade._files import write_json
+from saccade.checkpoints import head_configs
+from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes
+from saccade.checkpoints.backbone_tensors import tensor_shapes, unread_tensor_shapes
+from saccade.checkpoints.prompt_tokenizer import FIRST_ADDED, token_id, tokenizer
+from saccade.checkpoints.random_tensors import Outliers, Tensor, pieces
+from saccade.errors import InputError
+
+#: The robot of the checkpoint: its tag and published id, the width of each group of joints, its cameras.
+EMBODIMENT = "new_embodiment"
+EMBODIMENT_IDS = {"n1.5": 31, "n1.6": 10, "n1.7": 10}
+GROUPS = {"single_arm": 5, "gripper": 1}
+CAMERAS = ("front", "wrist")
+
+#: The added token that stands for an image token.
+IMAGE_TOKENS = {"n1.5": "<IMG_CONTEXT>", "n1.6": "<IMG_CONTEXT>", "n1.7": "<|image_pad|>"}
+
+_EAGLE = "NVEagle/eagle_er-qwen3_1_7B-Siglip2_400M_stage1_5_128gpu_er_v7_1mlp_nops"
+
+
+def small_backbone(version: str) -> dict[str, Any]:
+    """A config with the keys of `RELEASED` and sizes that take milliseconds, for the tokenizer without gaps.
+
+    Args:
+        version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
+    """
+    config = copy.deepcopy(dict(RELEASED[version]))
+    config |= {"kind": f"{version} backbone", "select_layer": 3}
+    config["image_token_index"] = token_id(IMAGE_TOKENS[version], published_ids=False)
+    config["text_config"] |= {
+        "hidden_size": 128,
+        "intermediate_size": 192,
+        "num_hidden_layers": 5,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "head_dim": 32,
+        "vocab_size": 512,
+    }
+    if version == "n1.7":
+        config["text_config"]["rope_scaling"] = {"mrope_interleaved": True, "mrope_section": [6, 5, 5]}
+        config["vision_config"] |= {
+            "hidden_size": 64,
+            "intermediate_size": 96,
+            "depth": 4,
+            "num_heads": 2,
+            "out_hidden_size": 128,
+            "num_position_embeddings": 36,
+            "deepstack_visual_indexes": [0, 1, 2],
+        }
+        return config
+    config["vision_config"] |= {
+        "hidden_size": 72,
+        "intermediate_size": 136,
+        "num_hidden_layers": 3,
+        "num_attention_heads": 2,
+    }
+    config["vision_config"] |= {"image_size": 56} if version == "n1.5" else {"num_patches": 16}
+    return config
+
+
+def small_head(version: str) -> dict[str, Any]:
+    """The config of a small head for the features of `small_backbone`, with the published embodiments."""
+    return head_configs.small_config(version) | {"max_num_embodiments": 32}
+
+
+def write(
+    folder: Path,
+    version: str = "n1.5",
+    *,
+    backbone: Mapping[str, Any] | None = None,
+    head: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    head_dtype: str = "BF16",
+    outliers: bool = False,
+    shard_bytes: int = 2_500_000_000,
+) -> Path:
+    """Writes a checkpoint: shards with an index, ``config.json``, statistics, ``tokenizer.json``.
+
+    Args:
+        folder: Where; made if it does not exist, and otherwise empty.
+        version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
+        backbone: Config with the keys of :data:`saccade.checkpoints.backbone_sizes.RELEASED`, or those of it
+            that differ. Default: the published sizes.
+        head: Config of the head in the released keys, for features as wide as the backbone's. Default: the
+            published sizes.
+        seed: Of all tensors and statistics.
+        head_dtype: ``"BF16"`` or ``"F32"``, as published. The backbone is bfloat16.
+        outliers: Plants outliers; see :class:`saccade.checkpoints.random_tensors.Outliers`.
+        shard_bytes: A shard is complete when it reaches this size.
+
+    Returns:
+        `folder`.
+
+    Raises:
+        InputError: The folder is not empty, or the head takes features of another width or has too few
+            embodiments.
+        CheckpointError: A config is not one of a head or of a backbone.
+        OSError: A file cannot be written.
+
+    Example:
+        >>> import tempfile, saccade
+        >>> folder = Path(tempfile.mkdtemp()) / "checkpoint"
+        >>> _ = write(folder, "n1.5", backbone=small_backbone("n1.5"), head=small_head("n1.5"))
+        >>> saccade.ActionHead.load(folder).config.context_dim
+        128
+    """
+    if head_dtype not in ("BF16", "F32"):
+        raise InputError(f"head_dtype: expected 'BF16' or 'F32', got {head_dtype!r}")
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: expected an empty directory")
+    config = {**RELEASED[version], **(backbone or {}), "kind": f"{version} backbone"}
+    sizes = BackboneSizes.from_config(config)
+    head_config = dict(head_configs.CONFIGS[version] if head is None else head)
+    width = head_config["backbone_embedding_dim"]
+    if width != sizes.features_width:
+        raise InputError(f"head: expected features of width {sizes.features_width}, got {width}")
+    if head_config["max_num_embodiments"] <= EMBODIMENT_IDS[version]:
+        raise InputError(
+            f"head: expected more than {EMBODIMENT_IDS[version]} embodiments, the id of {EMBODIMENT}, "
+            f"got {head_config['max_num_embodiments']}"
+        )
+    tensors = [Tensor(f"backbone.{name}", shape, "BF16") for name, shape in tensor_shapes(sizes)]
+    tensors += [Tensor(f"backbone.{name}", shape, "BF16") for name, shape in unread_tensor_shapes(sizes)]
+    whole_head = json.dumps(head_configs.whole_config(head_config))
+    tensors += [
+        Tensor(f"action_head.{name}", tuple(shape), head_dtype)
+        for name, shape in _saccade.tensor_shapes(whole_head)
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_tensors(folder, tensors, seed, Outliers(sizes) if outliers else None, shard_bytes)
+    write_json(
+        folder / "config.json", _config(version, head_config, config, sizes, released=backbone is None)
+    )
+    write_json(folder / "tokenizer.json", tokenizer(published_ids=sizes.text.vocabulary > FIRST_ADDED))
+    _write_statistics(folder, version, head_config, seed)
+    return folder
+
+
+def _write_tensors(
+    folder: Path, tensors: Sequence[Tensor], seed: int, outliers: Outliers | None, shard_bytes: int
+) -> None:
+    """Writes the shards and their index."""
+    shards = list(_shards(tensors, shard_bytes))
+    weight_map: dict[str, str] = {}
+    for number, shard in enumerate(shards, start=1):
+        name = f"model-{number:05}-of-{len(shards):05}.safetensors"
+        weight_map |= {tensor.name: name for tensor in shard}
+        header: dict[str, Any] = {"__metadata__": {"format": "pt"}}
+        end = 0
+        for tensor in shard:
+            start, end = end, end + tensor.nbytes
+            header[tensor.name] = {
+                "dtype": tensor.dtype,
+                "shape": list(tensor.shape),
+                "data_offsets": [start, end],
+            }
+        encoded = json.dumps(header, separators=(",", ":")).encode()
+        encoded += b" " * (-len(encoded) % 8)
+        with (folder / name).open("wb") as file:
+            file.write(len(encoded).to_bytes(8, "little"))
+            file.write(encoded)
+            for tensor in shard:
+                for piece in pieces(tensor, seed, None if outliers is None else outliers.plant):
+                    file.write(piece)
+    total = sum(tensor.nbytes for tensor in tensors)
+    index = {"metadata": {"total_size": total}, "weight_map": weight_map}
+    write_json(folder / "model.safetensors.index.json", index)
+
+
+def _shards(tensors: Sequence[Tensor], shard_bytes: int) -> Iterator[list[Tensor]]:
+    """The tensors in order, cut where a shard reaches its size."""
+    shard: list[Tensor] = []
+    for tensor in tensors:
+        shard.append(tensor)
+        if sum(held.nbytes for held in shard) >= shard_bytes:
+            yield shard
+            shard = []
+    if shard:
+        yield shard
+
+
+def _config(
+    version: str,
+    head: Mapping[str, Any],
+    backbone: Mapping[str, Any],
+    sizes: BackboneSizes,
+    *,
+    released: bool,
+) -> dict[str, Any]:
+    """The content of `config.json`. It has sizes of the backbone only if they are not the published ones."""
+    own: dict[str, Any] = {"select_layer": sizes.num_layers}
+    if not released:
+        keys = ("kind", "select_layer", "project_to_dim", "image_token_index")
+        own["eagle_config"] = {key: value for key, value in backbone.items() if key not in keys}
+        if version == "n1.7":
+            own["eagle_config"]["token_ids"] = {"image_token_id": sizes.image_token}
+        else:
+            own["eagle_config"] |= {"image_token_index": sizes.image_token, "select_layer": -1}
+    if version == "n1.5":
+        return {
+            **head_configs.whole_config(head),
+            "action_dim": head["max_action_dim"],
+            "action_horizon": head["action_horizon"],
+            "architectures": ["GR00T_N1_5"],
+            "backbone_cfg": {
+                "eagle_path": _EAGLE,
+                "load_bf16": False,
+                "project_to_dim": sizes.project_to_dim,
+                "reproject_vision": False,
+                "tune_llm": False,
+                "tune_visual": True,
+                "use_flash_attention": True,
+                **own,
+            },
+            "compute_dtype": "bfloat16",
+            "hidden_size": sizes.features_width,
+            "model_dtype": "float32",
+            "torch_dtype": "bfloat16",
+            "transformers_version": "4.51.3",
+        }
+    return {
+        **head,
+        "architectures": [head["model_type"]],
+        "backbone_model_type": "qwen" if version == "n1.7" else "eagle",
+        "model_name": "nvidia/Cosmos-Reason2-2B" if version == "n1.7" else "nvidia/Eagle-Block2A-2B-v2",
+        "select_layer": sizes.num_layers,
+        "use_relative_action": False,
+        **({} if released else {"backbone_cfg": own}),
+    }
+
+
+def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed: int) -> None:
+    """The robot's statistics and cameras, in the files of the version."""
+    rng = np.random.default_rng(seed)
+    statistics = {
+        kind: {name: _group(rng, width) for name, width in GROUPS.items()} for kind in ("state", "action")
+    }
+    if version == "n1.5":
+        joint = {"absolute": True, "rotation_type": None, "continuous": True}
+        modalities: dict[str, Any] = {
+            "video": {name: {"resolution": [640, 480], "channels": 3, "fps": 30.0} for name in CAMERAS},
+            **{
+                kind: {name: joint | {"shape": [width]} for name, width in GROUPS.items()}
+                for kind in statistics
+            },
+        }
+        entry = {"statistics": statistics, "modalities": modalities, "embodiment_tag": EMBODIMENT}
+        (folder / "experiment_cfg").mkdir()
+        write_json(folder / "experiment_cfg" / "metadata.json", {EMBODIMENT: entry})
+        return
+    write_json(folder / "embodiment_id.json", {EMBODIMENT: EMBODIMENT_IDS[version]})
+    write_json(folder / "statistics.json", {EMBODIMENT: {**statistics, "relative_action": {}}})
+    keys: dict[str, tuple[Sequence[str], list[int]]] = {
+        "video": (CAMERAS, [0]),
+        "state": (list(GROUPS), [0]),
+        "action": (list(GROUPS), list(range(16))),
+        "language": (["annotation.human.action.task_description"], [0]),
+    }
+    modality_config = {
+        kind: {"delta_indices": indices, "modality_keys": list(names)}
+        for kind, (names, indices) in keys.items()
+    }
+    values = {
+        "processor_class": "Gr00tN1d7Processor" if version == "n1.7" else "Gr00tN1d6Processor",
+        "processor_kwargs": {
+            "clip_outliers": True,
+            "crop_fraction": 0.95,
+            "formalize_language": True,
+            "letter_box_transform": False,
+            "max_action_dim": head["max_action_dim"],
+            "max_action_horizon": head["action_horizon"],
+            "max_state_dim": head["max_state_dim"],
+            "modality_configs": {EMBODIMENT: modality_config},
+            "shortest_image_edge": 256,
+            "use_albumentations": True,
+            "use_percentiles": True,
+            "use_relative_action": False,
+        },
+    }
+    write_json(folder / "processor_config.json", values)
+
+
+def _group(rng: np.random.Generator, width: int) -> dict[str, list[float]]:
+    """Statistics of one group of joints."""
+    centre, half = rng.standard_normal(width), 0.1 + rng.random(width)
+    shares = {"max": 1.0, "min": -1.0, "mean": 0.1, "q01": -0.9, "q99": 0.9}
+    return {key: (centre + share * half).tolist() for key, share in shares.items()} | {
+        "std": (half / 2).tolist()
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m saccade.checkpoints.random_checkpoint",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, help="where to write; must not exist or be empty")
+    parser.add_argument("--version", choices=RELEASED, default="n1.5", help="default: n1.5")
+    parser.add_argument("--small", action="store_true", help="a few MB instead of the published size")
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything (default 0)")
+    parser.add_argument("--head-dtype", choices=("BF16", "F32"), default="BF16", help="default: BF16")
+    parser.add_argument("--outliers", action="store_true", help="plant outlier channels in the backbone")
+    args = parser.parse_args(arguments)
+    try:
+        write(
+            args.folder,
+            args.version,
+            backbone=small_backbone(args.version) if args.small else None,
+            head=small_head(args.version) if args.small else None,
+            seed=args.seed,
+            head_dtype=args.head_dtype,
+            outliers=args.outliers,
+        )
+    except (InputError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    files = sorted(path for path in args.folder.rglob("*") if path.is_file())
+    for path in files:
+        print(f"{path.stat().st_size:>13,} {path.relative_to(args.folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
