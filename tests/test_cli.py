@@ -202,7 +202,11 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.parametrize("name", cli.NEEDS)
 def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path) -> None:
-    arguments = {"demos": ["--out", "out"], "train": ["--demos", str(tmp_path), "--out", "out"]}
+    arguments = {
+        "act": ["checkpoint"],
+        "demos": ["--out", "out"],
+        "train": ["--demos", str(tmp_path), "--out", "out"],
+    }
     (tmp_path / "reach").mkdir()
     (tmp_path / "reach" / "recording.json").write_text("{}")
     arguments |= {"study": ["cuts"], "study report": ["."], "study --features": ["--features", "looks.npz"]}

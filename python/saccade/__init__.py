@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._saccade import __version__
 from saccade.attention import CrossAttention, KeyValues
+from saccade.backbone import Backbone
+from saccade.backbone_config import BackboneConfig
+from saccade.backbone_features import BackboneFeatures, BackboneRecord
 from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig
@@ -27,12 +30,18 @@ from saccade.errors import (
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.policy import Policy
+from saccade.policy_context import PolicyContext
+from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer
 from saccade.trace import Record, Trace
 
 __all__ = [
     "ActionHead",
+    "Backbone",
+    "BackboneConfig",
+    "BackboneFeatures",
     "BackboneInputs",
+    "BackboneRecord",
     "CheckpointError",
     "Chunking",
     "Context",
@@ -45,6 +54,8 @@ __all__ = [
     "MissingExtraError",
     "Normalizer",
     "Policy",
+    "PolicyContext",
+    "Processor",
     "Record",
     "SaccadeError",
     "ShapeError",
@@ -59,6 +70,7 @@ _SUBMODULES = (
     "checkpoints",
     "cli",
     "comparison",
+    "dialects",
     "integrations",
     "maps",
     "observation",

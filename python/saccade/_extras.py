@@ -15,7 +15,7 @@ from saccade.errors import MissingExtraError
 #: The extras of pyproject.toml: the modules that each one adds, and the distribution that contains each
 #: module. A test compares them with pyproject.toml.
 EXTRAS: dict[str, dict[str, str]] = {
-    "cli": {"rich": "rich"},
+    "cli": {"rich": "rich", "PIL": "pillow"},
     "torch": {"torch": "torch", "safetensors": "safetensors"},
     "sim": {
         "gymnasium": "gymnasium",
@@ -24,7 +24,6 @@ EXTRAS: dict[str, dict[str, str]] = {
         "packaging": "packaging",
         "imageio": "imageio",
         "imageio_ffmpeg": "imageio-ffmpeg",
-        "PIL": "pillow",
         "matplotlib": "matplotlib",
         "threadpoolctl": "threadpoolctl",
         "jinja2": "jinja2",

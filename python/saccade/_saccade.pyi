@@ -11,15 +11,21 @@ from saccade._arrays import StoredTensor
 _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
+_Frame = npt.NDArray[np.uint8] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 _Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
+# rows by layer, and by observation and view the patches and the tokens
+_BackboneRecorded = tuple[list[_Float32], list[list[_Float32]], list[list[_Float32]]]
 _Intervention = dict[str, Any]  # the fields of saccade.Intervention, mappings as lists of their items
 
 __all__ = [
     "ActionHead",
+    "Backbone",
+    "BackboneFeatures",
     "Context",
     "CrossAttention",
     "KeyValues",
+    "Processor",
     "Published",
     "__version__",
     "available_isas",
@@ -136,6 +142,66 @@ class ActionHead:
     ) -> None: ...
 
 @final
+class BackboneFeatures:
+    @property
+    def nbytes(self) -> int: ...
+    def features(self) -> _Float32: ...
+    def views(self) -> list[list[_Int64]]: ...
+
+@final
+class Backbone:
+    @staticmethod
+    def load(source: str, config: str | None, precision: str, num_threads: int | None) -> Backbone: ...
+    @staticmethod
+    def from_tensors(
+        tensors: dict[str, StoredTensor], config: str | None, precision: str, num_threads: int | None
+    ) -> Backbone: ...
+    def config(self) -> dict[str, Any]: ...
+    @property
+    def num_threads(self) -> int: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def isa(self) -> str: ...
+    @property
+    def nbytes(self) -> int: ...
+    def encode(
+        self,
+        inputs: list[dict[str, Any]],  # the fields of saccade.BackboneInputs, pixel_values as a list
+        previous: list[BackboneFeatures],
+        hidden: bool,
+        vision: bool,
+        image_tokens: bool,
+    ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
+
+class Processor:
+    def __new__(
+        cls,
+        version: str,
+        tokenizer: str,
+        preprocessing: str | None,
+        image_size: int | None,
+        tokens_per_view: int | None,
+        plain_text: bool,
+        options: str | None,
+    ) -> Processor: ...
+    @property
+    def version(self) -> str: ...
+    @property
+    def preprocessing(self) -> str: ...
+    @property
+    def view_size(self) -> tuple[int, int] | None: ...
+    @property
+    def num_tokens(self) -> int: ...
+    @property
+    def image_token_id(self) -> int: ...
+    def frame(self, image: _Frame) -> _Float32: ...
+    def tokens(self, text: str) -> _Int64: ...
+    def process(
+        self, observations: list[tuple[list[tuple[str | None, _Frame]], str | None]]
+    ) -> tuple[list[_Float32], _Int64, _Bool, _Int64 | None, list[str] | None]: ...
+
+@final
 class KeyValues:
     @property
     def batch(self) -> int: ...
@@ -192,6 +258,7 @@ class Published:
 def parse_config(text: str) -> dict[str, Any]: ...
 def read_stored(source: str) -> dict[str, tuple[str, list[int], bytes]]: ...  # dtype, shape, content
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
+def tensor_names(source: str) -> list[str]: ...
 def quantize(rewrite: dict[str, Any]) -> dict[str, Any]: ...
 def convert(
     rewrite: dict[str, Any], embodiment_ids: list[int] | None, dtype: str | None

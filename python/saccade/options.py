@@ -13,12 +13,7 @@ from saccade.errors import InputError
 from saccade.intervention import Intervention, as_interventions
 
 
-class SampleOptions(TypedDict, total=False):
-    """The keyword arguments of :meth:`saccade.ActionHead.sample`, which documents them.
-
-    Functions that pass them on are annotated ``**options: Unpack[SampleOptions]``.
-    """
-
+class _Sampling(TypedDict, total=False):
     noise: ArrayLike | None
     seed: Any
     num_steps: int | None
@@ -26,9 +21,23 @@ class SampleOptions(TypedDict, total=False):
     num_samples: int | None
     future_refresh: int | None
     intervention: Intervention | Sequence[Intervention] | None
-    previous_chunk: ArrayLike | None
     chunking: Chunking | None
     out: ArrayLike | None
+
+
+class SampleOptions(_Sampling, total=False):
+    """The keyword arguments of :meth:`saccade.ActionHead.sample`, which documents them.
+
+    Functions that pass them on are annotated ``**options: Unpack[SampleOptions]``.
+    """
+
+    previous_chunk: ArrayLike | None
+
+
+class PolicyOptions(_Sampling, total=False):
+    """The keyword arguments of :meth:`saccade.Policy.sample`, which documents them."""
+
+    previous_chunk: Any  # an array, or actions by name
 
 
 class TraceOptions(TypedDict, total=False):

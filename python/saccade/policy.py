@@ -1,65 +1,43 @@
-"""A head in the robot's units: the robot's state in, the robot's actions out."""
+"""A policy in the robot's units: what the robot sees and is told in, the robot's actions out."""
 
 from __future__ import annotations
 
+import importlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from saccade._arrays import Array, ArrayLike, integer
+from saccade._arrays import Array, ArrayLike, Float32Array, integer
+from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
-from saccade.config import HeadConfig
 from saccade.context import Context
+from saccade.dialects import CameraSources, Reading, Requirements, StateReading, read, read_state
 from saccade.errors import InputError
-from saccade.options import SampleOptions
+from saccade.options import PolicyOptions, SampleOptions
+from saccade.policy_context import PolicyContext, encoded
+from saccade.policy_example import example_observation
+from saccade.policy_parts import Backbone, Features, Head, Processor, embodiment_of
 from saccade.robots import Normalizer, padded
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-
-class Head(Protocol):
-    """What a policy uses of its head, which is a :class:`saccade.ActionHead`."""
-
-    @property
-    def config(self) -> HeadConfig:
-        """Sizes and switches."""
-
-    @property
-    def source(self) -> str | None:
-        """Path of the checkpoint, or None."""
-
-    @property
-    def embodiment_ids(self) -> tuple[int, ...]:
-        """The loaded embodiments."""
-
-    def encode(
-        self,
-        backbone_features: ArrayLike,
-        *,
-        attention_mask: ArrayLike | None = None,
-        image_mask: ArrayLike | None = None,
-        drop_vl: ArrayLike | None = None,
-    ) -> Context:
-        """See :meth:`saccade.ActionHead.encode`."""
-
-    def sample(
-        self,
-        context: Context,
-        state: ArrayLike,
-        embodiment_id: int | ArrayLike,
-        **options: Unpack[SampleOptions],
-    ) -> Array:
-        """See :meth:`saccade.ActionHead.sample`."""
+#: One observation in a form of `saccade.dialects`, with or without a batch axis, or several of them.
+Observation = Mapping[str, Any]
+Observations = Observation | Sequence[Observation]
 
 
 class Policy:
-    """An action head with a normalizer. Created by :meth:`saccade.ActionHead.policy`.
+    """A policy in the robot's units: an action head with a normalizer, and the backbone that sees and reads.
 
-    It takes backbone features and the robot's state, and returns the robot's actions.
+    :meth:`load` loads a whole checkpoint: camera frames and an instruction in, the robot's actions out.
+    :meth:`saccade.ActionHead.policy` makes a policy without a backbone: backbone features in.
+
+    A policy is immutable, and holds nothing of the observations that it was given: any number of threads may
+    call it at the same time. The answer to an observation has the same bits alone and in any batch.
 
     Args:
         head: The action head.
@@ -67,11 +45,17 @@ class Policy:
             from. Default: the checkpoint that the head was loaded from.
         embodiment: Tag or id of the robot. Required if the statistics are of several robots. If the
             statistics do not contain the id, an id given here selects the head's embodiment.
+        backbone: The backbone, or None.
+        processor: The processor of the backbone's inputs, or None.
+        cameras: What the checkpoint says about cameras and language.
 
     Attributes:
         head: The action head.
+        backbone: The backbone, or None.
+        processor: The processor, or None.
         normalizer: The normalizer.
         embodiment_id: The embodiment of the head that is used.
+        requirements: What an observation must contain; ``str`` of it is a sentence.
 
     Raises:
         FileNotFoundError, CheckpointError: As :meth:`saccade.Normalizer.load`.
@@ -95,6 +79,10 @@ class Policy:
         head: Head,
         normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment: str | int | None = None,
+        *,
+        backbone: Backbone | None = None,
+        processor: Processor | None = None,
+        cameras: CameraSources | None = None,
     ) -> None:
         config = head.config
         if not isinstance(normalizer, Normalizer):
@@ -119,7 +107,178 @@ class Policy:
             )
         self.head = head
         self.normalizer = normalizer
-        self.embodiment_id = _embodiment_id(head, normalizer, embodiment)
+        self.embodiment_id = embodiment_of(head, normalizer, embodiment)
+        self.backbone = backbone
+        self.processor = processor
+        known = CameraSources() if cameras is None else cameras
+        self.requirements = Requirements(
+            embodiment=normalizer.embodiment,
+            cameras=known.cameras,
+            state=tuple((group.key, group.size) for group in normalizer.state_groups),
+            state_history=config.state_history,
+            video_horizon=known.video_horizon,
+            language_key=known.language_key,
+        )
+
+    @classmethod
+    def load(
+        cls,
+        source: str | os.PathLike[str],
+        *,
+        embodiment: str | int | None = None,
+        preprocessing: str | None = None,
+        tokenizer: str | os.PathLike[str] | None = None,
+        precision: str | Mapping[str, str] = "float32",
+        num_threads: int | None = None,
+        normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
+        cameras: Sequence[str] | None = None,
+    ) -> Policy:
+        """Loads a whole checkpoint: backbone, action head, tokenizer, processor and statistics.
+
+        Of the head, only the layers of the chosen embodiment are loaded.
+
+        Args:
+            source: The directory or id of a checkpoint, as for :meth:`saccade.ActionHead.load`.
+            embodiment: Tag or id of the robot. Required if the checkpoint has statistics of several robots.
+            preprocessing: ``"lerobot"`` or ``"isaac"``: how frames and words are prepared. It must be the way
+                of the program that trained the checkpoint. Default: by version and layout; see ``repr`` of
+                ``policy.processor``.
+            tokenizer: A ``tokenizer.json``, or a directory with one or with ``vocab.json`` and
+                ``merges.txt``. Default: in the checkpoint, else in the local cache of ``huggingface_hub``.
+            precision: How backbone and head compute, as for :meth:`saccade.ActionHead.load`: one name for
+                both, or ``{"backbone": name, "head": name}``.
+            num_threads: Number of threads, as for :meth:`saccade.ActionHead.load`.
+            normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from. Needed
+                where the data config of an N1.5 fine-tune differs from its ``metadata.json`` in keys, order
+                or modes.
+            cameras: The names of the cameras in the order of the prompt. Default: those of the checkpoint.
+                Needed where the data config of an N1.5 fine-tune uses some of the data set's cameras, or
+                another order than ``metadata.json``.
+
+        Raises:
+            FileNotFoundError: ``source``, a file of the checkpoint or the tokenizer does not exist.
+            CheckpointError: The checkpoint is damaged, or holds only a head or only a backbone. The message
+                says which part is missing.
+            InputError: An option is out of range.
+
+        Example:
+            >>> import saccade
+            >>> def first_chunk(checkpoint: str) -> dict:
+            ...     policy = saccade.Policy.load(checkpoint, embodiment="new_embodiment", precision="int8")
+            ...     return policy.act(policy.example_observation(), seed=0)
+        """
+        # By its name, because heads make policies too, and modules do not import each other in a circle.
+        parts = importlib.import_module("saccade.policy_loading").load(
+            source,
+            embodiment=embodiment,
+            preprocessing=preprocessing,
+            tokenizer=tokenizer,
+            precision=precision,
+            num_threads=num_threads,
+            normalizer=normalizer,
+            cameras=cameras,
+        )
+        return cls(
+            parts.head,
+            parts.normalizer,
+            parts.embodiment,
+            backbone=parts.backbone,
+            processor=parts.processor,
+            cameras=parts.cameras,
+        )
+
+    def act(
+        self,
+        observation: Observations,
+        *,
+        previous: PolicyContext | None = None,
+        **options: Unpack[PolicyOptions],
+    ) -> Any:
+        """Looks, reads and acts: :meth:`encode` followed by :meth:`sample`.
+
+        Call these two instead to keep the context: for several samples of one observation, or as ``previous``
+        of the next.
+
+        Args:
+            observation, previous: As in :meth:`encode`.
+            **options: As in :meth:`sample`.
+
+        Returns:
+            As :meth:`sample` with an observation.
+
+        Raises:
+            InputError, ShapeError, DtypeError: As :meth:`encode` and :meth:`sample`.
+        """
+        _, readings = self._read(observation)
+        context = self._encoded(readings, previous)
+        return self._sampled(context.context, observation, readings, options)
+
+    def encode(self, observation: Observations, *, previous: PolicyContext | None = None) -> PolicyContext:
+        """Encodes what the robot sees and is told.
+
+        Args:
+            observation: In one of three forms, told by its keys. Without the batch axis B, so is the answer.
+
+                - Isaac-GR00T, nested: ``{"video": {name: (B, T, H, W, 3)}, "state": {key: (B, T, D)},
+                  "language": {key: [[text]]}}``, frames uint8.
+                - Isaac-GR00T, flat: ``video.<name>``, ``state.<key>``, and ``annotation.<...>`` with a string
+                  or a list of one string for each row.
+                - lerobot: ``observation.images.<name> (B, 3, H, W)``, uint8 or float from 0 to 1,
+                  ``observation.state (B, D)``, and ``task``, a string for each row or one for all.
+
+                Or a sequence of observations, which need not agree in form, size or length. They are computed
+                together, and each has the bits that it has alone.
+            previous: The context of earlier observations, one for each of these. Vision tokens of views with
+                the same frames, and the unchanged beginning of the prompt, are taken from it. The result has
+                the same bits without.
+
+        Raises:
+            InputError, ShapeError, DtypeError: The observation does not fit the robot; the message lists what
+                the robot needs. Or this policy has no backbone, or ``previous`` does not fit.
+            MemoryError: There is not enough memory.
+        """
+        return self._encoded(self._read(observation)[1], previous)
+
+    def inputs(self, observation: Observations) -> list[BackboneInputs]:
+        """The backbone's inputs for each observation: resized frames and token ids, a batch of one each.
+
+        Args:
+            observation: As in :meth:`encode`.
+
+        Raises:
+            InputError, ShapeError, DtypeError: As :meth:`encode`.
+        """
+        return self._inputs(self._read(observation)[1])
+
+    def features(
+        self, inputs: Sequence[BackboneInputs], *, previous: PolicyContext | None = None
+    ) -> tuple[Features, ...]:
+        """The backbone's features for each of its inputs.
+
+        Args:
+            inputs: As :meth:`inputs` returns them.
+            previous: As in :meth:`encode`.
+
+        Raises:
+            InputError: This policy has no backbone, or ``previous`` does not fit.
+        """
+        backbone = self._whole("features", self.backbone)
+        held = None
+        if previous is not None:
+            if not isinstance(previous, PolicyContext):
+                raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
+            if previous.batch != len(inputs):
+                raise InputError(f"previous: expected {len(inputs)} observations, got {previous.batch}")
+            held = previous.features
+        return tuple(backbone.ragged(inputs, previous=held))
+
+    def context(self, features: Sequence[Features]) -> PolicyContext:
+        """What the head encodes of features of any lengths.
+
+        Args:
+            features: As :meth:`features` returns them.
+        """
+        return encoded(self.head, features)
 
     def __call__(
         self,
@@ -134,38 +293,128 @@ class Policy:
         """:meth:`saccade.ActionHead.encode` followed by :meth:`sample`.
 
         Args:
-            backbone_features, attention_mask, image_mask, drop_vl: As in ``encode``.
+            backbone_features, attention_mask, image_mask, drop_vl: As in ``encode`` of the head.
             state: As in :meth:`sample`.
             **options: Keyword arguments of :meth:`sample`.
         """
         context = self.head.encode(
             backbone_features, attention_mask=attention_mask, image_mask=image_mask, drop_vl=drop_vl
         )
-        return self.sample(context, state, **options)
+        return self._of_state(context, state, options)
 
-    def sample(self, context: Context, state: ArrayLike, **options: Unpack[SampleOptions]) -> Array:
+    def sample(
+        self,
+        context: PolicyContext | Context,
+        observation_or_state: Observations | ArrayLike,
+        **options: Unpack[PolicyOptions],
+    ) -> Any:
         """Samples chunks of the robot's actions.
 
         Args:
-            context: From ``encode`` of the head.
-            state: ``(batch, state_width)`` or ``(batch, state_history, state_width)``, in the robot's units.
+            context: From :meth:`encode`, or from ``encode`` of the head.
+            observation_or_state: An observation as in :meth:`encode`, of which only the state is read. Or the
+                state as an array, ``(batch, state_width)`` or ``(batch, state_history, state_width)``, in the
+                robot's units.
             **options: Keyword arguments of :meth:`saccade.ActionHead.sample` except ``out``, with these
                 differences:
 
-                - ``previous_chunk``: the chunk that the robot is executing, as this method returned it,
-                  ``(batch, horizon, action_width)`` in the robot's units. Actions relative to the state are
-                  converted to the new state. The padding beyond the robot's action is zero, as in training.
+                - ``previous_chunk``: the chunk that the robot is executing, as this method returned it, in
+                  the robot's units. Actions relative to the state are converted to the new state. The padding
+                  beyond the robot's action is zero, as in training.
                 - ``chunking``: its ``horizon`` is the normalizer's ``action_horizon`` by default.
+                - ``noise``: for an observation without a batch axis, it may have none either.
 
         Returns:
-            ``(batch, horizon, action_width)`` float32 in the robot's units, with an axis of ``num_samples``
-            after batch if that is given. A torch tensor if the features were torch. The horizon is the
-            normalizer's ``action_horizon``, if it has one, else that of the head.
+            float32 in the robot's units. The horizon T is the normalizer's ``action_horizon``, if it has one,
+            else that of the head. With ``num_samples``, there is an axis of them before T.
+
+            - For a state: ``(batch, T, action_width)``. A torch tensor if the head's features were torch.
+            - For an observation of Isaac-GR00T, nested: ``{name: (B, T, D)}``; flat: ``{"action.<name>": (B,
+              T, D)}``. For one of lerobot: ``(B, T, action_width)``, a torch tensor if it contains one.
+            - For a sequence of observations: a list of these.
 
         Raises:
             ShapeError, DtypeError, InputError: As :meth:`saccade.ActionHead.sample` and
-                :class:`saccade.Normalizer`.
+                :class:`saccade.Normalizer`; or the observation does not fit the robot.
         """
+        held = context.context if isinstance(context, PolicyContext) else context
+        if not _is_observation(observation_or_state):
+            return self._of_state(held, observation_or_state, options)  # type: ignore[arg-type]
+        observations = _listed(observation_or_state)  # type: ignore[arg-type]
+        readings = [read_state(one, self.requirements) for one in observations]
+        return self._sampled(held, observation_or_state, readings, options)  # type: ignore[arg-type]
+
+    def example_observation(self, seed: int = 0) -> dict[str, Any]:
+        """An observation that this policy accepts, to try it.
+
+        Args:
+            seed: Seed of the frames, at least 0.
+
+        Returns:
+            In Isaac-GR00T's nested form, with a batch of one: random frames, a state in the middle of the
+            range of the statistics, and an instruction. Only dicts, lists, strings and arrays.
+        """
+        return example_observation(self.requirements, self.normalizer, integer("seed", seed, least=0))
+
+    def _read(self, observation: Observations) -> tuple[list[Observation], list[Reading]]:
+        self._whole("act and encode", self.backbone)
+        observations = _listed(observation)
+        return observations, [read(one, self.requirements) for one in observations]
+
+    def _inputs(self, readings: Sequence[Reading]) -> list[BackboneInputs]:
+        processor = self._whole("inputs", self.processor)
+        return [
+            processor(frames, instruction)
+            for reading in readings
+            for frames, instruction in zip(reading.frames, reading.instructions, strict=True)
+        ]
+
+    def _encoded(self, readings: Sequence[Reading], previous: PolicyContext | None) -> PolicyContext:
+        return self.context(self.features(self._inputs(readings), previous=previous))
+
+    def _sampled(
+        self,
+        context: Context,
+        observation: Observations,
+        readings: Sequence[StateReading],
+        options: PolicyOptions,
+    ) -> Any:
+        """The answers to observations, in their form."""
+        state = np.concatenate([reading.state for reading in readings])
+        if len(state) != context.batch:
+            raise InputError(
+                f"observation: expected {context.batch}, as many as in context, got {len(state)}"
+            )
+        is_single = isinstance(observation, Mapping)
+        options = options.copy()
+        previous, noise = options.get("previous_chunk"), options.get("noise")
+        if previous is not None:
+            keys = tuple(group.key for group in self.normalizer.action_groups)
+            chunks = [previous] if is_single else list(previous)
+            if len(chunks) != len(readings):
+                raise InputError(f"previous_chunk: expected {len(readings)}, got {len(chunks)}")
+            joined = [
+                _batched(np.asarray(reading.dialect.previous_chunk(chunk, keys)), 3, reading)
+                for reading, chunk in zip(readings, chunks, strict=True)
+            ]
+            options["previous_chunk"] = np.concatenate(joined)
+        if noise is not None and is_single:
+            axes = 3 if options.get("num_samples") is None else 4
+            options["noise"] = _batched(np.asarray(noise), axes, readings[0])
+        actions = np.asarray(self._of_state(context, state, options))
+        answers, start = [], 0
+        for reading in readings:
+            chunk = actions[start : start + len(reading)]
+            parts = {
+                key: np.ascontiguousarray(chunk[..., where])
+                for key, where in self.normalizer.action_slices.items()
+            }
+            answers.append(reading.dialect.answer(parts, reading))
+            start += len(reading)
+        return answers[0] if is_single else answers
+
+    def _of_state(self, context: Context, state: ArrayLike, options: SampleOptions) -> Array:
+        """:meth:`sample` of a state."""
         if "out" in options:
             raise InputError("out: expected none, since it would contain the normalised actions of the head")
         previous, chunking = options.get("previous_chunk"), options.get("chunking")
@@ -178,26 +427,53 @@ class Policy:
         actions = self.head.sample(context, self.normalizer.state(state), self.embodiment_id, **options)
         return self.normalizer.actions(actions, state)
 
+    def _whole(self, what: str, part: Any) -> Any:
+        """A part of a whole policy.
+
+        Raises:
+            InputError: It is None.
+        """
+        if part is None:
+            raise InputError(
+                f"{what}: this policy has no backbone, since it was made from an action head: call it with "
+                "backbone features, policy(features, state), or load a whole checkpoint with "
+                "saccade.Policy.load(checkpoint)"
+            )
+        return part
+
     def __repr__(self) -> str:
+        whole = ""
+        if self.backbone is not None:
+            whole = f" backbone={self.backbone!r} processor={self.processor!r}"
         return (
             f"<saccade.Policy embodiment_id={self.embodiment_id} head={self.head!r} "
-            f"normalizer={self.normalizer!r}>"
+            f"normalizer={self.normalizer!r}{whole}>"
         )
 
 
-def _embodiment_id(head: Head, normalizer: Normalizer, embodiment: str | int | None) -> int:
-    """The head's embodiment: from the statistics, else as requested, else the only one that is loaded."""
-    chosen = normalizer.embodiment_id
-    if embodiment is not None and not isinstance(embodiment, str):
-        asked = integer("embodiment", embodiment, least=0)
-        if chosen is not None and asked != chosen:
-            raise InputError(f"embodiment: expected that of the normalizer, {chosen}, got {asked}")
-        chosen = asked
-    if chosen is None and len(head.embodiment_ids) == 1:
-        chosen = head.embodiment_ids[0]
-    if chosen not in head.embodiment_ids:
-        listed = ", ".join(map(str, head.embodiment_ids))
+def _is_observation(value: Any) -> bool:
+    """Whether a value is an observation or a sequence of them, and not an array."""
+    if isinstance(value, (list, tuple)):
+        return bool(value) and isinstance(value[0], Mapping)
+    return isinstance(value, Mapping)
+
+
+def _listed(observation: Observations) -> list[Observation]:
+    """Observations as a list.
+
+    Raises:
+        InputError: There is none.
+    """
+    if isinstance(observation, Mapping):
+        return [observation]
+    found = list(observation) if isinstance(observation, (list, tuple)) else []
+    if not found:
         raise InputError(
-            f"embodiment: expected the id of one of the head's embodiments ({listed}), got {chosen}"
+            f"observation: expected a mapping, or several of them, got {type(observation).__name__}"
         )
-    return chosen
+    return found
+
+
+def _batched(array: Float32Array, axes: int, reading: StateReading) -> Float32Array:
+    """An array with a batch axis, which it may lack if the observation does."""
+    return array[None] if not reading.is_batched and array.ndim == axes - 1 else array

@@ -34,6 +34,13 @@ pub(crate) fn read_tensors<'py>(
     Ok(dict)
 }
 
+/// The names of all tensors, sorted.
+#[pyfunction]
+pub(crate) fn tensor_names(py: Python<'_>, source: PathBuf) -> PyResult<Vec<String>> {
+    let checkpoint = call(py, || Ok(Checkpoint::open(&source)?))?;
+    Ok(checkpoint.names().map(str::to_owned).collect())
+}
+
 /// Type, shape and bytes of a tensor, as stored.
 type PyStoredTensor<'py> = (String, Vec<usize>, Bound<'py, PyBytes>);
 

@@ -5,6 +5,7 @@
 
 mod arrays;
 mod attention;
+mod backbone;
 mod checkpoint;
 mod config;
 mod context;
@@ -13,6 +14,7 @@ mod error;
 mod head;
 mod intervention;
 mod machine;
+mod processor;
 mod rewrite;
 
 use pyo3::prelude::*;
@@ -22,7 +24,9 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::checkpoint::{Published, read_stored, read_tensors};
+    use crate::backbone::{Backbone, BackboneFeatures};
+    #[pymodule_export]
+    use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
     use crate::config::{parse_config, tensor_shapes};
     #[pymodule_export]
@@ -36,6 +40,8 @@ mod _saccade {
         available_isas, default_num_threads, dot_products, measure_peaks, selected_isa, start_profile,
         take_profile,
     };
+    #[pymodule_export]
+    use crate::processor::Processor;
     #[pymodule_export]
     use crate::rewrite::{convert, merge_future_tokens, quantize, resize};
 

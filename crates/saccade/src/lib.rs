@@ -10,6 +10,7 @@
 
 mod alloc;
 mod array;
+mod backbone;
 mod config;
 mod engine;
 mod error;
@@ -19,12 +20,18 @@ mod memory;
 mod nn;
 mod ops;
 mod precision;
+mod processor;
 mod profile;
 mod recognise;
 mod rewrite;
 mod sampling;
+mod workspaces;
 
 pub use array::{Array, ArrayMut, OwnedArray};
+pub use backbone::{
+    Backbone, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep, BackboneLoadOptions,
+    BackboneRecord, LanguageConfig, VisionConfig,
+};
 pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};
 pub use head::action_head::ActionHead;
@@ -41,6 +48,9 @@ pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
 pub use memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
+pub use processor::{
+    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, Tokenizer, TokenizerFiles, View,
+};
 pub use profile::{Counter, Part, Profile};
 pub use recognise::{Published, TensorFacts};
 pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};

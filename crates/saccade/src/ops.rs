@@ -90,7 +90,13 @@ pub(crate) fn attention(
     weights: Option<&mut [f32]>,
     out: RowsMut<'_>,
 ) -> Result<()> {
-    let multiply_adds = 2 * queries.num_rows() * kv.len() * queries.num_columns();
+    let keys: usize = match mask {
+        Mask::Causal { offset } => (offset..offset + queries.num_rows())
+            .map(|before| kv.len().min(before + 1))
+            .sum(),
+        _ => queries.num_rows() * kv.len(),
+    };
+    let multiply_adds = 2 * keys * queries.num_columns();
     counted(Some(Part::Attention), (multiply_adds, kv.nbytes()), || {
         saccade_kernels::attention(threads, queries, kv, scale, mask, weights, out);
     });
@@ -166,6 +172,40 @@ pub(crate) fn pack(
     });
     result.map_err(refused("keys and values"))?;
     check_interrupted()
+}
+
+/// [`PackedKeyValues::append`].
+pub(crate) fn append(
+    threads: usize,
+    packed: &mut PackedKeyValues,
+    keys: Rows<'_>,
+    values: Rows<'_>,
+) -> Result<()> {
+    let result = counted(Some(Part::Pack), (0, 0), || packed.append(threads, keys, values));
+    result.map_err(refused("keys and values"))?;
+    check_interrupted()
+}
+
+/// No keys yet, of the type in which `engine` holds them, with room for `capacity`.
+pub(crate) fn room_for_keys_values(
+    engine: Engine,
+    [num_heads, head_dim]: [usize; 2],
+    capacity: usize,
+) -> Result<PackedKeyValues> {
+    let mut packed = no_keys_values(engine, num_heads, head_dim);
+    packed.reserve(capacity).map_err(refused("keys and values"))?;
+    Ok(packed)
+}
+
+/// [`PackedKeyValues::try_clone_first`].
+pub(crate) fn first_keys_values(
+    packed: &PackedKeyValues,
+    len: usize,
+    capacity: usize,
+) -> Result<PackedKeyValues> {
+    packed
+        .try_clone_first(len, capacity)
+        .map_err(refused("keys and values"))
 }
 
 /// No keys yet, of the type in which `engine` holds them.

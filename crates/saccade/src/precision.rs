@@ -18,6 +18,13 @@ pub(crate) enum Role {
     Other,
 }
 
+impl Role {
+    /// Whether its weights are large: they may be stored as int8, and the memory that they are read into is used again.
+    pub(crate) fn is_given_back(self) -> bool {
+        self == Self::Block
+    }
+}
+
 /// What weights are held in, and what the inputs of linear layers are rounded to. The residual stream, norms, softmax and all sums of
 /// floating-point products are float32 in each.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]

@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
-/// A part of the head's work.
+/// A part of the work of a head or a backbone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Part {
@@ -29,11 +29,15 @@ pub enum Part {
     Embodiment,
     /// The projection after the last block.
     Output,
+    /// What makes rows of the patches of views.
+    Patches,
+    /// What makes tokens of the rows of views.
+    Connector,
 }
 
 impl Part {
     /// All parts, in the order of the calls.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 13] = [
         Self::ToQ,
         Self::ToKv,
         Self::ContextToKv,
@@ -45,6 +49,8 @@ impl Part {
         Self::Norm,
         Self::Embodiment,
         Self::Output,
+        Self::Patches,
+        Self::Connector,
     ];
 
     /// Its name in a report.
@@ -62,6 +68,8 @@ impl Part {
             Self::Norm => "norm",
             Self::Embodiment => "embodiment",
             Self::Output => "output",
+            Self::Patches => "patches",
+            Self::Connector => "connector",
         }
     }
 }

@@ -21,6 +21,7 @@ from saccade._arguments import UsageError
 # A command is the module of its name in this package. Its line of help is repeated here, so that
 # `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
+    "act": "run a whole checkpoint on pictures and an instruction",
     "rollout": "run a policy on the simulated robot and report how often it succeeds",
     "demos": "record demonstrations of the tasks with scripted experts",
     "train": "train a policy on recorded demonstrations",
@@ -40,6 +41,7 @@ _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
 # The optional packages that each command needs, checked once its arguments have been: a message then names
 # all that are missing. Commands without an entry need NumPy only. See `saccade._extras` for the extras.
 NEEDS: dict[str, tuple[str, ...]] = {
+    "act": ("rich", "PIL"),
     "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),

@@ -214,6 +214,50 @@ impl PackedKeyValues {
         })
     }
 
+    /// A copy of the first `len` keys and values, with room for `capacity`.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory.
+    ///
+    /// # Panics
+    /// If there are fewer keys, or no room for `len`.
+    pub fn try_clone_first(&self, len: usize, capacity: usize) -> Result<Self, AllocError> {
+        assert!(
+            len <= self.len && len <= capacity,
+            "len: expected at most {} keys and room for them, got {len} in {capacity}",
+            self.len
+        );
+        let mut copy = Self::new(self.isa, self.element, self.num_kv_heads, self.head_dim);
+        copy.reserve(capacity)?;
+        (copy.len, copy.finite) = (len, self.finite);
+        let lanes = self.isa.vectors().lanes;
+        let (panel, width) = (self.keys_of_head(lanes), self.value_width());
+        for head in 0..self.num_kv_heads {
+            let (keys, values) = (self.head_keys(head), self.head_values(head));
+            let (keys_size, values_size) = (copy.keys_of_head(capacity), copy.values_of_head(capacity));
+            let keys_to = &mut copy.keys[head * keys_size..][..keys_size];
+            let values_to = &mut copy.values[head * values_size..][..values_size];
+            let (whole, rest) = (len / lanes * panel, len % lanes);
+            keys_to[..whole].copy_from_slice(&keys[..whole]);
+            if rest > 0 {
+                // Lanes of later keys stay zero.
+                let (to, from) = (&mut keys_to[whole..][..panel], &keys[whole..][..panel]);
+                for (to, from) in to.chunks_exact_mut(lanes).zip(from.chunks_exact(lanes)) {
+                    to[..rest].copy_from_slice(&from[..rest]);
+                }
+            }
+            let steps = len.div_ceil(self.step()) * width;
+            values_to[..steps].copy_from_slice(&values[..steps]);
+            if !len.is_multiple_of(self.step()) {
+                // As above: a word holds two keys.
+                values_to[steps - width..steps]
+                    .iter_mut()
+                    .for_each(|word| *word &= 0xffff);
+            }
+        }
+        Ok(copy)
+    }
+
     /// Number of keys.
     #[must_use]
     pub fn len(&self) -> usize {

@@ -1,6 +1,5 @@
 //! A loaded head: its layers, its config and the memory that its calls share.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use saccade_kernels::Isa;
@@ -10,8 +9,9 @@ use super::workspace::Workspace;
 use crate::array::Array;
 use crate::config::{HeadConfig, Reads};
 use crate::engine::Engine;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::precision::Precision;
+use crate::workspaces::Workspaces;
 
 /// A loaded action head. Immutable; serves any number of threads at once.
 pub struct ActionHead {
@@ -22,7 +22,7 @@ pub struct ActionHead {
     pub(super) embodiment_ids: Vec<usize>,
     pub(super) layers: HeadLayers,
     nbytes: usize,
-    workspaces: Mutex<Vec<Workspace>>,
+    workspaces: Workspaces<Workspace>,
 }
 
 impl ActionHead {
@@ -41,7 +41,7 @@ impl ActionHead {
             embodiment_ids,
             layers,
             nbytes,
-            workspaces: Mutex::new(Vec::new()),
+            workspaces: Workspaces::new(),
         }
     }
 
@@ -98,23 +98,14 @@ impl ActionHead {
         kinds
     }
 
-    /// Runs `call` with a workspace. The list is never waited for: a thread that finds its lock taken makes a workspace of its own, so that
-    /// callers never stop each other, and a fork that copies a taken lock leaves the child slower, not stuck.
+    /// Runs `call` with a workspace.
     pub(super) fn with_workspace<R>(&self, call: impl FnOnce(&mut Workspace) -> Result<R>) -> Result<R> {
-        let kept = self.workspaces.try_lock().ok().and_then(|mut kept| kept.pop());
-        let mut workspace = kept.unwrap_or_else(Workspace::new);
-        let result = call(&mut workspace);
-        // One that grew until memory ran out is not kept.
-        if !matches!(result, Err(Error::Memory { .. }))
-            && let Ok(mut kept) = self.workspaces.try_lock()
-        {
-            kept.push(workspace);
-        }
-        result
+        self.workspaces.with(Workspace::new, call)
     }
 }
 
-fn next_id() -> u64 {
+/// A number that no other model of this process has.
+pub(crate) fn next_id() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }

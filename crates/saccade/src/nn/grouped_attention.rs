@@ -1,6 +1,8 @@
 //! Self-attention of language and vision models: fewer heads of keys than of queries, norms of both, rotary positions, a causal mask.
 
-use saccade_kernels::{Epilogue, LinearScratch, Mask, PackedKeyValues};
+use std::ops::Range;
+
+use saccade_kernels::{Epilogue, LinearScratch, Mask, PackedKeyValues, Rows};
 
 use super::linear::Linear;
 use super::rms_norm::RmsNorm;
@@ -23,13 +25,37 @@ pub(crate) struct GroupedSizes {
     pub head_dim: usize,
 }
 
-/// The four projections of an attention: how a model names them, and which of them have a bias.
+/// The projections of an attention: how a model names them, and which of them have a bias.
 #[derive(Clone, Copy)]
 pub(crate) struct Projections {
-    /// Of queries, keys, values and the output.
-    pub names: [&'static str; 4],
+    pub qkv: Qkv,
+    pub out: &'static str,
     pub qkv_bias: bool,
     pub out_bias: bool,
+}
+
+/// The names of what makes queries, keys and values.
+#[derive(Clone, Copy)]
+pub(crate) enum Qkv {
+    Separate([&'static str; 3]),
+    /// One tensor, queries first.
+    Stacked(&'static str),
+}
+
+/// Which rows attend to which.
+pub(crate) enum Sequences<'a, 'b> {
+    /// Sequences of this many rows, one after the other: a row attends to all of its own sequence.
+    Whole(&'a [usize]),
+    /// Sequences one after the other: a row attends to itself and to the rows before it.
+    Causal(&'a mut [Causal<'b>]),
+}
+
+/// A sequence whose keys and values outlive the call.
+pub(crate) struct Causal<'a> {
+    /// Those of earlier rows; those of the given rows are added, if they may be attended to.
+    pub held: &'a mut PackedKeyValues,
+    /// For each of the given rows whether rows may attend to it. A row that finds nothing to attend to gets zeros from the attention.
+    pub attended: &'a [bool],
 }
 
 /// `o_proj(softmax(q k^T / sqrt(head_dim)) v)` with `q = rotate(norm(q_proj y))`, `k = rotate(norm(k_proj y))` and `v = v_proj y`.
@@ -64,11 +90,16 @@ impl GroupedAttention {
             head_dim,
         } = sizes;
         let (queries, keys) = (num_heads * head_dim, num_kv_heads * head_dim);
-        let [q_proj, k_proj, v_proj, o_proj] = projections.names;
-        let parts = [(q_proj, queries), (k_proj, keys), (v_proj, keys)];
-        let parts = parts.map(|(name, outputs)| (weights.at(name), outputs));
+        let parts = match projections.qkv {
+            Qkv::Separate([q_proj, k_proj, v_proj]) => vec![
+                (weights.at(q_proj), queries),
+                (weights.at(k_proj), keys),
+                (weights.at(v_proj), keys),
+            ],
+            Qkv::Stacked(qkv) => vec![(weights.at(qkv), queries + 2 * keys)],
+        };
         let qkv = Linear::stacked(&parts, width, Role::Block, projections.qkv_bias)?;
-        let out = [(weights.at(o_proj), width)];
+        let out = [(weights.at(projections.out), width)];
         let out = Linear::stacked(&out, queries, Role::Block, projections.out_bias)?;
         let norms = match norm_eps {
             Some(eps) => Some([
@@ -85,13 +116,13 @@ impl GroupedAttention {
         })
     }
 
-    /// `x += attention(y)` over the rows of one sequence, both `(rows, width)`.
+    /// `x += attention(y)` over the rows of all sequences, both `(rows, width)`.
     pub(crate) fn add(
         &self,
         engine: Engine,
         y: &[f32],
         rotation: Option<&Rotation>,
-        mask: Mask<'_>,
+        sequences: Sequences<'_, '_>,
         (buffers, scratch): (&mut GroupedBuffers, &mut LinearScratch),
         x: &mut [f32],
     ) -> Result<()> {
@@ -114,18 +145,81 @@ impl GroupedAttention {
             }
         }
         let qkv = rows(qkv, all);
-        let packed = buffers
-            .packed
-            .get_or_insert_with(|| no_keys_values(engine, num_kv_heads, head_dim));
-        let (k, v) = (
-            qkv.columns(queries..queries + keys),
-            qkv.columns(queries + keys..all),
-        );
-        ops::pack(engine.threads, packed, 0, k, v)?;
         let mix = sized(&mut buffers.mix, count * queries)?; // (rows, num_heads * head_dim)
-        let scale = 1.0 / (head_dim as f32).sqrt();
-        let (q, mixed) = (qkv.columns(0..queries), rows_mut(mix, queries));
-        ops::attention(engine.threads, q, packed, scale, mask, None, mixed)?;
+        let mut attend = Attend {
+            engine,
+            queries: qkv.columns(0..queries),
+            keys: qkv.columns(queries..queries + keys),
+            values: qkv.columns(queries + keys..all),
+            scale: 1.0 / (head_dim as f32).sqrt(),
+            mix,
+        };
+        let mut first = 0;
+        match sequences {
+            Sequences::Whole(lens) => {
+                let packed = buffers
+                    .packed
+                    .get_or_insert_with(|| no_keys_values(engine, num_kv_heads, head_dim));
+                for len in lens {
+                    attend.whole(first..first + len, packed)?;
+                    first += len;
+                }
+            }
+            Sequences::Causal(sequences) => {
+                for sequence in sequences {
+                    attend.causal(first, sequence)?;
+                    first += sequence.attended.len();
+                }
+            }
+        }
         self.out.apply(engine, mix, Epilogue::Add, x, scratch)
+    }
+}
+
+/// Queries, keys and values of all rows, and the rows that the attention makes of them.
+struct Attend<'a> {
+    engine: Engine,
+    queries: Rows<'a>,
+    keys: Rows<'a>,
+    values: Rows<'a>,
+    scale: f32,
+    mix: &'a mut [f32],
+}
+
+impl Attend<'_> {
+    /// A sequence whose rows all attend to each other; `packed` is memory for it.
+    fn whole(&mut self, rows: Range<usize>, packed: &mut PackedKeyValues) -> Result<()> {
+        let (keys, values) = (self.keys.rows(rows.clone()), self.values.rows(rows.clone()));
+        ops::pack(self.engine.threads, packed, 0, keys, values)?;
+        self.attend(rows, packed, Mask::None)
+    }
+
+    /// A causal sequence, whose rows begin with number `first`: run by run of rows that may be attended to, or may not.
+    fn causal(&mut self, first: usize, Causal { held, attended }: &mut Causal<'_>) -> Result<()> {
+        let mut start = 0;
+        for run in attended.chunk_by(|a, b| a == b) {
+            let rows = first + start..first + start + run.len();
+            start += run.len();
+            let before = held.len();
+            if run[0] {
+                let (keys, values) = (self.keys.rows(rows.clone()), self.values.rows(rows.clone()));
+                ops::append(self.engine.threads, held, keys, values)?;
+                self.attend(rows, held, Mask::Causal { offset: before })?;
+            } else if before == 0 {
+                let width = self.queries.num_columns();
+                self.mix[rows.start * width..rows.end * width].fill(0.0);
+            } else {
+                // All of them see the same keys.
+                self.attend(rows, held, Mask::Causal { offset: before })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn attend(&mut self, range: Range<usize>, kv: &PackedKeyValues, mask: Mask<'_>) -> Result<()> {
+        let width = self.queries.num_columns();
+        let mixed = rows_mut(&mut self.mix[range.start * width..range.end * width], width);
+        let queries = self.queries.rows(range);
+        ops::attention(self.engine.threads, queries, kv, self.scale, mask, None, mixed)
     }
 }

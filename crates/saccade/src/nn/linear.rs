@@ -34,14 +34,26 @@ impl Linear {
         role: Role,
         has_bias: bool,
     ) -> Result<Self> {
-        let (builder, _) = &parts[0];
+        let parts: Vec<_> = parts
+            .iter()
+            .map(|(weights, out_features)| (weights, vec![*out_features, in_features]))
+            .collect();
+        Self::of_shapes(&parts, role, has_bias)
+    }
+
+    /// A convolution whose windows do not overlap, `weight (out_features, ...)` and a bias: each window is a row.
+    pub(crate) fn windows(weights: &Weights<'_>, shape: &[usize], role: Role) -> Result<Self> {
+        Self::of_shapes(&[(weights, shape.to_vec())], role, true)
+    }
+
+    fn of_shapes(parts: &[(&Weights<'_>, Vec<usize>)], role: Role, has_bias: bool) -> Result<Self> {
+        let (builder, shape) = &parts[0];
+        let in_features = shape[1..].iter().product();
         let mut tensors = Vec::with_capacity(parts.len());
-        for (weights, out_features) in parts {
-            let weight = weights.weight(role, *out_features, in_features)?;
-            let bias = has_bias
-                .then(|| weights.bias("bias", *out_features))
-                .transpose()?;
-            tensors.push((weight, *out_features, bias));
+        for (weights, shape) in parts {
+            let weight = weights.weight(role, shape)?;
+            let bias = has_bias.then(|| weights.bias("bias", shape[0])).transpose()?;
+            tensors.push((weight, shape[0], bias));
         }
         let views: Vec<_> = tensors
             .iter()
@@ -49,7 +61,7 @@ impl Linear {
             .collect();
         let packed = builder.pack(role, &views)?;
         drop(views);
-        if role == Role::Block {
+        if role.is_given_back() {
             for (weight, ..) in tensors {
                 builder.give_back(weight);
             }

@@ -4,18 +4,21 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use saccade_checkpoint::Checkpoint;
-use saccade_kernels::{Epilogue, Isa, LinearScratch, LogitBias, Mask};
+use saccade_kernels::{Epilogue, Isa, LinearScratch};
 
 use super::gated_mlp::GatedMlp;
-use super::grouped_attention::{GroupedAttention, GroupedBuffers, GroupedSizes, Projections};
+use super::grouped_attention::{
+    Causal, GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Qkv, Sequences,
+};
 use super::linear::Linear;
 use super::mlp::{DIFFUSERS, FeedForward};
 use super::rms_norm::RmsNorm;
-use super::rotary::Rotation;
+use super::rotary::{Rotation, one_axis};
 use super::weights::{Builder, Weights};
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::memory::{ElementsRef, MemorySource, TensorView, TensorViews};
+use crate::ops::no_keys_values;
 use crate::precision::{Precision, Role};
 
 /// Numbers that look random and are the same everywhere, below 1 in size.
@@ -225,7 +228,8 @@ fn rms_norms_of_rows() {
 
 /// Qwen's names, with the biases of its second version.
 const QWEN_WITH_BIAS: Projections = Projections {
-    names: ["q_proj", "k_proj", "v_proj", "o_proj"],
+    qkv: Qkv::Separate(["q_proj", "k_proj", "v_proj"]),
+    out: "o_proj",
     qkv_bias: true,
     out_bias: false,
 };
@@ -256,9 +260,8 @@ fn attention(sizes: GroupedSizes, qkv: &[f64], bias: impl Fn(usize, usize) -> f6
             for (key, weight) in weights.iter().enumerate() {
                 let v = &qkv[key * all + queries + keys + of_kv..][..head_dim];
                 let out = &mut mix[row * queries + head * head_dim..][..head_dim];
-                out.iter_mut()
-                    .zip(v)
-                    .for_each(|(out, v)| *out += weight / total * v);
+                let weight = if total > 0.0 { weight / total } else { 0.0 };
+                out.iter_mut().zip(v).for_each(|(out, v)| *out += weight * v);
             }
         }
     }
@@ -285,10 +288,12 @@ fn grouped_attention_with_norms_rotation_and_masks() {
         ("k_norm.weight", &[4]),
     ]);
     let (count, base) = (37, 10_000.0);
-    let positions: Vec<usize> = (0..count).map(|row| 3 + row).collect();
+    let positions: Vec<[usize; 1]> = (0..count).map(|row| [3 + row]).collect();
     let (y, x) = (numbers(count * 10, 4), numbers(count * 10, 5));
-    let own = numbers(count, 6);
-    let rotation = Rotation::new(4, base, &positions).unwrap();
+    let attended: Vec<bool> = (0..count)
+        .map(|row| ![0, 1, 5, 6, 20, 36].contains(&row))
+        .collect();
+    let rotation = Rotation::new(4, &one_axis(base, 4), &positions).unwrap();
     for (has_norms, is_rotated, is_causal) in [(true, true, true), (false, true, false), (true, false, true)]
     {
         let [mut q, mut k, v] =
@@ -298,7 +303,7 @@ fn grouped_attention_with_norms_rotation_and_masks() {
             rms_norm(&mut k, &named.get("k_norm.weight"), 1e-6);
         }
         if is_rotated {
-            for (row, position) in positions.iter().enumerate() {
+            for (row, [position]) in positions.iter().enumerate() {
                 rotate(&mut q[row * 24..][..24], 4, base, *position);
                 rotate(&mut k[row * 8..][..8], 4, base, *position);
             }
@@ -306,30 +311,32 @@ fn grouped_attention_with_norms_rotation_and_masks() {
         let row = |row: usize| [&q[row * 24..][..24], &k[row * 8..][..8], &v[row * 8..][..8]].concat();
         let qkv: Vec<f64> = (0..count).flat_map(row).collect();
         let mix = attention(sizes, &qkv, |row, key| match is_causal {
-            true if key > row => f64::NEG_INFINITY,
-            true => 0.0,
-            false => f64::from(own[key]),
+            true if key > row || !attended[key] => f64::NEG_INFINITY,
+            _ => 0.0,
         });
         let mut expected = named.linear("o_proj", &mix, 24);
         expected
             .iter_mut()
             .zip(&x)
             .for_each(|(sum, x)| *sum += f64::from(*x));
-        let mask = match is_causal {
-            true => Mask::Causal { offset: 0 },
-            false => Mask::Bias(LogitBias {
-                values: &own,
-                head_stride: 0,
-                query_stride: 0,
-            }),
-        };
         let eps = has_norms.then_some(1e-6);
         for (engine, layer) in
             named.layers(|weights| GroupedAttention::new(weights, sizes, QWEN_WITH_BIAS, eps))
         {
             let (mut out, rotation) = (x.clone(), is_rotated.then_some(&rotation));
             let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
-            layer.add(engine, &y, rotation, mask, memory, &mut out).unwrap();
+            let mut held = no_keys_values(engine, 2, 4);
+            let causal = &mut [Causal {
+                held: &mut held,
+                attended: &attended,
+            }];
+            let sequences = match is_causal {
+                true => Sequences::Causal(causal),
+                false => Sequences::Whole(&[count]),
+            };
+            layer
+                .add(engine, &y, rotation, sequences, memory, &mut out)
+                .unwrap();
             assert_close(
                 &out,
                 &expected,
@@ -379,14 +386,18 @@ fn the_layers_of_qwen_are_those_of_transformers() {
         qkv_bias: false,
         ..QWEN_WITH_BIAS
     };
-    let positions: Vec<usize> = (5..16).collect();
-    let rotation = Rotation::new(8, 1e6, &positions).unwrap();
+    let positions: Vec<[usize; 1]> = (5..16).map(|position| [position]).collect();
+    let rotation = Rotation::new(8, &one_axis(1e6, 8), &positions).unwrap();
     assert_released(
         "qwen3.self_attn",
         |weights| GroupedAttention::new(weights, sizes, projections, Some(1e-6)),
         |engine, layer, y, x| {
             let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
-            layer.add(engine, y, Some(&rotation), Mask::Causal { offset: 0 }, memory, x)
+            let causal = &mut [Causal {
+                held: &mut no_keys_values(engine, 2, 8),
+                attended: &[true; 11],
+            }];
+            layer.add(engine, y, Some(&rotation), Sequences::Causal(causal), memory, x)
         },
     );
     assert_released(
@@ -410,7 +421,8 @@ fn the_layers_of_siglip_are_those_of_transformers() {
         head_dim: 8,
     };
     let projections = Projections {
-        names: ["q_proj", "k_proj", "v_proj", "out_proj"],
+        qkv: QWEN_WITH_BIAS.qkv,
+        out: "out_proj",
         qkv_bias: true,
         out_bias: true,
     };
@@ -419,7 +431,7 @@ fn the_layers_of_siglip_are_those_of_transformers() {
         |weights| GroupedAttention::new(weights, sizes, projections, None),
         |engine, layer, y, x| {
             let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
-            layer.add(engine, y, None, Mask::None, memory, x)
+            layer.add(engine, y, None, Sequences::Whole(&[11]), memory, x)
         },
     );
     assert_released(

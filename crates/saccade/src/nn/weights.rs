@@ -109,7 +109,15 @@ impl Tensor {
 
     /// The tensor rounded to bf16 where a layer of this role computes in float32 but is to be held in bf16.
     pub(crate) fn held_as(self, engine: Engine, role: Role) -> Result<Self> {
-        let is_rounded = role == Role::Time && engine.precision.rounds_weights();
+        match role {
+            Role::Time => self.rounded(engine),
+            _ => Ok(self),
+        }
+    }
+
+    /// The tensor rounded to bf16 unless it is to be held as it is stored.
+    fn rounded(self, engine: Engine) -> Result<Self> {
+        let is_rounded = engine.precision.rounds_weights();
         Ok(match self {
             Self::Held(Elements::F32(values)) if is_rounded => {
                 let rounded = values.iter().copied().map(bf16::from_f32);
@@ -223,17 +231,15 @@ impl Weights<'_> {
         self.builder.engine
     }
 
-    /// The weight `(out_features, in_features)` of a layer of this role.
-    pub(crate) fn weight(&self, role: Role, out_features: usize, in_features: usize) -> Result<Tensor> {
-        let shape = [out_features, in_features];
-        let is_block = role == Role::Block;
+    /// The weight of a layer of this role, `(out_features, in_features)` or with several axes in place of the last one.
+    pub(crate) fn weight(&self, role: Role, shape: &[usize]) -> Result<Tensor> {
         let weight = self.read(Request {
             spec: TensorSpec {
-                may_be_int8: is_block,
-                ..TensorSpec::plain(&self.name("weight"), &shape)
+                may_be_int8: role.is_given_back(),
+                ..TensorSpec::plain(&self.name("weight"), shape)
             },
             slices: None,
-            is_given_back: is_block,
+            is_given_back: role.is_given_back(),
         })?;
         weight.held_as(self.engine(), role)
     }
@@ -263,6 +269,22 @@ impl Weights<'_> {
             is_given_back: false,
         })?;
         table.into_f32()
+    }
+
+    /// The table `weight`, whose rows are looked up: in bf16 if that is how it is stored or what is computed in, else in float32.
+    pub(crate) fn looked_up(&self, shape: [usize; 2]) -> Result<Tensor> {
+        let table = self.read(Request {
+            spec: TensorSpec::plain(&self.name("weight"), &shape),
+            slices: None,
+            is_given_back: false,
+        })?;
+        let table = table.rounded(self.engine())?;
+        let size = match &table {
+            Tensor::Held(Elements::Bf16(_)) | Tensor::Outline(Stored::Bf16) => size_of::<bf16>(),
+            _ => size_of::<f32>(),
+        };
+        self.count(size * shape[0] * shape[1]);
+        Ok(table)
     }
 
     /// Slice `id` of tensor `name`, whose first axis is of embodiments.

@@ -1,0 +1,210 @@
+//! `saccade._saccade.Backbone` and its features.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+use saccade::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray};
+
+use crate::arrays::{held_tensors, optional_view, tensor_views, to_numpy, view};
+use crate::detached::call;
+use crate::error::raise;
+
+/// The fields of a `saccade.BackboneInputs`.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub(crate) struct PyInputs<'py> {
+    pixel_values: Vec<PyReadonlyArrayDyn<'py, f32>>,
+    input_ids: PyReadonlyArrayDyn<'py, i64>,
+    attention_mask: PyReadonlyArrayDyn<'py, bool>,
+    image_grid_thw: Option<PyReadonlyArrayDyn<'py, i64>>,
+}
+
+impl PyInputs<'_> {
+    fn view(&self) -> PyResult<BackboneInputs<'_>> {
+        let pixel_values = self.pixel_values.iter().map(view).collect::<PyResult<_>>()?;
+        Ok(BackboneInputs::new(pixel_values, view(&self.input_ids)?)
+            .with_attention_mask(view(&self.attention_mask)?)
+            .with_image_grid_thw(optional_view(&self.image_grid_thw)?))
+    }
+}
+
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct BackboneFeatures(Arc<saccade::BackboneFeatures>);
+
+#[pymethods]
+impl BackboneFeatures {
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+
+    /// `(batch, tokens, width)`.
+    fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let shape = [self.0.batch(), self.0.num_tokens(), self.0.feature_dim()];
+        to_numpy(py, call(py, || self.0.all_features())?, &shape)
+    }
+
+    /// For each prompt the places of the image tokens of its views.
+    fn views<'py>(&self, py: Python<'py>) -> PyResult<Vec<Vec<Bound<'py, PyArrayDyn<i64>>>>> {
+        let places = |view: &[usize]| {
+            let places: Vec<i64> = view.iter().map(|&place| place as i64).collect();
+            let len = places.len();
+            to_numpy(py, places, &[len])
+        };
+        (0..self.0.batch())
+            .map(|prompt| self.0.views(prompt).map(places).collect())
+            .collect()
+    }
+}
+
+/// Rows by layer, and by prompt and view the patches and the tokens.
+type PyBackboneRecord<'py> = (
+    Vec<Bound<'py, PyArrayDyn<f32>>>,
+    Vec<Vec<Bound<'py, PyArrayDyn<f32>>>>,
+    Vec<Vec<Bound<'py, PyArrayDyn<f32>>>>,
+);
+
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct Backbone(saccade::Backbone);
+
+#[pymethods]
+impl Backbone {
+    #[staticmethod]
+    fn load(
+        py: Python<'_>,
+        source: PathBuf,
+        config: Option<String>,
+        precision: &str,
+        num_threads: Option<usize>,
+    ) -> PyResult<Self> {
+        let options = options(config, precision, num_threads)?;
+        call(py, || saccade::Backbone::load(&source, &options)).map(Self)
+    }
+
+    #[staticmethod]
+    fn from_tensors(
+        py: Python<'_>,
+        tensors: &Bound<'_, PyDict>,
+        config: Option<String>,
+        precision: &str,
+        num_threads: Option<usize>,
+    ) -> PyResult<Self> {
+        let options = options(config, precision, num_threads)?;
+        let held = held_tensors(tensors)?;
+        let views = tensor_views(&held)?;
+        call(py, || saccade::Backbone::from_tensors(&views, &options)).map(Self)
+    }
+
+    fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        backbone_config_dict(py, self.0.config())
+    }
+
+    #[getter]
+    fn num_threads(&self) -> usize {
+        self.0.num_threads()
+    }
+
+    #[getter]
+    fn precision(&self) -> String {
+        self.0.precision().to_string()
+    }
+
+    #[getter]
+    fn isa(&self) -> String {
+        self.0.isa().to_string()
+    }
+
+    #[getter]
+    fn nbytes(&self) -> usize {
+        self.0.nbytes()
+    }
+
+    /// Features of each of the inputs, and what was recorded of each.
+    fn encode<'py>(
+        &self,
+        py: Python<'py>,
+        inputs: Vec<PyInputs<'py>>,
+        previous: Vec<PyRef<'py, BackboneFeatures>>,
+        hidden: bool,
+        vision: bool,
+        image_tokens: bool,
+    ) -> PyResult<Vec<(BackboneFeatures, PyBackboneRecord<'py>)>> {
+        let views = inputs.iter().map(PyInputs::view).collect::<PyResult<Vec<_>>>()?;
+        let previous: Vec<_> = previous.iter().map(|features| Arc::clone(&features.0)).collect();
+        let previous: Vec<&saccade::BackboneFeatures> = previous.iter().map(|features| &**features).collect();
+        let keep = BackboneKeep::default()
+            .with_hidden(hidden)
+            .with_vision(vision)
+            .with_image_tokens(image_tokens);
+        let encoded = call(py, || self.0.encode(&views, &previous, keep))?;
+        let features = encoded.into_iter().map(|mut features| {
+            let recorded = features.take_recorded();
+            let array = |array: OwnedArray| {
+                let (data, shape) = array.into_parts();
+                to_numpy(py, data, &shape)
+            };
+            let arrays = |given: Vec<OwnedArray>| given.into_iter().map(array).collect::<PyResult<Vec<_>>>();
+            let nested =
+                |given: Vec<Vec<OwnedArray>>| given.into_iter().map(arrays).collect::<PyResult<Vec<_>>>();
+            let record = (
+                arrays(recorded.hidden)?,
+                nested(recorded.vision)?,
+                nested(recorded.image_tokens)?,
+            );
+            Ok((BackboneFeatures(Arc::new(features)), record))
+        });
+        features.collect()
+    }
+}
+
+fn options(
+    config: Option<String>,
+    precision: &str,
+    num_threads: Option<usize>,
+) -> PyResult<BackboneLoadOptions> {
+    Ok(BackboneLoadOptions::default()
+        .with_config(config)
+        .with_precision(precision.parse().map_err(raise)?)
+        .with_num_threads(num_threads))
+}
+
+fn backbone_config_dict<'py>(py: Python<'py>, config: &BackboneConfig) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    let (vision, language) = (&config.vision, &config.language);
+    dict.set_item("version", &config.version)?;
+    for (name, size) in [
+        ("feature_dim", config.feature_dim()),
+        ("image_token_id", config.image_token_id),
+        ("width", language.width),
+        ("num_layers", language.num_layers),
+        ("num_heads", language.num_heads),
+        ("num_kv_heads", language.num_kv_heads),
+        ("head_dim", language.head_dim),
+        ("hidden_dim", language.hidden_dim),
+        ("vocab_size", language.vocab_size),
+        ("vision_width", vision.width),
+        ("vision_num_layers", vision.num_layers),
+        ("vision_num_heads", vision.num_heads),
+        ("vision_head_dim", vision.head_dim),
+        ("vision_hidden_dim", vision.hidden_dim),
+        ("patch_size", vision.patch_size),
+        ("num_positions", vision.num_positions),
+        ("merge", vision.merge),
+        ("connector_layers", vision.connector_layers),
+    ] {
+        dict.set_item(name, size)?;
+    }
+    dict.set_item("project_to_dim", config.project_to_dim)?;
+    dict.set_item("image_size", vision.image_size)?;
+    dict.set_item("rope_theta", language.rope_theta)?;
+    dict.set_item("norm_eps", language.norm_eps)?;
+    dict.set_item("vision_norm_eps", vision.norm_eps)?;
+    dict.set_item("has_final_norm", language.has_final_norm)?;
+    let mrope_section = language.mrope_section.map(|section| PyTuple::new(py, section));
+    dict.set_item("mrope_section", mrope_section.transpose()?)?;
+    dict.set_item("deepstack", PyTuple::new(py, &vision.deepstack)?)?;
+    Ok(dict)
+}

@@ -1,0 +1,512 @@
+//! Reading a backbone's config from JSON: every key is checked, and one error lists all problems.
+
+use std::ops::RangeInclusive;
+
+use serde_json::{Map, Value};
+
+use super::config::{BackboneConfig, CHANNELS, LanguageConfig, Tower, VisionConfig};
+use super::released::{Release, TowerKind};
+use crate::config::{Object, Version};
+use crate::error::{Error, Result};
+
+/// No size in a config is larger: products of three of them stay far below `u64::MAX`.
+const MAX_SIZE: u64 = 1 << 20;
+
+/// No tower or language model has more layers; the names of their tensors are written out.
+const MAX_LAYERS: u64 = 1024;
+
+/// The key of the backbone's config in a whole checkpoint's.
+const BACKBONE_KEY: &str = "backbone_cfg";
+
+/// A config as it is given: of a whole checkpoint, or of a backbone alone.
+pub(crate) struct GivenConfig {
+    top: Object,
+    /// `backbone_cfg` of a whole checkpoint; empty if there is none.
+    backbone: Object,
+    /// The sizes: `eagle_config` of a whole checkpoint, or the config itself; empty if it has none.
+    sizes: Object,
+}
+
+impl GivenConfig {
+    /// # Errors
+    /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object.
+    pub(crate) fn parse(text: &str) -> Result<Self> {
+        let bad = |problem: String| Err(Error::Checkpoint(format!("config: {problem}")));
+        let top = match serde_json::from_str(text) {
+            Ok(Value::Object(top)) => top,
+            Ok(_) => return bad("expected a JSON object".to_owned()),
+            Err(source) => {
+                return Err(Error::Json {
+                    what: "config".to_owned(),
+                    source,
+                });
+            }
+        };
+        let mut backbone = match top.get(BACKBONE_KEY) {
+            Some(Value::Object(backbone)) => backbone.clone(),
+            None | Some(Value::Null) => Map::new(),
+            Some(_) => return bad(format!("{BACKBONE_KEY}: expected an object")),
+        };
+        let sizes = match backbone.remove("eagle_config") {
+            Some(Value::Object(sizes)) => sizes,
+            None | Some(Value::Null) if is_of_sizes(&top) => top.clone(),
+            None | Some(Value::Null) => Map::new(),
+            Some(_) => return bad(format!("{BACKBONE_KEY}.eagle_config: expected an object")),
+        };
+        Ok(Self { top, backbone, sizes })
+    }
+
+    /// The version that the config names, with its words; none if it names none.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] for names of GR00T models that are unknown.
+    pub(crate) fn version(&self) -> Result<Option<(Version, String)>> {
+        let unknown = |what: &str, name: &str| {
+            let names = Version::model_types();
+            Err(Error::Checkpoint(format!(
+                "config: {what} is \"{name}\", expected one of {names}"
+            )))
+        };
+        if let Some(Value::String(kind)) = self.top.get("kind") {
+            let name = kind.split_whitespace().next().unwrap_or_default();
+            return match Version::named(name) {
+                Some(version) => Ok(Some((version, format!("kind is \"{kind}\"")))),
+                None => unknown("kind", kind),
+            };
+        }
+        let Some(Value::String(name)) = self.top.get("model_type") else {
+            return Ok(None);
+        };
+        match Version::of_model(name) {
+            Ok(version) => Ok(version.map(|version| (version, format!("model_type is \"{name}\"")))),
+            Err(()) => unknown("model_type", name),
+        }
+    }
+
+    /// The config of a backbone of this release: sizes that are not given are the released ones.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] with everything that is of the wrong type or contradictory.
+    pub(crate) fn read(&self, release: &Release) -> Result<BackboneConfig> {
+        let Ok(Value::Object(released)) = serde_json::from_str(release.sizes) else {
+            unreachable!("the released sizes are an object");
+        };
+        let mut reader = Reader {
+            given: self,
+            released,
+            problems: Vec::new(),
+        };
+        let config = reader.config(release);
+        if reader.problems.is_empty() {
+            return Ok(config);
+        }
+        Err(Error::Checkpoint(format!(
+            "config: {}",
+            reader.problems.join("; ")
+        )))
+    }
+}
+
+/// Whether an object holds sizes of a backbone.
+fn is_of_sizes(object: &Object) -> bool {
+    ["kind", "vision_config", "text_config", "eagle"]
+        .iter()
+        .any(|key| object.contains_key(*key))
+}
+
+/// Where a key is looked up.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Section {
+    Vision,
+    Text,
+    Eagle,
+    Tokens,
+}
+
+impl Section {
+    fn key(self) -> &'static str {
+        match self {
+            Self::Vision => "vision_config",
+            Self::Text => "text_config",
+            Self::Eagle => "eagle",
+            Self::Tokens => "token_ids",
+        }
+    }
+}
+
+/// Reads keys and collects all problems, so that one error lists everything.
+struct Reader<'a> {
+    given: &'a GivenConfig,
+    released: Object,
+    problems: Vec<String>,
+}
+
+impl Reader<'_> {
+    fn config(&mut self, release: &Release) -> BackboneConfig {
+        for section in [Section::Vision, Section::Text, Section::Eagle, Section::Tokens] {
+            let key = section.key();
+            if self.given.sizes.get(key).is_some_and(|value| !value.is_object()) {
+                self.problems.push(format!("{key}: expected an object"));
+            }
+        }
+        let vision = self.vision(release);
+        let language = self.language(release);
+        let config = BackboneConfig {
+            version: release.version.name().to_owned(),
+            project_to_dim: self.project_to_dim(),
+            image_token_id: self.image_token_id(release),
+            vision,
+            language,
+        };
+        if self.problems.is_empty() {
+            self.check(&config);
+        }
+        config
+    }
+
+    fn vision(&mut self, release: &Release) -> VisionConfig {
+        use Section::{Eagle, Vision};
+        let [layers, heads] = match release.tower {
+            TowerKind::Siglip { .. } => ["num_hidden_layers", "num_attention_heads"],
+            TowerKind::Qwen3Vl => ["depth", "num_heads"],
+        };
+        self.expect(Vision, "hidden_act", &["gelu_pytorch_tanh"].map(Value::from));
+        for key in ["num_channels", "in_channels"] {
+            self.expect(Vision, key, &[Value::from(CHANNELS)]);
+        }
+        self.expect(Vision, "use_rope", &[Value::from(false)]);
+        let (width, num_heads) = (self.size(Vision, "hidden_size"), self.size(Vision, heads));
+        let patch_size = self.size(Vision, "patch_size");
+        let mut config = VisionConfig {
+            width,
+            num_layers: self.within(Vision, layers, 1..=MAX_LAYERS),
+            num_heads,
+            head_dim: width / num_heads,
+            hidden_dim: self.size(Vision, "intermediate_size"),
+            norm_eps: 1e-6,
+            patch_size,
+            image_size: None,
+            num_positions: 1,
+            merge: 1,
+            connector_layers: 2,
+            deepstack: Vec::new(),
+            tower: Tower::Qwen3Vl {
+                patch_elements: 0,
+                frames: 0,
+            },
+        };
+        match release.tower {
+            TowerKind::Siglip {
+                pixels,
+                patches,
+                is_fixed,
+            } => {
+                config.tower = Tower::Siglip { pixels, patches };
+                config.norm_eps = self.number(Vision, "layer_norm_eps");
+                if is_fixed {
+                    let image_size = self.size(Vision, "image_size");
+                    config.image_size = Some(image_size);
+                    config.num_positions = (image_size / patch_size) * (image_size / patch_size);
+                } else {
+                    config.num_positions = self.size(Vision, "num_patches");
+                }
+                if self.flag(Eagle, "use_pixel_shuffle") {
+                    self.expect(Eagle, "downsample_ratio", &[Value::from(0.5)]);
+                    config.merge = 2;
+                }
+                config.connector_layers = self.within(Eagle, "mlp_connector_layers", 1..=2);
+                self.expect_last_vision_layer();
+            }
+            TowerKind::Qwen3Vl => {
+                let frames = self.within(Vision, "temporal_patch_size", 1..=16);
+                config.tower = Tower::Qwen3Vl {
+                    patch_elements: CHANNELS * frames * patch_size * patch_size,
+                    frames,
+                };
+                config.num_positions = self.size(Vision, "num_position_embeddings");
+                config.merge = self.within(Vision, "spatial_merge_size", 1..=16);
+                config.deepstack = self.sizes(Vision, "deepstack_visual_indexes");
+            }
+        }
+        config
+    }
+
+    fn language(&mut self, release: &Release) -> LanguageConfig {
+        use Section::Text;
+        self.expect(Text, "hidden_act", &["silu"].map(Value::from));
+        self.expect(Text, "attention_bias", &[Value::from(false)]);
+        self.expect(Text, "use_sliding_window", &[Value::from(false)]);
+        let mrope_section = match self.value(Text, "rope_scaling") {
+            Some(Value::Object(scaling)) => self.mrope_section(&scaling),
+            None | Some(Value::Null) => None,
+            Some(_) => {
+                self.problems
+                    .push("text_config.rope_scaling: expected an object or null".to_owned());
+                None
+            }
+        };
+        LanguageConfig {
+            width: self.size(Text, "hidden_size"),
+            num_layers: self.select_layer(),
+            num_heads: self.size(Text, "num_attention_heads"),
+            num_kv_heads: self.size(Text, "num_key_value_heads"),
+            head_dim: self.size(Text, "head_dim"),
+            hidden_dim: self.size(Text, "intermediate_size"),
+            vocab_size: self.size(Text, "vocab_size"),
+            norm_eps: self.number(Text, "rms_norm_eps"),
+            rope_theta: self.number(Text, "rope_theta"),
+            mrope_section,
+            has_final_norm: release.has_final_norm,
+        }
+    }
+
+    /// What the sizes must be to each other.
+    fn check(&mut self, config: &BackboneConfig) {
+        let BackboneConfig { vision, language, .. } = config;
+        let mut add = |is_wrong: bool, problem: String| {
+            if is_wrong {
+                self.problems.push(problem);
+            }
+        };
+        add(
+            !vision.width.is_multiple_of(vision.num_heads),
+            format!(
+                "vision_config: expected a hidden_size that {} heads divide, got {}",
+                vision.num_heads, vision.width
+            ),
+        );
+        if let Some(size) = vision.image_size {
+            add(
+                !size.is_multiple_of(vision.token_size()),
+                format!(
+                    "vision_config: expected an image_size of whole tokens of {} pixels, got {size}",
+                    vision.token_size()
+                ),
+            );
+        }
+        add(
+            vision.table_side() * vision.table_side() != vision.num_positions,
+            format!(
+                "vision_config: expected positions in a square, got {}",
+                vision.num_positions
+            ),
+        );
+        let is_rotated = matches!(vision.tower, Tower::Qwen3Vl { .. });
+        add(
+            is_rotated && !vision.head_dim.is_multiple_of(4),
+            format!(
+                "vision_config: expected heads of a multiple of 4, got {}",
+                vision.head_dim
+            ),
+        );
+        let sorted = vision.deepstack.windows(2).all(|pair| pair[0] < pair[1]);
+        let in_range = vision.deepstack.iter().all(|&block| block < vision.num_layers);
+        add(
+            !sorted || !in_range || vision.deepstack.len() > language.num_layers,
+            format!(
+                "vision_config.deepstack_visual_indexes: expected at most {} ascending blocks below {}, got {:?}",
+                language.num_layers, vision.num_layers, vision.deepstack
+            ),
+        );
+        add(
+            !language.num_heads.is_multiple_of(language.num_kv_heads),
+            format!(
+                "text_config: expected a num_attention_heads that {} heads of keys divide, got {}",
+                language.num_kv_heads, language.num_heads
+            ),
+        );
+        add(
+            !language.head_dim.is_multiple_of(2),
+            format!(
+                "text_config: expected an even head_dim, got {}",
+                language.head_dim
+            ),
+        );
+        if let Some(section) = language.mrope_section {
+            add(
+                section.iter().sum::<usize>() != language.head_dim / 2,
+                format!(
+                    "text_config.rope_scaling.mrope_section: expected three numbers with the sum {}, got {section:?}",
+                    language.head_dim / 2
+                ),
+            );
+        }
+        add(
+            config.image_token_id >= language.vocab_size,
+            format!(
+                "the image token is {}, expected an id below the vocab_size {}",
+                config.image_token_id, language.vocab_size
+            ),
+        );
+    }
+
+    /// Layers of the language model that are kept.
+    fn select_layer(&mut self) -> usize {
+        let given = self.given;
+        // The sizes may have one of the vision tower, which is negative.
+        let found = [&given.top, &given.backbone, &given.sizes]
+            .into_iter()
+            .filter_map(|object| object.get("select_layer"))
+            .find(|value| !value.as_f64().is_some_and(|layer| layer < 0.0))
+            .or_else(|| self.released.get("select_layer"))
+            .cloned();
+        self.whole("select_layer", found.as_ref(), 1..=MAX_LAYERS)
+    }
+
+    /// That the vision tower's last layer is taken.
+    fn expect_last_vision_layer(&mut self) {
+        let eagle = self
+            .given
+            .sizes
+            .get("eagle")
+            .and_then(|eagle| eagle.get("select_layer"));
+        let plain = self.given.sizes.get("select_layer");
+        let of_vision = plain.filter(|layer| layer.as_f64().is_some_and(|layer| layer < 0.0));
+        if let Some(layer) = eagle.or(of_vision)
+            && *layer != Value::from(-1)
+        {
+            self.problems.push(format!(
+                "eagle.select_layer is {layer}, expected -1, the last layer of the vision tower"
+            ));
+        }
+    }
+
+    fn project_to_dim(&mut self) -> Option<usize> {
+        let given = self.given;
+        let found = [&given.top, &given.backbone, &given.sizes]
+            .into_iter()
+            .find_map(|object| object.get("project_to_dim"))
+            .filter(|value| !value.is_null())?;
+        Some(self.whole("project_to_dim", Some(found), 1..=MAX_SIZE))
+    }
+
+    fn image_token_id(&mut self, release: &Release) -> usize {
+        let (section, key) = match release.tower {
+            TowerKind::Siglip { .. } => (Section::Eagle, "image_token_index"),
+            TowerKind::Qwen3Vl => (Section::Tokens, "image_token_id"),
+        };
+        self.within(section, key, 0..=MAX_SIZE)
+    }
+
+    /// The pairs that turn with time, height and width, if they are interleaved as released.
+    fn mrope_section(&mut self, scaling: &Object) -> Option<[usize; 3]> {
+        let is_known = scaling.get("mrope_interleaved") == Some(&Value::Bool(true))
+            && scaling
+                .get("rope_type")
+                .is_none_or(|kind| *kind == Value::from("default"));
+        let section = scaling.get("mrope_section").and_then(Value::as_array);
+        let section: Option<Vec<usize>> = section.and_then(|section| {
+            let size = |value: &Value| value.as_u64().filter(|size| *size <= MAX_SIZE);
+            section
+                .iter()
+                .map(|value| size(value).map(|size| size as usize))
+                .collect()
+        });
+        match section.as_deref() {
+            Some(&[time, height, width]) if is_known => return Some([time, height, width]),
+            _ => self.problems.push(format!(
+                "text_config.rope_scaling is {}, expected interleaved mrope with a mrope_section of three numbers",
+                Value::Object(scaling.clone())
+            )),
+        }
+        None
+    }
+
+    /// The value of a key: as it is given, or else as it was released.
+    fn value(&self, section: Section, key: &str) -> Option<Value> {
+        let sizes = &self.given.sizes;
+        let of = |object: &Object| object.get(section.key()).and_then(|part| part.get(key)).cloned();
+        let beside = match section {
+            Section::Eagle | Section::Tokens => sizes.get(key).cloned(),
+            Section::Vision | Section::Text => None,
+        };
+        of(sizes).or(beside).or_else(|| of(&self.released))
+    }
+
+    /// A key that may be absent, but if present must have a value that the released code was run with.
+    fn expect(&mut self, section: Section, key: &str, expected: &[Value]) {
+        if let Some(value) = self.value(section, key)
+            && !expected.contains(&value)
+        {
+            let expected = expected.iter().map(Value::to_string).collect::<Vec<_>>();
+            self.problems.push(format!(
+                "{}.{key} is {value}, expected {}",
+                section.key(),
+                expected.join(" or ")
+            ));
+        }
+    }
+
+    fn size(&mut self, section: Section, key: &str) -> usize {
+        self.within(section, key, 1..=MAX_SIZE)
+    }
+
+    fn within(&mut self, section: Section, key: &str, sizes: RangeInclusive<u64>) -> usize {
+        let value = self.value(section, key);
+        self.whole(&format!("{}.{key}", section.key()), value.as_ref(), sizes)
+    }
+
+    fn whole(&mut self, path: &str, value: Option<&Value>, sizes: RangeInclusive<u64>) -> usize {
+        let problem = match value {
+            None => format!("{path} is missing"),
+            Some(value) => match value.as_u64() {
+                Some(size) if sizes.contains(&size) => return size as usize,
+                _ => format!(
+                    "{path} is {value}, expected a whole number from {} to {}",
+                    sizes.start(),
+                    sizes.end()
+                ),
+            },
+        };
+        self.problems.push(problem);
+        1
+    }
+
+    fn sizes(&mut self, section: Section, key: &str) -> Vec<usize> {
+        let value = self.value(section, key);
+        let sizes: Option<Vec<usize>> = value.as_ref().and_then(Value::as_array).and_then(|sizes| {
+            let size = |value: &Value| value.as_u64().filter(|size| *size <= MAX_SIZE);
+            sizes
+                .iter()
+                .map(|value| size(value).map(|size| size as usize))
+                .collect()
+        });
+        sizes.unwrap_or_else(|| {
+            self.problems.push(format!(
+                "{}.{key}: expected a list of whole numbers",
+                section.key()
+            ));
+            Vec::new()
+        })
+    }
+
+    /// A positive number.
+    fn number(&mut self, section: Section, key: &str) -> f64 {
+        let value = self.value(section, key);
+        match value.as_ref().and_then(Value::as_f64) {
+            Some(number) if number > 0.0 && number.is_finite() => number,
+            _ => {
+                let shown = value.map_or("missing".to_owned(), |value| value.to_string());
+                self.problems.push(format!(
+                    "{}.{key} is {shown}, expected a positive number",
+                    section.key()
+                ));
+                1.0
+            }
+        }
+    }
+
+    fn flag(&mut self, section: Section, key: &str) -> bool {
+        match self.value(section, key) {
+            Some(Value::Bool(flag)) => flag,
+            other => {
+                let shown = other.map_or("missing".to_owned(), |value| value.to_string());
+                self.problems.push(format!(
+                    "{}.{key} is {shown}, expected true or false",
+                    section.key()
+                ));
+                false
+            }
+        }
+    }
+}

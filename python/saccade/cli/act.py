@@ -1,0 +1,266 @@
+"""`saccade act`: runs a whole checkpoint on pictures and an instruction, and prints the actions."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from saccade import _arguments as arguments
+from saccade._arguments import UsageError
+from saccade.cli import EXIT_OK, _output, require
+from saccade.cli._tables import Section, show
+
+if TYPE_CHECKING:
+    from saccade import Policy
+    from saccade._arrays import Float32Array
+
+HELP = "run a whole checkpoint on pictures and an instruction"
+EPILOG = """\
+Prints a chunk of actions in the robot's units, and how long each part took. The checkpoint must hold the
+backbone and the head. `saccade inspect` lists its robots, cameras and states.
+
+Without --image the frames are random, without --state the state is in the middle of the robot's range.
+
+examples:
+  saccade act GR00T-N1.5-3B/ --embodiment gr1 --image ego_view=table.png --instruction "pick up the pear"
+  saccade act my-policy/ --image front=a.png wrist=b.png --instruction "open the drawer" --state state.json
+  saccade act my-policy/ --precision int8 --head-precision bfloat16 --seed 7 --json
+state.json holds numbers by key, {"single_arm": [0, 0.1, 0, 0, 0], "gripper": [1]}, or one list of all.
+"""
+
+#: The parts that are timed, in order, and what each does.
+PARTS = {
+    "load": "checkpoint, tokenizer, statistics",
+    "frames": "reading the pictures",
+    "processor": "resizing frames, making tokens",
+    "backbone": "vision tower and language model",
+    "encode": "the head's keys and values",
+    "sample": "denoising the actions",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = EPILOG
+    arguments.add_checkpoint_argument(parser)
+    seen = parser.add_argument_group("what the robot sees, is told and feels")
+    seen.add_argument(
+        "--image",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="[CAMERA=]FILE",
+        help="picture of each camera; the name may be left out if there is one camera",
+    )
+    seen.add_argument("--instruction", metavar="TEXT", help="what to do")
+    seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
+    seen.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
+    parser.add_argument(
+        "--precision",
+        choices=arguments.PRECISIONS,
+        default="float32",
+        help="default: float32, which is exact",
+    )
+    parser.add_argument(
+        "--head-precision", choices=arguments.PRECISIONS, help="of the head (default: as --precision)"
+    )
+    parser.add_argument(
+        "--preprocessing",
+        choices=("lerobot", "isaac"),
+        help="the way in which frames and words are prepared (default: by version and layout)",
+    )
+    parser.add_argument(
+        "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
+    )
+    arguments.add_seed(parser, "seed of the noise")
+    arguments.add_num_steps(parser)
+    arguments.add_num_threads(parser, "threads (default: the physical cores)")
+    arguments.add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Loads, looks, acts and prints."""
+    require("act")
+    import saccade
+
+    pictures = named_pictures(args.image)
+    state = None if args.state is None else read_state(args.state)
+    clock = Clock()
+    with _output.progress_bar("loading", transient=True):
+        policy = saccade.Policy.load(
+            args.checkpoint,
+            embodiment=embodiment(args.embodiment),
+            preprocessing=args.preprocessing,
+            tokenizer=args.tokenizer,
+            precision={"backbone": args.precision, "head": args.head_precision or args.precision},
+            num_threads=args.num_threads,
+        )
+    clock.done("load")
+    given = observation(policy, pictures, args.instruction, state)
+    clock.done("frames")
+    inputs = policy.inputs(given)
+    clock.done("processor")
+    features = policy.features(inputs)
+    clock.done("backbone")
+    context = policy.context(features)
+    clock.done("encode")
+    actions = policy.sample(context, given, seed=args.seed, num_steps=args.num_steps)
+    clock.done("sample")
+    if args.json:
+        _output.print_json(report(args, policy, inputs[0].input_ids.shape[1], actions, clock))
+        return EXIT_OK
+    assumed = [
+        *(["random frames"] if not pictures else []),
+        *(["a state in the middle of the robot's range"] if state is None else []),
+        *([f'the instruction "{instruction_of(given)}"'] if args.instruction is None else []),
+    ]
+    if assumed:
+        _output.note("act", f"for want of arguments: {', '.join(assumed)}")
+    show([chunk(policy, actions), times(clock)])
+    return EXIT_OK
+
+
+class Clock:
+    """Milliseconds of each part, measured from the end of the part before."""
+
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def done(self, part: str) -> None:
+        """Ends a part of `PARTS`."""
+        now = time.perf_counter()
+        self.milliseconds[part] = 1e3 * (now - self._last)
+        self._last = now
+
+
+def embodiment(given: str | None) -> str | int | None:
+    """A tag, or an id if it is a number."""
+    return int(given) if given is not None and given.isdecimal() else given
+
+
+def named_pictures(given: list[str]) -> dict[str, Path]:
+    """Files by camera; the name is empty if it was left out.
+
+    Raises:
+        UsageError: A camera occurs twice, or one of several has no name.
+    """
+    found: dict[str, Path] = {}
+    for word in given:
+        name, separator, file = word.partition("=")
+        # A file may have an equals sign in its name.
+        if not separator or Path(word).is_file():
+            name, file = "", word
+        if name in found or (found and "" in (name, *found)):
+            raise UsageError(f"--image: expected CAMERA=FILE, each camera once, got {' '.join(given)}")
+        found[name] = Path(file)
+    return found
+
+
+def read_state(path: Path) -> Any:
+    """The state in a JSON file: numbers by key, or one list.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        UsageError: It contains something else.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path}: cannot be read as JSON: {error}") from None
+    rows = list(values.values()) if isinstance(values, dict) else [values]
+    if not rows or not all(is_numbers(row) for row in rows):
+        raise UsageError(f"{path}: expected lists of numbers by key, or one list of numbers")
+    return values
+
+
+def is_numbers(row: Any) -> bool:
+    """Whether a value of JSON is a list of numbers."""
+    return isinstance(row, list) and all(
+        isinstance(value, (int, float)) and not isinstance(value, bool) for value in row
+    )
+
+
+def observation(
+    policy: Policy, pictures: Mapping[str, Path], instruction: str | None, state: Any
+) -> dict[str, Any]:
+    """An observation in Isaac-GR00T's nested form, with a batch of one.
+
+    Raises:
+        FileNotFoundError, UsageError: A picture cannot be read, or a list of the state is too short or long.
+    """
+    from saccade.cli._pictures import read_picture
+
+    given = policy.example_observation()
+    if pictures:
+        cameras = policy.requirements.cameras
+        only = cameras[0].name if cameras is not None and len(cameras) == 1 else next(iter(given["video"]))
+        horizon = policy.requirements.video_horizon or 1
+        given["video"] = {
+            name or only: np.repeat(read_picture(path)[None, None], horizon, axis=1)
+            for name, path in pictures.items()
+        }
+    if isinstance(state, list):
+        width = policy.requirements.state_width
+        if len(state) != width:
+            keys = ", ".join(f"{key} ({size})" for key, size in policy.requirements.state)
+            raise UsageError(f"--state: expected {width} numbers ({keys}), got {len(state)}")
+        state = {key: state[where] for key, where in policy.normalizer.state_slices.items()}
+    if state is not None:
+        history = policy.requirements.state_history
+        given["state"] = {
+            key: np.tile(np.asarray(values, np.float32), (1, history, 1)) for key, values in state.items()
+        }
+    if instruction is not None:
+        given["language"] = {key: [[instruction]] for key in given["language"]}
+    return given
+
+
+def instruction_of(given: Mapping[str, Any]) -> str:
+    """The instruction of an observation of `observation`."""
+    return str(next(iter(given["language"].values()))[0][0])
+
+
+def chunk(policy: Policy, actions: Mapping[str, Float32Array]) -> Section:
+    """The chunk: a row for each step, a column for each number."""
+    columns = [">step"]
+    for key, part in actions.items():
+        columns += [f">{key}" if number == 0 else ">" for number in range(part.shape[-1])]
+    joined = np.concatenate([part[0] for part in actions.values()], axis=-1)
+    rows = [[str(step), *(f"{value:.4f}" for value in row)] for step, row in enumerate(joined)]
+    robot = policy.normalizer.embodiment or policy.embodiment_id
+    return Section(f"Actions of {robot}, in its units", columns, rows)
+
+
+def times(clock: Clock) -> Section:
+    """How long each part took."""
+    spent = clock.milliseconds
+    rows = [[part, f"{spent[part]:,.1f}", what] for part, what in PARTS.items()]
+    looking = sum(spent.values()) - spent["load"]
+    rows.append(["all but load", f"{looking:,.1f}", "the first call; later ones need not allocate memory"])
+    return Section("Time", ["", ">ms", ""], rows)
+
+
+def report(
+    args: argparse.Namespace,
+    policy: Policy,
+    num_tokens: int,
+    actions: Mapping[str, Float32Array],
+    clock: Clock,
+) -> dict[str, Any]:
+    """Everything as values for JSON."""
+    return {
+        "checkpoint": str(args.checkpoint),
+        "embodiment": policy.normalizer.embodiment,
+        "embodiment_id": policy.embodiment_id,
+        "precision": {"backbone": args.precision, "head": args.head_precision or args.precision},
+        "num_vl_tokens": num_tokens,
+        "actions": {key: part[0].tolist() for key, part in actions.items()},
+        "milliseconds": clock.milliseconds,
+    }

@@ -1,0 +1,24 @@
+"""The forms of observations and answers: Isaac-GR00T's two, and lerobot's.
+
+`dialects.read` tells the form of an observation by its keys, checks it against what the robot needs
+(`requirements`, read from the checkpoint by `sources`), and returns a `Reading`, which is the same for all
+forms. `isaac_nested`, `isaac_flat` and `lerobot` have one form each; `checks` has what they share.
+"""
+
+from saccade.dialects.dialects import DIALECTS, read, read_state
+from saccade.dialects.reading import Dialect, Reading, StateReading
+from saccade.dialects.requirements import Camera, Requirements
+from saccade.dialects.sources import CameraSources, camera_sources
+
+__all__ = [
+    "DIALECTS",
+    "Camera",
+    "CameraSources",
+    "Dialect",
+    "Reading",
+    "Requirements",
+    "StateReading",
+    "camera_sources",
+    "read",
+    "read_state",
+]

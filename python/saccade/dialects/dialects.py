@@ -1,0 +1,46 @@
+"""The table of forms, and how the form of an observation is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from saccade.dialects.isaac_flat import IsaacFlat
+from saccade.dialects.isaac_nested import IsaacNested
+from saccade.dialects.lerobot import Lerobot
+from saccade.dialects.reading import Dialect, Reading, StateReading
+from saccade.dialects.requirements import Requirements
+
+#: All forms, in the order in which they are tried.
+DIALECTS: tuple[Dialect, ...] = (Lerobot(), IsaacFlat(), IsaacNested())
+
+
+def read(observation: Mapping[str, Any], needs: Requirements) -> Reading:
+    """Reads an observation of any form.
+
+    Raises:
+        InputError, ShapeError, DtypeError: It has no known form, or does not fit. The message lists what the
+            robot needs.
+    """
+    return _dialect(observation, needs).read(observation, needs)
+
+
+def read_state(observation: Mapping[str, Any], needs: Requirements) -> StateReading:
+    """Reads the state of an observation of any form; raises as `read`."""
+    return _dialect(observation, needs).read_state(observation, needs)
+
+
+def _dialect(observation: Mapping[str, Any], needs: Requirements) -> Dialect:
+    if not isinstance(observation, Mapping):
+        raise needs.input_error("observation", "a mapping", type(observation).__name__)
+    if not all(isinstance(key, str) for key in observation):
+        raise needs.input_error("observation", "strings as keys", repr(list(observation)))
+    for dialect in DIALECTS:
+        if dialect.matches(observation):
+            return dialect
+    raise needs.input_error(
+        "observation",
+        "the keys of Isaac-GR00T (video, state, language, or video.*, state.*, annotation.*) or of lerobot "
+        "(observation.images.*, observation.state, task)",
+        ", ".join(observation) or "none",
+    )

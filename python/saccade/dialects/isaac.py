@@ -1,0 +1,133 @@
+"""What Isaac-GR00T's two forms share: frames and states with a time axis, and rows of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from saccade._arrays import Float32Array, UInt8Array
+from saccade.dialects.checks import as_text, check_batch, check_cameras, check_frames, check_state, views
+from saccade.dialects.requirements import Requirements
+
+#: The instruction that Isaac-GR00T N1.5 uses if an observation has none.
+DEFAULT_INSTRUCTION = "Perform the default behavior."
+
+
+def read_frames(
+    prefix: str, given: Mapping[str, Any], is_batched: bool, needs: Requirements
+) -> tuple[dict[str, UInt8Array], ...]:
+    """The views of each observation.
+
+    Args:
+        prefix: What the keys begin with, for messages.
+        given: Frames by camera, ``(batch, time, height, width, 3)``, or without batch.
+        is_batched: Whether there is a batch axis.
+        needs: What the robot needs.
+    """
+    cameras = check_cameras(prefix, given, needs, sort=False)
+    frames = {}
+    for camera in cameras:
+        name = f"{prefix}{camera.name}"
+        found = check_frames(name, given[camera.name], 5 if is_batched else 4, camera, needs)
+        frames[camera.name] = found if is_batched else found[None]
+    horizons = {name: found.shape[1] for name, found in frames.items()}
+    expected = needs.video_horizon
+    if len(set(horizons.values())) != 1 or expected not in (None, *horizons.values()):
+        listed = ", ".join(f"{name} {horizon}" for name, horizon in horizons.items())
+        wanted = "as many of every camera" if expected is None else expected
+        raise needs.shape_error(f"{prefix}*: frames along the time axis", str(wanted), listed)
+    check_batch({f"{prefix}{name}": len(found) for name, found in frames.items()}, needs)
+    return views(cameras, frames)
+
+
+def is_batched(prefix: str, state: Mapping[str, Any], needs: Requirements) -> bool:
+    """Whether the state has a batch axis, as Isaac-GR00T decides it: ``(batch, time, width)``."""
+    axes = {getattr(value, "ndim", np.ndim(value)) for value in state.values()}
+    if len(axes) != 1 or not axes <= {2, 3}:
+        shapes = ", ".join(f"{key} {np.shape(value)}" for key, value in state.items())
+        raise needs.shape_error(
+            f"{prefix}*", "(batch, time, width) everywhere, or (time, width) everywhere", shapes or "none"
+        )
+    return axes == {3}
+
+
+def read_state(prefix: str, given: Mapping[str, Any], needs: Requirements) -> tuple[Float32Array, bool]:
+    """The state ``(batch, state_history, state_width)``, and whether it had a batch axis.
+
+    Args:
+        prefix: What the keys begin with, for messages.
+        given: Parts of the state by key, ``(batch, time, width)``, or without batch. Parts that the robot
+            does not need are ignored, as in Isaac-GR00T.
+        needs: What the robot needs.
+    """
+    missing = [key for key, _ in needs.state if key not in given]
+    if missing:
+        raise needs.input_error(f"{prefix}*", f"{', '.join(missing)} too", ", ".join(given) or "none")
+    chosen = {key: given[key] for key, _ in needs.state}
+    batched = is_batched(prefix, chosen, needs)
+    parts = {}
+    for key, width in needs.state:
+        part = check_state(f"{prefix}{key}", chosen[key], 3 if batched else 2, width, needs)
+        parts[key] = part if batched else part[None]
+        if parts[key].shape[1] != needs.state_history:
+            raise needs.shape_error(
+                f"{prefix}{key}", f"{needs.state_history} along the time axis", f"shape {part.shape}"
+            )
+    check_batch({f"{prefix}{key}": len(part) for key, part in parts.items()}, needs)
+    return np.concatenate(list(parts.values()), axis=-1), batched
+
+
+def read_texts(name: str, given: Any, is_batched: bool, needs: Requirements) -> tuple[tuple[str, ...], bool]:
+    """The instruction of each observation, and whether all were given as plain strings in a batch.
+
+    Args:
+        name: The key, for messages.
+        given: With a batch, a string or a list of one string for each row. Otherwise a string or a list of
+            one string. Lists may be tuples or arrays.
+        is_batched: Whether the observation has a batch axis.
+        needs: What the robot needs.
+    """
+    rows = _listed(given) if is_batched else [given]
+    if not isinstance(rows, list):
+        raise needs.input_error(name, "one instruction for each row of the batch", repr(given))
+    found, plain = [], []
+    for row in rows:
+        text = _listed(row)
+        plain.append(not isinstance(text, list))
+        if isinstance(text, list):
+            if len(text) != 1:
+                raise needs.input_error(name, "one instruction for each observation", repr(row))
+            text = text[0]
+        found.append(as_text(name, text, needs))
+    if len(set(plain)) > 1:
+        raise needs.input_error(name, "strings only, or lists of one string only", repr(given))
+    return tuple(found), is_batched and all(plain)
+
+
+def _listed(value: Any) -> Any:
+    """Lists, tuples and arrays as a list; anything else unchanged."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, (list, tuple)) else value
+
+
+def answer(parts: Mapping[str, Float32Array], prefix: str, is_batched: bool) -> dict[str, Float32Array]:
+    """Actions by key, without the batch axis if the observation had none."""
+    return {f"{prefix}{key}": part if is_batched else part[0] for key, part in parts.items()}
+
+
+def joined(answer: Any, prefix: str, keys: tuple[str, ...], needs: str) -> Any:
+    """The inverse of `answer`: one array. Anything but a mapping is returned unchanged."""
+    from saccade._arrays import float32
+    from saccade.errors import InputError
+
+    if not isinstance(answer, Mapping):
+        return answer
+    missing = [prefix + key for key in keys if prefix + key not in answer]
+    if missing:
+        raise InputError(
+            f"{needs}: expected actions {', '.join(prefix + key for key in keys)}, got {', '.join(answer)}"
+        )
+    return np.concatenate([float32(needs, answer[prefix + key]) for key in keys], axis=-1)

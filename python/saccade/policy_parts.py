@@ -1,0 +1,111 @@
+"""What a policy uses of its parts: the head, the backbone and the processor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade._arrays import Array, ArrayLike, Float32Array, UInt8Array, integer
+from saccade.backbone_inputs import BackboneInputs
+from saccade.config import HeadConfig
+from saccade.context import Context
+from saccade.errors import InputError
+from saccade.options import SampleOptions
+from saccade.robots import Normalizer
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class Head(Protocol):
+    """What a policy uses of its head, which is a :class:`saccade.ActionHead`."""
+
+    @property
+    def config(self) -> HeadConfig:
+        """Sizes and switches."""
+
+    @property
+    def source(self) -> str | None:
+        """Path of the checkpoint, or None."""
+
+    @property
+    def embodiment_ids(self) -> tuple[int, ...]:
+        """The loaded embodiments."""
+
+    def encode(
+        self,
+        backbone_features: ArrayLike,
+        *,
+        attention_mask: ArrayLike | None = None,
+        image_mask: ArrayLike | None = None,
+        drop_vl: ArrayLike | None = None,
+    ) -> Context:
+        """See :meth:`saccade.ActionHead.encode`."""
+
+    def sample(
+        self,
+        context: Context,
+        state: ArrayLike,
+        embodiment_id: int | ArrayLike,
+        **options: Unpack[SampleOptions],
+    ) -> Array:
+        """See :meth:`saccade.ActionHead.sample`."""
+
+
+class Features(Protocol):
+    """What a policy uses of a backbone's features, which are a :class:`saccade.BackboneFeatures`."""
+
+    @property
+    def backbone_features(self) -> Float32Array:
+        """``(batch, T, width)``."""
+
+    @property
+    def image_mask(self) -> npt.NDArray[np.bool_]:
+        """``(batch, T)``."""
+
+
+class Backbone(Protocol):
+    """What a policy uses of its backbone, which is a :class:`saccade.Backbone`."""
+
+    def ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] | None = None
+    ) -> Sequence[Features]:
+        """The features of observations of any lengths, each with the bits that it has alone."""
+
+
+class Processor(Protocol):
+    """What a policy uses of its processor, which is a :class:`saccade.Processor`."""
+
+    def __call__(self, frames: Mapping[str, UInt8Array], instruction: str) -> BackboneInputs:
+        """See :class:`saccade.Processor`."""
+
+
+def embodiment_of(head: Head, normalizer: Normalizer, embodiment: str | int | None) -> int:
+    """The head's embodiment: from the statistics, else as requested, else the only one that is loaded."""
+    chosen = requested_id(normalizer, embodiment)
+    if chosen is None and len(head.embodiment_ids) == 1:
+        chosen = head.embodiment_ids[0]
+    if chosen not in head.embodiment_ids:
+        listed = ", ".join(map(str, head.embodiment_ids))
+        raise InputError(
+            f"embodiment: expected the id of one of the head's embodiments ({listed}), got {chosen}"
+        )
+    return chosen
+
+
+def requested_id(normalizer: Normalizer, embodiment: str | int | None) -> int | None:
+    """The embodiment's id: from the statistics, else as requested, or None.
+
+    Raises:
+        InputError: The two differ.
+    """
+    chosen = normalizer.embodiment_id
+    if embodiment is None or isinstance(embodiment, str):
+        return chosen
+    asked = integer("embodiment", embodiment, least=0)
+    if chosen is not None and asked != chosen:
+        raise InputError(f"embodiment: expected that of the normalizer, {chosen}, got {asked}")
+    return asked
