@@ -20,13 +20,16 @@ IMAGE, TOKENS = 300, 4
 
 
 class StandInProcessor:
-    """A token for each byte of the instruction, and a few for each view. Remembers the instructions."""
+    """A token for each byte of the instruction, and a few for each view. Remembers what it was told."""
 
     def __init__(self) -> None:
-        self.seen: list[str] = []
+        self.seen: list[tuple[str | None, bool]] = []
 
-    def __call__(self, frames: Sequence[NDArray[np.uint8]], instruction: str) -> BackboneInputs:
-        self.seen.append(instruction)
+    def __call__(
+        self, frames: Sequence[NDArray[np.uint8]], instruction: str | None, *, plain_text: bool = False
+    ) -> BackboneInputs:
+        self.seen.append((instruction, plain_text))
+        instruction = instruction or "default"
         pixels = np.stack([np.resize(view, (3, 4, 4)) / np.float32(255) for view in frames])
         ids = np.concatenate([np.full(TOKENS * len(frames), IMAGE), list(instruction.encode())])
         return BackboneInputs(pixels.astype(np.float32), ids[None])

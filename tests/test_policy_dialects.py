@@ -15,8 +15,6 @@ from policy_cases import StandInProcessor, policy
 import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
 from saccade.dialects import CameraSources
-from saccade.dialects.isaac import DEFAULT_INSTRUCTION as ISAAC_DEFAULT
-from saccade.dialects.lerobot import DEFAULT_INSTRUCTION as LEROBOT_DEFAULT
 
 Observation = dict[str, Any]
 
@@ -158,19 +156,19 @@ def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() 
     processor = made.processor
     assert isinstance(processor, StandInProcessor)
     for task, expected in (
-        (["a", ""], ["a", LEROBOT_DEFAULT]),
+        (["a", ""], ["a", None]),
         ("a", ["a", "a"]),
-        (None, [LEROBOT_DEFAULT] * 2),
+        (None, [None, None]),
     ):
         processor.seen.clear()
         made.act(given | {"task": task}, seed=0)
-        assert processor.seen == expected
+        assert processor.seen == [(text, False) for text in expected]
     # Sorted by name, whatever the order of the observation.
     assert made.inputs(given)[0].view_names == ("front", "wrist")
     isaac = policy("isaac")
     observation = flat(nested(isaac))
     del observation["annotation.human.action.task_description"]
-    assert isaac._read(observation)[1][0].instructions == (ISAAC_DEFAULT,)
+    assert isaac._read(observation)[1][0].instructions == (None,)
     observation["task"] = ["go"]
     assert isaac._read(observation)[1][0].instructions == ("go",)
 

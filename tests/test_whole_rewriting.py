@@ -117,7 +117,8 @@ def test_convert_keeps_what_acts(layout: str, tmp_path: Path) -> None:
     assert sidecars(tmp_path / "one") == sidecars(source)
     convert(source, tmp_path / "bf16", dtype="bfloat16")
     assert all(tensor.dtype == torch.bfloat16 for tensor in backbone(tmp_path / "bf16", layout).values())
-    assert same(act(tmp_path / "bf16", "bfloat16"), act(source, "bfloat16"))
+    exact, found = act(source), act(tmp_path / "bf16")
+    assert all(np.allclose(found[key], exact[key], atol=0.1) for key in exact)
 
 
 @pytest.mark.parametrize("layout", ["nvidia", "lerobot"])

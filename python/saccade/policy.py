@@ -362,7 +362,7 @@ class Policy:
         for reading in readings:
             for frames, instruction in zip(reading.frames, reading.instructions, strict=True):
                 # Without their names, by which lerobot's processor would sort them: they are in order.
-                inputs = processor(list(frames.values()), instruction)
+                inputs = processor(list(frames.values()), instruction, plain_text=reading.is_plain)
                 inputs.view_names = tuple(frames)
                 found.append(inputs)
         return found

@@ -79,7 +79,9 @@ class Backbone(Protocol):
 class Processor(Protocol):
     """What a policy uses of its processor, which is a :class:`saccade.Processor`."""
 
-    def __call__(self, frames: Sequence[UInt8Array], instruction: str) -> BackboneInputs:
+    def __call__(
+        self, frames: Sequence[UInt8Array], instruction: str | None, *, plain_text: bool = False
+    ) -> BackboneInputs:
         """See :class:`saccade.Processor`."""
 
 
