@@ -174,6 +174,16 @@ class Backbone:
         image_tokens: bool,
     ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
 
+@final
+class PublishedBackbone:
+    @staticmethod
+    def open(source: str, config: str | None) -> PublishedBackbone: ...
+    def config(self) -> dict[str, Any]: ...
+    @property
+    def prefix(self) -> str: ...
+    def nbytes(self, precision: str) -> int: ...
+
+@final
 class Processor:
     def __new__(
         cls,

@@ -24,7 +24,7 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::backbone::{Backbone, BackboneFeatures};
+    use crate::backbone::{Backbone, BackboneFeatures, PublishedBackbone};
     #[pymodule_export]
     use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]

@@ -30,7 +30,7 @@ mod workspaces;
 pub use array::{Array, ArrayMut, OwnedArray};
 pub use backbone::{
     Backbone, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep, BackboneLoadOptions,
-    BackboneRecord, LanguageConfig, VisionConfig,
+    BackboneRecord, LanguageConfig, PublishedBackbone, VisionConfig,
 };
 pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};

@@ -1,5 +1,6 @@
 //! The vision-language backbone: camera views and words in, features for the action head out.
 
+mod agreement;
 pub(crate) mod config;
 mod connector;
 mod encode;
@@ -12,6 +13,7 @@ mod model;
 mod plan;
 mod positions;
 mod prefix;
+mod published;
 mod qwen3;
 mod qwen3_vl;
 mod recognise;
@@ -26,3 +28,4 @@ pub use features::{BackboneFeatures, BackboneRecord};
 pub use inputs::BackboneInputs;
 pub use load::BackboneLoadOptions;
 pub use model::Backbone;
+pub use published::PublishedBackbone;
