@@ -92,7 +92,9 @@ def _features(folder: Path, run: str, views: int) -> Any:
     inputs = setup.inputs_of(sizes, views)
     engine, precision = run.split("-")
     if engine == "saccade":
-        return np.asarray(setup.saccade_backbone(folder, precision)(inputs).backbone_features)
+        import saccade
+
+        return np.asarray(saccade.Backbone.load(folder, precision=precision)(inputs).backbone_features)
     import torch
 
     dtype = getattr(torch, precision)

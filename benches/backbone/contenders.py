@@ -58,7 +58,9 @@ def works_of(task: Task) -> dict[str, Call]:
     engine, precision = task.name.split("-")
     inputs = {views: setup.inputs_of(setup.sizes_of(task.checkpoint), views) for views in task.views}
     if engine == "saccade":
-        backbone = setup.saccade_backbone(task.checkpoint, precision, task.threads)
+        import saccade
+
+        backbone = saccade.Backbone.load(task.checkpoint, precision=precision, num_threads=task.threads)
 
         def ours(views: int) -> Call:
             return lambda: np.asarray(backbone(inputs[views]).backbone_features)

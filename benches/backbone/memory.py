@@ -40,14 +40,15 @@ def measure(folder: Path, what: str, precision: str, threads: int) -> dict[str, 
 
 
 def _load(folder: Path, what: str, precision: str, threads: int) -> dict[str, Any]:
+    import saccade
     from benches.backbone import setup
 
     before = peak_memory()
     start = time.perf_counter()
     if what == "backbone":
-        loaded: Any = setup.saccade_backbone(folder, precision, threads)
+        loaded: Any = saccade.Backbone.load(folder, precision=precision, num_threads=threads)
     else:
-        loaded = setup.saccade_policy(folder, precision, threads)
+        loaded = saccade.Policy.load(folder, precision=precision, num_threads=threads)
     seconds = time.perf_counter() - start
     found: dict[str, Any] = {"before": before, "loaded": peak_memory(), "load": seconds}
     found["nbytes"] = getattr(loaded, "nbytes", None)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-import saccade
 from saccade import BackboneInputs
 from saccade._arrays import Float32Array
 from saccade.checkpoints import random_checkpoint
@@ -45,18 +44,6 @@ def checkpoint(args: Any) -> Path:
             head=random_checkpoint.small_head("n1.5") if args.small else None,
         )
     return folder
-
-
-def saccade_backbone(folder: Path, precision: str, threads: int | None = None) -> Any:
-    """`saccade.Backbone` of a checkpoint."""
-    package: Any = saccade
-    return package.Backbone.load(folder, precision=precision, num_threads=threads)
-
-
-def saccade_policy(folder: Path, precision: str, threads: int | None = None) -> Any:
-    """`saccade.Policy` of a checkpoint with one robot."""
-    package: Any = saccade
-    return package.Policy.load(folder, precision=precision, num_threads=threads)
 
 
 def sizes_of(folder: Path) -> BackboneSizes:
