@@ -71,10 +71,12 @@ def policy(layout: str, cameras: CameraSources | None = None) -> Policy:
     """A policy with the head, the statistics and the cameras of a whole checkpoint, and stand-ins."""
     folder = whole_checkpoints.whole(layout)
     found = camera_sources(folder, whole_checkpoints.EMBODIMENT) if cameras is None else cameras
+    backbone: Any = StandInBackbone(head(layout).config.context_dim)
+    processor: Any = StandInProcessor()
     return Policy(
         head(layout),
         embodiment=whole_checkpoints.EMBODIMENT,
-        backbone=StandInBackbone(head(layout).config.context_dim),
-        processor=StandInProcessor(),
+        backbone=backbone,
+        processor=processor,
         cameras=found,
     )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import whole_checkpoints
-from policy_cases import StandInProcessor, policy
+from policy_cases import policy
 
 import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
@@ -153,8 +153,7 @@ def test_one_string_a_row_of_a_batch_is_plain() -> None:
 def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() -> None:
     made = policy("lerobot")
     given = lerobot(nested(made, batch=2))
-    processor = made.processor
-    assert isinstance(processor, StandInProcessor)
+    processor: Any = made.processor
     for task, expected in (
         (["a", ""], ["a", None]),
         ("a", ["a", "a"]),

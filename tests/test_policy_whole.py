@@ -25,7 +25,7 @@ Observation = dict[str, Any]
 
 
 @functools.cache
-def load(layout: str) -> Policy:
+def load(layout: str) -> Any:
     return Policy.load(whole(layout), embodiment=EMBODIMENT)
 
 
@@ -140,7 +140,7 @@ def test_one_string_a_row_of_a_batch_is_rendered_plainly() -> None:
 
 @pytest.mark.parametrize("precision", ["bfloat16", {"backbone": "int8", "head": "bfloat16"}])
 def test_parts_may_differ_in_precision(precision: Any) -> None:
-    policy = Policy.load(whole("n17"), embodiment=EMBODIMENT, precision=precision, num_threads=1)
+    policy: Any = Policy.load(whole("n17"), embodiment=EMBODIMENT, precision=precision, num_threads=1)
     both = precision if isinstance(precision, dict) else dict.fromkeys(("backbone", "head"), precision)
     assert {"backbone": policy.backbone.precision, "head": policy.head.precision} == both
     assert policy.backbone.num_threads == policy.head.num_threads == 1
@@ -151,7 +151,7 @@ def test_parts_may_differ_in_precision(precision: Any) -> None:
 
 def test_the_data_config_of_a_fine_tune_may_differ_from_its_metadata() -> None:
     default = load("isaac")
-    policy = Policy.load(whole("isaac"), cameras=["front"])
+    policy: Any = Policy.load(whole("isaac"), cameras=["front"])
     assert [camera.name for camera in policy.requirements.cameras] == ["front"]
     observation = told(policy, "push")
     assert list(observation["video"]) == ["front"]
@@ -209,7 +209,7 @@ def test_what_cannot_be_loaded_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="precision"):
         Policy.load(whole("isaac"), precision={"head": "int8", "backbone": "int2"})
     with pytest.raises(InputError, match="preprocessing"):
-        Policy.load(whole("isaac"), preprocessing="mine")
+        Policy.load(whole("isaac"), preprocessing="mine")  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match="missing"):
         Policy.load(whole("isaac"), tokenizer=tmp_path / "missing.json")
     bare = whole_checkpoints.write(tmp_path / "bare", "isaac", tokenizer=False)
@@ -230,7 +230,7 @@ def test_a_policy_needs_numpy_only(tmp_path: Path) -> None:
         "import sys\n"
         "class Finder:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in ('torch', 'transformers', 'tokenizers', 'PIL', 'rich', 'safetensors'):\n"
+        "        if name.split('.')[0] in {'torch', 'transformers', 'tokenizers', 'PIL', 'safetensors'}:\n"
         "            raise ModuleNotFoundError(name)\n"
         "sys.meta_path.insert(0, Finder())\n"
         "import saccade\n"

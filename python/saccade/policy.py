@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from saccade._arrays import Array, ArrayLike, Float32Array, integer
+from saccade.backbone import Backbone
+from saccade.backbone_features import BackboneFeatures
 from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.context import Context
@@ -19,7 +21,8 @@ from saccade.errors import InputError
 from saccade.options import PolicyOptions, SampleOptions
 from saccade.policy_context import PolicyContext, encoded
 from saccade.policy_example import example_observation
-from saccade.policy_parts import Backbone, Features, Head, Processor, embodiment_of
+from saccade.policy_head import Head, embodiment_of
+from saccade.processor import Preprocessing, Processor
 from saccade.robots import Normalizer, padded
 
 if TYPE_CHECKING:
@@ -126,7 +129,7 @@ class Policy:
         source: str | os.PathLike[str],
         *,
         embodiment: str | int | None = None,
-        preprocessing: str | None = None,
+        preprocessing: Preprocessing | None = None,
         tokenizer: str | os.PathLike[str] | None = None,
         precision: str | Mapping[str, str] = "float32",
         num_threads: int | None = None,
@@ -252,7 +255,7 @@ class Policy:
 
     def features(
         self, inputs: Sequence[BackboneInputs], *, previous: PolicyContext | None = None
-    ) -> tuple[Features, ...]:
+    ) -> tuple[BackboneFeatures, ...]:
         """The backbone's features for each of its inputs.
 
         Args:
@@ -267,7 +270,7 @@ class Policy:
             raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
         return tuple(backbone._ragged(inputs, previous=() if previous is None else previous.features))
 
-    def context(self, features: Sequence[Features]) -> PolicyContext:
+    def context(self, features: Sequence[BackboneFeatures]) -> PolicyContext:
         """What the head encodes of features of any lengths.
 
         Args:

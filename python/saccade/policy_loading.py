@@ -16,8 +16,8 @@ from saccade.dialects import Camera, CameraSources, camera_sources
 from saccade.errors import CheckpointError, InputError
 from saccade.head import ActionHead
 from saccade.hub import resolve
-from saccade.policy_parts import requested_id
-from saccade.processor import Processor
+from saccade.policy_head import requested_id
+from saccade.processor import Preprocessing, Processor
 from saccade.robots import Normalizer
 
 #: What the names of a part's tensors begin with, in NVIDIA's and in lerobot's checkpoints.
@@ -43,7 +43,7 @@ def load(
     source: str | os.PathLike[str],
     *,
     embodiment: str | int | None,
-    preprocessing: str | None,
+    preprocessing: Preprocessing | None,
     tokenizer: str | os.PathLike[str] | None,
     precision: str | Mapping[str, str],
     num_threads: int | None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,10 +117,18 @@ def _metadata_tags(values: Mapping[str, Any]) -> list[str | None]:
     return [tag for tag, entry in values.items() if isinstance(entry, Mapping) and "statistics" in entry]
 
 
+def _lerobot_tags(values: Mapping[str, Any]) -> list[str | None]:
+    return [None] if values.get("steps") else []
+
+
+def _own_tags(values: Mapping[str, Any]) -> list[str | None]:
+    return [None] if "policy_cfg" in values else []
+
+
 #: Files with statistics, in the order in which `Normalizer.load` tries them, and how their robots are listed.
-TAGS = {
-    "policy_preprocessor.json": lambda values: [None] if values.get("steps") else [],
+TAGS: dict[str, Callable[[Mapping[str, Any]], list[str | None]]] = {
+    "policy_preprocessor.json": _lerobot_tags,
     "processor_config.json": _processor_tags,
     "experiment_cfg/metadata.json": _metadata_tags,
-    "config.json": lambda values: [None] if "policy_cfg" in values else [],
+    "config.json": _own_tags,
 }
