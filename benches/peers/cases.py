@@ -34,6 +34,9 @@ WORKS: dict[str, tuple[str, ...]] = {
 computed too. For the whole head, `both` is the sum of its two works in the same round.
 """
 
+USUAL = ("head", "blocks", "cross", "linear")
+"""The pieces of a run that names none: all but the cost model."""
+
 
 @dataclass(frozen=True, order=True)
 class Case:
@@ -82,8 +85,8 @@ class Case:
 
 
 def default_cases(threads: list[int]) -> list[Case]:
-    """The cases for a quarter of an hour: the released size, one view, N 32, one observation, one chunk."""
-    cases = [Case(piece, count) for count in threads for piece in ("head", "blocks", "cross", "linear")]
+    """Every piece at the released size, one view, N 32, one observation, one chunk."""
+    cases = [Case(piece, count) for count in threads for piece in USUAL]
     return [*cases, Case("cost", max(threads))]
 
 

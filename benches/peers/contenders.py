@@ -19,7 +19,7 @@ class Contender:
         options: What the engine's `build` reads.
         environment: Set in its process.
         usual: Whether it is part of a run that names nobody; the others are settings that were tried and
-            that another setting of the same engine beats.
+            that another setting of the same engine beats, or that take minutes to compile.
     """
 
     label: str
@@ -64,7 +64,12 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "saccade-float32-avx2": _saccade("float32", 3.3, "avx2"),
         "torch-float32": Contender("torch float32", "pytorch", ALL, 3.6, {"arithmetic": "float32"}),
         "compile-float32": Contender(
-            "torch.compile float32", "pytorch", ALL, 6.5, {"arithmetic": "float32", "compiled": True}
+            "torch.compile float32",
+            "pytorch",
+            ALL,
+            6.5,
+            {"arithmetic": "float32", "compiled": True},
+            usual=False,
         ),
         "compile-float32-autotuned": Contender(
             "torch.compile float32, autotuned",
@@ -85,6 +90,13 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "lerobot-bfloat16": Contender(
             "lerobot 0.4.4 bfloat16", "lerobot", ("blocks", "head"), 2.0, {"arithmetic": "autocast"}
         ),
+        "lerobot-bfloat16-pure": Contender(
+            "lerobot 0.4.4 bfloat16, no autocast",
+            "lerobot",
+            ("blocks", "head"),
+            2.0,
+            {"arithmetic": "bfloat16"},
+        ),
         "openvino-bfloat16": Contender("OpenVINO bfloat16", "open_vino", ALL, 3, {"arithmetic": "bfloat16"}),
         "saccade-int8": _saccade("int8", 1.0),
         "saccade-int8-refresh2": _saccade("int8", 1.0, refresh=2),
@@ -93,7 +105,12 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "saccade-int8-avx2": _saccade("int8", 1.0, "avx2"),
         "torch-bfloat16": Contender("torch bfloat16", "pytorch", ALL, 2.2, {"arithmetic": "bfloat16"}),
         "compile-bfloat16": Contender(
-            "torch.compile bfloat16", "pytorch", ALL, 3.5, {"arithmetic": "bfloat16", "compiled": True}
+            "torch.compile bfloat16",
+            "pytorch",
+            ALL,
+            3.5,
+            {"arithmetic": "bfloat16", "compiled": True},
+            usual=False,
         ),
         "onnxruntime-int8": Contender(
             "ONNX Runtime int8, dynamic", "onnx_runtime", ALL, 1.8, {"arithmetic": "int8"}
@@ -101,13 +118,6 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "ggml-float16": Contender("ggml f16", "ggml", ("linear",), 1, {"arithmetic": "float16"}),
         "ggml-bfloat16": Contender("ggml bf16", "ggml", ("linear",), 1, {"arithmetic": "bfloat16"}),
         "ggml-int8": Contender("ggml q8_0", "ggml", ("linear",), 1, {"arithmetic": "int8"}),
-        "lerobot-bfloat16-pure": Contender(
-            "lerobot 0.4.4 bfloat16, no autocast",
-            "lerobot",
-            ("blocks", "head"),
-            2.0,
-            {"arithmetic": "bfloat16"},
-        ),
         "torch-autocast": Contender(
             "torch bfloat16 autocast", "pytorch", ALL, 2.2, {"arithmetic": "autocast"}, usual=False
         ),
@@ -124,7 +134,9 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         ),
     },
 }
-"""By arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds."""
+"""By arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds. The
+contenders of the targets come first, so that they share rounds.
+"""
 
 CONTENDERS: Mapping[str, Contender] = {
     name: contender for group in GROUPS.values() for name, contender in group.items()
