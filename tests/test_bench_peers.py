@@ -17,11 +17,12 @@ import saccade
 from benches.peers import __main__ as command
 from benches.peers import figures, goals, inputs, report, text
 from benches.peers.cases import COST, Case, exact_macs
-from benches.peers.contenders import CONTENDERS, GROUPS
+from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.engines import Task
-from benches.peers.floors import floor
+from benches.peers.floors import floor, limits
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
+from benches.peers.throughput import throughput
 from saccade.bench.timing import quartiles
 from saccade.reference.random_weights import n15_config
 
@@ -76,7 +77,7 @@ PACKAGES = {"onnx_runtime": "onnxruntime", "open_vino": "openvino", "lerobot": "
     [(engine, options) for engine, settings in ENGINES.items() for options in settings],
     ids=str,
 )
-@pytest.mark.parametrize("piece", ["head", "blocks", "cross", "cost"])
+@pytest.mark.parametrize("piece", ["head", "blocks", "cross", "throughput", "cost"])
 def test_every_engine_computes_what_the_reference_does(
     engine: str, options: dict[str, Any], piece: str, tmp_path: Path
 ) -> None:
@@ -84,7 +85,7 @@ def test_every_engine_computes_what_the_reference_does(
         pytest.importorskip(PACKAGES[engine], reason="in the environment of make bench-peers")
     if not any(piece in c.pieces for c in CONTENDERS.values() if c.engine == engine):
         pytest.skip(f"{engine} has no piece {piece}")
-    samples = 1 if piece in ("blocks", "cost") else 3
+    samples = 1 if piece in ("blocks", "throughput", "cost") else 3
     batch = 1 if piece == "cost" else 2
     case = Case(piece, 1, 7, 5, batch=batch, samples=samples, steps=3, size="small")
     arrays = inputs.expected_of(case, tmp_path)
@@ -209,6 +210,43 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     assert floor(results, CASE, "lerobot-float32") == pytest.approx(least, rel=0.03)
     assert f"| {100 * least / 2.4:.0f} % |" in page
     assert "Some CPU" in page
+
+
+def test_throughput_of_known_numbers(tmp_path: Path) -> None:
+    results = measured(tmp_path / "results.json")
+    results.data["machine"]["isa"] = "amx"
+    rates = {"float32": 1e11, "bfloat16": 2e12, "int8": 4e12}
+    results.data["peaks"] = [
+        {"threads": threads, "macs_per_second": {"amx": rates}, "read_bytes_per_second": 2e10}
+        for threads in (1, 2)
+    ]
+    for threads, batch, both in [(1, 1, 1.0), (1, 32, 8.0), (2, 1, 0.8), (2, 32, 4.0)]:
+        record = results.open(Case("throughput", threads, batch=batch))
+        seconds = {"encode": [0.5 * both], "sample": [0.5 * both]}
+        record["contenders"]["saccade-int8"] = {"error": 1e-3, "scale": 4.0, "notes": "", "seconds": seconds}
+    lines = "\n".join(throughput(results)).splitlines()
+    assert "| saccade int8 | 1 |  | 4 | 4.00 x |" in lines
+    assert "| saccade int8 | 1.25 |  | 8 | 6.40 x |" in lines
+    assert "| saccade int8 | 32 | 4 (1.00 x) | 8 (2.00 x) |" in lines
+    rows = [row for row in goals.goals(results).splitlines() if "batch 32" in row]
+    assert [row.split(" | ")[1:] for row in rows] == [
+        ["1 thread", "4.0 x", "4.00 x", "yes |"],
+        ["2 threads", "4.0 x", "6.40 x", "yes |"],
+    ]
+    # One observation reads 415 M weights in a step; 32 multiply 32 times as often and read the same weights.
+    one, many = (limits(results, Case("throughput", 1, batch=batch), "saccade-int8") for batch in (1, 32))
+    assert one is not None
+    assert many is not None
+    assert one[0] < one[1]
+    assert many[0] == pytest.approx(32 * one[0], rel=1e-2)
+    assert many[0] > many[1]
+
+
+def test_forced_instruction_sets_are_those_that_the_machine_does_not_choose() -> None:
+    names = ["saccade-int8", "saccade-int8-avx2", "saccade-int8-avx512"]
+    assert able(names, {"isa": "amx", "isas": ["avx2", "avx512", "amx"]}) == names
+    assert able(names, {"isa": "avx512", "isas": ["avx2", "avx512"]}) == names[:2]
+    assert able(names, {"isa": "neon", "isas": ["neon"]}) == names[:1]
 
 
 def test_a_result_that_is_wrong_is_marked_and_not_ranked(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@
     make bench-peers PEERS_ARGS="--only blocks --threads 1 2 --rounds 9"
     make bench-peers PEERS_ARGS="--full --minutes 600"     every piece at every size: hours
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
+    make bench-peers PEERS_ARGS="--only throughput --rounds 3 --minutes 120"
+                       chunks per second of 1, 8 and 32 observations at once, on 1 thread to all cores
     python -m benches.peers report                         write the report of existing measurements
     python -m benches.peers report --write                 write docs/performance.md and its figures
 
@@ -31,8 +33,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from benches.peers import machine, processes, report
-from benches.peers.cases import USUAL, WORKS, Case, default_cases, full_cases
-from benches.peers.contenders import CONTENDERS, GROUPS
+from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
+from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.goals import NEEDED
 from benches.peers.processes import Ready, note
 from benches.peers.results import RECORDS, Results
@@ -48,6 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.command == "report":
         return report.command(results, args)
     machine_now = machine.describe()
+    args.contenders = able(args.contenders, machine_now)
     if results.begin(machine_now):
         note(f"{args.results} is from another machine or build; it is set aside and measured again")
     measure_all(results, args)
@@ -136,7 +139,7 @@ def batches(results: Results, case: Case, args: argparse.Namespace, names: Seque
 
 def gigabytes(case: Case, name: str) -> float:
     """Memory of a contender, roughly: the weights of the whole head, or of a fifth of it."""
-    return CONTENDERS[name].gigabytes * (1.0 if case.piece in ("head", "cost") else 0.3)
+    return CONTENDERS[name].gigabytes * (1.0 if case.piece in WHOLE else 0.3)
 
 
 def measure(results: Results, case: Case, names: list[str], args: argparse.Namespace, end: float) -> None:
@@ -193,7 +196,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="default: all except settings that are slower than another setting of the same engine; of: "
         + ", ".join(CONTENDERS),
     )
-    parser.add_argument("--threads", type=int, nargs="+", default=[2], help="thread counts (default 2)")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        nargs="+",
+        help="counts (default 2; of throughput 1, 2, 4, ... all cores)",
+    )
     parser.add_argument("--rounds", type=int, default=5, help="repetitions of everything (default 5)")
     parser.add_argument(
         "--linear-rounds",
@@ -236,6 +244,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     args = parser.parse_args(arguments)
     args.results = args.results or args.work / "results.json"
     args.only = args.only or list(WORKS if args.full else USUAL)
+    args.threads = args.threads or (machine.thread_counts() if args.only == ["throughput"] else [2])
     if args.contenders is None:
         args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]
     if args.rounds < 1 or min(args.threads) < 1:

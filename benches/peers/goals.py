@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from benches.peers.cases import LINEAR_SHAPES
 from benches.peers.contenders import CONTENDERS
@@ -94,6 +94,10 @@ FLOOR_GOALS_AMX = {"saccade-bfloat16": (0.60, 0.75), "saccade-int8": (0.60, 0.75
 """Contender -> shares of the floor of the whole head at which the target is reached, and exceeded."""
 
 
+BATCH_GOAL_AMX = (4.0, 32)
+"""Chunks per second of so many observations at once, relative to one."""
+
+
 NEEDED = tuple(dict.fromkeys(name for goal in (*GOALS, *GOALS_AMX) for name in (goal.ours, *goal.peers)))
 """The contenders of the targets."""
 
@@ -136,6 +140,23 @@ def goals(results: Results) -> str:
                         f"{percent([least_share])} ({percent([beyond_share])})",
                         percent([share]),
                         reached(share, least_share, beyond_share),
+                    ]
+                )
+    gain, batch = BATCH_GOAL_AMX
+    for name in ("saccade-bfloat16", "saccade-int8") if has_tiles else ():
+        for case in sorted(
+            case for case in results.cases if case.piece == "throughput" and case.batch == batch
+        ):
+            one, many = (results.seconds(each, name, "both") for each in (replace(case, batch=1), case))
+            if one and many:
+                measured_gain = batch * quartiles(one)[1] / quartiles(many)[1]
+                rows.append(
+                    [
+                        f"{CONTENDERS[name].label}, chunks/s of batch {batch} against batch 1",
+                        plural(case.threads),
+                        f"{gain} x",
+                        f"{measured_gain:.2f} x",
+                        reached(measured_gain, gain, float("inf")),
                     ]
                 )
     for threads, (least, beyond) in LINEAR_GOALS.items():

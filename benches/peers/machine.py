@@ -51,6 +51,12 @@ def describe() -> dict[str, Any]:
     }
 
 
+def thread_counts() -> list[int]:
+    """1, 2, 4, ... and the physical cores that this process may use, in ascending order."""
+    cores = saccade.show_config("dicts")["num_threads"]
+    return sorted({cores, *(1 << power for power in range(cores.bit_length()))})
+
+
 def version(name: str) -> str:
     """Version of an installed package; empty if it is not installed."""
     if name == "saccade":

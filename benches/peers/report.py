@@ -25,6 +25,7 @@ from benches.peers.text import (
     table,
     usual,
 )
+from benches.peers.throughput import throughput
 from saccade.bench.timing import quartiles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -104,6 +105,7 @@ def of_machine(results: Results, images: str) -> list[str]:
         "## Where a peer is faster",
         faster_peers(results),
         *linear(results),
+        *throughput(results),
         *settings(results),
         *cost(results, images),
     ]
@@ -177,7 +179,7 @@ def machine(results: Results) -> str:
     ]
     forced = {
         one.environment["SACCADE_ISA"] for one in CONTENDERS.values() if "SACCADE_ISA" in one.environment
-    }
+    } - {held["isa"]}
     rows = []
     for threads in sorted({entry["threads"] for entry in results.data["peaks"]}):
         for isa in (held["isa"], *sorted(forced)):
