@@ -277,6 +277,22 @@ fn bits_of_a_row_do_not_depend_on_the_others() {
 }
 
 #[test]
+fn bits_do_not_depend_on_the_order_of_panels() {
+    // Weights of 8 MB: blocks of 200 rows pass them in groups, one row passes all of them.
+    let (inputs, outputs, row_count) = (3001, 700, 200);
+    let x = numbers(10, row_count * inputs, 1.0);
+    for isa in Isa::available() {
+        for layer in layers(isa, inputs, outputs) {
+            let all = bits(&apply(&layer, 2, &x, Epilogue::Store));
+            for row in [0, 95, 96, 199] {
+                let alone = bits(&apply(&layer, 1, &x[row * inputs..][..inputs], Epilogue::Store));
+                assert_eq!(alone, all[row * outputs..][..outputs], "{isa}, row {row}");
+            }
+        }
+    }
+}
+
+#[test]
 fn bf16_storage_gives_the_bits_of_f32_storage() {
     for inputs in [1, 2, 63, 640, 1537] {
         let part = Part {

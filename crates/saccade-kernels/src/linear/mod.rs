@@ -6,6 +6,7 @@
 
 mod epilogue;
 mod error;
+mod order;
 mod pack;
 mod rows;
 
@@ -22,6 +23,7 @@ pub use epilogue::Epilogue;
 use epilogue::{Finish, Int8};
 pub use error::KernelError;
 use error::MAX_INT8_INPUTS;
+use order::Order;
 use pack::{Panels, pack_panels};
 pub use rows::LinearScratch;
 
@@ -55,6 +57,9 @@ pub struct PackedLinear {
 /// Below this many multiply-accumulates a second thread costs more than it saves: waking one takes about 5 us, in which a core does
 /// about 250 k of them.
 const MACS_FOR_THREADS: usize = 1 << 19;
+
+/// As many multiply-accumulates should each thread have, for the same reason.
+const MACS_OF_THREAD: usize = MACS_FOR_THREADS / 2;
 
 /// Tasks that each thread should have, if they are not smaller than that: one that begins its last task late keeps the others waiting for a
 /// quarter of the work at most.
@@ -234,7 +239,11 @@ impl PackedLinear {
         let macs = rows
             .saturating_mul(self.in_features)
             .saturating_mul(self.out_features);
-        let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
+        let threads = if macs < MACS_FOR_THREADS {
+            1
+        } else {
+            threads.min(macs / MACS_OF_THREAD)
+        };
         let shape = self.gemm.shape();
         let columns = shape.columns;
         let num_panels = self.out_features.div_ceil(columns);
@@ -260,11 +269,12 @@ impl PackedLinear {
             (call.x, call.x_stride) = (converted.words, stride as isize);
             call.quantized = converted.quantized;
         }
-        // Row blocks outside, panels inside: threads then share a block of activations and walk the weights next to each other.
-        parallel_for(threads, blocks * num_panels, &|task| {
-            let (block, panel) = (task / num_panels, task % num_panels);
+        let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
+        let order = Order::new(blocks, num_panels, panel_bytes, TASKS_PER_THREAD * threads);
+        parallel_for(threads, order.tasks(), &|task| {
+            let (block, panel) = order.at(task);
             let range = tiles.count * block / blocks..tiles.count * (block + 1) / blocks;
-            self.run_panel(&call, range, columns, panel, threads);
+            self.run_panel(&call, range, columns, panel, order.ahead(task, threads));
         });
         Ok(())
     }
