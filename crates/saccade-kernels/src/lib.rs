@@ -10,6 +10,7 @@
 mod activation;
 mod aligned;
 mod attention;
+mod cpu;
 mod gemm;
 mod isa;
 mod linear;
@@ -21,11 +22,13 @@ mod rope;
 mod rows;
 mod simd;
 mod threads;
+mod tiles;
 mod weights;
 
 pub use activation::{exp, gelu_erf, gelu_tanh, relu, silu};
 pub use aligned::AllocError;
 pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
+pub use cpu::CpuReport;
 pub use half::bf16;
 pub use isa::{ISA_VARIABLE, Isa, IsaError};
 pub use linear::{Epilogue, KernelError, LinearScratch, PackedLinear};
