@@ -28,7 +28,7 @@ const MACS_FOR_THREADS: usize = 1 << 19;
 /// `num_heads / num_kv_heads` consecutive heads share a head of the keys and values (grouped-query attention). A query with no key left gets
 /// zeros. `weights`, if given, is `(num_heads, queries, len)` and receives the probabilities; otherwise they are never in memory together.
 ///
-/// Sums and the softmax are float32. Where the CPU multiplies pairs of bfloat16 and `kv` holds them, queries and probabilities are rounded to
+/// Sums and the softmax are float32. Where pairs of bfloat16 are multiplied, by vectors or in tiles, and `kv` holds them, queries and probabilities are rounded to
 /// bfloat16 too, the sum of a query's probabilities is that of the rounded ones, and denormals may count as zero; elsewhere nothing but
 /// `kv` is rounded.
 ///

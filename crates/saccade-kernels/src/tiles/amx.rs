@@ -268,3 +268,95 @@ unsafe impl TileUnit for Amx {
         ITERATIONS * 6 * TILE * TILE * TILE * operation.per_word()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::super::software::tests::{pairs, product, words};
+    use super::super::{MAX_ROWS, Product, Session, Software};
+    use super::*;
+
+    /// What both units make of a product with these operands.
+    fn both(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &[u32], before: &[u32]) {
+        let amx = Amx::new().expect("looked at before");
+        let of = |columns: usize, add: bool| {
+            let [mut hard, mut soft] = [before.to_vec(), before.to_vec()];
+            let with = |sums| Product {
+                columns,
+                add,
+                ..product(operation, x, w, sums)
+            };
+            // SAFETY: the operands have these sizes.
+            unsafe {
+                Session::new(amx).multiply(&with(&mut hard));
+                Session::new(Software).multiply(&with(&mut soft));
+            }
+            let is_nan = |bits: u32| operation == Operation::Bf16 && f32::from_bits(bits).is_nan();
+            for (index, (&hard, &soft)) in hard.iter().zip(&soft).enumerate() {
+                let same = hard == soft || (is_nan(hard) && is_nan(soft));
+                let what =
+                    format!("{operation:?}, {rows} rows, {steps} steps, {columns} columns, number {index}");
+                assert!(same, "{what}: {hard:#x} in hardware, {soft:#x} in software");
+            }
+        };
+        for add in [false, true] {
+            of(3, add);
+            if rows <= TILE {
+                of(1, add);
+            }
+        }
+    }
+
+    #[test]
+    fn hardware_and_software_tiles_agree_bit_for_bit() {
+        if let Err(refusal) = permission() {
+            // Past the test runner, which keeps back what a test prints.
+            let _ = writeln!(
+                std::io::stderr(),
+                "SKIPPED: the tiles of AMX are not compared with software: {refusal}"
+            );
+            return;
+        }
+        for rows in 1..=MAX_ROWS {
+            let steps = 1 + rows % 4;
+            let (x_size, w_size, sums) = (rows * TILE * steps, 3 * TILE * TILE * steps, rows * 3 * TILE);
+            for seed in 0..20 {
+                let (x, w, before) = (
+                    words(seed, x_size),
+                    words(seed + 50, w_size),
+                    words(seed + 90, sums),
+                );
+                both(Operation::Int8, rows, steps, &x, &w, &before);
+                // Any bits; exponents far apart; denormals.
+                both(Operation::Bf16, rows, steps, &x, &w, &before);
+                for (keep, set) in [(0x83ff_83ff, 0x3000_3000), (0x81ff_81ff, 0)] {
+                    let masked =
+                        |words: &[u32]| words.iter().map(|word| word & keep | set).collect::<Vec<_>>();
+                    both(
+                        Operation::Bf16,
+                        rows,
+                        steps,
+                        &masked(&x),
+                        &masked(&w),
+                        &masked(&before),
+                    );
+                }
+                let numbers = [pairs(seed, x_size), pairs(seed + 50, w_size)];
+                let before: Vec<_> = before
+                    .iter()
+                    .map(|word| (*word as f32 * 1e-9).to_bits())
+                    .collect();
+                both(Operation::Bf16, rows, steps, &numbers[0], &numbers[1], &before);
+            }
+        }
+    }
+
+    #[test]
+    fn peaks_of_tiles_are_counted() {
+        if let Some(amx) = Amx::new() {
+            let [bf16, int8] = [Operation::Bf16, Operation::Int8].map(|operation| amx.chains(operation));
+            assert_eq!(int8, 2 * bf16);
+        }
+    }
+}

@@ -228,13 +228,13 @@ unsafe impl TileUnit for Software {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use half::bf16;
 
     use super::super::{Ahead, MAX_ROWS, Product, Session};
     use super::*;
 
-    fn words(seed: u32, count: usize) -> Vec<u32> {
+    pub(in super::super) fn words(seed: u32, count: usize) -> Vec<u32> {
         let mut state = u64::from(seed) << 17 | 0x9e37_79b9;
         let mut next = || {
             state = state
@@ -246,7 +246,7 @@ mod tests {
     }
 
     /// Numbers between -2 and 2, in pairs.
-    fn pairs(seed: u32, count: usize) -> Vec<u32> {
+    pub(in super::super) fn pairs(seed: u32, count: usize) -> Vec<u32> {
         let number = |word: u32| u32::from(bf16::from_f32((word & 0xffff) as f32 / 16384.0 - 2.0).to_bits());
         let words = words(seed, count);
         words
@@ -260,7 +260,12 @@ mod tests {
     }
 
     /// One step of `rows` by three tiles.
-    fn product<'a>(operation: Operation, x: &'a [u32], w: &'a [u32], sums: &'a mut [u32]) -> Product {
+    pub(in super::super) fn product<'a>(
+        operation: Operation,
+        x: &'a [u32],
+        w: &'a [u32],
+        sums: &'a mut [u32],
+    ) -> Product {
         assert_eq!((x.len() % TILE, w.len() % (3 * TILE * TILE)), (0, 0));
         let steps = w.len() / (3 * TILE * TILE);
         Product {
