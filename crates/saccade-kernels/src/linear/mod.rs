@@ -14,7 +14,8 @@ use std::mem::MaybeUninit;
 use std::ops::Range;
 
 use crate::aligned::{AlignedBuffer, AllocError};
-use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, ROW_BLOCK, Tiles};
+use crate::cpu::Cpu;
+use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, Tiles};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
@@ -52,6 +53,8 @@ pub struct PackedLinear {
     panels: Panels,
     /// One for each column of the panels, zero in the padding.
     bias: AlignedBuffer<f32>,
+    /// Whether memory is asked for them as many streams.
+    streams: bool,
 }
 
 /// Below this many multiply-accumulates a second thread costs more than it saves: waking one takes about 5 us, in which a core does
@@ -138,7 +141,15 @@ impl PackedLinear {
             out_features,
             panels,
             bias,
+            streams: Cpu::current().wants_streams(),
         })
+    }
+
+    /// Asks memory for the weights as many streams, or in their order, instead of as was measured to be faster on this family of CPUs. For
+    /// programs that measure it: results have the same bits.
+    #[must_use]
+    pub fn with_streams(self, streams: bool) -> Self {
+        Self { streams, ..self }
     }
 
     /// The bytes that a layer of `(out_features, in_features)` holds when it is packed. `weights` is [`Element::Bf16`] if all its parts are
@@ -253,7 +264,7 @@ impl PackedLinear {
             .div_ceil(num_panels)
             .min(macs / (num_panels * MACS_FOR_THREADS));
         let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
-        let blocks = rows.div_ceil(ROW_BLOCK).max(most);
+        let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
         let mut call = Call {
             x: x.as_ptr().cast(),
             x_stride: x.row_stride() as isize,
@@ -303,6 +314,7 @@ impl PackedLinear {
             range,
             weights: &self.panels.words[panel * size..][..size],
             ahead,
+            streams: self.streams,
             sums,
             out,
             out_stride: call.out_stride,
