@@ -74,6 +74,7 @@ _SUBMODULES = (
     "observation",
     "reference",
     "robots",
+    "serve",
     "sim",
     "study",
     "torch",
