@@ -50,7 +50,7 @@ def nested(depth: int) -> Any:
 
 @pytest.mark.parametrize("array", ARRAYS, ids=lambda array: f"{array.dtype}{array.shape}")
 def test_arrays_are_numpys(array: Any) -> None:
-    found = unpack(packed({"a": array}), LIMITS)["a"]
+    found = unpack(packed({"a": array}), LIMITS).value["a"]
     np.testing.assert_array_equal(found, array)
     assert found.dtype == array.dtype.newbyteorder("=")
     back = msgpack.unpackb(pack({"a": array}), object_hook=decoded)["a"]
@@ -59,7 +59,7 @@ def test_arrays_are_numpys(array: Any) -> None:
 
 @pytest.mark.parametrize("array", ARRAYS, ids=lambda array: f"{array.dtype}{array.shape}")
 def test_arrays_of_msgpack_numpy(array: Any) -> None:
-    # As the package msgpack-numpy, which later N1.7 clients use, writes them: keys are bytes.
+    # As the package msgpack-numpy, which N1.7 clients use, writes them: keys are bytes.
     fields = {
         b"nd": True,
         b"type": array.dtype.str,
@@ -67,10 +67,14 @@ def test_arrays_of_msgpack_numpy(array: Any) -> None:
         b"shape": array.shape,
         b"data": array.tobytes(),
     }
-    found = unpack(msgpack.packb({"a": fields}), LIMITS)["a"]
-    np.testing.assert_array_equal(found, array)
+    found = unpack(msgpack.packb({"a": fields}), LIMITS)
+    assert found.is_msgpack_numpy
+    np.testing.assert_array_equal(found.value["a"], array)
+    written = unpack(pack({"a": array}, as_msgpack_numpy=True), LIMITS)
+    assert written.is_msgpack_numpy
+    np.testing.assert_array_equal(written.value["a"], array)
     number = {b"nd": False, b"type": "<f4", b"data": np.float32(2.5).tobytes()}
-    assert unpack(msgpack.packb({"a": number}), LIMITS)["a"] == 2.5
+    assert unpack(msgpack.packb({"a": number}), LIMITS).value["a"] == 2.5
 
 
 @pytest.mark.parametrize(
@@ -128,7 +132,7 @@ def test_arrays_of_objects_are_not_unpickled() -> None:
 @given(st.binary(max_size=200))
 def test_any_bytes_are_refused_or_decoded_as_msgpack_does(data: bytes) -> None:
     try:
-        value = unpack(data, LIMITS)
+        value = unpack(data, LIMITS).value
     except SaccadeError:
         return
     assert value == msgpack.unpackb(data) or value != value
@@ -157,14 +161,14 @@ MESSAGES = st.recursive(
 def test_messages_are_decoded_as_msgpack_does(value: Any) -> None:
     data = msgpack.packb(value)
     check(memoryview(data), LIMITS)
-    assert msgpack.packb(unpack(data, LIMITS)) == data
+    assert msgpack.packb(unpack(data, LIMITS).value) == data
     for end in range(0, len(data), max(1, len(data) // 10)):
         with pytest.raises(InputError, match=r"cut off|empty"):
             check(memoryview(data)[:end], LIMITS)
 
 
 def test_nesting() -> None:
-    assert unpack(msgpack.packb(nested(16)), LIMITS) == nested(16)
+    assert unpack(msgpack.packb(nested(16)), LIMITS).value == nested(16)
     for deep in (nested(17), nested(400)):
         with pytest.raises(InputError, match="nesting of at most 16"):
             unpack(msgpack.packb(deep), LIMITS)

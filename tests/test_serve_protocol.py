@@ -73,6 +73,34 @@ def test_n15_gets_the_actions_and_later_releases_a_list() -> None:
         assert info == {}
 
 
+def test_n17_gets_arrays_in_the_form_that_it_sends() -> None:
+    def array(value: Any) -> Any:
+        return {
+            b"nd": True,
+            b"type": value.dtype.str,
+            b"kind": b"",
+            b"shape": value.shape,
+            b"data": value.tobytes(),
+        }
+
+    with serving() as running, requester(running.port) as made:
+        made.send(msgpack.packb(get_action(seed=5), default=array))
+        actions, _ = msgpack.unpackb(made.recv())
+        fields = actions["arm"]
+        assert (fields[b"nd"], fields[b"type"], fields[b"shape"]) == (True, "<f4", [1, HORIZON, 2])
+        expected = ask(made, get_action(seed=5))[0]["arm"]
+        np.testing.assert_array_equal(np.frombuffer(fields[b"data"], "<f4").reshape(expected.shape), expected)
+
+
+def test_a_seed_for_clients_that_bring_none() -> None:
+    request = {"endpoint": "get_action", "data": flat_observation()}
+    with serving(seed=3) as running, requester(running.port) as made:
+        first, second = (ask(made, request)["action.arm"] for _ in range(2))
+        np.testing.assert_array_equal(first, second)
+        seeded = ask(made, get_action(flat_observation(), seed=4))[0]["action.arm"]
+        assert not np.array_equal(first, seeded)
+
+
 def test_modality_configs_by_release() -> None:
     plain = {
         "video": {"delta_indices": [0], "modality_keys": ["front"]},
@@ -80,7 +108,8 @@ def test_modality_configs_by_release() -> None:
         "action": {"delta_indices": list(range(HORIZON)), "modality_keys": ["arm", "gripper"]},
         "language": {"delta_indices": [0], "modality_keys": ["annotation.task"]},
     }
-    as_maps = {name: {"__ModalityConfig_class__": True, "as_json": config} for name, config in plain.items()}
+    marks = {"__ModalityConfig_class__": True, "__ModalityConfig__": True}
+    as_maps = {name: {**marks, "as_json": config} for name, config in plain.items()}
     request = {"endpoint": "get_modality_config"}
     with serving(MemoryPolicy(version="n1.7")) as running, requester(running.port) as made:
         assert ask(made, request) == as_maps

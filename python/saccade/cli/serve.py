@@ -67,6 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_integer(
         served, "--port", minimum=0, default=5555, help="port; 0 takes one that is free and prints it"
     )
+    arguments.add_integer(
+        served,
+        "--seed",
+        minimum=0,
+        help="seed of the noise of requests that bring none (default: different noise each time)",
+    )
     served.add_argument(
         "--api-token",
         default=os.environ.get(TOKEN_VARIABLE),
@@ -172,6 +178,7 @@ def run(args: argparse.Namespace) -> int:
             limits=limits_of(args),
             max_batch=args.max_batch,
             max_wait_ms=args.max_wait_ms,
+            seed=args.seed,
             api_token=args.api_token,
             allow_kill=args.allow_kill,
             modality_form=args.modality_form,

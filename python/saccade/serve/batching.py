@@ -24,6 +24,7 @@ class Job:
         rows: Number of its observations.
         client: Who asks.
         size: Bytes of its message.
+        is_msgpack_numpy: In which form its arrays came, and those of the answer go.
         received: When it arrived, on the clock of `time.perf_counter`.
         reply: How it is answered; only the server reads it.
         milliseconds: How long each part took.
@@ -33,6 +34,7 @@ class Job:
     rows: int
     client: Hashable
     size: int
+    is_msgpack_numpy: bool = False
     received: float = field(default_factory=time.perf_counter)
     reply: Any = None
     milliseconds: dict[str, float] = field(default_factory=dict)

@@ -88,7 +88,7 @@ class Client:
             request["data"] = data
         if self._api_token is not None:
             request["api_token"] = self._api_token
-        answer = unpack(self.exchange(pack(request)), Limits())
+        answer = unpack(self.exchange(pack(request)), Limits()).value
         if isinstance(answer, dict) and "error" in answer:
             raise ServerError(str(answer["error"]))
         return answer

@@ -49,7 +49,8 @@ def answers(policy: Policy) -> dict[str, Any]:
 
 
 def _wrapped(config: Any) -> dict[str, Any]:
-    return {"__ModalityConfig_class__": True, "as_json": config}
+    # N1.5's and N1.6's clients know the first mark, N1.7's the second.
+    return {"__ModalityConfig_class__": True, "__ModalityConfig__": True, "as_json": config}
 
 
 def _prefixed(modality: str, config: Mapping[str, Any]) -> dict[str, Any]:

@@ -73,8 +73,19 @@ def from_npy(data: Any, most_elements: int) -> npt.NDArray[Any]:
     return _array(view[start + length :], found[1].decode(), shape, found[2] == b"True", most_elements)
 
 
+def to_msgpack_numpy(array: npt.NDArray[Any]) -> dict[bytes, Any]:
+    """The map of the package msgpack-numpy for an array."""
+    return {
+        b"nd": True,
+        b"type": array.dtype.str,
+        b"kind": b"",
+        b"shape": array.shape,
+        b"data": array.tobytes(),
+    }
+
+
 def from_msgpack_numpy(fields: Mapping[Any, Any], most_elements: int) -> Any:
-    """The array or number in a map of the package msgpack-numpy, which later N1.7 clients send.
+    """The array or number in a map of the package msgpack-numpy, which N1.7 clients send.
 
     Args:
         fields: The map, with ``nd``, ``type``, ``kind``, ``shape`` and ``data`` as text or bytes.

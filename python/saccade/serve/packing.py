@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import Any
 
 import msgpack
@@ -9,7 +11,7 @@ import numpy as np
 
 from saccade.errors import InputError, SaccadeError
 from saccade.serve.limits import Limits
-from saccade.serve.npy import Bytes, from_msgpack_numpy, from_npy, to_npy
+from saccade.serve.npy import Bytes, from_msgpack_numpy, from_npy, to_msgpack_numpy, to_npy
 
 #: Bytes of a number, or of the length that follows, by the first byte.
 NUMBERS = {0xCA: 4, 0xCB: 8, 0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}
@@ -21,17 +23,36 @@ CONSTANTS = (0xC0, 0xC2, 0xC3)
 NDARRAY = "__ndarray_class__"
 
 
-def pack(value: Any) -> bytes:
-    """A message of dicts, lists, text, numbers and arrays. Arrays are the bytes of a ``.npy`` file.
+@dataclass(frozen=True, eq=False)
+class Message:
+    """An unpacked message.
+
+    Attributes:
+        value: What it contains.
+        is_msgpack_numpy: Whether it has arrays in the form of the package msgpack-numpy.
+    """
+
+    value: Any
+    is_msgpack_numpy: bool
+
+
+def pack(value: Any, *, as_msgpack_numpy: bool = False) -> bytes:
+    """A message of dicts, lists, text, numbers and arrays.
+
+    Args:
+        value: What it contains.
+        as_msgpack_numpy: Whether arrays are maps of the package msgpack-numpy, instead of bytes of a ``.npy``
+            file.
 
     Raises:
         TypeError: It contains anything else.
     """
-    packed: bytes = msgpack.packb(value, default=_plain)
+    plain = functools.partial(_plain, as_msgpack_numpy=as_msgpack_numpy)
+    packed: bytes = msgpack.packb(value, default=plain)
     return packed
 
 
-def unpack(data: Bytes, limits: Limits) -> Any:
+def unpack(data: Bytes, limits: Limits) -> Message:
     """The value in a message; its arrays share the memory of copies of parts of ``data``.
 
     Raises:
@@ -39,24 +60,28 @@ def unpack(data: Bytes, limits: Limits) -> Any:
             maps with text as keys, lists, text, bytes, numbers and arrays.
 
     Example:
-        >>> unpack(pack({"endpoint": "ping"}), Limits())
+        >>> unpack(pack({"endpoint": "ping"}), Limits()).value
         {'endpoint': 'ping'}
     """
     check(memoryview(data), limits)
+    foreign = False
 
     def hook(fields: dict[Any, Any]) -> Any:
+        nonlocal foreign
         if NDARRAY in fields:
             return from_npy(fields.get("as_npy"), limits.array_elements)
         if b"nd" in fields or ("nd" in fields and "data" in fields):
+            foreign = True
             return from_msgpack_numpy(fields, limits.array_elements)
         return fields
 
     try:
-        return msgpack.unpackb(data, object_hook=hook)
+        value = msgpack.unpackb(data, object_hook=hook)
     except SaccadeError:
         raise
     except (msgpack.UnpackException, ValueError) as error:
         raise InputError(f"message: {error}") from None
+    return Message(value, foreign)
 
 
 def check(data: memoryview, limits: Limits) -> None:
@@ -120,8 +145,10 @@ def _value(data: memoryview, position: int) -> tuple[int, int | None]:
     return position, items
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, as_msgpack_numpy: bool) -> Any:
     if isinstance(value, np.ndarray):
+        if as_msgpack_numpy:
+            return to_msgpack_numpy(value)
         return {NDARRAY: True, "as_npy": to_npy(value)}
     if isinstance(value, np.generic):
         return value.item()

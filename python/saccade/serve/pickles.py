@@ -14,8 +14,7 @@ TORCH = b"PK\x03\x04"
 
 REFUSAL = (
     "message: expected msgpack, got a pickle, which is never loaded: this client is of GR00T N1, or of N1.5 "
-    "before September 2025. Update it to Isaac-GR00T N1.5 with pull request 329 or later "
-    "(gr00t/eval/service.py with MsgSerializer), N1.6 or N1.7"
+    "before 26 August 2025. Update it to Isaac-GR00T N1.5 with pull request 329 or later, N1.6 or N1.7"
 )
 
 

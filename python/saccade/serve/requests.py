@@ -1,7 +1,7 @@
 """What a request asks for, in each of the released wire forms, and the answers in the same form.
 
 GR00T N1.5 sends the observation itself as `data`, and gets the actions. N1.6 and N1.7 send `observation` and
-`options`, and get `[actions, info]`.
+`options`, and get `[actions, info]`. N1.7's arrays are in another form than the others'; see `npy`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import hashlib
 import hmac
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from saccade._arrays import integer
@@ -67,11 +67,12 @@ class Call:
     options: Options = Options()
 
 
-def parse(value: Any) -> Call:
+def parse(value: Any, seed: int | None = None) -> Call:
     """What a request asks for.
 
     Args:
         value: The unpacked message.
+        seed: The seed of a request that brings none.
 
     Raises:
         InputError: It is no request, or an option is out of range.
@@ -90,7 +91,7 @@ def parse(value: Any) -> Call:
     if not isinstance(data, dict):
         raise InputError(f"data: expected a map with the observation, got {type(data).__name__}")
     if "observation" not in data:
-        return Call(endpoint, is_bare=True, observation=data)
+        return Call(endpoint, is_bare=True, observation=data, options=Options(seed))
     unknown = [key for key in data if key not in ("observation", "options")]
     if unknown:
         raise InputError(
@@ -99,7 +100,10 @@ def parse(value: Any) -> Call:
     observation = data["observation"]
     if not isinstance(observation, dict):
         raise InputError(f"observation: expected a map, got {type(observation).__name__}")
-    return Call(endpoint, observation=observation, options=_options(data.get("options")))
+    options = _options(data.get("options"))
+    if options.seed is None:
+        options = replace(options, seed=seed)
+    return Call(endpoint, observation=observation, options=options)
 
 
 def action_answer(call: Call, actions: Any, info: Mapping[str, Any]) -> Any:

@@ -50,6 +50,7 @@ class Server:
         limits: What it takes at most.
         max_batch: Observations that are computed together.
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
+        seed: Seed of the noise of requests that bring none, or None for noise that is different each time.
         api_token: A secret that every request must contain, or None.
         allow_kill: Whether a client may stop the server.
         modality_form: How `get_modality_config` is answered to a client that did not show its release:
@@ -71,6 +72,7 @@ class Server:
         limits: Limits = Limits(),  # noqa: B008 (it is immutable)
         max_batch: int = 16,
         max_wait_ms: float = 5.0,
+        seed: int | None = None,
         api_token: str | None = None,
         allow_kill: bool = False,
         modality_form: str | None = None,
@@ -78,6 +80,7 @@ class Server:
         self._policy, self._log, self._limits = policy, log, limits
         self._token = Token(api_token)
         self._allow_kill = allow_kill
+        self._seed = seed
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
         self._forms: OrderedDict[Connection, str] = OrderedDict()
@@ -172,13 +175,13 @@ class Server:
                 self._reply(connection, request, pickles.refusal(request.payload))
                 error = pickles.REFUSAL
                 return
-            value = unpack(request.payload, self._limits)
-            if not self._token.allows(value):
+            message = unpack(request.payload, self._limits)
+            if not self._token.allows(message.value):
                 raise InputError(UNAUTHORIZED)
-            call = parse(value)
+            call = parse(message.value, self._seed)
             endpoint = call.endpoint
             if endpoint == "get_action":
-                self._enqueue(connection, request, call)
+                self._enqueue(connection, request, call, message.is_msgpack_numpy)
                 return
             self._reply(connection, request, pack(self._answer(connection, call)))
         except Exception as caught:
@@ -207,7 +210,7 @@ class Server:
         self.stop("kill")
         return {"status": "ok", "message": "Server is stopping"}
 
-    def _enqueue(self, connection: Connection, request: Request, call: Call) -> None:
+    def _enqueue(self, connection: Connection, request: Request, call: Call, is_msgpack_numpy: bool) -> None:
         if self._stopping is not None:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
@@ -221,7 +224,8 @@ class Server:
         while len(self._forms) > MOST_KNOWN:
             self._forms.popitem(last=False)
         self._unanswered += 1
-        self._queue.put(Job(call, rows, connection, request.size, reply=(connection, request.address)))
+        reply = (connection, request.address)
+        self._queue.put(Job(call, rows, connection, request.size, is_msgpack_numpy, reply=reply))
 
     def _compute(self) -> None:
         """The thread that computes."""
@@ -230,7 +234,7 @@ class Server:
                 payload = None
                 if outcome.error is None:
                     try:
-                        payload = pack(outcome.answer)
+                        payload = pack(outcome.answer, as_msgpack_numpy=outcome.job.is_msgpack_numpy)
                     except Exception as error:
                         outcome = engine.Outcome(outcome.job, error=error)
                 if payload is None:
