@@ -365,7 +365,7 @@ def test_more_clients_than_allowed_are_closed() -> None:
                 assert ask(client, {"endpoint": "ping"}) == PONG
             with connect(running.port) as third:
                 assert third.recv(10) == b""
-        assert any("2 clients are connected" in text for text in running.log.warnings())
+        wait_until(lambda: any("2 clients are connected" in text for text in running.log.warnings()))
         wait_until(lambda: is_alive(running.port))
 
 
