@@ -31,6 +31,7 @@ from saccade.head import ActionHead
 from saccade.intervention import Intervention
 from saccade.policy import Policy
 from saccade.policy_context import PolicyContext
+from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer
 from saccade.trace import Record, Trace
 
@@ -54,6 +55,7 @@ __all__ = [
     "Normalizer",
     "Policy",
     "PolicyContext",
+    "Processor",
     "Record",
     "SaccadeError",
     "ShapeError",

@@ -61,6 +61,21 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
         return np.require(array, np.float32, ["C", "A"])
 
 
+def frame(name: str, value: ArrayLike) -> npt.NDArray[Any]:
+    """A camera frame as a C-contiguous array of uint8, float32 or float64, copied only if it must be.
+
+    Raises:
+        DtypeError: ``value`` has another dtype, or is not on the CPU.
+        ShapeError: ``value`` is not an array.
+    """
+    if is_torch(value):
+        value = _torch_memory(name, value.detach())  # type: ignore[union-attr]
+    array = _asarray(name, value)
+    if array.dtype not in (np.uint8, np.float32, np.float64):
+        raise DtypeError(f"{name}: expected a frame of uint8, float32 or float64, got {array.dtype}")
+    return np.require(array, requirements=["C", "A"])
+
+
 def as_stored(tensors: Mapping[str, ArrayLike]) -> dict[str, StoredTensor]:
     """Tensors in their own dtype, C-contiguous. Those that are contiguous already are not copied.
 

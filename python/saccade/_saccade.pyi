@@ -11,6 +11,7 @@ from saccade._arrays import StoredTensor
 _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
 _Int64 = npt.NDArray[np.int64]
+_Frame = npt.NDArray[np.uint8] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 _Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
 # rows by layer, and by observation and view the patches and the tokens
@@ -24,6 +25,7 @@ __all__ = [
     "Context",
     "CrossAttention",
     "KeyValues",
+    "Processor",
     "Published",
     "__version__",
     "available_isas",
@@ -171,6 +173,43 @@ class Backbone:
         vision: bool,
         image_tokens: bool,
     ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
+
+@final
+class PublishedBackbone:
+    @staticmethod
+    def open(source: str, config: str | None) -> PublishedBackbone: ...
+    def config(self) -> dict[str, Any]: ...
+    @property
+    def prefix(self) -> str: ...
+    def nbytes(self, precision: str) -> int: ...
+
+@final
+class Processor:
+    def __new__(
+        cls,
+        version: str,
+        tokenizer: str,
+        preprocessing: str | None,
+        image_size: int | None,
+        tokens_per_view: int | None,
+        plain_text: bool,
+        options: str | None,
+    ) -> Processor: ...
+    @property
+    def version(self) -> str: ...
+    @property
+    def preprocessing(self) -> str: ...
+    @property
+    def view_size(self) -> tuple[int, int] | None: ...
+    @property
+    def num_tokens(self) -> int: ...
+    @property
+    def image_token_id(self) -> int: ...
+    def frame(self, image: _Frame) -> _Float32: ...
+    def tokens(self, text: str) -> _Int64: ...
+    def process(
+        self, observations: list[tuple[list[tuple[str | None, _Frame]], str | None]]
+    ) -> tuple[list[_Float32], _Int64, _Bool, _Int64 | None, list[str] | None]: ...
 
 @final
 class KeyValues:

@@ -14,6 +14,7 @@ mod error;
 mod head;
 mod intervention;
 mod machine;
+mod processor;
 mod rewrite;
 
 use pyo3::prelude::*;
@@ -23,7 +24,7 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::backbone::{Backbone, BackboneFeatures};
+    use crate::backbone::{Backbone, BackboneFeatures, PublishedBackbone};
     #[pymodule_export]
     use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
@@ -39,6 +40,8 @@ mod _saccade {
         available_isas, default_num_threads, dot_products, measure_peaks, selected_isa, start_profile,
         take_profile,
     };
+    #[pymodule_export]
+    use crate::processor::Processor;
     #[pymodule_export]
     use crate::rewrite::{convert, merge_future_tokens, quantize, resize};
 

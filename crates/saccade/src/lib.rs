@@ -20,6 +20,7 @@ mod memory;
 mod nn;
 mod ops;
 mod precision;
+mod processor;
 mod profile;
 mod recognise;
 mod rewrite;
@@ -29,7 +30,7 @@ mod workspaces;
 pub use array::{Array, ArrayMut, OwnedArray};
 pub use backbone::{
     Backbone, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep, BackboneLoadOptions,
-    BackboneRecord, LanguageConfig, VisionConfig,
+    BackboneRecord, LanguageConfig, PublishedBackbone, VisionConfig,
 };
 pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};
@@ -47,6 +48,9 @@ pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
 pub use memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
+pub use processor::{
+    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, Tokenizer, TokenizerFiles, View,
+};
 pub use profile::{Counter, Part, Profile};
 pub use recognise::{Published, TensorFacts};
 pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};

@@ -1,0 +1,161 @@
+//! Cubic, antialiased resizing in whole numbers: torch's and Pillow's.
+
+use super::taps::Taps;
+use super::{Image, Sums, along_height, along_width};
+use crate::aligned::AllocError;
+use crate::isa::Isa;
+
+/// Whose rounding of the weights.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CubicRule {
+    /// torch's `interpolate(..., mode="bicubic", antialias=True)` of uint8: as many bits as keep every weight in 16.
+    Torch,
+    /// Pillow's `resize(..., Image.BICUBIC)`: 22 bits.
+    Pillow,
+}
+
+/// Bits of Pillow's weights, and the most that torch's have.
+const MAX_BITS: u32 = 22;
+
+/// Inputs on either side of an output that is as large as they.
+const SUPPORT: f64 = 2.0;
+
+/// `image` resized to `(height, width, 3)`: cubic with `a = -0.5`, antialiased, along the width and then along the height, each result rounded
+/// to bytes. A pass that would change no size is left out.
+///
+/// ```
+/// use saccade_kernels::{CubicRule, Image, Isa, resize_cubic_u8};
+/// let grey = vec![100; 40 * 30 * 3];
+/// let small = resize_cubic_u8(Isa::best(), Image::new(&grey, 40, 30), 20, 20, CubicRule::Torch)?;
+/// assert_eq!(small, vec![100; 20 * 20 * 3]);
+/// # Ok::<(), saccade_kernels::AllocError>(())
+/// ```
+///
+/// # Errors
+/// If the system refuses the memory.
+///
+/// # Panics
+/// If `height` or `width` is 0, or if this CPU lacks `isa`.
+pub fn resize_cubic_u8(
+    isa: Isa,
+    image: Image<'_>,
+    height: usize,
+    width: usize,
+    rule: CubicRule,
+) -> Result<Vec<u8>, AllocError> {
+    assert!(height > 0 && width > 0);
+    let narrow = match image.width == width {
+        true => image.to_vec()?,
+        false => along_width(isa, &Cubic::new(image.width, width, rule)?, image)?,
+    };
+    if image.height == height {
+        return Ok(narrow);
+    }
+    along_height(isa, &Cubic::new(image.height, height, rule)?, &narrow, width)
+}
+
+/// The sums of one axis.
+struct Cubic {
+    taps: Taps<i32>,
+    bits: u32,
+}
+
+impl Cubic {
+    fn new(from: usize, to: usize, rule: CubicRule) -> Result<Self, AllocError> {
+        let taps = cubic_taps(from, to)?;
+        let bits = match rule {
+            CubicRule::Pillow => MAX_BITS,
+            CubicRule::Torch => {
+                let largest = taps.weights().iter().copied().fold(0.0, f64::max);
+                let fits = |bits: &u32| 0.5 + largest * f64::from(1 << bits) < f64::from(1 << 15);
+                (0..=MAX_BITS).rev().find(fits).unwrap_or(0)
+            }
+        };
+        let one = f64::from(1 << bits);
+        // Half is added towards the sign, and `as` truncates.
+        let taps = taps.map(|weight| (weight * one + 0.5_f64.copysign(weight)) as i32)?;
+        Ok(Self { taps, bits })
+    }
+}
+
+/// The weights in double.
+fn cubic_taps(from: usize, to: usize) -> Result<Taps<f64>, AllocError> {
+    let scale = from as f64 / to as f64;
+    let stretch = scale.max(1.0);
+    let support = SUPPORT * stretch;
+    let shrink = 1.0 / stretch;
+    let mut taps = Taps::with_room(to)?;
+    let mut weights = super::reserved((2.0 * support) as usize + 3)?;
+    for output in 0..to {
+        let centre = scale * (output as f64 + 0.5);
+        // A negative number becomes 0.
+        let first = (centre - support + 0.5) as usize;
+        let end = ((centre + support + 0.5) as usize).min(from);
+        weights.clear();
+        weights.extend((first..end).map(|input| cubic((input as f64 - centre + 0.5) * shrink)));
+        let sum: f64 = weights.iter().sum();
+        weights.iter_mut().for_each(|weight| *weight /= sum);
+        taps.push(first, &weights)?;
+    }
+    Ok(taps)
+}
+
+/// The cubic of Keys with `a = -0.5`.
+fn cubic(x: f64) -> f64 {
+    const A: f64 = -0.5;
+    let x = x.abs();
+    if x < 1.0 {
+        ((A + 2.0) * x - (A + 3.0)) * x * x + 1.0
+    } else if x < 2.0 {
+        (((x - 5.0) * x + 8.0) * x - 4.0) * A
+    } else {
+        0.0
+    }
+}
+
+/// Elements of a row that are summed together.
+const TOGETHER: usize = 48;
+
+impl Sums for Cubic {
+    type Value = u8;
+
+    fn num_outputs(&self) -> usize {
+        self.taps.len()
+    }
+
+    #[inline(always)]
+    fn value(byte: u8) -> u8 {
+        byte
+    }
+
+    #[inline(always)]
+    fn sum(&self, index: usize, inputs: &[u8], inner: usize, out: &mut [u8]) {
+        let (first, weights) = self.taps.of(index);
+        let half = (1 << self.bits) >> 1;
+        let inputs = &inputs[first * inner..(first + weights.len()) * inner];
+        for (start, out) in (0..inner).step_by(TOGETHER).zip(out.chunks_mut(TOGETHER)) {
+            let mut sums = [half; TOGETHER];
+            for (&weight, row) in weights.iter().zip(inputs.chunks_exact(inner)) {
+                let row = &row[start..start + out.len()];
+                match <&[u8; TOGETHER]>::try_from(row) {
+                    Ok(row) => add(&mut sums, weight, row),
+                    Err(_) => sums
+                        .iter_mut()
+                        .zip(row)
+                        .for_each(|(sum, &byte)| *sum += weight * i32::from(byte)),
+                }
+            }
+            for (out, sum) in out.iter_mut().zip(sums) {
+                *out = (sum >> self.bits).clamp(0, 255) as u8;
+            }
+        }
+    }
+}
+
+/// Adds a row times its weight.
+#[inline(always)]
+fn add(sums: &mut [i32; TOGETHER], weight: i32, row: &[u8; TOGETHER]) {
+    for (sum, &byte) in sums.iter_mut().zip(row) {
+        *sum += weight * i32::from(byte);
+    }
+}

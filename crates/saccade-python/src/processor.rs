@@ -1,0 +1,156 @@
+//! `saccade._saccade.Processor`: frames and words to the inputs of a backbone.
+
+use std::path::PathBuf;
+
+use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
+use pyo3::prelude::*;
+use saccade::{Frame, Observation, OwnedArray, Preprocessing, ProcessorOptions, TokenizerFiles};
+
+use crate::arrays::{to_numpy, view};
+use crate::detached::call;
+use crate::error::raise;
+
+/// A frame as the Python package gives it.
+#[derive(FromPyObject)]
+enum PyFrame<'py> {
+    U8(PyReadonlyArrayDyn<'py, u8>),
+    F32(PyReadonlyArrayDyn<'py, f32>),
+    F64(PyReadonlyArrayDyn<'py, f64>),
+}
+
+impl PyFrame<'_> {
+    fn view(&self) -> PyResult<Frame<'_>> {
+        Ok(match self {
+            Self::U8(array) => Frame::U8(view(array)?),
+            Self::F32(array) => Frame::F32(view(array)?),
+            Self::F64(array) => Frame::F64(view(array)?),
+        })
+    }
+}
+
+/// The views of an observation, with their names where they have any, and its instruction.
+type PyObservation<'py> = (Vec<(Option<String>, PyFrame<'py>)>, Option<String>);
+
+/// Arrays of pixels, ids `(batch, length)`, mask, grids `(views, 3)`, names of views.
+type PyPrepared<'py> = (
+    Vec<Bound<'py, PyArrayDyn<f32>>>,
+    Bound<'py, PyArrayDyn<i64>>,
+    Bound<'py, PyArrayDyn<bool>>,
+    Option<Bound<'py, PyArrayDyn<i64>>>,
+    Option<Vec<String>>,
+);
+
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct Processor(saccade::Processor);
+
+#[pymethods]
+impl Processor {
+    #[new]
+    #[allow(clippy::too_many_arguments)]
+    fn new(
+        py: Python<'_>,
+        version: &str,
+        tokenizer: PathBuf,
+        preprocessing: Option<&str>,
+        image_size: Option<usize>,
+        tokens_per_view: Option<usize>,
+        plain_text: bool,
+        options: Option<&str>,
+    ) -> PyResult<Self> {
+        let preprocessing = preprocessing
+            .map(Preprocessing::named)
+            .transpose()
+            .map_err(raise)?;
+        let options = ProcessorOptions {
+            preprocessing,
+            image_size,
+            tokens_per_view,
+            plain_text,
+            options,
+        };
+        call(py, || {
+            let tokenizer = TokenizerFiles::at(&tokenizer)?.read()?;
+            saccade::Processor::new(version, tokenizer, &options)
+        })
+        .map(Self)
+    }
+
+    #[getter]
+    fn version(&self) -> &'static str {
+        self.0.version()
+    }
+
+    #[getter]
+    fn preprocessing(&self) -> &'static str {
+        self.0.preprocessing().name()
+    }
+
+    #[getter]
+    fn view_size(&self) -> Option<(usize, usize)> {
+        self.0.view_size()
+    }
+
+    #[getter]
+    fn num_tokens(&self) -> usize {
+        self.0.num_tokens()
+    }
+
+    #[getter]
+    fn image_token_id(&self) -> u32 {
+        self.0.image_token_id()
+    }
+
+    fn frame<'py>(&self, py: Python<'py>, image: PyFrame<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let frame = image.view()?;
+        owned_to_numpy(py, call(py, || self.0.view(frame))?.pixels)
+    }
+
+    fn tokens<'py>(&self, py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyArrayDyn<i64>>> {
+        let ids = call(py, || self.0.tokens(text))?;
+        let ids: Vec<i64> = ids.into_iter().map(i64::from).collect();
+        let shape = [ids.len()];
+        to_numpy(py, ids, &shape)
+    }
+
+    fn process<'py>(
+        &self,
+        py: Python<'py>,
+        observations: Vec<PyObservation<'py>>,
+    ) -> PyResult<PyPrepared<'py>> {
+        let observations = observations
+            .iter()
+            .map(|(views, instruction)| {
+                let views = views
+                    .iter()
+                    .map(|(name, frame)| Ok((name.as_deref(), frame.view()?)));
+                Ok(Observation {
+                    views: views.collect::<PyResult<_>>()?,
+                    instruction: instruction.as_deref(),
+                })
+            })
+            .collect::<PyResult<Vec<_>>>()?;
+        let prepared = call(py, || self.0.process(&observations))?;
+        let shape = [observations.len(), prepared.length];
+        let pixels = prepared
+            .pixel_values
+            .into_iter()
+            .map(|array| owned_to_numpy(py, array));
+        let grids = prepared.image_grid_thw;
+        let grid = match grids.is_empty() {
+            true => None,
+            false => Some(to_numpy(py, grids.concat(), &[grids.len(), 3])?),
+        };
+        Ok((
+            pixels.collect::<PyResult<_>>()?,
+            to_numpy(py, prepared.input_ids, &shape)?,
+            to_numpy(py, prepared.attention_mask, &shape)?,
+            grid,
+            prepared.view_names,
+        ))
+    }
+}
+
+fn owned_to_numpy(py: Python<'_>, array: OwnedArray) -> PyResult<Bound<'_, PyArrayDyn<f32>>> {
+    let (data, shape) = array.into_parts();
+    to_numpy(py, data, &shape)
+}

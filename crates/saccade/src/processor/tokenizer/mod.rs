@@ -1,0 +1,140 @@
+//! The tokenizer of Qwen2 and its descendants: byte-level BPE, run by the crate `tokenizers`.
+//!
+//! Files are read strictly: a tokenizer of another kind, or one with anything in it that would change ids silently, is an error.
+
+mod find;
+mod json;
+mod parts;
+mod slow;
+
+use tokenizers::models::bpe::BPE;
+use tokenizers::normalizers::NFC;
+use tokenizers::pre_tokenizers::PreTokenizerWrapper;
+use tokenizers::pre_tokenizers::byte_level::ByteLevel;
+use tokenizers::pre_tokenizers::sequence::Sequence;
+use tokenizers::pre_tokenizers::split::{Split, SplitPattern};
+use tokenizers::{AddedToken, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl};
+
+use crate::error::{Error, Result};
+use parts::Parts;
+
+pub use find::TokenizerFiles;
+
+/// How Qwen2 splits text before BPE.
+const PATTERN: &str = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+";
+
+/// Longer text is refused before it is looked at: no model takes as many tokens, and the pattern above gives up on a million spaces.
+const MAX_TEXT_BYTES: usize = 1 << 18;
+
+/// That text which errors call `name` is not too long to be split.
+///
+/// # Errors
+/// [`Error::Input`] for more than 256 kB.
+pub(super) fn check_length(name: &str, text: &str) -> Result<()> {
+    match text.len() {
+        ..=MAX_TEXT_BYTES => Ok(()),
+        len => Err(Error::Input(format!(
+            "{name}: expected at most {MAX_TEXT_BYTES} bytes of text, got {len}"
+        ))),
+    }
+}
+
+type Inner = TokenizerImpl<BPE, NFC, Sequence, PostProcessorWrapper, DecoderWrapper>;
+
+/// Text to token ids.
+pub struct Tokenizer {
+    inner: Inner,
+    /// Number of tokens.
+    len: usize,
+}
+
+impl Tokenizer {
+    /// The tokenizer of a `tokenizer.json`, given as text.
+    ///
+    /// # Errors
+    /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] for a tokenizer of another kind, and for everything that is wrong with
+    /// this one, in one list.
+    pub fn from_json(text: &str) -> Result<Self> {
+        Self::build(json::parse(text)?)
+    }
+
+    /// The tokenizer of `vocab.json` and `merges.txt`, with the added tokens of `added_tokens.json` and `tokenizer_config.json`, given as text.
+    ///
+    /// # Errors
+    /// As [`from_json`](Self::from_json).
+    pub fn from_slow(
+        vocab: &str,
+        merges: &str,
+        added_tokens: Option<&str>,
+        tokenizer_config: Option<&str>,
+    ) -> Result<Self> {
+        Self::build(slow::parse(vocab, merges, added_tokens, tokenizer_config)?)
+    }
+
+    fn build(parts: Parts) -> Result<Self> {
+        parts.check()?;
+        let len = parts.len();
+        let Parts {
+            mut vocab,
+            merges,
+            added,
+        } = parts;
+        // Added tokens are in the vocabulary too, so that they keep the ids of the file: the crate numbers others in their order.
+        vocab.extend(added.iter().map(|token| (token.content.clone(), token.id)));
+        let bpe = BPE::builder().vocab_and_merges(vocab, merges).build();
+        let bpe = bpe.map_err(|problem| Error::Checkpoint(format!("tokenizer: merges: {problem}")))?;
+        let split = Split::new(
+            SplitPattern::Regex(PATTERN.to_owned()),
+            SplitDelimiterBehavior::Isolated,
+            false,
+        );
+        let split = split.map_err(|problem| Error::Checkpoint(format!("tokenizer: {problem}")))?;
+        let mut inner = Inner::new(bpe);
+        inner.with_normalizer(Some(NFC));
+        inner.with_pre_tokenizer(Some(Sequence::new(vec![
+            PreTokenizerWrapper::Split(split),
+            PreTokenizerWrapper::ByteLevel(ByteLevel::new(false, true, false)),
+        ])));
+        let added: Vec<AddedToken> = added
+            .into_iter()
+            .map(|token| {
+                AddedToken::from(token.content, token.special)
+                    .single_word(token.single_word)
+                    .lstrip(token.lstrip)
+                    .rstrip(token.rstrip)
+                    .normalized(token.normalized)
+            })
+            .collect();
+        inner.add_tokens(&added);
+        Ok(Self { inner, len })
+    }
+
+    /// The ids of `text`, which errors call `name`. Nothing is added at either end, and a special token's own string becomes that token.
+    /// [`check_length`] comes before it, where the text is a user's.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for text that the crate refuses.
+    pub(crate) fn encode(&self, name: &str, text: &str) -> Result<Vec<u32>> {
+        let encoding = self.inner.encode_fast(text, false);
+        let encoding = encoding.map_err(|problem| Error::Input(format!("{name}: {problem}")))?;
+        Ok(encoding.get_ids().to_vec())
+    }
+
+    /// The id of a special token, found by its string.
+    pub(crate) fn id_of(&self, token: &str) -> Option<u32> {
+        let added = self.inner.get_added_vocabulary();
+        added.get_vocab().get(token).copied()
+    }
+
+    /// Number of tokens, added ones included.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there are no tokens; never, since such files are refused.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+}

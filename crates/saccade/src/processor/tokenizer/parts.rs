@@ -1,0 +1,203 @@
+//! What both kinds of files describe: a vocabulary, merges and added tokens; and everything that can be wrong with them.
+
+use std::collections::{HashMap, HashSet};
+use std::fmt;
+
+use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, Visitor};
+use tokenizers::models::bpe::{Merges, Vocab};
+use tokenizers::pre_tokenizers::byte_level::ByteLevel;
+
+use crate::error::{Error, Result};
+
+/// No model has as many rows in its embedding table.
+const MAX_ID: u32 = 1 << 24;
+
+/// Problems that one error lists.
+const MAX_PROBLEMS: usize = 20;
+
+/// A token that is found in text before anything else.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Added {
+    pub id: u32,
+    pub content: String,
+    pub special: bool,
+    pub single_word: bool,
+    pub lstrip: bool,
+    pub rstrip: bool,
+    pub normalized: bool,
+}
+
+impl Added {
+    /// A token that is matched as it stands.
+    pub(super) fn plain(id: u32, content: String) -> Self {
+        Self {
+            id,
+            content,
+            special: true,
+            single_word: false,
+            lstrip: false,
+            rstrip: false,
+            normalized: false,
+        }
+    }
+}
+
+/// A tokenizer as its files describe it.
+#[derive(Default)]
+pub(super) struct Parts {
+    pub vocab: Vocab,
+    pub merges: Merges,
+    pub added: Vec<Added>,
+}
+
+impl Parts {
+    /// Number of different ids.
+    pub(super) fn len(&self) -> usize {
+        let added = self
+            .added
+            .iter()
+            .filter(|token| !self.vocab.contains_key(&token.content));
+        self.vocab.len() + added.count()
+    }
+
+    /// That the parts fit each other.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] that lists what does not.
+    pub(super) fn check(&self) -> Result<()> {
+        let mut problems = Problems::default();
+        self.check_ids(&mut problems);
+        self.check_alphabet(&mut problems);
+        self.check_merges(&mut problems);
+        problems.into_result()
+    }
+
+    fn check_ids(&self, problems: &mut Problems) {
+        let mut tokens: HashMap<u32, &str> = HashMap::with_capacity(self.vocab.len());
+        let mut contents = HashSet::new();
+        let added = self.added.iter().map(|token| (token.content.as_str(), token.id));
+        let vocab = self.vocab.iter().map(|(token, &id)| (token.as_str(), id));
+        for (token, id) in vocab.chain(added) {
+            if id >= MAX_ID {
+                problems.add(|| format!("{token:?}: expected an id below {MAX_ID}, got {id}"));
+            }
+            if let Some(other) = tokens.insert(id, token)
+                && other != token
+            {
+                problems.add(|| format!("{token:?} and {other:?} have the same id, {id}"));
+            }
+        }
+        for token in &self.added {
+            if token.content.is_empty() {
+                problems.add(|| format!("the added token {} is empty", token.id));
+            }
+            if !contents.insert(&token.content) {
+                problems.add(|| format!("{:?} is added twice", token.content));
+            }
+            if let Some(&id) = self.vocab.get(&token.content)
+                && id != token.id
+            {
+                problems.add(|| {
+                    format!(
+                        "{:?}: expected the id of the vocabulary, {id}, got {}",
+                        token.content, token.id
+                    )
+                });
+            }
+        }
+    }
+
+    /// Text that no token stands for would be dropped without a word.
+    fn check_alphabet(&self, problems: &mut Problems) {
+        let alphabet = ByteLevel::alphabet();
+        let missing = alphabet
+            .iter()
+            .filter(|byte| !self.vocab.contains_key(byte.encode_utf8(&mut [0; 4]) as &str));
+        match missing.count() {
+            0 => {}
+            missing => problems.add(|| format!("vocab: {missing} of the 256 byte tokens are missing")),
+        }
+    }
+
+    fn check_merges(&self, problems: &mut Problems) {
+        let mut seen = HashSet::with_capacity(self.merges.len());
+        for (rank, pair) in self.merges.iter().enumerate() {
+            let (left, right) = pair;
+            if left.is_empty() || right.is_empty() {
+                problems.add(|| format!("merges: {rank}: expected two tokens, got {pair:?}"));
+                continue;
+            }
+            for token in [left.clone(), right.clone(), format!("{left}{right}")] {
+                if !self.vocab.contains_key(&token) {
+                    problems.add(|| format!("merges: {rank}: {token:?} is not in the vocabulary"));
+                }
+            }
+            if !seen.insert(pair) {
+                problems.add(|| format!("merges: {rank}: {pair:?} appears twice"));
+            }
+        }
+    }
+}
+
+/// What is wrong with a tokenizer.
+#[derive(Default)]
+pub(super) struct Problems {
+    listed: Vec<String>,
+    more: usize,
+}
+
+impl Problems {
+    pub(super) fn add(&mut self, problem: impl FnOnce() -> String) {
+        match self.listed.len() < MAX_PROBLEMS {
+            true => self.listed.push(problem()),
+            false => self.more += 1,
+        }
+    }
+
+    /// # Errors
+    /// [`Error::Checkpoint`] if there is a problem.
+    pub(super) fn into_result(mut self) -> Result<()> {
+        // Maps have no order of their own.
+        self.listed.sort();
+        if self.more > 0 {
+            self.listed.push(format!("and {} more", self.more));
+        }
+        match &self.listed[..] {
+            [] => Ok(()),
+            [problem] => Err(Error::Checkpoint(format!("tokenizer: {problem}"))),
+            problems => Err(Error::Checkpoint(format!(
+                "tokenizer: it is broken:\n  {}",
+                problems.join("\n  ")
+            ))),
+        }
+    }
+}
+
+/// Ids by token, each token once.
+#[derive(Default)]
+pub(super) struct Ids(pub Vocab);
+
+impl<'de> Deserialize<'de> for Ids {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        struct Entries;
+        impl<'de> Visitor<'de> for Entries {
+            type Value = Ids;
+
+            fn expecting(&self, formatter: &mut fmt::Formatter) -> fmt::Result {
+                formatter.write_str("an object of tokens and their ids")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Ids, A::Error> {
+                let mut ids = Vocab::new();
+                while let Some((token, id)) = map.next_entry::<String, u32>()? {
+                    if ids.contains_key(&token) {
+                        return Err(A::Error::custom(format!("{token:?} appears twice")));
+                    }
+                    ids.insert(token, id);
+                }
+                Ok(Ids(ids))
+            }
+        }
+        deserializer.deserialize_map(Entries)
+    }
+}

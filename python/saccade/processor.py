@@ -1,0 +1,265 @@
+"""Camera frames and an instruction to the inputs of a backbone, as the released processors prepare them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+import saccade._saccade as _saccade
+from saccade._arrays import ArrayLike, Float32Array, frame, integer, text
+from saccade.backbone_inputs import BackboneInputs
+from saccade.errors import InputError
+
+#: The views of one observation: by camera name, or in the order of the prompt.
+Frames: TypeAlias = "Mapping[str, ArrayLike] | Sequence[ArrayLike] | npt.NDArray[Any]"
+Version: TypeAlias = Literal["n1.5", "n1.6", "n1.7"]
+Preprocessing: TypeAlias = Literal["lerobot", "isaac"]
+
+_View: TypeAlias = "tuple[str | None, npt.NDArray[Any]]"
+
+
+class Processor:
+    """Prepares frames and an instruction for the backbone of one version of GR00T.
+
+    Everything is computed in Rust, with the bits of the released processors: crops, resizing, the prompt and
+    its tokens. A processor is immutable: any number of threads may use it at the same time.
+
+    Args:
+        version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
+        tokenizer: A ``tokenizer.json``, or a directory with one or with ``vocab.json`` and ``merges.txt``.
+        preprocessing: Whose frames and words the checkpoint was trained on. ``"lerobot"``: views sorted by
+            name, no crop. ``"isaac"`` (Isaac-GR00T): views in the order given, a centre crop of 95 %.
+            Default: lerobot's for N1.5, Isaac-GR00T's for N1.6 and N1.7.
+        image_size: N1.5: height and width of a view. Default: 224.
+        tokens_per_view: N1.5: image tokens of a view. Default: ``(image_size / 14) ** 2``.
+        plain_text: N1.5: the instruction stands in the prompt as it is. Otherwise it stands there as Python
+            prints a list of it, ``['open the drawer']``, as in both released processors.
+        options: Keys of the released ``processor_config.json`` and ``preprocessor_config.json``, such as
+            ``shortest_image_edge``, ``crop_fraction``, ``min_pixels`` or ``formalize_language``. Default: as
+            in the published checkpoints.
+
+    Raises:
+        InputError: An argument or option is unknown, has another type, or belongs to another version.
+        CheckpointError: The tokenizer is broken, or of another kind than the version's. The message lists
+            every problem.
+        FileNotFoundError: There is no such tokenizer.
+
+    Example:
+        >>> import numpy as np, saccade
+        >>> processor = saccade.Processor("n1.5", "tests/data/backbone/tiny_tokenizer.json")
+        >>> inputs = processor({"front": np.zeros((480, 640, 3), np.uint8)}, "open the drawer")
+        >>> inputs.pixel_values.shape, inputs.view_names
+        ((1, 3, 224, 224), ('front',))
+    """
+
+    def __init__(
+        self,
+        version: Version,
+        tokenizer: str | os.PathLike[str],
+        *,
+        preprocessing: Preprocessing | None = None,
+        image_size: int | None = None,
+        tokens_per_view: int | None = None,
+        plain_text: bool = False,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not isinstance(plain_text, bool):
+            raise InputError(f"plain_text: expected True or False, got {plain_text!r}")
+        self._processor = _saccade.Processor(
+            text("version", version),
+            _path("tokenizer", tokenizer),
+            None if preprocessing is None else text("preprocessing", preprocessing),
+            None if image_size is None else integer("image_size", image_size),
+            None if tokens_per_view is None else integer("tokens_per_view", tokens_per_view),
+            plain_text,
+            None if options is None else _to_json(options),
+        )
+
+    @property
+    def version(self) -> str:
+        """``"n1.5"``, ``"n1.6"`` or ``"n1.7"``."""
+        return self._processor.version
+
+    @property
+    def preprocessing(self) -> str:
+        """Whose frames and words it prepares: ``"lerobot"`` or ``"isaac"``."""
+        return self._processor.preprocessing
+
+    @property
+    def image_size(self) -> int | None:
+        """N1.5: height and width of a view. None for N1.6 and N1.7, where they depend on the frame."""
+        size = self._processor.view_size
+        return None if size is None else size[0]
+
+    @property
+    def tokens_per_view(self) -> int | None:
+        """N1.5: image tokens of a view. None for N1.6 and N1.7, where they depend on the frame."""
+        size = self._processor.view_size
+        return None if size is None else size[1]
+
+    def __call__(
+        self,
+        frames: Frames | Sequence[Frames],
+        instruction: str | Sequence[str | None] | None = None,
+        *,
+        view_names: Sequence[str] | None = None,
+    ) -> BackboneInputs:
+        """Prepares one observation, or a batch.
+
+        Args:
+            frames: ``{name: frame}`` or a sequence of frames. A frame is ``(height, width, 3)`` uint8. With
+                lerobot's preprocessing it may also be ``(3, height, width)``, and floating point from 0 to 1:
+                values beyond that are clamped, as lerobot does. A batch is a list of observations with the
+                same views; its prompts are padded on the left.
+            instruction: What the robot is to do. For a batch: a list with one instruction for each
+                observation. None, and with lerobot's preprocessing an empty text: the released default.
+            view_names: Names of the views of a sequence.
+
+        Raises:
+            ShapeError, DtypeError: A frame is none. The message names it.
+            InputError: There are no frames, the observations of a batch differ in their views, or an
+                instruction is too long, contains a token that stands for an image, or a placeholder such as
+                ``<image-2>``, which the released N1.5 would replace by another copy of a frame.
+            MemoryError: There is not enough memory.
+
+        Example:
+            >>> import numpy as np, saccade
+            >>> processor = saccade.Processor("n1.5", "tests/data/backbone/tiny_tokenizer.json")
+            >>> frames = {"front": np.zeros((480, 640, 3), np.uint8)}
+            >>> inputs = processor([frames, frames], ["push", "open the drawer"])
+            >>> inputs.input_ids.shape, inputs.attention_mask.sum(axis=1)
+            ((2, 294), array([292, 294]))
+        """
+        observations, instructions = _batch(frames, instruction)
+        names = None if view_names is None else [text("view_names", name) for name in view_names]
+        prepared = self._processor.process(
+            [
+                (_views(observation, names), None if told is None else text("instruction", told))
+                for observation, told in zip(observations, instructions, strict=True)
+            ]
+        )
+        pixels, input_ids, attention_mask, grid, found = prepared
+        return BackboneInputs(
+            pixels if self.version == "n1.6" else pixels[0],
+            input_ids,
+            attention_mask,
+            grid,
+            view_names=found,
+        )
+
+    def frame(self, image: ArrayLike) -> Float32Array:
+        """The ``pixel_values`` of one frame.
+
+        Args:
+            image: A frame, as in a call.
+
+        Returns:
+            N1.5: ``(3, image_size, image_size)``. N1.6: ``(1, 3, height, width)``. N1.7: ``(patches, 1536)``.
+
+        Raises:
+            ShapeError, DtypeError, InputError: It is not a frame.
+            MemoryError: There is not enough memory.
+        """
+        return self._processor.frame(frame("image", image))
+
+    def tokens(self, text: str) -> npt.NDArray[np.int64]:
+        """The token ids of ``text`` alone, ``(tokens,)``.
+
+        The string of a special token becomes that token.
+
+        Raises:
+            InputError: It is not text, or longer than 256 kB.
+
+        Example:
+            >>> import saccade
+            >>> saccade.Processor("n1.5", "tests/data/backbone/tiny_tokenizer.json").tokens("push")
+            array([388])
+        """
+        return self._processor.tokens(_text("text", text))
+
+    def __repr__(self) -> str:
+        size = (
+            ""
+            if self.image_size is None
+            else f" image_size={self.image_size} tokens_per_view={self.tokens_per_view}"
+        )
+        return (
+            f"<saccade.Processor version={self.version} preprocessing={self.preprocessing}{size} "
+            f"tokens={self._processor.num_tokens}>"
+        )
+
+
+_text = text  # in a method with an argument of that name
+
+
+def _path(name: str, value: Any) -> str:
+    try:
+        path = os.fspath(value)
+    except TypeError:
+        path = None
+    if not isinstance(path, str) or "\0" in path:
+        raise InputError(f"{name}: expected a path, got {value!r}")
+    return path
+
+
+def _to_json(options: Any) -> str:
+    if not isinstance(options, Mapping):
+        raise InputError(f"options: expected a mapping, got {type(options).__name__}")
+    try:
+        return json.dumps(dict(options), allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"options: expected values that JSON has: {error}") from None
+
+
+def _batch(frames: Any, instruction: Any) -> tuple[Sequence[Any], Sequence[str | None]]:
+    """Observations and their instructions."""
+    is_batch = isinstance(frames, (list, tuple)) and any(
+        isinstance(item, (Mapping, list, tuple)) for item in frames
+    )
+    if isinstance(instruction, (list, tuple)):
+        if not is_batch:
+            raise InputError(
+                f"frames: expected a list of {len(instruction)} observations for as many instructions, got "
+                f"{_kind(frames)}"
+            )
+        if len(instruction) != len(frames):
+            raise InputError(
+                f"instruction: expected one for each of {len(frames)} observations, got {len(instruction)}"
+            )
+        return frames, instruction
+    if not is_batch:
+        return [frames], [instruction]
+    if instruction is not None:
+        raise InputError(
+            f"instruction: expected a list of {len(frames)}, one for each observation, got {instruction!r}"
+        )
+    return frames, [None] * len(frames)
+
+
+def _views(frames: Any, names: list[str] | None) -> list[_View]:
+    """The frames of an observation with their names."""
+    if isinstance(frames, Mapping):
+        if names is not None:
+            raise InputError("view_names: expected none, since the frames have names")
+        return [(text("frames", name), frame(f"frames[{name!r}]", image)) for name, image in frames.items()]
+    is_array = getattr(frames, "ndim", None) == 4
+    if not is_array and not isinstance(frames, (list, tuple)):
+        raise InputError(
+            f"frames: expected a mapping of names to frames or a sequence of frames, got {_kind(frames)}"
+        )
+    if names is not None and len(names) != len(frames):
+        raise InputError(f"view_names: expected {len(frames)} names, got {len(names)}")
+    return [
+        (None if names is None else names[index], frame(f"frames[{index}]", image))
+        for index, image in enumerate(frames)
+    ]
+
+
+def _kind(value: Any) -> str:
+    shape = getattr(value, "shape", None)
+    return type(value).__name__ if shape is None else f"an array of shape {tuple(shape)}"
