@@ -26,6 +26,7 @@ __all__ = [
     "CrossAttention",
     "KeyValues",
     "Processor",
+    "ProcessorSource",
     "Published",
     "__version__",
     "available_isas",
@@ -195,6 +196,8 @@ class Processor:
         plain_text: bool,
         options: str | None,
     ) -> Processor: ...
+    @staticmethod
+    def load(source: ProcessorSource, tokenizer: str | None, preprocessing: str | None) -> Processor: ...
     @property
     def version(self) -> str: ...
     @property
@@ -210,6 +213,18 @@ class Processor:
     def process(
         self, observations: list[tuple[list[tuple[str | None, _Frame]], str | None]]
     ) -> tuple[list[_Float32], _Int64, _Bool, _Int64 | None, list[str] | None]: ...
+
+@final
+class ProcessorSource:
+    def __new__(cls, source: str) -> ProcessorSource: ...
+    @property
+    def version(self) -> str: ...
+    @property
+    def has_tokenizer(self) -> bool: ...
+    @property
+    def published(self) -> list[str]: ...
+    @property
+    def needed_files(self) -> list[str]: ...
 
 @final
 class KeyValues:

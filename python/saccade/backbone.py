@@ -215,12 +215,13 @@ class Backbone:
     def _encode(
         self, inputs: list[BackboneInputs], previous: list[BackboneFeatures], record: Sequence[str]
     ) -> list[BackboneFeatures]:
-        for given in inputs:
-            if not isinstance(given, BackboneInputs):
-                raise InputError(f"inputs: expected saccade.BackboneInputs, got {type(given).__name__}")
-        for given in previous:
-            if not isinstance(given, BackboneFeatures):
-                raise InputError(f"previous: expected what a backbone returns, got {type(given).__name__}")
+        for name, values, kind in (
+            ("inputs", inputs, BackboneInputs),
+            ("previous", previous, BackboneFeatures),
+        ):
+            for value in values:
+                if not isinstance(value, kind):
+                    raise InputError(f"{name}: expected saccade.{kind.__name__}, got {type(value).__name__}")
         keep = check_backbone_record(record)
         encoded = self._backbone.encode(
             [_plain(given) for given in inputs], [given._held for given in previous], *keep
@@ -234,8 +235,8 @@ class Backbone:
     def __reduce__(self) -> tuple[Any, ...]:
         if self._source is None:
             raise DtypeError(
-                "a backbone made by Backbone.from_tensors cannot be pickled or copied, because it has no file "
-                "to be loaded from: write its tensors to a checkpoint and use Backbone.load"
+                "a backbone made by Backbone.from_tensors cannot be pickled or copied, because it has no "
+                "file to be loaded from: write its tensors to a checkpoint and use Backbone.load"
             )
         return _load, (self._source, self._options)
 

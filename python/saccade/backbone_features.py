@@ -40,7 +40,7 @@ class BackboneRecord:
     def nbytes(self) -> int:
         """Size in memory, in bytes."""
         parts = (self.hidden, self.vision, self.image_tokens)
-        return sum(int(array.nbytes) for part in parts for array in part.values())  # type: ignore[attr-defined]
+        return sum(int(array.nbytes) for part in parts for array in part.values())
 
     def __repr__(self) -> str:
         counts = [f"{name}={len(getattr(self, name))}" for name in RECORDS]
@@ -121,8 +121,8 @@ class BackboneFeatures:
 
     def __reduce__(self) -> NoReturn:
         raise DtypeError(
-            "BackboneFeatures cannot be pickled, because they belong to one loaded backbone: pickle the array "
-            "backbone_features"
+            "BackboneFeatures cannot be pickled, because they belong to one loaded backbone: pickle the "
+            "array backbone_features"
         )
 
     def __repr__(self) -> str:

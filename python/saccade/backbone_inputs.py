@@ -20,11 +20,12 @@ class BackboneInputs:
 
     Args:
         pixel_values: The normalised pixels of all views, those of the first observation first. N1.5:
-            ``(batch * views, 3, height, width)``. N1.6: a list of ``(1, 3, height, width)``, one array a view,
-            since their sizes may differ. N1.7: ``(patches, 1536)``, the patches of all views.
+            ``(batch * views, 3, height, width)``. N1.6: a list of ``(1, 3, height, width)``, one array a
+            view, since their sizes may differ. N1.7: ``(patches, 1536)``, the patches of all views.
         input_ids: The tokens of the prompts, ``(batch, T)``.
         attention_mask: ``(batch, T)``, integers or booleans; 0 or False marks padding. Default: no padding.
-        image_grid_thw: N1.7 only: the grid of patches of each view, ``(batch * views, 3)``: time, height, width.
+        image_grid_thw: N1.7 only: the grid of patches of each view, ``(batch * views, 3)``: time, height,
+            width.
         view_names: The names of the views of an observation, in the order of the prompt. Default:
             ``"view_1"``, ``"view_2"``, and so on.
 
@@ -74,8 +75,8 @@ class BackboneInputs:
             self.pixel_values = float32("pixel_values", cast("ArrayLike", pixel_values))
             if self.pixel_values.ndim not in (2, 4):
                 raise ShapeError(
-                    "pixel_values: expected (views, 3, height, width), or (patches, values) for N1.7, got shape "
-                    f"{self.pixel_values.shape}"
+                    "pixel_values: expected (views, 3, height, width), or (patches, values) for N1.7, got "
+                    f"shape {self.pixel_values.shape}"
                 )
         self.input_ids = _with_axes("input_ids", int64("input_ids", input_ids), 2)
         self.attention_mask = _mask(attention_mask, self.input_ids.shape)

@@ -41,7 +41,7 @@ mod _saccade {
         take_profile,
     };
     #[pymodule_export]
-    use crate::processor::Processor;
+    use crate::processor::{Processor, ProcessorSource};
     #[pymodule_export]
     use crate::rewrite::{convert, merge_future_tokens, quantize, resize};
 

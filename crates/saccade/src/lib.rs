@@ -49,7 +49,8 @@ pub use memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
 pub use processor::{
-    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, Tokenizer, TokenizerFiles, View,
+    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, ProcessorSource, Tokenizer,
+    TokenizerFiles, View,
 };
 pub use profile::{Counter, Part, Profile};
 pub use recognise::{Published, TensorFacts};

@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 
 use serde_json::{Map, Value};
 
+use super::agreement::disagreements;
 use super::config::{BackboneConfig, CHANNELS, LanguageConfig, Tower, VisionConfig};
 use super::released::{Release, TowerKind};
 use crate::config::{Object, Version};
@@ -159,7 +160,7 @@ impl Reader<'_> {
             language,
         };
         if self.problems.is_empty() {
-            self.check(&config);
+            self.problems = disagreements(&config);
         }
         config
     }
@@ -260,86 +261,6 @@ impl Reader<'_> {
         }
     }
 
-    /// What the sizes must be to each other.
-    fn check(&mut self, config: &BackboneConfig) {
-        let BackboneConfig { vision, language, .. } = config;
-        let mut add = |is_wrong: bool, problem: String| {
-            if is_wrong {
-                self.problems.push(problem);
-            }
-        };
-        add(
-            !vision.width.is_multiple_of(vision.num_heads),
-            format!(
-                "vision_config: expected a hidden_size that {} heads divide, got {}",
-                vision.num_heads, vision.width
-            ),
-        );
-        if let Some(size) = vision.image_size {
-            add(
-                !size.is_multiple_of(vision.token_size()),
-                format!(
-                    "vision_config: expected an image_size of whole tokens of {} pixels, got {size}",
-                    vision.token_size()
-                ),
-            );
-        }
-        add(
-            vision.table_side() * vision.table_side() != vision.num_positions,
-            format!(
-                "vision_config: expected positions in a square, got {}",
-                vision.num_positions
-            ),
-        );
-        let is_rotated = matches!(vision.tower, Tower::Qwen3Vl { .. });
-        add(
-            is_rotated && !vision.head_dim.is_multiple_of(4),
-            format!(
-                "vision_config: expected heads of a multiple of 4, got {}",
-                vision.head_dim
-            ),
-        );
-        let sorted = vision.deepstack.windows(2).all(|pair| pair[0] < pair[1]);
-        let in_range = vision.deepstack.iter().all(|&block| block < vision.num_layers);
-        add(
-            !sorted || !in_range || vision.deepstack.len() > language.num_layers,
-            format!(
-                "vision_config.deepstack_visual_indexes: expected at most {} ascending blocks below {}, got {:?}",
-                language.num_layers, vision.num_layers, vision.deepstack
-            ),
-        );
-        add(
-            !language.num_heads.is_multiple_of(language.num_kv_heads),
-            format!(
-                "text_config: expected a num_attention_heads that {} heads of keys divide, got {}",
-                language.num_kv_heads, language.num_heads
-            ),
-        );
-        add(
-            !language.head_dim.is_multiple_of(2),
-            format!(
-                "text_config: expected an even head_dim, got {}",
-                language.head_dim
-            ),
-        );
-        if let Some(section) = language.mrope_section {
-            add(
-                section.iter().sum::<usize>() != language.head_dim / 2,
-                format!(
-                    "text_config.rope_scaling.mrope_section: expected three numbers with the sum {}, got {section:?}",
-                    language.head_dim / 2
-                ),
-            );
-        }
-        add(
-            config.image_token_id >= language.vocab_size,
-            format!(
-                "the image token is {}, expected an id below the vocab_size {}",
-                config.image_token_id, language.vocab_size
-            ),
-        );
-    }
-
     /// Layers of the language model that are kept.
     fn select_layer(&mut self) -> usize {
         let given = self.given;
@@ -363,7 +284,7 @@ impl Reader<'_> {
         let plain = self.given.sizes.get("select_layer");
         let of_vision = plain.filter(|layer| layer.as_f64().is_some_and(|layer| layer < 0.0));
         if let Some(layer) = eagle.or(of_vision)
-            && *layer != Value::from(-1)
+            && layer.as_i64() != Some(-1)
         {
             self.problems.push(format!(
                 "eagle.select_layer is {layer}, expected -1, the last layer of the vision tower"
@@ -391,9 +312,7 @@ impl Reader<'_> {
     /// The pairs that turn with time, height and width, if they are interleaved as released.
     fn mrope_section(&mut self, scaling: &Object) -> Option<[usize; 3]> {
         let is_known = scaling.get("mrope_interleaved") == Some(&Value::Bool(true))
-            && scaling
-                .get("rope_type")
-                .is_none_or(|kind| *kind == Value::from("default"));
+            && scaling.get("rope_type").is_none_or(|kind| kind == "default");
         let section = scaling.get("mrope_section").and_then(Value::as_array);
         let section: Option<Vec<usize>> = section.and_then(|section| {
             let size = |value: &Value| value.as_u64().filter(|size| *size <= MAX_SIZE);

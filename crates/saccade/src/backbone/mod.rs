@@ -1,5 +1,6 @@
 //! The vision-language backbone: camera views and words in, features for the action head out.
 
+mod agreement;
 pub(crate) mod config;
 mod connector;
 mod encode;

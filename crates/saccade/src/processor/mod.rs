@@ -4,6 +4,7 @@ mod frames;
 mod prompt;
 mod python_text;
 mod settings;
+mod source;
 mod tokenizer;
 
 use saccade_kernels::Isa;
@@ -19,6 +20,7 @@ use tokenizer::check_length;
 
 pub use frames::{Frame, View};
 pub use settings::{Preprocessing, ProcessorOptions};
+pub use source::ProcessorSource;
 pub use tokenizer::{Tokenizer, TokenizerFiles};
 
 /// Positions that the language model of N1.5 and N1.6 has, and that of N1.7.

@@ -120,11 +120,17 @@ fn text(settings: &Settings, instruction: Option<&str>) -> Result<String> {
         }
         (_, Some(text)) => text,
     };
-    let text = match settings.version {
-        Version::N15 if settings.plain_text => instruction.to_owned(),
-        Version::N15 => list_of(instruction),
-        _ if settings.formalize_language => formalized(instruction),
-        _ => instruction.to_owned(),
+    let is_n15 = settings.version == Version::N15;
+    let text = match settings.formalize_language {
+        false => instruction.to_owned(),
+        // lerobot's N1.5 keeps no underscores; Isaac-GR00T's does not read the option.
+        true if is_n15 && settings.preprocessing == Preprocessing::Isaac => instruction.to_owned(),
+        true if is_n15 => formalized(instruction).replace('_', ""),
+        true => formalized(instruction),
+    };
+    let text = match is_n15 && !settings.plain_text {
+        true => list_of(&text),
+        false => text,
     };
     if settings.version != Version::N17
         && let Some(found) = PLACEHOLDER.find(&text)
