@@ -3,6 +3,8 @@
 //! A value of a [`Simd`] type proves that this CPU has an instruction set. [`Simd::run`] is the only place that turns target features on;
 //! a [`Kernel`] is inlined into it whole, so that every operation below becomes one instruction.
 
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod aarch64;
 pub(crate) mod math;
 pub(crate) mod portable;
 #[cfg(target_arch = "x86_64")]
@@ -165,6 +167,8 @@ pub(crate) enum Dot {
 /// # Safety
 /// Every method needs a CPU that has the instruction set of `V` and the dot products of the implementation.
 pub(crate) unsafe trait Dots<V: Vector> {
+    /// What users call the instructions; empty where there are none.
+    const NAME: &'static str = "";
     /// Up to where [`Self::int8`] takes unsigned bytes.
     const MAX_BYTE: u8 = V::MAX_BYTE;
     /// Whether [`Self::bf16`] is one instruction.
