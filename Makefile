@@ -23,7 +23,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat fuzz setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-aarch64 test-aarch64-all fuzz setup-rollout setup-test clean
 
 help:
 	@echo "make rollout      run the bundled policy in simulation; table and videos in $(ROLLOUT_OUT)"
@@ -34,6 +34,7 @@ help:
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
 	@echo "make fuzz         fuzz headers, indexes, configs and resizing, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
+	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
 	@echo "make wheel        build a manylinux wheel of the last commit in dist"
 	@echo "make test-wheel   test the wheel on CPythons, NumPys and emulated old CPUs; writes docs/wheels.md"
 	@echo "make clean        remove the virtual environments and build outputs"
@@ -165,6 +166,13 @@ fuzz: setup-test
 # lerobot 0.5 and later need Python 3.12. If python3.12 is not on PATH: COMPAT_ARGS="--python312 PATH".
 test-compat: setup-test
 	$(BIN)/python tests/compat/run.py $(COMPAT_ARGS)
+
+# On one emulated CPU, and on those that differ in what they have. docs/aarch64.md says more.
+test-aarch64:
+	.ci/aarch64/run.sh test
+
+test-aarch64-all:
+	CPUS="max,sve=off neoverse-n1 cortex-a72 max" .ci/aarch64/run.sh test
 
 wheel:
 	@$(PYTHON) .ci/needs.py python rust

@@ -156,9 +156,10 @@ impl<S: Simd> Step<S> for BfmmlaStep {
     unsafe fn multiply_add<const NV: usize, const MR: usize>(
         sums: &mut [[float32x4_t; NV]; MR],
         x: &[*const u32; MR],
+        beyond: usize,
         weights: *const u32,
     ) {
         // SAFETY: the caller's promise.
-        unsafe { pairs::multiply_add::<Self, NV, MR>(sums, x, weights) }
+        unsafe { pairs::multiply_add::<Self, NV, MR>(sums, x, beyond, weights) }
     }
 }

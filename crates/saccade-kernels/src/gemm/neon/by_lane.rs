@@ -23,13 +23,14 @@ pub(super) trait ByLane {
 pub(super) unsafe fn multiply_add<P: ByLane, const NV: usize, const MR: usize>(
     sums: &mut [[P::Sum; NV]; MR],
     x: &[*const u32; MR],
+    beyond: usize,
     weights: *const u32,
 ) {
     // SAFETY: the caller's promise.
     unsafe {
-        let mut rows = [vld1q_u32(x[0]); MR];
+        let mut rows = [vld1q_u32(x[0].add(beyond)); MR];
         for (row, x) in rows.iter_mut().zip(x).skip(1) {
-            *row = vld1q_u32(*x);
+            *row = vld1q_u32(x.add(beyond));
         }
         word::<P, NV, MR, 0>(sums, &rows, weights);
         word::<P, NV, MR, 1>(sums, &rows, weights);

@@ -227,10 +227,11 @@ macro_rules! float_step {
         unsafe fn multiply_add<const NV: usize, const MR: usize>(
             sums: &mut [[float32x4_t; NV]; MR],
             x: &[*const u32; MR],
+            beyond: usize,
             weights: *const u32,
         ) {
             // SAFETY: the caller's promise.
-            unsafe { by_lane::multiply_add::<Fmla, NV, MR>(sums, x, weights) }
+            unsafe { by_lane::multiply_add::<Fmla, NV, MR>(sums, x, beyond, weights) }
         }
     };
 }

@@ -160,10 +160,11 @@ impl<S: Simd> Step<S> for UsmmlaStep {
     unsafe fn multiply_add<const NV: usize, const MR: usize>(
         sums: &mut [[int32x4_t; NV]; MR],
         x: &[*const u32; MR],
+        beyond: usize,
         weights: *const u32,
     ) {
         // SAFETY: the caller's promise.
-        unsafe { pairs::multiply_add::<Self, NV, MR>(sums, x, weights) }
+        unsafe { pairs::multiply_add::<Self, NV, MR>(sums, x, beyond, weights) }
     }
 }
 
@@ -187,10 +188,11 @@ impl<S: Simd> Step<S> for SdotStep {
     unsafe fn multiply_add<const NV: usize, const MR: usize>(
         sums: &mut [[int32x4_t; NV]; MR],
         x: &[*const u32; MR],
+        beyond: usize,
         weights: *const u32,
     ) {
         // SAFETY: the caller's promise.
-        unsafe { by_lane::multiply_add::<Self, NV, MR>(sums, x, weights) }
+        unsafe { by_lane::multiply_add::<Self, NV, MR>(sums, x, beyond, weights) }
     }
 }
 
@@ -264,13 +266,14 @@ impl<S: Simd> Step<S> for WideningStep {
     unsafe fn multiply_add<const NV: usize, const MR: usize>(
         sums: &mut [[int32x4_t; NV]; MR],
         x: &[*const u32; MR],
+        beyond: usize,
         weights: *const u32,
     ) {
         // SAFETY: the caller's promise.
         unsafe {
-            let mut rows = [vld1q_s16(x[0].cast()); MR];
+            let mut rows = [vld1q_s16(x[0].add(beyond).cast()); MR];
             for (row, x) in rows.iter_mut().zip(x).skip(1) {
-                *row = vld1q_s16(x.cast());
+                *row = vld1q_s16(x.add(beyond).cast());
             }
             Self::two_words::<NV, MR, 0, 1, 2, 3>(sums, &rows, weights);
             Self::two_words::<NV, MR, 4, 5, 6, 7>(sums, &rows, weights.add(2 * COLUMNS));

@@ -28,13 +28,14 @@ pub(super) trait Pairwise {
 pub(super) unsafe fn multiply_add<P: Pairwise, const NV: usize, const MR: usize>(
     sums: &mut [[P::Sum; NV]; MR],
     x: &[*const u32; MR],
+    beyond: usize,
     weights: *const u32,
 ) {
     // SAFETY: the caller's promise.
     unsafe {
-        let mut rows = [vld1q_u32(x[0]); MR];
+        let mut rows = [vld1q_u32(x[0].add(beyond)); MR];
         for (rows, x) in rows.iter_mut().zip(x).skip(1) {
-            *rows = vld1q_u32(*x);
+            *rows = vld1q_u32(x.add(beyond));
         }
         for v in 0..NV {
             let columns = vld1q_u32(weights.add(v * 4));

@@ -83,10 +83,11 @@ pub(super) trait Step<S: Simd> {
     /// `sums += x W` over a step.
     ///
     /// # Safety
-    /// `weights` points to [`Self::STEP_WORDS`], each of `x` to a vector of a group of rows.
+    /// `weights` points to [`Self::STEP_WORDS`], and so many words beyond each of `x` is a vector of a group of rows.
     unsafe fn multiply_add<const NV: usize, const MR: usize>(
         sums: &mut [[Self::Sum; NV]; MR],
         x: &[*const u32; MR],
+        beyond: usize,
         weights: *const u32,
     );
 }
@@ -185,8 +186,7 @@ unsafe fn tile_part<S: Simd, P: Step<S>, const NV: usize, const MR: usize>(
         for (group, x) in x.iter_mut().enumerate() {
             *x = block
                 .x
-                .offset((tile.row + group * P::ROW_GROUP) as isize * block.x_stride)
-                .add(part.start * VECTOR);
+                .offset((tile.row + group * P::ROW_GROUP) as isize * block.x_stride);
         }
         // As in `super::super::tile`: each tile asks for its share of a later panel.
         let size = block.weights.len();
@@ -209,32 +209,37 @@ unsafe fn tile_part<S: Simd, P: Step<S>, const NV: usize, const MR: usize>(
                 end
             };
             let mut sums = [[P::zero(); NV]; MR];
-            for _ in first..whole {
-                prefetch(next.cast());
-                // Few rows leave little time: a step's share is then longer than a cache line.
-                if stride > LINE {
-                    for line in 1..P::PANEL_WORDS.div_ceil(LINE) {
+            // Few rows leave little time: a step's share of the later panel is then longer than a cache line. The loops are apart so that
+            // each is one block without a branch.
+            if stride > LINE {
+                for step in first..whole {
+                    for line in 0..P::PANEL_WORDS.div_ceil(LINE) {
                         prefetch(next.wrapping_add(line * LINE).cast());
                     }
+                    next = next.wrapping_add(stride);
+                    P::multiply_add(&mut sums, &x, step * VECTOR, weights);
+                    weights = weights.add(P::STEP_WORDS);
                 }
-                next = next.wrapping_add(stride);
-                P::multiply_add(&mut sums, &x, weights);
-                weights = weights.add(P::STEP_WORDS);
-                for x in &mut x {
-                    *x = x.wrapping_add(VECTOR);
+            } else {
+                for step in first..whole {
+                    prefetch(next.cast());
+                    next = next.wrapping_add(stride);
+                    P::multiply_add(&mut sums, &x, step * VECTOR, weights);
+                    weights = weights.add(P::STEP_WORDS);
                 }
             }
             if whole < end {
                 let rest = block.in_features - whole * P::DEPTH;
                 let mut last = [[0; VECTOR]; MR];
                 for (last, x) in last.iter_mut().zip(x) {
-                    x.copy_to_nonoverlapping(last.as_mut_ptr(), rest);
+                    x.add(whole * VECTOR)
+                        .copy_to_nonoverlapping(last.as_mut_ptr(), rest);
                 }
                 let mut last_x = [last[0].as_ptr(); MR];
                 for (pointer, last) in last_x.iter_mut().zip(&last) {
                     *pointer = last.as_ptr();
                 }
-                P::multiply_add(&mut sums, &last_x, weights);
+                P::multiply_add(&mut sums, &last_x, 0, weights);
             }
             for (group, sums) in sums.iter_mut().enumerate() {
                 let rows = P::ROW_GROUP.min(tile.rows - group * P::ROW_GROUP);

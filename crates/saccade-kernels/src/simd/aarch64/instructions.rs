@@ -38,24 +38,36 @@ sums! {
     bfdot(float32x4_t, uint16x8_t, uint16x8_t) = "bfdot {0:v}.4s, {1:v}.8h, {2:v}.8h";
 }
 
-/// `dotprod`: adds to each lane the four products of its signed bytes in `a` and those in lane `LANE` of `b`.
-///
-/// # Safety
-/// The CPU has the instruction.
-#[inline(always)]
-pub(crate) unsafe fn sdot_lane<const LANE: i32>(mut sum: int32x4_t, a: int8x16_t, b: int8x16_t) -> int32x4_t {
-    // SAFETY: the caller's promise; registers alone are read and written.
-    unsafe {
-        asm!(
-            "sdot {0:v}.4s, {1:v}.16b, {2:v}.4b[{3}]",
-            inout(vreg) sum,
-            in(vreg) a,
-            in(vreg) b,
-            const LANE,
-            options(pure, nomem, nostack, preserves_flags)
-        );
-    }
-    sum
+/// The same of instructions that take four bytes of `b` from lane `LANE`.
+macro_rules! sums_by_lane {
+    ($($(#[$doc:meta])* $name:ident($sum:ty, $a:ty, $b:ty) = $template:literal;)+) => {$(
+        $(#[$doc])*
+        ///
+        /// # Safety
+        /// The CPU has the instruction.
+        #[inline(always)]
+        pub(crate) unsafe fn $name<const LANE: i32>(mut sum: $sum, a: $a, b: $b) -> $sum {
+            // SAFETY: the caller's promise; registers alone are read and written.
+            unsafe {
+                asm!(
+                    $template,
+                    inout(vreg) sum,
+                    in(vreg) a,
+                    in(vreg) b,
+                    const LANE,
+                    options(pure, nomem, nostack, preserves_flags)
+                );
+            }
+            sum
+        }
+    )+};
+}
+
+sums_by_lane! {
+    /// `dotprod`: adds to each lane the four products of its signed bytes in `a` and those in lane `LANE` of `b`.
+    sdot_lane(int32x4_t, int8x16_t, int8x16_t) = "sdot {0:v}.4s, {1:v}.16b, {2:v}.4b[{3}]";
+    /// `bf16`: adds to each lane the products of its two bfloat16 in `a` and those in lane `LANE` of `b`, rounded as by [`bfdot`].
+    bfdot_lane(float32x4_t, uint16x8_t, uint16x8_t) = "bfdot {0:v}.4s, {1:v}.8h, {2:v}.2h[{3}]";
 }
 
 /// `bf16`: rounded to bfloat16, to nearest and ties to even; NaN becomes quiet.

@@ -3,7 +3,7 @@
 use std::arch::aarch64::*;
 use std::arch::is_aarch64_feature_detected;
 
-use super::instructions::{bfcvtn, bfdot, prefetch};
+use super::instructions::{bfcvtn, bfdot, bfdot_lane, prefetch};
 use super::simd_type;
 use crate::simd::{Dots, Kernel, NoDots, Simd, Vector};
 
@@ -58,6 +58,12 @@ unsafe impl Dots<float32x4_t> for Bf16 {
     }
 
     #[inline(always)]
+    unsafe fn bf16_lane<const LANE: i32>(sum: float32x4_t, a: int32x4_t, b: int32x4_t) -> float32x4_t {
+        // SAFETY: the caller's promise.
+        unsafe { bfdot_lane::<LANE>(sum, vreinterpretq_u16_s32(a), vreinterpretq_u16_s32(b)) }
+    }
+
+    #[inline(always)]
     unsafe fn store_bf16(first: float32x4_t, second: float32x4_t, to: *mut u16) {
         // SAFETY: the caller's promise, and room for eight elements.
         unsafe { vst1q_u16(to, vcombine_u16(bfcvtn(first), bfcvtn(second))) }
@@ -67,9 +73,9 @@ unsafe impl Dots<float32x4_t> for Bf16 {
 // SAFETY: pointers are read and written for the lanes named only.
 unsafe impl Vector for float32x4_t {
     const LANES: usize = 4;
-    // Of the products with packed weights only those of attention have this tile: 24 sums, four factors and a broadcast one. Four vectors
-    // divide the usual widths of heads.
-    const TILE_ROWS: usize = 6;
+    // The tile of attention alone: 20 sums, five factors by lane, four columns and what widens them. Four vectors divide the usual widths
+    // of heads.
+    const TILE_ROWS: usize = 5;
     const TILE_VECTORS: usize = 4;
     type Ints = int32x4_t;
     const MAX_BYTE: u8 = 255;
@@ -307,5 +313,13 @@ unsafe impl Vector for float32x4_t {
     #[inline(always)]
     unsafe fn prefetch(at: *const u8) {
         prefetch(at);
+    }
+
+    const BY_LANE: bool = true;
+
+    #[inline(always)]
+    unsafe fn fma_lane<const LANE: i32>(self, factors: Self, addend: Self) -> Self {
+        // SAFETY: as in splat.
+        unsafe { vfmaq_laneq_f32::<LANE>(addend, self, factors) }
     }
 }
