@@ -13,6 +13,7 @@ COMPAT_ARGS ?=
 FUZZ_SECONDS ?= 1800
 WHEEL_VENV ?= .venv-wheel
 WHEEL_ARGS ?=
+WHEEL_TARGETS ?= x86_64-unknown-linux-gnu aarch64-unknown-linux-gnu
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
@@ -35,8 +36,8 @@ help:
 	@echo "make fuzz         fuzz headers, indexes, configs and resizing, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
 	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
-	@echo "make wheel        build a manylinux wheel of the last commit in dist"
-	@echo "make test-wheel   test the wheel on CPythons, NumPys and emulated old CPUs; writes docs/wheels.md"
+	@echo "make wheel        build manylinux wheels of the last commit in dist, for x86-64 and 64-bit ARM (WHEEL_TARGETS)"
+	@echo "make test-wheel   test the wheels on CPythons, NumPys and emulated CPUs; writes docs/wheels.md"
 	@echo "make clean        remove the virtual environments and build outputs"
 
 rollout: setup-rollout
@@ -177,7 +178,9 @@ test-aarch64-all:
 wheel:
 	@$(PYTHON) .ci/needs.py python rust
 	@$(MAKE) -s $(WHEEL_VENV)/.tools
-	$(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist $(WHEEL_ARGS)
+	$(if $(filter aarch64-%,$(WHEEL_TARGETS)),.ci/aarch64/run.sh setup)
+	rm -rf dist
+	for target in $(WHEEL_TARGETS); do $(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist --target $$target $(WHEEL_ARGS) || exit 1; done
 
 test-wheel: wheel
 	@$(PYTHON) .ci/needs.py opengl qemu

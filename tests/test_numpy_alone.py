@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from released import NAMES, VARIANTS, Released, load_released
 
 import saccade
-from saccade.environment import cpu_name
+from saccade.environment import _name_in, cpu_name
 from saccade.errors import CheckpointError, InputError, ShapeError
 
 #: How far actions may be from those of float32, relative to the largest.
@@ -90,5 +90,20 @@ def test_inputs_and_files_that_do_not_fit(tmp_path: Path) -> None:
         saccade.ActionHead.load(cut, config=released.config)
 
 
-def test_the_cpu_has_a_name() -> None:
-    assert cpu_name().strip()
+@pytest.mark.parametrize(
+    ("cpuinfo", "name"),
+    [
+        ("processor\t: 0\nmodel name\t: AMD EPYC: 7\nmodel name\t: another\n", "AMD EPYC: 7"),
+        ("CPU implementer\t: 0x41\nCPU part\t: 0xd0b\n", "ARM Cortex-A76"),
+        (
+            "CPU implementer\t: 0x41\nCPU part\t: 0xd05\n\nCPU implementer\t: 0x41\nCPU part\t: 0xd41\n"
+            "CPU implementer\t: 0x41\nCPU part\t: 0xd05\n",
+            "ARM Cortex-A55, ARM Cortex-A78",
+        ),
+        ("CPU implementer\t: 0x7f\nCPU part\t: 0x123\n", "implementer 0x7f part 0x123"),
+        ("CPU implementer\t:\nCPU part\t:\nno colon\n", ""),
+    ],
+)
+def test_the_name_of_a_cpu(cpuinfo: str, name: str) -> None:
+    assert _name_in(cpuinfo) == name
+    assert saccade.show_config("dicts")["cpu"] == cpu_name() != ""

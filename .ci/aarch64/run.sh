@@ -92,7 +92,9 @@ python() {
     # shellcheck source=/dev/null
     (. /etc/os-release && sources | mmdebstrap --quiet --variant=extract --arch=arm64 --include=python3 "$VERSION_CODENAME" "$ROOT" -)
     python3 -m venv "$WORK/venv"
-    arm_pip "$WORK/packages" "numpy>=2" pytest hypothesis safetensors rich
+    # NumPy apart from what only tests need: a wheel is tested with it alone.
+    arm_pip "$(arm_site)" "numpy>=2"
+    arm_pip "$WORK/packages" pytest hypothesis safetensors rich
     touch "$WORK/python.done"
 }
 
@@ -109,6 +111,11 @@ sources() {
 
 arm_python() {
     basename "$(ls "$ROOT"/usr/bin/python3.[0-9]* | grep -v config | head -1)"
+}
+
+# Where that Python looks for packages.
+arm_site() {
+    echo "$ROOT/usr/local/lib/$(arm_python)/dist-packages"
 }
 
 arm_pip() {
