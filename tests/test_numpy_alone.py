@@ -73,7 +73,9 @@ def test_an_instruction_set_that_this_cpu_lacks_is_named(monkeypatch: pytest.Mon
     available = saccade.show_config("dicts")["available_isas"]
     lacking = next(isa for isa in ("neon", "avx2", "avx1024") if isa not in available)
     monkeypatch.setenv("SACCADE_ISA", lacking)
-    with pytest.raises(InputError, match=f"SACCADE_ISA: expected one of {', '.join(available)}, got `{lacking}`"):
+    with pytest.raises(
+        InputError, match=f"SACCADE_ISA: expected one of {', '.join(available)}, got `{lacking}`"
+    ):
         load(load_released("n15_tiny"))
 
 

@@ -3,8 +3,8 @@
     .ci/aarch64/run.sh loops
 
 Takes the assembly of saccade-kernels. A loop is a block that ends in a jump to its own beginning; of those with
-the same instruction, the ones of the largest tile count. What a loop could do at most is what llvm-mca predicts for
-its multiply-adds alone, without loads and jumps.
+the same instruction, the ones of the largest tile count. What a loop could do at most is what llvm-mca predicts
+for its multiply-adds alone, without loads and jumps.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def loops_of(assembly: str) -> list[Loop]:
 
 
 def cycles(instructions: tuple[str, ...], cpu: str) -> float:
-    """Cycles of an iteration, as llvm-mca predicts them; jumps are left out, because their labels are not there."""
+    """Cycles of an iteration, as llvm-mca predicts them; without the jump, whose label is not there."""
     text = "\n".join(line for line in instructions if not JUMP.match(line))
     said = subprocess.run([*MCA, f"-mcpu={cpu}"], input=text, capture_output=True, text=True, check=True)
     total = re.search(r"Total Cycles:\s+(\d+)", said.stdout)
@@ -85,14 +85,14 @@ def cycles(instructions: tuple[str, ...], cpu: str) -> float:
 
 
 def largest(loops: list[Loop]) -> list[Loop]:
-    """One loop for each instruction, of products with weights and of attention: the one with most multiply-adds."""
+    """For each instruction, in products with weights and in attention, the loop with most multiply-adds."""
     best = dict[tuple[str, bool], Loop]()
     for loop in loops:
         place = (loop.kind, loop.in_attention)
         loads = sum(loop.counts[name] for name in ("ldr", "ldp"))
         if loads < 2 or len(loop.multiply_adds) < 20 or loop.counts["and"] > 0:
             continue
-        # Of equal tiles the one that asks for one line a step: with more rows than a few, which of them it is.
+        # Of equal tiles the one that asks for one line a step: that of more rows than a few.
         order = (-len(loop.multiply_adds), len(loop.instructions))
         if place not in best or order < (-len(best[place].multiply_adds), len(best[place].instructions)):
             best[place] = loop

@@ -5,6 +5,7 @@
 #   .ci/aarch64/run.sh rust       the Rust tests on each of $CPUS
 #   .ci/aarch64/run.sh python     the Python tests that need NumPy alone, on each of $CPUS
 #   .ci/aarch64/run.sh loops      the inner loops of the kernels, judged by llvm-mca, as a table in Markdown
+#   .ci/aarch64/run.sh instructions   instructions a multiply-add of whole linear layers, counted by the emulator
 #   .ci/aarch64/run.sh check      that it compiles for macOS (ARM) and Windows (x86-64), without their standard libraries
 #   .ci/aarch64/run.sh test       setup, rust and python
 #
@@ -182,6 +183,28 @@ loops() (
     python3 .ci/aarch64/loops.py "$(ls -t "$WORK/target/$TARGET"/release/deps/saccade_kernels-*.s | head -1)"
 )
 
+# The emulator writes a line for every instruction. Two numbers of calls: packing and starting count in neither.
+instructions() (
+    cross
+    CARGO_PROFILE_RELEASE_LTO=false cargo build --locked --quiet --release --target $TARGET -p saccade-kernels --example linear_calls
+    local program=$WORK/target/$TARGET/release/examples/linear_calls rows=49 inputs=512 outputs=96
+    count() {
+        SACCADE_ISA=$1 qemu-aarch64-static -cpu max -L /usr/aarch64-linux-gnu -singlestep -d nochain,exec -D /dev/stdout \
+            "$program" "$2" $rows $inputs $outputs "$3" | grep -c '^Trace'
+    }
+    echo "| instructions a multiply-add, $rows x $inputs x $outputs | float32 | bfloat16 | int8 |"
+    echo "|---|---|---|---|"
+    for isa in portable neon dotprod i8mm bf16; do
+        local row="| \`$isa\` |" few many
+        for arithmetic in float32 bfloat16 int8; do
+            few=$(count "$isa" "$arithmetic" 1)
+            many=$(count "$isa" "$arithmetic" 2)
+            row+=" $(python3 -c "print(f'{($many - $few) / ($rows * $inputs * $outputs):.3f}')") |"
+        done
+        echo "$row"
+    done
+)
+
 check() (
     cross
     # Debian has no standard library for them, but its sources, which are checked too.
@@ -204,6 +227,7 @@ setup) setup ;;
 rust) rust ;;
 python) run_python ;;
 loops) loops ;;
+instructions) instructions ;;
 check) check ;;
 test) setup && rust && run_python ;;
 *)

@@ -1,4 +1,4 @@
-"""Builds the wheel: one file for every CPython from 3.10 on, for Linux with an old glibc on x86-64 or 64-bit ARM.
+"""Builds a wheel: one file for every CPython from 3.10 on, for x86-64 or ARM Linux with an old glibc.
 
     python .ci/wheels/build.py --out dist [--target aarch64-unknown-linux-gnu]
 

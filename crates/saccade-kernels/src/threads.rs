@@ -14,7 +14,8 @@ pub struct NumThreadsError {
 
 /// `SACCADE_NUM_THREADS`; where it is unset or empty, the number of physical cores that this process may use.
 ///
-/// The affinity mask and the quota of the control group (v1 and v2, rounded up) are counted; siblings of one core count once.
+/// The affinity mask and the quota of the control group (v1 and v2, rounded up) are counted; siblings of one core count once. Other systems
+/// than Linux count logical processors.
 ///
 /// # Errors
 /// The variable holds something else than a whole number of at least 1.
