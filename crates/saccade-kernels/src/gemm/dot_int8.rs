@@ -157,6 +157,32 @@ impl Kernel for Quantizing<'_> {
 unsafe fn quantize_row<V: Vector, D: Dots<V>>(x: *const f32, width: usize, bytes: *mut u8) -> Quantized {
     // SAFETY: the caller's promise.
     unsafe {
+        let Quantization { quantized, inverse } = row_quantization::<V, D>(x, width);
+        let (inverse, most) = (V::splat(inverse), V::splat_int(i32::from(D::MAX_BYTE)));
+        let zero_byte = V::splat_int(quantized.zero);
+        for i in (0..width).step_by(V::LANES) {
+            let x = load::<V>(x.add(i), V::LANES.min(width - i));
+            x.mul(inverse).store_bytes(zero_byte, most, bytes.add(i));
+        }
+        quantized
+    }
+}
+
+/// How a row is quantised, and what its elements are multiplied with.
+pub(super) struct Quantization {
+    pub quantized: Quantized,
+    /// One over the scale, or zero for a row that counts as zero.
+    pub inverse: f32,
+}
+
+/// What [`quantize_row`] makes a row's bytes by.
+///
+/// # Safety
+/// `x` points to `width` elements; the caller runs with `V`'s instruction set.
+#[inline(always)]
+pub(super) unsafe fn row_quantization<V: Vector, D: Dots<V>>(x: *const f32, width: usize) -> Quantization {
+    // SAFETY: the caller's promise.
+    unsafe {
         // Chains of their own, which do not wait for each other.
         const CHAINS: usize = 4;
         let zero = V::splat(0.0);
@@ -189,24 +215,15 @@ unsafe fn quantize_row<V: Vector, D: Dots<V>>(x: *const f32, width: usize, bytes
         let scale = high / f32::from(steps) - low / f32::from(steps);
         let is_zero = scale < f32::MIN_POSITIVE;
         let inverse = if is_zero { 0.0 } else { 1.0 / scale };
-        let offset = (-low * inverse).round_ties_even() as i32;
-        let (inverse, most) = (V::splat(inverse), V::splat_int(i32::from(steps)));
-        let zero_byte = V::splat_int(offset);
-        for i in (0..width).step_by(V::LANES) {
-            let x = load::<V>(x.add(i), V::LANES.min(width - i));
-            x.mul(inverse).store_bytes(zero_byte, most, bytes.add(i));
-        }
-        let quantized = Quantized {
-            scale: if is_zero { 0.0 } else { scale },
-            zero: offset,
-        };
-        if not_finite.reduce_add().is_nan() {
-            Quantized {
-                scale: f32::NAN,
-                ..quantized
-            }
+        let scale = if not_finite.reduce_add().is_nan() {
+            f32::NAN
+        } else if is_zero {
+            0.0
         } else {
-            quantized
-        }
+            scale
+        };
+        let zero = (-low * inverse).round_ties_even() as i32;
+        let quantized = Quantized { scale, zero };
+        Quantization { quantized, inverse }
     }
 }

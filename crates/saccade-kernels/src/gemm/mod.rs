@@ -9,6 +9,8 @@ mod chains;
 )]
 pub(crate) mod dot_bf16;
 pub(crate) mod dot_int8;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
 mod panel;
 mod streams;
 mod tile;
