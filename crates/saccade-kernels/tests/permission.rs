@@ -125,8 +125,8 @@ fn with_seccomp(error: u32) -> Result<String, String> {
 /// A thread that was there before, one that comes after, and a child: all may do what the process may.
 fn with_threads_and_children() -> Result<String, String> {
     let (ask, asked) = mpsc::channel::<()>();
-    std::thread::scope(|scope| {
-        let early = scope.spawn(|| asked.recv().is_ok() && best_computes());
+    std::thread::scope(move |scope| {
+        let early = scope.spawn(move || asked.recv().is_ok() && best_computes());
         let said = tiles()?;
         ask.send(()).expect("the thread is there");
         let late = scope.spawn(best_computes);
