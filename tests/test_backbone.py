@@ -205,3 +205,33 @@ def test_what_a_backbone_says_of_itself() -> None:
     assert backbone.nbytes < released.load("bfloat16").nbytes < released.load().nbytes
     for shown in ("n1.5", "precision=int8", "num_threads=3"):
         assert shown in repr(backbone)
+
+
+@pytest.mark.parametrize("kind", ["down", "residual", "fc2"])
+def test_int8_bears_outliers(kind: str, isa: str) -> None:
+    """Channels a thousand times as large as the others, as trained models have."""
+    released = released_backbone("n15_one_view")
+    tensors = {
+        name: torch.from_numpy(array.copy())
+        for name, array in saccade._saccade.read_tensors(str(released.path), "backbone.").items()
+    }
+    large = 1000.0
+    for name, tensor in tensors.items():
+        if kind == "residual" and name.endswith("patch_embedding.bias"):
+            tensor[5], tensor[40] = large, -large
+        if kind == "down" and name.endswith("up_proj.weight"):
+            tensor[[7, 100]] *= large / 4
+        if kind == "down" and name.endswith("down_proj.weight"):
+            tensor[:, [7, 100]] /= 100.0
+        if kind == "fc2" and name.endswith("fc1.bias"):
+            tensor[3] = large
+        if kind == "fc2" and name.endswith("fc2.weight"):
+            tensor[:, 3] /= 100.0
+
+    def features(precision: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+        backbone = saccade.Backbone.from_tensors(tensors, config=released.about, precision=precision)
+        return np.asarray(backbone(released.inputs()).backbone_features)
+
+    error = relative_error(features("int8"), features("float32"))
+    print(kind, isa, error)
+    assert error < 0.12
