@@ -9,6 +9,7 @@ use super::chains::{Chains, Link};
 use super::pairs::{self, Pairwise};
 use super::quantizing::Quantizing;
 use super::tile::{COLUMNS, Step, multiply, panel_words, shape};
+use crate::gemm::outliers::MultiplyOutliers;
 use crate::gemm::{Block, Gemm, PanelMut, Shape, Source, odd_lines, panel};
 use crate::simd::aarch64::instructions::{sdot_lane, usmmla};
 use crate::simd::aarch64::neon::{Neon, NeonDotprod, NeonI8mm};
@@ -56,6 +57,11 @@ macro_rules! product {
 
             unsafe fn multiply(&self, block: &Block<'_>) {
                 self.0.run($run(block));
+            }
+
+            fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
+                let run = if $in_pairs { 2 } else { 1 };
+                self.0.run(MultiplyOutliers { run, ..outliers });
             }
 
             fn chains(&self) -> usize {

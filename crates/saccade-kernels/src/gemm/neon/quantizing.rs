@@ -30,7 +30,10 @@ impl Kernel for Quantizing<'_> {
             // within `Simd::run`.
             unsafe {
                 let x = source.x.offset(row as isize * source.x_stride);
-                let Quantization { quantized, inverse } = row_quantization::<float32x4_t, NoDots>(x, width);
+                let apart = source.outliers.map(|outliers| outliers.add(row));
+                let Quantization { quantized, inverse } =
+                    row_quantization::<float32x4_t, NoDots>(x, width, apart);
+                let outliers = || apart.into_iter().flat_map(|apart| (*apart).iter());
                 let zero = quantized.zero;
                 let to = source.words;
                 if self.in_pairs {
@@ -40,6 +43,7 @@ impl Kernel for Quantizing<'_> {
                         let bytes = four_bytes(load(x.add(i), 4.min(width - i)), inverse, zero, 255);
                         place(pair, row, i).cast::<u32>().write_unaligned(bytes);
                     }
+                    outliers().for_each(|(input, _)| place(pair, row, input).write(zero as u8));
                 } else {
                     let zero = zero.wrapping_sub(SIGNED);
                     source.quantized.add(row).write(Quantized { zero, ..quantized });
@@ -48,6 +52,7 @@ impl Kernel for Quantizing<'_> {
                         let bytes = four_bytes(load(x.add(i), 4.min(width - i)), inverse, zero, 255 - SIGNED);
                         to.add(i / 4).write(bytes);
                     }
+                    outliers().for_each(|(input, _)| to.cast::<u8>().add(input).write(zero as u8));
                 }
             }
         }
