@@ -60,19 +60,11 @@ def test_a_backbone_alone(
 
 
 @pytest.mark.parametrize(
-    ("layout", "version", "preprocessing"),
-    [
-        ("nvidia", "n1.5", "isaac"),
-        ("isaac", "n1.5", "isaac"),
-        ("lerobot", "n1.5", "lerobot"),
-        ("nvidia-n16", "n1.6", "isaac"),
-        ("nvidia-n17", "n1.7", "isaac"),
-        ("lerobot-n17", "n1.7", "lerobot"),
-    ],
+    ("layout", "preprocessing"), [("nvidia", "isaac"), ("isaac", "isaac"), ("lerobot", "lerobot")]
 )
-def test_whole_checkpoints(layout: str, version: str, preprocessing: str) -> None:
+def test_whole_checkpoints(layout: str, preprocessing: str) -> None:
     processor = load(published(layout))
-    assert (processor.version, processor.preprocessing) == (version, preprocessing)
+    assert (processor.version, processor.preprocessing) == ("n1.5", preprocessing)
 
 
 def test_the_preprocessing_may_be_another() -> None:
@@ -97,7 +89,7 @@ def test_sizes_of_a_config_in_nvidias_layout(tmp_path: Path) -> None:
 
 def test_a_config_of_another_version(tmp_path: Path) -> None:
     source = checkpoint(tmp_path / "other", "n15_one_view", {"model_type": "Gr00tN1d7"})
-    with pytest.raises(CheckpointError, match="model_type .* but the tensors are those of N1.5"):
+    with pytest.raises(CheckpointError, match=r"model_type .* but the tensors are those of N1\.5"):
         load(source)
 
 
@@ -260,7 +252,7 @@ def test_no_such_tokenizer(name: str) -> None:
 
 
 def test_a_directory_without_a_tokenizer(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="holds neither tokenizer.json nor vocab.json and merges.txt"):
+    with pytest.raises(CheckpointError, match=r"holds neither tokenizer\.json nor vocab\.json and"):
         saccade.Processor("n1.5", tmp_path)
 
 
