@@ -34,7 +34,7 @@ help:
 	@echo "make format       format all Rust and Python files"
 	@echo "make bench-peers  compare with other engines that run the same head; report in out/peers"
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
-	@echo "make fuzz         fuzz headers, indexes, configs and resizing, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
+	@echo "make fuzz         fuzz headers, indexes, configs, resizing, tokenizers and processors, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
 	@echo "make test-clients test saccade serve with Isaac-GR00T's clients: CLIENTS_ARGS=\"--clone PATH\" of its repository"
 	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
@@ -162,7 +162,7 @@ $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
 fuzz: setup-test
 	@cargo +nightly fuzz --version >/dev/null 2>&1 || { echo "make fuzz needs a nightly Rust (rustup toolchain install nightly) and cargo-fuzz (cargo install cargo-fuzz)"; exit 1; }
 	$(BIN)/python fuzz/seeds.py
-	@for target in header index config resize; do \
+	@for target in header index config resize tokenizer processor; do \
 		cargo +nightly fuzz run --sanitizer none $$target -- -dict=fuzz/words.dict -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=2048 || exit 1; \
 	done
 
