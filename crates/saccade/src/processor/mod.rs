@@ -218,7 +218,12 @@ impl Processor {
             )));
         }
         check_length("instruction", observation.instruction.unwrap_or_default())?;
-        let text = prompt(&self.settings, observation.instruction, observation.plain_text, views)?;
+        let text = prompt(
+            &self.settings,
+            observation.instruction,
+            observation.plain_text,
+            views,
+        )?;
         let ids = self.tokenizer.encode("instruction", &text)?;
         let found = ids.iter().filter(|id| **id == self.ids.image).count();
         if found != expected {
