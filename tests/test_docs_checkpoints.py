@@ -13,7 +13,7 @@ import pytest
 from published import published
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = ("lerobot", "nvidia", "fork", "resize")
+PAGES = ("lerobot", "nvidia", "fork", "resize", "policy")
 #: Names on the pages, and the layouts of these checkpoints.
 CHECKPOINTS = {
     "GR00T-N1.5-3B": "nvidia",
