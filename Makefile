@@ -10,6 +10,7 @@ PYTEST_ARGS ?=
 PEERS_VENV ?= .venv-peers
 PEERS_ARGS ?=
 COMPAT_ARGS ?=
+CLIENTS_ARGS ?=
 FUZZ_SECONDS ?= 1800
 WHEEL_VENV ?= .venv-wheel
 WHEEL_ARGS ?=
@@ -23,7 +24,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat fuzz setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients fuzz setup-rollout setup-test clean
 
 help:
 	@echo "make rollout      run the bundled policy in simulation; table and videos in $(ROLLOUT_OUT)"
@@ -34,6 +35,7 @@ help:
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
 	@echo "make fuzz         fuzz headers, indexes, configs and resizing, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
+	@echo "make test-clients test saccade serve with Isaac-GR00T's clients: CLIENTS_ARGS=\"--clone PATH\" of its repository"
 	@echo "make wheel        build a manylinux wheel of the last commit in dist"
 	@echo "make test-wheel   test the wheel on CPythons, NumPys and emulated old CPUs; writes docs/wheels.md"
 	@echo "make clean        remove the virtual environments and build outputs"
@@ -165,6 +167,10 @@ fuzz: setup-test
 # lerobot 0.5 and later need Python 3.12. If python3.12 is not on PATH: COMPAT_ARGS="--python312 PATH".
 test-compat: setup-test
 	$(BIN)/python tests/compat/run.py $(COMPAT_ARGS)
+
+# Nothing is fetched: the clients are read from a clone of Isaac-GR00T.
+test-clients: setup-test
+	$(BIN)/python tests/compat/groot.py $(CLIENTS_ARGS)
 
 wheel:
 	@$(PYTHON) .ci/needs.py python rust

@@ -39,6 +39,13 @@ CONFIGS = (
 )
 
 
+@pytest.fixture(params=[*_saccade.available_isas(), "software_tiles"])
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Also what AMX computes, emulated: every machine then runs the whole head in tiles."""
+    monkeypatch.setenv("SACCADE_ISA", request.param)
+    return str(request.param)
+
+
 @pytest.fixture(params=PRECISIONS)
 def precision(request: pytest.FixtureRequest) -> str:
     return str(request.param)

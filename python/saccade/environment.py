@@ -20,8 +20,11 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
 
     - ``isa``: the instruction set. The environment variable ``SACCADE_ISA`` selects one of
       ``available_isas``.
-    - ``dot_products``: the dot product instructions of this CPU: ``bf16`` for the precision bfloat16 and
+    - ``dot_products``: the dot products that it uses on this CPU: ``bf16`` for the precision bfloat16 and
       ``vnni`` for int8. Both precisions also work without them.
+    - ``cpu``: the family of this CPU, and ``rates``: the family whose measured rates choose between its
+      instructions. A family that was not measured gets what the newest one of its vendor gets.
+    - ``tiles``: whether AMX can be used; if not, why.
     - ``num_threads``: the default number of threads, which ``SACCADE_NUM_THREADS`` sets.
 
     Args:
@@ -35,11 +38,16 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
         >>> "portable" in saccade.show_config(mode="dicts")["available_isas"]
         True
     """
+    isa = _saccade.selected_isa()
+    cpu, rates, tiles = _saccade.cpu_report()
     config = {
         "saccade": _saccade.__version__,
-        "isa": _saccade.selected_isa(),
+        "isa": isa,
         "dot_products": _saccade.dot_products(),
         "available_isas": _saccade.available_isas(),
+        "cpu": cpu,
+        "rates": rates,
+        "tiles": tiles,
         "num_threads": _saccade.default_num_threads(),
         "numpy": np.__version__,
         "python": platform.python_version(),

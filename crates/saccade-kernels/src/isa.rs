@@ -3,6 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use crate::cpu::tiles::{Refusal, permission};
+use crate::gemm::amx::{InTiles, Pairs, Quads};
 use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
 #[allow(
     unused_imports,
@@ -11,13 +13,16 @@ use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
 use crate::gemm::dot_bf16::DotBf16;
 use crate::gemm::dot_int8::DotInt8;
 use crate::gemm::{Gemm, Product, available};
-use crate::simd::portable::Portable;
+use crate::simd::portable::{Loops, Portable};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::x86_64::{
     avx2::{Avx2, Avx2EvexVnni, Avx2VexVnni},
-    avx512::{Avx512, Avx512Bf16, Avx512Vnni},
+    avx512::{Avx512, Avx512Amx, Avx512Bf16, Avx512Vnni},
 };
 use crate::simd::{Dot, Kernel, MAX_LANES, MAX_TILE_ROWS, Simd, Vector};
+#[cfg(target_arch = "x86_64")]
+use crate::tiles::amx::Amx;
+use crate::tiles::{Software, TILE, TileKernel, TileUnit};
 
 /// Environment variable that forces an instruction set, so that every path can be tested on one machine.
 pub const ISA_VARIABLE: &str = "SACCADE_ISA";
@@ -28,7 +33,8 @@ pub const ISA_VARIABLE: &str = "SACCADE_ISA";
 ///   such products uses the first that the CPU has, and else `vectors`;
 /// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last one listed are made of
 ///   `vectors` alone;
-/// - `needs`: of these types, the CPU must have at least one.
+/// - `needs`: of these types, the CPU must have at least one;
+/// - `tiles`: the unit that multiplies tiles, where there is one, and which must be there: attention over bfloat16 uses it.
 macro_rules! instruction_sets {
     ($(
         $(#[$doc:meta])*
@@ -39,6 +45,7 @@ macro_rules! instruction_sets {
             gemm_bf16: [$($gemm_bf16:ty),*],
             gemm_int8: [$($gemm_int8:ty),*],
             needs: [$($needed:ty),+],
+            $(tiles: $tiles:ty,)?
         }
     )+) => {
         /// An instruction set that the kernels are written for.
@@ -70,7 +77,7 @@ macro_rules! instruction_sets {
             #[inline]
             pub fn is_available(self) -> bool {
                 match self {
-                    $(#[cfg($condition)] Self::$isa => $(<$needed as Simd>::new().is_some())||+,)+
+                    $(#[cfg($condition)] Self::$isa => ($(<$needed as Simd>::new().is_some())||+) $(&& <$tiles as TileUnit>::new().is_some())?,)+
                     #[allow(unreachable_patterns, reason = "on some architectures all of them are there")]
                     _ => false,
                 }
@@ -122,6 +129,28 @@ macro_rules! instruction_sets {
                             None => self.is_missing(),
                         }
                     })+
+                    _ => self.is_missing(),
+                }
+            }
+
+            /// Whether attention over bfloat16 runs in tiles.
+            pub(crate) fn has_tiles(self) -> bool {
+                match self {
+                    $($(#[cfg($condition)] Self::$isa => <$tiles as TileUnit>::new().is_some(),)?)+
+                    _ => false,
+                }
+            }
+
+            /// Runs a kernel on its unit for tiles.
+            ///
+            /// # Panics
+            /// If it has none, or this CPU lacks it.
+            pub(crate) fn run_tiles<K: TileKernel>(self, kernel: K) -> K::Output {
+                match self {
+                    $($(#[cfg($condition)] Self::$isa => match <$tiles as TileUnit>::new() {
+                        Some(unit) => kernel.run(unit),
+                        None => self.is_missing(),
+                    },)?)+
                     _ => self.is_missing(),
                 }
             }
@@ -179,6 +208,28 @@ instruction_sets! {
         gemm_int8: [DotInt8<Avx512Vnni>],
         needs: [Avx512],
     }
+    /// Tiles in software: what [`Isa::Amx`] computes, bit for bit but for the vectors beside the tiles, at the speed of an emulator. For
+    /// tests; never chosen, and not among [`Isa::available`].
+    #[doc(hidden)]
+    SoftwareTiles = "software_tiles" if all() {
+        vectors: Loops<TILE>,
+        bf16: [Loops<TILE>],
+        int8: [Loops<TILE>],
+        gemm_bf16: [InTiles<Software, Pairs>],
+        gemm_int8: [InTiles<Software, Quads>],
+        needs: [Loops<TILE>],
+        tiles: Software,
+    }
+    /// AVX-512, and products of bfloat16 and int8 in the tiles of AMX.
+    Amx = "amx" if target_arch = "x86_64" {
+        vectors: Avx512,
+        bf16: [Avx512Amx],
+        int8: [Avx512Vnni],
+        gemm_bf16: [InTiles<Amx, Pairs>],
+        gemm_int8: [InTiles<Amx, Quads>],
+        needs: [Avx512Amx],
+        tiles: Amx,
+    }
 }
 
 /// Sizes that data are laid out by.
@@ -204,12 +255,13 @@ impl Vectors {
     }
 }
 
-/// `SACCADE_ISA` holds a name that is unknown, or of an instruction set that this CPU lacks.
+/// `SACCADE_ISA` holds a name that is unknown, or of an instruction set that this CPU lacks or the system keeps from this process.
 #[derive(Debug, thiserror::Error)]
-#[error("{ISA_VARIABLE}: expected one of {}, got `{given}`{}", names(&Isa::available()), if *known { ", which this CPU lacks" } else { "" })]
+#[error("{ISA_VARIABLE}: expected one of {}, got `{given}`{why}", names(&Isa::available()))]
 pub struct IsaError {
     given: String,
-    known: bool,
+    /// Why not, from a comma on; empty where the name is unknown.
+    why: String,
 }
 
 impl Isa {
@@ -222,10 +274,13 @@ impl Isa {
     /// All that this CPU has, slowest first.
     #[must_use]
     pub fn available() -> Vec<Self> {
-        ALL.iter().copied().filter(|isa| isa.is_available()).collect()
+        ALL.iter()
+            .copied()
+            .filter(|&isa| isa != Self::SoftwareTiles && isa.is_available())
+            .collect()
     }
 
-    /// The dot products that it uses on this CPU: `bf16` (pairs of bfloat16), `vnni` (quads of int8).
+    /// The dot products that it uses on this CPU: `bf16` (pairs of bfloat16), `vnni` (quads of int8); in tiles, for [`Isa::Amx`].
     ///
     /// ```
     /// assert!(saccade_kernels::Isa::Portable.dot_products().is_empty());
@@ -252,11 +307,19 @@ impl Isa {
                 } else {
                     Err(IsaError {
                         given: given.into_owned(),
-                        known: true,
+                        why: isa.why_not(),
                     })
                 }
             }
             _ => Ok(Self::best()),
+        }
+    }
+
+    /// Why it is not available.
+    fn why_not(self) -> String {
+        match (self, permission()) {
+            (Self::Amx, Err(refusal)) if refusal != Refusal::NotThere => format!(": {refusal}"),
+            _ => ", which this CPU lacks".to_owned(),
         }
     }
 
@@ -286,7 +349,7 @@ impl FromStr for Isa {
         let known = ALL.iter().copied().find(|isa| isa.name() == name);
         known.ok_or_else(|| IsaError {
             given: name.to_owned(),
-            known: false,
+            why: String::new(),
         })
     }
 }

@@ -6,11 +6,11 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Barrier;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use common::{numbers, rows, rows_mut};
+use common::{isas, numbers, rows, rows_mut};
 use saccade_kernels::{
-    Arithmetic, Element, Epilogue, Isa, LinearScratch, LogitBias, Mask, Matrix, PackedKeyValues,
-    PackedLinear, WeightRef, attention, gelu_erf, gelu_tanh, layer_norm, parallel_for, rms_norm_in_place,
-    rotary_embedding, silu,
+    Arithmetic, Element, Epilogue, LinearScratch, LogitBias, Mask, Matrix, PackedKeyValues, PackedLinear,
+    WeightRef, attention, gelu_erf, gelu_tanh, layer_norm, parallel_for, rms_norm_in_place, rotary_embedding,
+    silu,
 };
 
 /// The system's allocator, counting what all threads ask of it.
@@ -48,7 +48,7 @@ fn the_second_call_of_a_shape_allocates_nothing() {
     let weight = numbers(1, WIDTH * WIDTH, 1.0);
     let x = numbers(2, 296 * WIDTH, 1.0);
     let bias = numbers(3, 296, 1.0);
-    for isa in Isa::available() {
+    for isa in isas() {
         let weight = WeightRef::F32(Matrix::new(&weight, WIDTH));
         let pack = |arithmetic| PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
         let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);

@@ -37,8 +37,8 @@ mod _saccade {
     use crate::head::ActionHead;
     #[pymodule_export]
     use crate::machine::{
-        available_isas, default_num_threads, dot_products, measure_peaks, selected_isa, start_profile,
-        take_profile,
+        available_isas, cpu_report, default_num_threads, dot_products, measure_peaks, selected_isa,
+        start_profile, take_profile,
     };
     #[pymodule_export]
     use crate::processor::{Processor, ProcessorSource};

@@ -5,6 +5,7 @@ use std::marker::PhantomData;
 use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
 use super::mask::Mask;
 use crate::simd::{Kernel, Simd, Vector};
+use crate::tiles::{Ahead, Operation, Product, Session, TILE, TileUnit};
 
 /// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
 pub(super) struct TileProduct {
@@ -27,25 +28,69 @@ pub(super) struct TileProduct {
     pub add: bool,
 }
 
-/// An [`TileArithmetic`] whose products are a piece of code of their own: their tiles are many, and compilers take minutes over them.
-pub(super) trait Multiply<S: Simd>: TileArithmetic<S> {
+/// What makes the products of a tile whose factors are `A`'s.
+pub(super) trait Multiply<S: Simd, A> {
+    /// Blocks of keys begin at multiples of so many.
+    const KEYS: usize;
+
     /// # Safety
     /// As [`TileProduct::run`].
-    unsafe fn multiply(simd: S, product: &TileProduct);
+    unsafe fn multiply(&mut self, simd: S, product: &TileProduct);
 }
 
-impl<S: Simd, H: Stored> Multiply<S> for Float32<H> {
+/// Vectors. Their products are a piece of code of their own for each arithmetic: their tiles are many, and compilers take minutes over them.
+pub(super) struct InVectors;
+
+impl<S: Simd, H: Stored> Multiply<S, Float32<H>> for InVectors {
+    const KEYS: usize = S::Vector::LANES;
+
     #[inline(always)]
-    unsafe fn multiply(simd: S, product: &TileProduct) {
+    unsafe fn multiply(&mut self, simd: S, product: &TileProduct) {
         let held = PhantomData::<H>;
         simd.run(FloatProduct { product, held });
     }
 }
 
-impl<S: Simd> Multiply<S> for Pairs {
+impl<S: Simd> Multiply<S, Pairs> for InVectors {
+    const KEYS: usize = S::Vector::LANES;
+
     #[inline(always)]
-    unsafe fn multiply(simd: S, product: &TileProduct) {
+    unsafe fn multiply(&mut self, simd: S, product: &TileProduct) {
         simd.run(PairProduct(product));
+    }
+}
+
+/// Tiles, where vectors have as many lanes. Factors and what they multiply hold zeros to whole steps.
+impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
+    const KEYS: usize = TILE * Operation::Bf16.per_word();
+
+    #[inline(always)]
+    unsafe fn multiply(&mut self, _: S, product: &TileProduct) {
+        const { assert!(S::Vector::LANES == TILE) }
+        let mut vector = 0;
+        while vector < product.vectors {
+            let are_together = product.b_vector == TILE && product.vectors - vector >= 3;
+            let columns = if are_together { 3 } else { 1 };
+            // SAFETY: the caller's promise.
+            unsafe {
+                self.multiply(&Product {
+                    operation: Operation::Bf16,
+                    rows: product.rows,
+                    x: product.factors.cast(),
+                    x_stride: product.factors_stride,
+                    w: product.b.add(vector * product.b_vector),
+                    w_stride: product.b_step,
+                    w_step: TILE * product.b_step,
+                    columns,
+                    steps: product.depth.div_ceil(<Self as Multiply<S, Pairs>>::KEYS),
+                    sums: product.out.add(vector * TILE).cast(),
+                    sums_stride: product.out_stride,
+                    add: product.add,
+                    ahead: Ahead::NOTHING,
+                });
+            }
+            vector += columns;
+        }
     }
 }
 

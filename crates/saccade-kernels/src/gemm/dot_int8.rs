@@ -118,10 +118,11 @@ impl<S: Simd<Vector = V>, V: Vector> Step<S> for QuadStep {
 }
 
 /// Rows quantised to bytes.
-struct Quantizing<'a> {
-    source: &'a Source,
-    rows: Range<usize>,
-    stride: usize,
+pub(super) struct Quantizing<'a> {
+    pub source: &'a Source,
+    pub rows: Range<usize>,
+    /// Words from one converted row to the next.
+    pub stride: usize,
 }
 
 impl Kernel for Quantizing<'_> {
