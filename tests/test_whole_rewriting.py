@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import numpy as np
 import pytest
 import torch
 import whole_checkpoints
+from safetensors.torch import save_file
 from whole_checkpoints import EMBODIMENT, whole
 
-from saccade import CheckpointError, Policy, cli
+from saccade import ActionHead, CheckpointError, Policy, cli
 from saccade.checkpoints import convert, quantize, resize
 
 PREFIXES = {"lerobot": "_groot_model.backbone.", "lerobot-n17": "_groot_model.backbone."}
@@ -105,6 +107,30 @@ def test_a_backbone_of_an_unknown_kind_is_copied(tmp_path: Path) -> None:
     assert "is missing" in report.backbone_copied
     before, after = backbone(source, "isaac"), backbone(tmp_path / "out", "isaac")
     assert all(torch.equal(after[name], before[name]) for name in before)
+
+
+@pytest.mark.parametrize("layout", ["isaac", "n17", "lerobot"])
+def test_a_backbone_alone_is_named(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "backbone"
+    shutil.copytree(whole(layout), source, ignore=shutil.ignore_patterns("model*"))
+    prefix = PREFIXES.get(layout, "backbone.")
+    save_file(
+        {prefix + name: one for name, one in backbone(whole(layout), layout).items()},
+        source / "model.safetensors",
+    )
+    out = ["--out", str(tmp_path / "out")]
+    for command in (
+        ["inspect"],
+        ["quantize", *out],
+        ["convert", *out],
+        ["resize", *out, "--num-future-tokens", "3"],
+    ):
+        assert cli.main([command[0], str(source), *command[1:]]) == 2
+        error = capsys.readouterr().err
+        assert "there is no action head among the" in error
+        assert "this is a backbone alone" in error
+    with pytest.raises(CheckpointError, match="a backbone alone"):
+        ActionHead.load(source)
 
 
 @pytest.mark.parametrize("layout", ["isaac", "lerobot", "n16", "n17"])

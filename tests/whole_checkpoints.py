@@ -17,7 +17,7 @@ from typing import Any
 
 import layouts
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 DATA = Path(__file__).parent / "data" / "backbone"
@@ -87,7 +87,9 @@ def write(folder: Path, layout: str, *, seed: int = 0, tokenizer: bool = True) -
     """
     layouts.write(folder, layout, seed=seed, config=head_config(layout))
     shards = sorted(folder.glob("model*.safetensors"))
-    tensors = {name: tensor for name, tensor in layouts.read(folder, "").items() if "backbone." not in name}
+    # Not the statistics of lerobot's processors, which are in safetensors too.
+    tensors = {name: tensor for shard in shards for name, tensor in load_file(shard).items()}
+    tensors = {name: tensor for name, tensor in tensors.items() if "backbone." not in name}
     for path in [*shards, *folder.glob("*.index.json")]:
         path.unlink()
     save_file(tensors | backbone_tensors(layout), folder / "model.safetensors", {"format": "pt"})

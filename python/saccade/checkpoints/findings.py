@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from saccade.checkpoints.description import Description
+from saccade.checkpoints.whole import BackboneFindings, RobotFindings
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,10 @@ class Inspection(Description):
     """Number of values of the whole head."""
     outside: dict[str, Counts]
     """What is outside the head, by module."""
+    backbone: BackboneFindings | None
+    """The backbone; None if nothing is outside the head."""
+    robots: list[RobotFindings]
+    """The robots whose statistics are among the files."""
     memory: dict[str, Memory]
     """Size of a loaded head by precision."""
     num_vl_tokens: int

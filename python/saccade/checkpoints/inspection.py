@@ -16,8 +16,10 @@ from saccade.checkpoints.findings import Counts, Inspection, MachineRates, Memor
 from saccade.checkpoints.resemblance import Reference
 from saccade.checkpoints.survey import Piece, Survey
 from saccade.checkpoints.tokens import token_statistics
-from saccade.config import HeadConfig
+from saccade.checkpoints.whole import backbone_of, robots_of
+from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError, SaccadeError
+from saccade.hub import resolve
 from saccade.robots import EMBODIMENTS, read_json
 
 #: Embodiments of N1.7, as lerobot and Isaac-GR00T number them.
@@ -79,6 +81,8 @@ def inspect(
         if other is not None:
             other.compare(piece)
 
+    path = resolve(source)
+    outside = _outside(description)
     survey = Survey(published, head, look, progress)
     parts = survey.parts()
     embodiments = survey.embodiments(_embodiment_names(description))
@@ -91,7 +95,9 @@ def inspect(
         **vars(description),
         parts=parts,
         parameters=sum(part.parameters for part in parts.values()),
-        outside=_outside(description),
+        outside=outside,
+        backbone=backbone_of(path, None if config is None else to_json(config)) if outside else None,
+        robots=robots_of(path, head.state_history),
         memory={
             precision: Memory(
                 all=published.nbytes(precision, head.num_embodiments), one=published.nbytes(precision, 1)

@@ -62,7 +62,7 @@ def backbone_of(source: Path, config: str | None) -> BackboneFindings:
         return BackboneFindings(None, str(error), {}, None, None)
     processor, problem = None, None
     try:
-        processor = repr(Processor.load(source))
+        processor = repr(Processor.load(source)).removeprefix("<saccade.Processor ").removesuffix(">")
     except (SaccadeError, FileNotFoundError) as error:
         problem = str(error)
     return BackboneFindings(
@@ -74,8 +74,13 @@ def backbone_of(source: Path, config: str | None) -> BackboneFindings:
     )
 
 
-def robots_of(source: Path) -> list[RobotFindings]:
-    """The robots whose statistics a checkpoint holds, with what an observation of each must contain."""
+def robots_of(source: Path, state_history: int) -> list[RobotFindings]:
+    """The robots whose statistics a checkpoint holds, with what an observation of each must contain.
+
+    Args:
+        source: The checkpoint.
+        state_history: Number of states that its head takes.
+    """
     found = []
     for tag in _tags(source):
         try:
@@ -88,6 +93,7 @@ def robots_of(source: Path) -> list[RobotFindings]:
             embodiment=normalizer.embodiment,
             cameras=cameras.cameras,
             state=tuple((group.key, group.size) for group in normalizer.state_groups),
+            state_history=state_history,
             video_horizon=cameras.video_horizon,
             language_key=cameras.language_key,
         )

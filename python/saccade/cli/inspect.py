@@ -14,6 +14,7 @@ from saccade.cli._tables import Section, show
 
 if TYPE_CHECKING:
     from saccade.checkpoints.findings import Embodiment, Inspection, Resemblance, Spread, TokenStatistics
+    from saccade.checkpoints.whole import BackboneFindings, RobotFindings
 
 HELP = "show what a checkpoint contains"
 
@@ -71,7 +72,12 @@ def run(args: argparse.Namespace) -> int:
 
 def sections(report: Inspection) -> list[Section]:
     """All tables, top to bottom."""
-    found = [checkpoint(report), sizes(report), parts(report), memory(report), embodiments(report)]
+    found = [checkpoint(report), sizes(report), parts(report), memory(report)]
+    if report.backbone is not None:
+        found.append(backbone(report.backbone))
+    if report.robots:
+        found.append(robots(report.robots))
+    found.append(embodiments(report))
     if report.future_tokens is not None:
         found.append(future_tokens(report.future_tokens))
     if report.reference is not None:
@@ -149,6 +155,59 @@ def memory(report: Inspection) -> Section:
         f"({machine.isa}, {machine.num_threads} threads, by the cost model)"
     )
     return Section(title, [*columns, ">ms, encode", ">ms, sample", ">ms, chunk"], rows)
+
+
+def backbone(found: BackboneFindings) -> Section:
+    """The backbone: sizes, memory, and what prepares its inputs."""
+    config = found.config
+    if config is None:
+        return Section("Backbone", ["", ""], [["not one that saccade loads", line(found.problem)]])
+    vision = f"{config.vision_num_layers} layers of {config.vision_width}, {config.vision_num_heads} heads"
+    words = f"{config.num_layers} layers of {config.width}, {config.num_heads} heads of {config.head_dim}"
+    image = "any size" if config.image_size is None else f"{config.image_size} x {config.image_size}"
+    memory = ", ".join(f"{precision} {megabytes(nbytes)}" for precision, nbytes in found.memory.items())
+    return Section(
+        "Backbone",
+        ["", ""],
+        [
+            ["version", f"GR00T {config.version.upper()}"],
+            ["vision tower", f"{vision}, patches of {config.patch_size}, views of {image}"],
+            ["language model", f"{words}, {config.vocab_size:,} tokens"],
+            ["width of features", str(config.feature_dim)],
+            ["MB in memory", memory],
+            ["frames and words", found.processor or "see below"],
+            *([["missing", line(found.processor_problem)]] if found.processor_problem else []),
+        ],
+    )
+
+
+def robots(found: Sequence[RobotFindings]) -> Section:
+    """What an observation of each robot must contain."""
+    rows = []
+    for robot in found:
+        name = robot.embodiment or "the robot"
+        if robot.needs is None:
+            rows.append([name, "", line(robot.problem), "", "", ""])
+            continue
+        needs = robot.needs
+        cameras = "not named" if needs.cameras is None else ", ".join(map(str, needs.cameras))
+        rows.append(
+            [
+                needs.embodiment or name,
+                "" if robot.embodiment_id is None else str(robot.embodiment_id),
+                cameras,
+                ", ".join(f"{key} {width}" for key, width in needs.state),
+                needs.language_key or "not named",
+                ", ".join(f"{key} {width}" for key, width in robot.actions),
+            ]
+        )
+    columns = ["embodiment", ">id", "cameras", "state", "language", "actions"]
+    return Section("Robots whose statistics are here, and what an observation contains", columns, rows)
+
+
+def line(text: str | None) -> str:
+    """Text on one line."""
+    return " ".join((text or "").split())
 
 
 def embodiments(report: Inspection) -> Section:

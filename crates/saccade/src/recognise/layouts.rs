@@ -31,10 +31,13 @@ pub(super) fn has_head_config(config: &WholeConfig) -> Result<bool> {
     Ok(true)
 }
 
+/// What the names of the tensors of a backbone begin with, in the layouts that name them so.
+const BACKBONES: [&str; 2] = ["backbone.", "_groot_model.backbone."];
+
 /// What the names of the head's tensors begin with: empty if no layout's prefix is used.
 ///
 /// # Errors
-/// [`Error::Checkpoint`] if there are two heads in one checkpoint.
+/// [`Error::Checkpoint`] if there are two heads in one checkpoint, or a backbone alone.
 pub(super) fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
     let mut used: Vec<&str> = Vec::new();
     for prefix in LAYOUTS.iter().filter_map(|layout| layout.prefix()) {
@@ -43,7 +46,16 @@ pub(super) fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
         }
     }
     match used[..] {
-        [] => Ok(""),
+        [] => {
+            let is_backbone = |name: &str| BACKBONES.iter().any(|prefix| name.starts_with(prefix));
+            match checkpoint.names().next() {
+                Some(first) if checkpoint.names().all(is_backbone) => Err(Error::Checkpoint(format!(
+                    "source: there is no action head among the {} tensors, such as {first}: this is a backbone alone",
+                    checkpoint.names().count()
+                ))),
+                _ => Ok(""),
+            }
+        }
         [prefix] => Ok(prefix),
         [first, second, ..] => Err(Error::Checkpoint(format!(
             "source: two heads in one checkpoint, under `{first}` and `{second}`"
