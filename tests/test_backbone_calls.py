@@ -77,14 +77,21 @@ def test_calls_are_stopped_and_the_backbone_stays_usable() -> None:
         np.tile(released.arrays["_in.input_ids"], (count, 1)),
         np.tile(released.arrays["_in.attention_mask"], (count, 1)),
     )
-    for delay in (0.02, 0.1, 0.3):
-        with pytest.raises(Stopped), stopped_after(delay):
-            while True:
-                backbone(many)
-        assert np.array_equal(backbone(released.inputs()).backbone_features, few)
-    with pytest.raises(Stopped), stopped_after(0.1):
+
+    def call_again_and_again() -> None:
+        while True:
+            backbone(many)
+
+    def load_again_and_again() -> None:
         while True:
             released.load()
+
+    for delay in (0.02, 0.1, 0.3):
+        with pytest.raises(Stopped), stopped_after(delay):
+            call_again_and_again()
+        assert np.array_equal(backbone(released.inputs()).backbone_features, few)
+    with pytest.raises(Stopped), stopped_after(0.1):
+        load_again_and_again()
 
 
 WITHOUT_MEMORY = """
