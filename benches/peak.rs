@@ -3,7 +3,7 @@
 use saccade_benches::measure::{Contender, measure, quantile};
 use saccade_benches::options::Options;
 use saccade_benches::report::Report;
-use saccade_kernels::peak::{clock_hz, read_bytes_per_second};
+use saccade_kernels::peak::{READ_STREAMS, clock_hz, read_bytes_per_second};
 use saccade_kernels::{Arithmetic, Isa};
 
 fn main() {
@@ -35,10 +35,13 @@ fn main() {
     }
     println!();
     for &threads in &options.threads {
-        println!(
-            "read, {threads} threads{:>34.1} GB/s",
-            1e-9 * read_bytes_per_second(threads).expect("there is enough memory")
-        );
+        for streams in READ_STREAMS {
+            println!(
+                "{:<34}{:>8.1} GB/s",
+                format!("read, {threads} threads, {streams} streams"),
+                1e-9 * read_bytes_per_second(threads, streams).expect("there is enough memory")
+            );
+        }
     }
     report.end(&options);
 }

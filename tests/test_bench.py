@@ -13,8 +13,8 @@ import pytest
 
 import saccade
 from saccade import _saccade
-from saccade.bench import heads
-from saccade.bench.cost import PRECISIONS, Machine, floor, floors, predict
+from saccade.bench import heads, roofline
+from saccade.bench.cost import PRECISIONS, Machine, floor, floors, limit, predict
 from saccade.bench.timing import by_turns, pieces, profiled, quartiles
 from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import bench, main
@@ -179,6 +179,8 @@ MACHINE = Machine("avx512", 1, {"float32": 1e9, "bfloat16": 2e9, "int8": 4e9}, 1
 def test_the_floor_is_the_longer_of_two() -> None:
     assert floor(MACHINE, "int8", 8e9, 1e9) == 2.0
     assert floor(MACHINE, "int8", 8e9, 3e9) == 3.0
+    assert limit(MACHINE, "int8", 8e9, 1e9) == "arithmetic"
+    assert limit(MACHINE, "int8", 8e9, 3e9) == "memory"
 
 
 def test_floors_of_a_part_follow_its_arithmetic() -> None:
@@ -215,9 +217,69 @@ def test_peaks_of_this_machine() -> None:
     peaks = _saccade.measure_peaks(1)
     assert list(peaks["macs_per_second"]) == _saccade.available_isas()
     assert all(set(rates) == set(PRECISIONS) for rates in peaks["macs_per_second"].values())
-    assert peaks["read_bytes_per_second"] > 0
+    assert list(peaks["read_bytes_per_second_by_streams"]) == [1, 16]
+    assert peaks["read_bytes_per_second"] == max(peaks["read_bytes_per_second_by_streams"].values()) > 0
     with pytest.raises(saccade.InputError, match="num_threads: expected at least 1, got 0"):
         _saccade.measure_peaks(0)
+
+
+# The roofline
+
+#: Attention at half its roof, a layer at the memory's, and a part that reads nothing.
+PARTS = [
+    {"part": "norm", "seconds": 9.0, "multiply_adds": 0, "bytes": 0},
+    {"part": "attention", "seconds": 4.0, "multiply_adds": 2e9, "bytes": 1e8},
+    {"part": "feed_forward_in", "seconds": 10.0, "multiply_adds": 5e9, "bytes": 1e10},
+]
+
+
+def test_points_of_the_roofline() -> None:
+    layer, attention = roofline.points(MACHINE, "int8", PARTS)
+    assert (layer.part, layer.runs_in, layer.intensity, layer.rate) == ("feed_forward_in", "int8", 0.5, 5e8)
+    assert (layer.share, layer.limit) == (1.0, "memory")
+    assert (attention.runs_in, attention.intensity, attention.rate) == ("bfloat16", 20.0, 5e8)
+    assert (attention.share, attention.limit) == (0.25, "arithmetic")
+    assert [roofline.roof(MACHINE, "int8", intensity) for intensity in (0.5, 4.0, 100.0)] == [5e8, 4e9, 4e9]
+
+
+def test_the_roofline_as_text() -> None:
+    shown = roofline.points(MACHINE, "int8", PARTS)
+    lines = roofline.text(MACHINE, shown)
+    picture, legend = lines[: roofline.HEIGHT + 3], lines[roofline.HEIGHT + 4 :]
+    assert all(len(line) <= roofline.WIDTH + 11 for line in picture)
+    assert sum(line.count("a") for line in picture[1 : roofline.HEIGHT + 1]) == 1
+    assert any("/" in line for line in picture)
+    assert any("---" in line for line in picture[1 : roofline.HEIGHT + 1])
+    assert [line.split() for line in legend] == [
+        ["part", "arithmetic", "a", "byte", "GMAC/s", "roof", "of", "it", "limit"],
+        ["a", "feed_forward_in", "int8", "0.5", "0.5", "0.5", "100%", "memory"],
+        ["b", "attention", "bfloat16", "20.0", "0.5", "2.0", "25%", "arithmetic"],
+    ]
+    # A point on its roof stands on the line: above it there is nothing.
+    plane = roofline.Range.of(MACHINE, shown)
+    column = 11 + plane.column(0.5)
+    above = [line[column] for line in picture[1 : roofline.HEIGHT - plane.row(5e8)] if len(line) > column]
+    assert set(above) <= {" "}
+    assert roofline.text(MACHINE, []) == ["no part has both multiply-adds and bytes"]
+
+
+def test_the_command_draws_the_roofline(
+    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    arguments = ["--checkpoint", str(folder), "--precisions", "float32", "--rounds", "1"]
+    arguments += ["--num-vl-tokens", "5"]
+    image = tmp_path / "roofline.png"
+    assert main(["bench", *arguments, "--roofline", "--figure", str(image)]) == 0
+    text = capsys.readouterr().out
+    assert "float32 encode, roofline" in text
+    assert "float32 sample, roofline" in text
+    assert "as 1, " in text
+    assert image.read_bytes().startswith(b"\x89PNG")
+    assert main(["bench", *arguments, "--figure", str(tmp_path / "no" / "such.png")]) == 2
+    assert "no such directory" in capsys.readouterr().err
+    report = printed(capsys, *arguments, "--roofline")
+    assert set(report["roofline"]) == {"float32 encode", "float32 sample"}
 
 
 # The pieces of the command

@@ -205,6 +205,7 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
     arguments = {
         "act": ["checkpoint"],
         "demos": ["--out", "out"],
+        "serve": ["checkpoint"],
         "train": ["--demos", str(tmp_path), "--out", "out"],
     }
     (tmp_path / "reach").mkdir()

@@ -14,7 +14,7 @@ import saccade
 
 PACKAGE = Path(saccade.__file__).parent
 LAZY = ("bench", "checkpoints", "comparison", "integrations", "maps", "observation", "reference", "robots",
-        "sim", "study", "torch")  # fmt: skip
+        "serve", "sim", "study", "torch")  # fmt: skip
 
 
 def python(code: str) -> str:

@@ -39,6 +39,13 @@ CONFIGS = (
 )
 
 
+@pytest.fixture(params=[*_saccade.available_isas(), "software_tiles"])
+def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Also what AMX computes, emulated: every machine then runs the whole head in tiles."""
+    monkeypatch.setenv("SACCADE_ISA", request.param)
+    return str(request.param)
+
+
 @pytest.fixture(params=PRECISIONS)
 def precision(request: pytest.FixtureRequest) -> str:
     return str(request.param)
@@ -220,8 +227,8 @@ def test_a_precision_that_is_no_text(given: Any, tmp_path: Path) -> None:
 
 def test_show_config_names_the_dot_products(isa: str) -> None:
     products = saccade.show_config("dicts")["dot_products"]
-    assert set(products) <= {"bf16", "vnni"}
-    if isa in ("portable", "avx2", "avx512f"):
+    assert set(products) <= {"bf16", "vnni", "dotprod", "i8mm"}
+    if isa in ("portable", "avx2", "avx512f", "neon"):
         assert products == []
 
 

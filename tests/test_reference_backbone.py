@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 import torch
 import upstream_backbones
+from reference_backbone_cases import random_inputs, random_sizes, randomised
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from saccade import BackboneInputs, CheckpointError, InputError, ShapeError
 from saccade.checkpoints import backbone_tensors
-from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes, TextSizes, VisionSizes
+from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes
 from saccade.reference import Backbone, BackboneFeatures
 
 DATA = Path(__file__).parent / "data" / "backbone"
@@ -104,74 +105,6 @@ def test_every_intermediate_of_the_released_code_in_float64(name: str) -> None:
     assert torch.equal(features.attention_mask, held["_in.attention_mask"].bool())
     if "_out.image_mask" in held:
         assert torch.equal(features.image_mask, held["_out.image_mask"].bool())
-
-
-def randomised(backbone: Backbone, seed: int) -> Backbone:
-    """All parameters drawn, norms and biases included, so that each shows in the features."""
-    generator = torch.Generator().manual_seed(seed)
-    for name, parameter in backbone.named_parameters():
-        drawn = torch.randn(parameter.shape, generator=generator)
-        scale = 0.3 if parameter.ndim == 1 else parameter[0].numel() ** -0.5
-        offset = 1.0 if parameter.ndim == 1 and not name.endswith("bias") else 0.0
-        parameter.data = offset + scale * drawn
-    return backbone
-
-
-def random_sizes(version: str, rng: np.random.Generator) -> BackboneSizes:
-    """Sizes of a small backbone, in which heads times head_dim is not the width."""
-    key_heads, head_dim = int(rng.integers(1, 3)), 2 * int(rng.integers(3, 7))
-    side = 2 * int(rng.integers(1, 4))
-    merge = 2 if version == "n1.7" else int(rng.integers(1, 3))
-    half = head_dim // 2
-    sections = (half - 2 * (half // 3), half // 3, half // 3) if version == "n1.7" else ()
-    vision = VisionSizes(
-        width=24 * int(rng.integers(1, 4)),
-        mlp_width=int(rng.integers(20, 60)),
-        num_layers=3,
-        num_heads=int(rng.choice([1, 2, 3])),
-        patch_size=int(rng.integers(2, 6)),
-        num_positions=side**2,
-        eps=1e-6,
-        deepstack=(0, 2) if version == "n1.7" else (),
-        temporal_patch_size=2 if version == "n1.7" else 1,
-    )
-    text = TextSizes(
-        width=8 * int(rng.integers(3, 9)),
-        mlp_width=int(rng.integers(20, 60)),
-        num_heads=key_heads * int(rng.integers(1, 4)),
-        num_key_heads=key_heads,
-        head_dim=head_dim,
-        vocabulary=40,
-        eps=1e-6,
-        theta=float(rng.choice([1e4, 1e6])),
-        sections=sections,
-    )
-    layers = int(rng.integers(1, 3)) if merge == 2 else 1
-    return BackboneSizes(version, 3, 35, layers, merge, None, vision, text)
-
-
-def random_inputs(sizes: BackboneSizes, rng: np.random.Generator, batch: int, views: int) -> BackboneInputs:
-    """A batch whose prompts have different lengths, padded on the left."""
-    vision = sizes.vision
-    side = round(vision.num_positions**0.5)
-    grids = [(side, side)] * (batch * views)
-    pixels = rng.standard_normal((batch * views, 3, *[side * vision.patch_size] * 2))
-    if sizes.version == "n1.7":
-        grids = [(2 * int(rng.integers(1, 4)), 2 * int(rng.integers(1, 4))) for _ in grids]
-        values = 3 * vision.temporal_patch_size * vision.patch_size**2
-        pixels = rng.standard_normal((sum(rows * columns for rows, columns in grids), values))
-    prompts = []
-    for row in range(batch):
-        prompt: list[int] = []
-        for rows, columns in grids[row * views : (row + 1) * views]:
-            tokens = rows * columns // sizes.merge**2
-            prompt += [sizes.image_token - 2, *[sizes.image_token] * tokens, sizes.image_token - 1]
-        prompts.append(prompt + rng.integers(30, size=int(rng.integers(1, 9))).tolist())
-    longest = max(map(len, prompts))
-    ids = np.array([[0] * (longest - len(prompt)) + prompt for prompt in prompts])
-    mask = np.array([[0] * (longest - len(prompt)) + [1] * len(prompt) for prompt in prompts])
-    grid_thw = np.array([(1, *grid) for grid in grids]) if sizes.version == "n1.7" else None
-    return BackboneInputs(pixels, ids, mask, grid_thw)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -1,16 +1,19 @@
 """Compares saccade with other engines that run the same head, on this machine.
 
-    make bench-peers                                       the usual set, about a quarter of an hour
-    make bench-peers PEERS_ARGS="--only blocks --threads 2 --rounds 9"
-    make bench-peers PEERS_ARGS="--full"                   every piece at every size: hours
+    make bench-peers                                       the usual set, at most half an hour
+    make bench-peers PEERS_ARGS="--only blocks --threads 1 2 --rounds 9"
+    make bench-peers PEERS_ARGS="--full --minutes 600"     every piece at every size: hours
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
+    make bench-peers PEERS_ARGS="--only throughput --rounds 3 --minutes 120"
+                       chunks per second of 1, 8 and 32 observations at once, on 1 thread to all cores
     python -m benches.peers report                         write the report of existing measurements
     python -m benches.peers report --write                 write docs/performance.md and its figures
 
 Every contender runs in a separate process with the requested number of threads and waits while another one
 works. In a round, each does every piece of work once, in an order that rotates. Before anything is timed, its
-result is compared with the reference in float32. Measurements are added to a JSON file, so an interrupted run
-resumes, and contenders that have all their rounds are not started again.
+result is compared with the reference in float32. What has a target comes first. Measurements are added to a
+JSON file, so an interrupted run resumes, and contenders that have all their rounds are not started again.
+At the end the file is copied to benches/peers/results/ under the name of the CPU's family.
 
 Needs the environment that `make bench-peers` sets up. A contender whose package is missing is left out, with
 the reason in the report. The whole head in all contenders takes 12 GB of memory; `--memory` limits how much
@@ -21,17 +24,21 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from benches.peers import machine, processes, report
-from benches.peers.cases import WORKS, Case, default_cases, full_cases
-from benches.peers.contenders import CONTENDERS, GROUPS
+from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
+from benches.peers.contenders import CONTENDERS, GROUPS, able
+from benches.peers.goals import NEEDED
 from benches.peers.processes import Ready, note
-from benches.peers.results import Results
+from benches.peers.results import RECORDS, Results
+from benches.peers.text import usual
 
 BUILDING = 40.0  # seconds to build the slowest batch, once its graphs are written
 
@@ -43,31 +50,56 @@ def main(arguments: list[str] | None = None) -> int:
     if args.command == "report":
         return report.command(results, args)
     machine_now = machine.describe()
+    args.contenders = able(args.contenders, machine_now)
     if results.begin(machine_now):
         note(f"{args.results} is from another machine or build; it is set aside and measured again")
     measure_all(results, args)
     if not args.prepare:
         report.write(results, args.results.parent)
+        keep(results, args.record)
     return 0
 
 
 def measure_all(results: Results, args: argparse.Namespace) -> None:
-    """Measures all cases, until they are done or the time limit is reached."""
-    end = time.monotonic() + args.seconds if args.seconds else float("inf")
+    """Measures all cases, until they are done or the time limit is reached: first what has a target."""
+    end = time.monotonic() + 60.0 * args.minutes
     cases = chosen_cases(args)
     if not args.prepare:
         for threads in args.threads:
             results.data["peaks"].append(machine.peaks(threads))
-        if args.linear_rounds and any(case.piece == "linear" for case in cases):
-            results.data["linear"].append(machine.linear_bench(args.threads, args.linear_rounds))
         results.save()
+    needed = [name for name in args.contenders if name in NEEDED]
+    with_targets = [] if args.prepare else [case for case in cases if case.piece in ("head", "blocks")]
+    if not measure_cases(results, with_targets, needed, args, end):
+        return
+    wants_linear = args.linear_rounds and any(case.piece == "linear" for case in cases)
+    if wants_linear and not args.prepare and not results.data["linear"]:
+        note("linear layers: cargo bench")
+        results.data["linear"].append(machine.linear_bench(args.linear_threads, args.linear_rounds))
+        results.save()
+    measure_cases(results, cases, args.contenders, args, end)
+
+
+def measure_cases(
+    results: Results, cases: list[Case], names: Sequence[str], args: argparse.Namespace, end: float
+) -> bool:
+    """Measures the named contenders; whether the time was enough."""
     for case in cases:
-        for batch in batches(results, case, args):
+        for batch in batches(results, case, args, names):
             if time.monotonic() + BUILDING > end:
                 note("the time limit is reached; the next run continues here")
-                return
+                return False
             processes.prepare(case, args.work)
             measure(results, case, batch, args, end)
+    return True
+
+
+def keep(results: Results, folder: Path) -> None:
+    """Copies the measurements to the record of this CPU's family, if the whole head is among them."""
+    if usual(results, "head"):
+        path = folder / f"{results.slug}.json"
+        results.save(path)
+        print(path)
 
 
 def chosen_cases(args: argparse.Namespace) -> list[Case]:
@@ -82,11 +114,11 @@ def chosen_cases(args: argparse.Namespace) -> list[Case]:
     return list(dict.fromkeys(cases))
 
 
-def batches(results: Results, case: Case, args: argparse.Namespace) -> list[list[str]]:
+def batches(results: Results, case: Case, args: argparse.Namespace, names: Sequence[str]) -> list[list[str]]:
     """Batches of contenders with unfinished rounds that fit into memory, each with the first of its group."""
     found: list[list[str]] = []
     for group in GROUPS.values():
-        able = [name for name in group if case.piece in group[name].pieces and name in args.contenders]
+        able = [name for name in group if case.piece in group[name].pieces and name in names]
         pending = [name for name in able if results.rounds(case, name) < args.rounds]
         if args.prepare:
             found += [[name] for name in able]
@@ -107,7 +139,7 @@ def batches(results: Results, case: Case, args: argparse.Namespace) -> list[list
 
 def gigabytes(case: Case, name: str) -> float:
     """Memory of a contender, roughly: the weights of the whole head, or of a fifth of it."""
-    return CONTENDERS[name].gigabytes * (1.0 if case.piece in ("head", "cost") else 0.3)
+    return CONTENDERS[name].gigabytes * (1.0 if case.piece in WHOLE else 0.3)
 
 
 def measure(results: Results, case: Case, names: list[str], args: argparse.Namespace, end: float) -> None:
@@ -150,7 +182,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("command", nargs="?", choices=commands, default="measure", help="default: measure")
     parser.add_argument("--full", action="store_true", help="every size, not only the usual one")
     parser.add_argument(
-        "--only", nargs="+", choices=WORKS, default=list(WORKS), metavar="PIECE", help=" ".join(WORKS)
+        "--only",
+        nargs="+",
+        choices=WORKS,
+        metavar="PIECE",
+        help=f"of {', '.join(WORKS)} (default: {', '.join(USUAL)}; with --full all)",
     )
     parser.add_argument(
         "--contenders",
@@ -160,7 +196,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="default: all except settings that are slower than another setting of the same engine; of: "
         + ", ".join(CONTENDERS),
     )
-    parser.add_argument("--threads", type=int, nargs="+", default=[2, 1], help="thread counts (default 2 1)")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        nargs="+",
+        help="counts (default 2; of throughput 1, 2, 4, ... all cores)",
+    )
     parser.add_argument("--rounds", type=int, default=5, help="repetitions of everything (default 5)")
     parser.add_argument(
         "--linear-rounds",
@@ -168,8 +209,19 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         default=8,
         help="rounds of `cargo bench --bench linear`; 0 skips it (default 8)",
     )
-    parser.add_argument("--seconds", type=float, help="time limit; the next run continues")
-    parser.add_argument("--memory", type=float, default=12, help="GB that contenders may use (default 12)")
+    parser.add_argument(
+        "--linear-threads", type=int, nargs="+", default=[1, 2], help="its thread counts (default 1 2)"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=30, help="time limit; the next run continues (default 30)"
+    )
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    parser.add_argument(
+        "--memory",
+        type=float,
+        default=min(12.0, 0.6 * memory),
+        help="GB that contenders may use (default 12, or 0.6 of the machine's)",
+    )
     parser.add_argument(
         "--prepare", action="store_true", help="write inputs and graphs, compare results, time nothing"
     )
@@ -179,15 +231,20 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
     )
+    parser.add_argument("--results", type=Path, help="the JSON file (default: results.json in --work)")
     parser.add_argument(
-        "--results",
+        "--record",
         type=Path,
-        help="the JSON file (default: results.json in --work; for report --write: the committed one)",
+        default=RECORDS,
+        help="folder with a JSON file per CPU family (default benches/peers/results)",
     )
-    parser.add_argument("--write", action="store_true", help="report: write docs/performance.md")
+    parser.add_argument(
+        "--write", action="store_true", help="report: write docs/performance.md from --record"
+    )
     args = parser.parse_args(arguments)
-    committed = args.command == "report" and args.write
-    args.results = args.results or (report.COMMITTED if committed else args.work / "results.json")
+    args.results = args.results or args.work / "results.json"
+    args.only = args.only or list(WORKS if args.full else USUAL)
+    args.threads = args.threads or (machine.thread_counts() if args.only == ["throughput"] else [2])
     if args.contenders is None:
         args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]
     if args.rounds < 1 or min(args.threads) < 1:

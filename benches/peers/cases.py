@@ -25,6 +25,7 @@ WORKS: dict[str, tuple[str, ...]] = {
     "cross": ("held", "both"),
     "blocks": ("held", "both"),
     "head": ("encode", "sample"),
+    "throughput": ("encode", "sample"),
     "cost": (
         *(f"encode, T_vl {value}" for value in COST["T_vl"]),
         *(f"sample, {name} {value}" for name, values in COST.items() for value in values),
@@ -34,6 +35,13 @@ WORKS: dict[str, tuple[str, ...]] = {
 computed too. For the whole head, `both` is the sum of its two works in the same round.
 """
 
+USUAL = ("head", "blocks", "cross", "linear")
+"""The pieces of a run that names none: all but the cost model and throughput."""
+WHOLE = ("head", "throughput", "cost")
+"""The pieces that are the whole head."""
+BATCHES = (1, 8, 32)
+"""Observations of the piece `throughput`."""
+
 
 @dataclass(frozen=True, order=True)
 class Case:
@@ -41,7 +49,8 @@ class Case:
 
     Attributes:
         piece: A key of `WORKS`: the linear layers alone (`LINEAR_SHAPES`), the attention of the eight cross
-            blocks, four DiT blocks, the whole head, the whole head at the sizes of `COST`.
+            blocks, four DiT blocks, the whole head, the whole head for several observations at once, the
+            whole head at the sizes of `COST`.
         threads: Threads that every engine is given.
         num_vl_tokens: T_vl.
         num_future_tokens: N.
@@ -68,7 +77,7 @@ class Case:
     @property
     def reported(self) -> tuple[str, ...]:
         """The works that are reported."""
-        return (*self.works, "both") if self.piece == "head" else self.works
+        return (*self.works, "both") if self.piece in ("head", "throughput") else self.works
 
     def as_dict(self) -> dict[str, Any]:
         """The fields, for JSON."""
@@ -82,8 +91,9 @@ class Case:
 
 
 def default_cases(threads: list[int]) -> list[Case]:
-    """The cases for a quarter of an hour: the released size, one view, N 32, one observation, one chunk."""
-    cases = [Case(piece, count) for count in threads for piece in ("head", "blocks", "cross", "linear")]
+    """Every piece at the released size, one view, N 32, one chunk; one observation, of throughput several."""
+    cases = [Case(piece, count) for count in threads for piece in USUAL]
+    cases += [Case("throughput", count, batch=batch) for batch in BATCHES for count in threads]
     return [*cases, Case("cost", max(threads))]
 
 
@@ -92,7 +102,7 @@ def full_cases(threads: list[int]) -> list[Case]:
     cases = []
     for default in default_cases(threads):
         cases.append(default)
-        if default.piece in ("linear", "cost"):
+        if default.piece in ("linear", "throughput", "cost"):
             continue
         for vl in (296, 822):
             # The cross-attention sees N only as more rows; four blocks have no samples of one observation.

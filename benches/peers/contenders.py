@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,7 @@ class Contender:
         options: What the engine's `build` reads.
         environment: Set in its process.
         usual: Whether it is part of a run that names nobody; the others are settings that were tried and
-            that another setting of the same engine beats.
+            that another setting of the same engine beats, or that take minutes to compile.
     """
 
     label: str
@@ -33,6 +33,7 @@ class Contender:
 
 ALL = ("linear", "cross", "blocks", "head")
 PARTS = ("cross", "blocks", "head")
+MANY = (*ALL, "throughput")
 
 
 def _saccade(
@@ -40,18 +41,16 @@ def _saccade(
 ) -> Contender:
     label = f"saccade {precision}"
     options: dict[str, Any] = {"precision": precision}
+    pieces: tuple[str, ...] = (*PARTS, "throughput", "cost")
     if refresh is not None:
         options["future_refresh"] = refresh
         label += f", future_refresh={refresh}"
+        pieces = ("head",)
     if isa is not None:
         label += f" ({isa})"
+        pieces = (*PARTS, "throughput") if isa == "avx2" else ("throughput",)
     return Contender(
-        label,
-        "saccade_head",
-        ("head",) if refresh else PARTS if isa else (*PARTS, "cost"),
-        gigabytes,
-        options,
-        {} if isa is None else {"SACCADE_ISA": isa},
+        label, "saccade_head", pieces, gigabytes, options, {} if isa is None else {"SACCADE_ISA": isa}
     )
 
 
@@ -62,9 +61,15 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
             "lerobot 0.4.4 float32", "lerobot", ("blocks", "head"), 3.6, {"arithmetic": "float32"}
         ),
         "saccade-float32-avx2": _saccade("float32", 3.3, "avx2"),
-        "torch-float32": Contender("torch float32", "pytorch", ALL, 3.6, {"arithmetic": "float32"}),
+        "saccade-float32-avx512": _saccade("float32", 3.3, "avx512"),
+        "torch-float32": Contender("torch float32", "pytorch", MANY, 3.6, {"arithmetic": "float32"}),
         "compile-float32": Contender(
-            "torch.compile float32", "pytorch", ALL, 6.5, {"arithmetic": "float32", "compiled": True}
+            "torch.compile float32",
+            "pytorch",
+            ALL,
+            6.5,
+            {"arithmetic": "float32", "compiled": True},
+            usual=False,
         ),
         "compile-float32-autotuned": Contender(
             "torch.compile float32, autotuned",
@@ -77,7 +82,7 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "onnxruntime-float32": Contender(
             "ONNX Runtime float32", "onnx_runtime", ALL, 4.5, {"arithmetic": "float32"}
         ),
-        "openvino-float32": Contender("OpenVINO float32", "open_vino", ALL, 4.5, {"arithmetic": "float32"}),
+        "openvino-float32": Contender("OpenVINO float32", "open_vino", MANY, 4.5, {"arithmetic": "float32"}),
         "ggml-float32": Contender("ggml f32", "ggml", ("linear",), 1, {"arithmetic": "float32"}),
     },
     "narrow": {
@@ -85,22 +90,6 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "lerobot-bfloat16": Contender(
             "lerobot 0.4.4 bfloat16", "lerobot", ("blocks", "head"), 2.0, {"arithmetic": "autocast"}
         ),
-        "openvino-bfloat16": Contender("OpenVINO bfloat16", "open_vino", ALL, 3, {"arithmetic": "bfloat16"}),
-        "saccade-int8": _saccade("int8", 1.0),
-        "saccade-int8-refresh2": _saccade("int8", 1.0, refresh=2),
-        "saccade-int8-refresh4": _saccade("int8", 1.0, refresh=4),
-        "saccade-bfloat16-avx2": _saccade("bfloat16", 1.8, "avx2"),
-        "saccade-int8-avx2": _saccade("int8", 1.0, "avx2"),
-        "torch-bfloat16": Contender("torch bfloat16", "pytorch", ALL, 2.2, {"arithmetic": "bfloat16"}),
-        "compile-bfloat16": Contender(
-            "torch.compile bfloat16", "pytorch", ALL, 3.5, {"arithmetic": "bfloat16", "compiled": True}
-        ),
-        "onnxruntime-int8": Contender(
-            "ONNX Runtime int8, dynamic", "onnx_runtime", ALL, 1.8, {"arithmetic": "int8"}
-        ),
-        "ggml-float16": Contender("ggml f16", "ggml", ("linear",), 1, {"arithmetic": "float16"}),
-        "ggml-bfloat16": Contender("ggml bf16", "ggml", ("linear",), 1, {"arithmetic": "bfloat16"}),
-        "ggml-int8": Contender("ggml q8_0", "ggml", ("linear",), 1, {"arithmetic": "int8"}),
         "lerobot-bfloat16-pure": Contender(
             "lerobot 0.4.4 bfloat16, no autocast",
             "lerobot",
@@ -108,6 +97,29 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
             2.0,
             {"arithmetic": "bfloat16"},
         ),
+        "openvino-bfloat16": Contender("OpenVINO bfloat16", "open_vino", MANY, 3, {"arithmetic": "bfloat16"}),
+        "saccade-int8": _saccade("int8", 1.0),
+        "saccade-int8-refresh2": _saccade("int8", 1.0, refresh=2),
+        "saccade-int8-refresh4": _saccade("int8", 1.0, refresh=4),
+        "saccade-bfloat16-avx2": _saccade("bfloat16", 1.8, "avx2"),
+        "saccade-int8-avx2": _saccade("int8", 1.0, "avx2"),
+        "saccade-bfloat16-avx512": _saccade("bfloat16", 1.8, "avx512"),
+        "saccade-int8-avx512": _saccade("int8", 1.0, "avx512"),
+        "torch-bfloat16": Contender("torch bfloat16", "pytorch", MANY, 2.2, {"arithmetic": "bfloat16"}),
+        "compile-bfloat16": Contender(
+            "torch.compile bfloat16",
+            "pytorch",
+            ALL,
+            3.5,
+            {"arithmetic": "bfloat16", "compiled": True},
+            usual=False,
+        ),
+        "onnxruntime-int8": Contender(
+            "ONNX Runtime int8, dynamic", "onnx_runtime", ALL, 1.8, {"arithmetic": "int8"}
+        ),
+        "ggml-float16": Contender("ggml f16", "ggml", ("linear",), 1, {"arithmetic": "float16"}),
+        "ggml-bfloat16": Contender("ggml bf16", "ggml", ("linear",), 1, {"arithmetic": "bfloat16"}),
+        "ggml-int8": Contender("ggml q8_0", "ggml", ("linear",), 1, {"arithmetic": "int8"}),
         "torch-autocast": Contender(
             "torch bfloat16 autocast", "pytorch", ALL, 2.2, {"arithmetic": "autocast"}, usual=False
         ),
@@ -124,8 +136,20 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
         ),
     },
 }
-"""By arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds."""
+"""By arithmetic, so that a batch fits into memory. Ratios are to the first of each group, within rounds. The
+contenders of the targets come first, so that they share rounds.
+"""
 
 CONTENDERS: Mapping[str, Contender] = {
     name: contender for group in GROUPS.values() for name, contender in group.items()
 }
+
+
+def able(names: Iterable[str], machine: Mapping[str, Any]) -> list[str]:
+    """Those of the contenders whose instruction set the machine has and does not choose by itself anyway."""
+
+    def fits(name: str) -> bool:
+        isa = CONTENDERS[name].environment.get("SACCADE_ISA")
+        return isa is None or (isa in machine["isas"] and isa != machine["isa"])
+
+    return [name for name in names if fits(name)]

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def write_figures(results: Results, folder: Path) -> None:
-    """Writes what was measured: `performance.png`, the whole head; `cost.png`, the cost model."""
+    """Writes what was measured: the whole head, and the cost model, each with the name of the CPU."""
     folder.mkdir(parents=True, exist_ok=True)
     if usual(results, "head"):
-        head_figure(results).savefig(folder / "performance.png", dpi=130)
+        head_figure(results).savefig(folder / f"performance-{results.slug}.png", dpi=130)
     if any(case.piece == "cost" for case in results.cases):
-        cost_figure(results).savefig(folder / "cost.png", dpi=130)
+        cost_figure(results).savefig(folder / f"cost-{results.slug}.png", dpi=130)
 
 
 def head_figure(results: Results) -> Figure:

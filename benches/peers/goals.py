@@ -1,11 +1,12 @@
-"""Speed-ups that saccade aimed for, and whether they were reached."""
+"""Speed-ups and shares of the floor that saccade aimed for, and whether they were reached."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from benches.peers.cases import LINEAR_SHAPES
 from benches.peers.contenders import CONTENDERS
+from benches.peers.floors import floor
 from benches.peers.results import Results
 from benches.peers.text import percent, plural, table, usual
 from saccade.bench.timing import quartiles
@@ -33,6 +34,9 @@ class Goal:
 
 
 LEROBOT_BF16 = ("lerobot-bfloat16", "lerobot-bfloat16-pure")
+
+
+PURE_BF16 = ("lerobot-bfloat16-pure",)
 
 
 GOALS = (
@@ -75,6 +79,29 @@ GOALS = (
 )
 
 
+GOALS_AMX = (
+    Goal("bfloat16, encode + sample", "head", "both", PURE_BF16, "saccade-bfloat16", 2.6, 3.2),
+    Goal("bfloat16, sample from a cached context", "head", "sample", PURE_BF16, "saccade-bfloat16", 3.6, 4.5),
+    Goal("int8, encode + sample", "head", "both", PURE_BF16, "saccade-int8", 3.5, 4.6),
+    Goal("int8, sample from a cached context", "head", "sample", PURE_BF16, "saccade-int8", 4.8, 6.5),
+    Goal("bfloat16, encode + sample", "head", "both", ("openvino-bfloat16",), "saccade-bfloat16", 1.3, 1.6),
+    Goal("float32, encode + sample", "head", "both", ("lerobot-float32",), "saccade-float32", 2.4, 2.7),
+)
+"""Where AMX multiplies. torch and OpenVINO use it too."""
+
+
+FLOOR_GOALS_AMX = {"saccade-bfloat16": (0.60, 0.75), "saccade-int8": (0.60, 0.75)}
+"""Contender -> shares of the floor of the whole head at which the target is reached, and exceeded."""
+
+
+BATCH_GOAL_AMX = (4.0, 32)
+"""Chunks per second of so many observations at once, relative to one."""
+
+
+NEEDED = tuple(dict.fromkeys(name for goal in (*GOALS, *GOALS_AMX) for name in (goal.ours, *goal.peers)))
+"""The contenders of the targets."""
+
+
 LINEAR_GOALS = {1: ((0.86, 0.94), (0.90, 0.97)), 2: ((0.82, 0.91), (0.90, 0.97))}
 """Thread count -> shares of the peak at (49, 296) rows at which the target is reached, and exceeded."""
 
@@ -82,7 +109,8 @@ LINEAR_GOALS = {1: ((0.86, 0.94), (0.90, 0.97)), 2: ((0.82, 0.91), (0.90, 0.97))
 def goals(results: Results) -> str:
     """The table of targets, and whether each was reached."""
     rows = []
-    for goal in GOALS:
+    has_tiles = results.data["machine"]["isa"] == "amx"
+    for goal in GOALS_AMX if has_tiles else GOALS:
         for case in usual(results, goal.piece):
             peers = [name for name in goal.peers if name in results.names(case)]
             if not peers or goal.ours not in results.names(case):
@@ -98,6 +126,37 @@ def goals(results: Results) -> str:
                         f"{'' if results.ratios(case, peer, goal.ours, goal.work) else '~'}"
                         f"{measured[1]:.2f} x ({measured[0]:.2f}–{measured[2]:.2f})",
                         reached(measured[1], goal.least, goal.beyond),
+                    ]
+                )
+    for name, (least_share, beyond_share) in FLOOR_GOALS_AMX.items() if has_tiles else ():
+        for case in usual(results, "head"):
+            seconds, shortest = results.seconds(case, name, "both"), floor(results, case, name)
+            if seconds and shortest is not None:
+                share = shortest / quartiles(seconds)[1]
+                rows.append(
+                    [
+                        f"{CONTENDERS[name].label}, encode + sample, share of the floor",
+                        plural(case.threads),
+                        f"{percent([least_share])} ({percent([beyond_share])})",
+                        percent([share]),
+                        reached(share, least_share, beyond_share),
+                    ]
+                )
+    gain, batch = BATCH_GOAL_AMX
+    for name in ("saccade-bfloat16", "saccade-int8") if has_tiles else ():
+        for case in sorted(
+            case for case in results.cases if case.piece == "throughput" and case.batch == batch
+        ):
+            one, many = (results.seconds(each, name, "both") for each in (replace(case, batch=1), case))
+            if one and many:
+                measured_gain = batch * quartiles(one)[1] / quartiles(many)[1]
+                rows.append(
+                    [
+                        f"{CONTENDERS[name].label}, chunks/s of batch {batch} against batch 1",
+                        plural(case.threads),
+                        f"{gain} x",
+                        f"{measured_gain:.2f} x",
+                        reached(measured_gain, gain, float("inf")),
                     ]
                 )
     for threads, (least, beyond) in LINEAR_GOALS.items():

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benches.peers.cases import LINEAR_SHAPES, NUM_BLOCKS, Case
+from benches.peers.cases import LINEAR_SHAPES, NUM_BLOCKS, WHOLE, Case
 from saccade import HeadConfig
 
 Arrays = dict[str, NDArray[Any]]
@@ -36,7 +36,7 @@ def config_of(case: Case) -> dict[str, Any]:
     config["num_target_vision_tokens"] = case.num_future_tokens
     if case.piece == "blocks":
         config["diffusion_model_cfg"] |= {"num_layers": NUM_BLOCKS, "output_dim": 64}
-    if case.piece not in ("head", "cost"):
+    if case.piece not in WHOLE:
         config |= {"use_vlln": False, "hidden_size": 64}
     config["diffusion_model_cfg"]["output_dim"] = config["hidden_size"]
     return config
@@ -44,7 +44,7 @@ def config_of(case: Case) -> dict[str, Any]:
 
 def checkpoint(case: Case, folder: Path, dtype: str = "float32") -> Path:
     """The checkpoint of the piece under `folder`, `float32` or `bfloat16`; written if it is not there."""
-    piece = {"cost": "head", "linear": "cross"}.get(case.piece, case.piece)
+    piece = "head" if case.piece in WHOLE else "cross" if case.piece == "linear" else case.piece
     path = folder / f"{case.size}-{piece}-n{case.num_future_tokens}-{dtype}"
     if not path.exists():
         import torch

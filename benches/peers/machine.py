@@ -21,15 +21,20 @@ PACKAGES = ("saccade", "torch", "lerobot", "diffusers", "onnxruntime", "openvino
 
 
 def describe() -> dict[str, Any]:
-    """CPU, its flags that matter here, cores, memory, versions of all engines, the build of saccade."""
+    """CPU, its flags that matter here, cores, memory, versions of all engines, the build of saccade.
+
+    `name` is that of the CPU's family where saccade knows it, otherwise vendor and numbers: one record each.
+    """
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpuinfo = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
     flags = set(cpuinfo.get("flags", "").split())
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     config = saccade.show_config("dicts")
+    family = f"family {cpuinfo.get('cpu family')}, model {cpuinfo.get('model')}"
     return {
         "cpu": cpuinfo.get("model name", platform.machine()),
-        "family": f"family {cpuinfo.get('cpu family')}, model {cpuinfo.get('model')}",
+        "name": config.get("cpu_family") or f"{cpuinfo.get('vendor_id', platform.machine())}, {family}",
+        "family": family,
         "flags": [flag for flag in FLAGS + AMX if flag in flags],
         "cores": len(os.sched_getaffinity(0)),
         "memory_gb": round(memory / 1e9),
@@ -44,6 +49,12 @@ def describe() -> dict[str, Any]:
         "build": hashlib.sha256(Path(saccade._saccade.__file__).read_bytes()).hexdigest()[:12],
         "commit": said("git", "describe", "--always", "--dirty", "--exclude", "*"),
     }
+
+
+def thread_counts() -> list[int]:
+    """1, 2, 4, ... and the physical cores that this process may use, in ascending order."""
+    cores = saccade.show_config("dicts")["num_threads"]
+    return sorted({cores, *(1 << power for power in range(cores.bit_length()))})
 
 
 def version(name: str) -> str:

@@ -1,15 +1,17 @@
-"""The report of `make bench-peers`: Markdown and figures; docs/performance.md is one of them."""
+"""The report of `make bench-peers`: Markdown and figures of one machine, and docs/performance.md of all."""
 
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
 from benches.peers.cases import LINEAR_SHAPES, Case, exact_macs
 from benches.peers.contenders import CONTENDERS
 from benches.peers.figures import cost_lines, straight, write_figures
+from benches.peers.floors import floor
 from benches.peers.goals import goals
-from benches.peers.results import Results
+from benches.peers.results import Results, records
 from benches.peers.text import (
     PART_TITLES,
     PIECES,
@@ -23,12 +25,12 @@ from benches.peers.text import (
     table,
     usual,
 )
+from benches.peers.throughput import throughput
 from saccade.bench.timing import quartiles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE, IMAGES = DOCS / "performance.md", DOCS / "images"
 NOTES = Path(__file__).with_name("notes.md")
-COMMITTED = Path(__file__).with_name("results.json")
 OVERVIEW_ROWS = (
     "saccade-float32",
     "saccade-bfloat16",
@@ -51,43 +53,95 @@ OVERVIEW_ROWS = (
 
 def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report`."""
+    if args.write:
+        measured = records(args.record)
+        PAGE.write_text(page(measured))
+        for each in measured:
+            write_figures(each, IMAGES)
+        return 0
     if not results.data["machine"]:
         raise SystemExit(f"bench-peers: {args.results} has no measurements; run `make bench-peers`")
-    if args.write:
-        PAGE.write_text(document(results, "images"))
-        write_figures(results, IMAGES)
-    else:
-        write(results, args.results.parent)
+    write(results, args.results.parent)
     return 0
 
 
 def write(results: Results, folder: Path) -> None:
     """Writes `report.md` and its figures into the folder of the JSON file."""
     write_figures(results, folder)
-    (folder / "report.md").write_text(document(results, "."))
+    (folder / "report.md").write_text(document(results))
     print(folder / "report.md")
 
 
-def document(results: Results, images: str) -> str:
-    """The whole report; `images` is the folder of the figures, relative to it."""
+def document(results: Results) -> str:
+    """The report of one machine, beside its figures."""
+    return joined([f"# Performance, {results.cpu}", *of_machine(results, "."), NOTES.read_text().strip()])
+
+
+def page(measured: list[Results]) -> str:
+    """docs/performance.md: all machines, one after the other."""
+    names = ", ".join(results.cpu for results in measured)
     parts = [
         "# Performance",
-        "Written by `python -m benches.peers report --write` from `benches/peers/results.json`, which "
-        "`make bench-peers` wrote to `out/peers/results.json` on the machine below.",
+        f"Measured on {names}. A number of one CPU says little about another. `make bench-peers` measures "
+        "a machine in half an hour and keeps the numbers in `benches/peers/results/`, one file per CPU "
+        "family; `python -m benches.peers report --write` writes this page from these files.",
+        across(measured),
+    ]
+    for results in measured:
+        parts += [f"## {results.cpu}", *(demoted(part) for part in of_machine(results, "images"))]
+    return joined([*parts, NOTES.read_text().strip()])
+
+
+def of_machine(results: Results, images: str) -> list[str]:
+    """What was measured on one machine; `images` is the folder of the figures, relative to the text."""
+    return [
         overview(results),
         machine(results),
-        NOTES.read_text().strip(),
         "## Targets",
         goals(results),
-        f"![The whole head, encode + sample, in every engine]({images}/performance.png)",
+        said_of(results),
+        f"![The whole head, encode + sample, in every engine]({images}/performance-{results.slug}.png)",
         *sections(results),
         "## Where a peer is faster",
         faster_peers(results),
         *linear(results),
+        *throughput(results),
         *settings(results),
         *cost(results, images),
     ]
+
+
+def said_of(results: Results) -> str:
+    """What is to be said about the numbers: the Markdown file beside them, if there is one."""
+    path = results.path.with_suffix(".md")
+    return path.read_text().strip() if path.exists() else ""
+
+
+def demoted(text: str) -> str:
+    """Headings one level lower."""
+    return re.sub(r"^#", "##", text, flags=re.MULTILINE)
+
+
+def joined(parts: list[str]) -> str:
+    """Paragraphs, without empty ones."""
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def across(measured: list[Results]) -> str:
+    """A table of the whole head on two threads, one column per CPU; empty if there is only one."""
+    case = Case("head", 2)
+    rows = []
+    for name in OVERVIEW_ROWS:
+        cells = [
+            " / ".join(milliseconds(results.seconds(case, name, work)) for work in ("both", "sample"))
+            if name in results.names(case)
+            else ""
+            for results in measured
+        ]
+        if any(cells):
+            rows.append([CONTENDERS[name].label, *cells])
+    head = ["ms: encode + sample / sample from a cached context, 2 threads", *(each.cpu for each in measured)]
+    return table(head, rows) if len(measured) > 1 else ""
 
 
 def overview(results: Results) -> str:
@@ -125,7 +179,7 @@ def machine(results: Results) -> str:
     ]
     forced = {
         one.environment["SACCADE_ISA"] for one in CONTENDERS.values() if "SACCADE_ISA" in one.environment
-    }
+    } - {held["isa"]}
     rows = []
     for threads in sorted({entry["threads"] for entry in results.data["peaks"]}):
         for isa in (held["isa"], *sorted(forced)):
@@ -173,7 +227,7 @@ def section(results: Results, case: Case) -> str:
         compared = results.ratio(case, name, ours, "both") if ours in results.names(case) else None
         in_turn = bool(results.ratios(case, name, ours, "both"))
         cells.append("" if compared is None else f"{'' if in_turn else '~'}{compared[1]:.2f}")
-        cells.append(floor_share(results, case, name, macs["both"] / calls(case)))
+        cells.append(floor_share(results, case, name))
         cells.append(error_cell(results, case, name))
         rows.append(cells)
     failed = [
@@ -200,14 +254,12 @@ def error_cell(results: Results, case: Case, name: str) -> str:
     return f"{error:.1e}" + ("" if results.is_correct(case, name) else f" of {scale:.1f}: **not correct**")
 
 
-def floor_share(results: Results, case: Case, name: str, macs: float) -> str:
-    """Time of the exact multiply-adds at the peak of the contender's arithmetic, divided by its own time."""
-    isa = CONTENDERS[name].environment.get("SACCADE_ISA", results.data["machine"]["isa"])
-    peak = results.peak(case.threads, isa, arithmetic(name))
-    seconds = results.seconds(case, name, "both")
-    if peak is None or not seconds or "future_refresh" in CONTENDERS[name].options:
+def floor_share(results: Results, case: Case, name: str) -> str:
+    """The least time of the exact computation in the contender's arithmetic, divided by its own time."""
+    least, seconds = floor(results, case, name), results.seconds(case, name, "both")
+    if least is None or not seconds or "future_refresh" in CONTENDERS[name].options:
         return ""  # with future_refresh less is computed than the floor counts
-    return f"{100 * macs / peak / quartiles(seconds)[1]:.0f} %"
+    return f"{100 * least / quartiles(seconds)[1]:.0f} %"
 
 
 def milliseconds(seconds: list[float]) -> str:
@@ -316,19 +368,18 @@ def settings(results: Results) -> list[str]:
 
 
 def taken_instead(name: str) -> str:
-    """The usual contender with the same engine and arithmetic."""
+    """The usual contender with the same engine and arithmetic; compiled if this one is and there is one."""
     contender = CONTENDERS[name]
-    return next(
-        (
-            other
-            for other, candidate in CONTENDERS.items()
-            if candidate.usual
-            and candidate.engine == contender.engine
-            and arithmetic(other) == arithmetic(name)
-            and candidate.options.get("compiled") == contender.options.get("compiled")
-        ),
-        name,
-    )
+    usual_ones = [
+        other
+        for other, candidate in CONTENDERS.items()
+        if candidate.usual and candidate.engine == contender.engine and arithmetic(other) == arithmetic(name)
+    ]
+    is_alike = [
+        CONTENDERS[other].options.get("compiled") == contender.options.get("compiled") for other in usual_ones
+    ]
+    alike = [other for other, same in zip(usual_ones, is_alike, strict=True) if same]
+    return next(iter([*alike, *usual_ones]), name)
 
 
 def cost(results: Results, images: str) -> list[str]:
@@ -353,7 +404,7 @@ def cost(results: Results, images: str) -> list[str]:
     head = ["", "", "work, x", "ms = ", "R²", "measured, ms"]
     return [
         "## The cost model",
-        f"![Time against N, T_vl, steps and samples]({images}/cost.png)",
+        f"![Time against N, T_vl, steps and samples]({images}/cost-{results.slug}.png)",
         "One size varies, the others are as released (N 32, T_vl 296, 4 steps, 1 sample); least squares.",
         table(head, rows),
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,10 @@ from benches.peers.cases import Case
 from saccade.bench.timing import quartiles
 
 FORMAT = 1
+RECORDS = Path(__file__).with_name("results")
+"""The committed measurements: a JSON file per CPU family, and what to say about it in a Markdown file of the
+same name.
+"""
 TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
 """Tolerances relative to the reference's largest absolute value; larger differences are not ranked."""
 
@@ -43,12 +48,23 @@ class Results:
         self.data["machine"] = machine
         return other
 
-    def save(self) -> None:
-        """Writes the file under a temporary name, then renames it."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        part = self.path.with_name(self.path.name + ".part")
+    def save(self, path: Path | None = None) -> None:
+        """Writes the file, or a copy to `path`, under a temporary name, then renames it."""
+        path = path or self.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(path.name + ".part")
         part.write_text(json.dumps(rounded(self.data), indent=1) + "\n")
-        part.replace(self.path)
+        part.replace(path)
+
+    @property
+    def cpu(self) -> str:
+        """The name of the CPU's family, such as `Zen 4`."""
+        return str(self.data["machine"]["name"])
+
+    @property
+    def slug(self) -> str:
+        """`cpu` as a file name, such as `zen-4`."""
+        return re.sub(r"[^a-z0-9]+", "-", self.cpu.lower()).strip("-")
 
     @property
     def cases(self) -> list[Case]:
@@ -148,3 +164,8 @@ def rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [rounded(each) for each in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def records(folder: Path = RECORDS) -> list[Results]:
+    """The committed measurements, by name of the CPU."""
+    return sorted((Results(path) for path in folder.glob("*.json")), key=lambda results: results.cpu)

@@ -76,6 +76,7 @@ _SUBMODULES = (
     "observation",
     "reference",
     "robots",
+    "serve",
     "sim",
     "study",
     "torch",

@@ -35,10 +35,12 @@ EXTRAS: dict[str, dict[str, str]] = {
         "pandas": "pandas",
         "sklearn": "scikit-learn",
     },
+    "serve": {"zmq": "pyzmq", "msgpack": "msgpack"},
     "ray": {"ray": "ray"},
 }
 #: The extras that an extra includes.
 INCLUDES: dict[str, tuple[str, ...]] = {
+    "serve": ("cli",),
     "sim": ("cli",),
     "study": ("sim", "cli", "torch"),
     "ray": ("study", "sim", "cli", "torch"),

@@ -55,6 +55,40 @@ def resolve(source: str | os.PathLike[str]) -> Path:
     return _snapshot(published["id"], published["revision"])
 
 
+def cached(name: str, revision: str | None = None) -> Path | None:
+    """The directory of a published repository in the local cache, whichever of its files it contains.
+
+    Needs no other package, unlike :func:`resolve`. Nothing is downloaded.
+
+    Args:
+        name: An id such as ``Qwen/Qwen3-VL-2B-Instruct``.
+        revision: A branch, tag or commit. Default: ``main``.
+
+    Returns:
+        None if it is not there.
+    """
+    repository = cache() / f"models--{name.replace('/', '--')}"
+    revision = revision or "main"
+    try:
+        commit = (repository / "refs" / revision).read_text(encoding="utf-8").strip()
+    except (OSError, ValueError):
+        commit = revision
+    folder = repository / "snapshots" / commit
+    return folder if folder.is_dir() else None
+
+
+def cache() -> Path:
+    """The directory in which ``huggingface_hub`` keeps published repositories."""
+    given = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE")
+    if given:
+        return Path(given).expanduser()
+    home = os.environ.get("HF_HOME")
+    if home:
+        return Path(home).expanduser() / "hub"
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "huggingface" / "hub"
+
+
 def _snapshot(name: str, revision: str | None) -> Path:
     """The directory of a revision in the cache."""
     download = f"hf download {name}" + ("" if revision is None else f" --revision {revision}")

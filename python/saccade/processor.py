@@ -14,6 +14,7 @@ import saccade._saccade as _saccade
 from saccade._arrays import ArrayLike, Float32Array, frame, integer, text
 from saccade.backbone_inputs import BackboneInputs
 from saccade.errors import InputError
+from saccade.hub import PUBLISHED, cache, cached, resolve
 
 #: The views of one observation: by camera name, or in the order of the prompt.
 Frames: TypeAlias = "Mapping[str, ArrayLike] | Sequence[ArrayLike] | npt.NDArray[Any]"
@@ -31,7 +32,8 @@ class Processor:
 
     Args:
         version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
-        tokenizer: A ``tokenizer.json``, or a directory with one or with ``vocab.json`` and ``merges.txt``.
+        tokenizer: A ``tokenizer.json``; a directory with one, or with ``vocab.json`` and ``merges.txt``; or
+            the id of a published repository in the local Hugging Face cache.
         preprocessing: Whose frames and words the checkpoint was trained on. ``"lerobot"``: views sorted by
             name, no crop. ``"isaac"`` (Isaac-GR00T): views in the order given, a centre crop of 95 %.
             Default: lerobot's for N1.5, Isaac-GR00T's for N1.6 and N1.7.
@@ -72,13 +74,58 @@ class Processor:
             raise InputError(f"plain_text: expected True or False, got {plain_text!r}")
         self._processor = _saccade.Processor(
             text("version", version),
-            _path("tokenizer", tokenizer),
+            _tokenizer(tokenizer),
             None if preprocessing is None else text("preprocessing", preprocessing),
             None if image_size is None else integer("image_size", image_size),
             None if tokens_per_view is None else integer("tokens_per_view", tokens_per_view),
             plain_text,
             None if options is None else _to_json(options),
         )
+
+    @classmethod
+    def load(
+        cls,
+        source: str | os.PathLike[str],
+        *,
+        preprocessing: Preprocessing | None = None,
+        tokenizer: str | os.PathLike[str] | None = None,
+    ) -> Processor:
+        """The processor of a checkpoint.
+
+        Version and sizes come from its tensors, options from ``processor_config.json``,
+        ``preprocessor_config.json`` or lerobot's ``policy_preprocessor.json``. A checkpoint that holds only a
+        backbone will do.
+
+        Args:
+            source: A path, or the id of a published checkpoint in the local Hugging Face cache.
+            preprocessing: Whose frames and words. Default: lerobot's for a checkpoint that lerobot wrote, and
+                else Isaac-GR00T's.
+            tokenizer: A ``tokenizer.json``, a directory, or a published id in the local cache. Default: the
+                checkpoint's own, or that of the released processor in the local cache.
+
+        Raises:
+            InputError: An argument has the wrong type or an unknown value.
+            CheckpointError: The checkpoint or tokenizer is broken or of another kind.
+            FileNotFoundError: There is no such checkpoint, or no tokenizer. The message says which files of
+                which published id are needed.
+
+        Example:
+            >>> import saccade
+            >>> processor = saccade.Processor.load(
+            ...     "tests/data/backbone/n15_two_views.safetensors",
+            ...     tokenizer="tests/data/backbone/tiny_tokenizer.json",
+            ... )
+            >>> processor
+            <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
+        """
+        held = _saccade.ProcessorSource(os.fspath(resolve(source)))
+        chosen = None if preprocessing is None else text("preprocessing", preprocessing)
+        files = None if tokenizer is None else _tokenizer(tokenizer)
+        if files is None and not held.has_tokenizer:
+            files = _published_tokenizer(held)
+        processor = cls.__new__(cls)
+        processor._processor = _saccade.Processor.load(held, files, chosen)
+        return processor
 
     @property
     def version(self) -> str:
@@ -108,6 +155,7 @@ class Processor:
         instruction: str | Sequence[str | None] | None = None,
         *,
         view_names: Sequence[str] | None = None,
+        plain_text: bool = False,
     ) -> BackboneInputs:
         """Prepares one observation, or a batch.
 
@@ -119,6 +167,8 @@ class Processor:
             instruction: What the robot is to do. For a batch: a list with one instruction for each
                 observation. None, and with lerobot's preprocessing an empty text: the released default.
             view_names: Names of the views of a sequence.
+            plain_text: N1.5: the instruction stands in the prompt as it is, also if this processor renders
+                instructions as lists.
 
         Raises:
             ShapeError, DtypeError: A frame is none. The message names it.
@@ -141,7 +191,8 @@ class Processor:
             [
                 (_views(observation, names), None if told is None else text("instruction", told))
                 for observation, told in zip(observations, instructions, strict=True)
-            ]
+            ],
+            bool(plain_text),
         )
         pixels, input_ids, attention_mask, grid, found = prepared
         return BackboneInputs(
@@ -197,14 +248,36 @@ class Processor:
 _text = text  # in a method with an argument of that name
 
 
-def _path(name: str, value: Any) -> str:
+def _tokenizer(given: Any) -> str:
+    """The path of a tokenizer that is given as a path or as a published id."""
     try:
-        path = os.fspath(value)
+        path = os.fspath(given)
     except TypeError:
         path = None
     if not isinstance(path, str) or "\0" in path:
-        raise InputError(f"{name}: expected a path, got {value!r}")
-    return path
+        raise InputError(f"tokenizer: expected a path, got {given!r}")
+    published = PUBLISHED.fullmatch(path)
+    if published is None or os.path.exists(path):  # noqa: PTH110 (of a name that is too long Path.exists raises)
+        return path
+    folder = cached(published["id"], published["revision"])
+    return path if folder is None else str(folder)
+
+
+def _published_tokenizer(source: _saccade.ProcessorSource) -> str:
+    """The tokenizer of a checkpoint that has none, from the local cache."""
+    for name in source.published:
+        folder = cached(name)
+        if folder is not None and any(
+            all((folder / file).is_file() for file in files)
+            for files in (("tokenizer.json",), ("vocab.json", "merges.txt"))
+        ):
+            return str(folder)
+    commands = [f"hf download {name} {' '.join(source.needed_files)}" for name in source.published]
+    raise FileNotFoundError(
+        f"tokenizer: the checkpoint has none, and neither has the cache {cache()}. Download that of "
+        f"{source.version.upper()} with: {' or: '.join(commands)}. Or pass tokenizer=, a tokenizer.json or a "
+        "directory with vocab.json and merges.txt"
+    )
 
 
 def _to_json(options: Any) -> str:

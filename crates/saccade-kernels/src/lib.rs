@@ -10,6 +10,7 @@
 mod activation;
 mod aligned;
 mod attention;
+mod cpu;
 mod gemm;
 mod image;
 mod isa;
@@ -22,11 +23,13 @@ mod rope;
 mod rows;
 mod simd;
 mod threads;
+mod tiles;
 mod weights;
 
 pub use activation::{exp, gelu_erf, gelu_tanh, relu, silu};
 pub use aligned::AllocError;
 pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
+pub use cpu::CpuReport;
 pub use half::bf16;
 pub use image::{CubicRule, FloatImage, Image, resize_area, resize_cubic_u8, resize_linear_f32};
 pub use isa::{ISA_VARIABLE, Isa, IsaError};

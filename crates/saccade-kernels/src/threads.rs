@@ -1,4 +1,10 @@
-//! How many threads a process should use by default: the physical cores that it is allowed to run on.
+//! How many threads a process should use by default: the fast physical cores that it is allowed to run on.
+//!
+//! One thread a core is right for both limits of a call. Many rows are bound by arithmetic: siblings share one core's multipliers. Few rows
+//! are bound by memory: siblings share one core's requests to it. On hybrid CPUs an efficiency core does about a third of the multiply-adds
+//! of a performance core (half the vector width at three quarters of the clock): threads there would add little to the first limit and
+//! nothing to the second, and a robot has other work for them. How many of these threads a product gets depends on its size (`linear`).
+//! `benches/throughput.py` measures from which number of threads on memory is the limit of a machine.
 
 use std::num::NonZeroUsize;
 
@@ -12,9 +18,12 @@ pub struct NumThreadsError {
     given: String,
 }
 
-/// `SACCADE_NUM_THREADS`; where it is unset or empty, the number of physical cores that this process may use.
+/// `SACCADE_NUM_THREADS`; where it is unset or empty, the number of fast physical cores that this process may use.
 ///
-/// The affinity mask and the quota of the control group (v1 and v2, rounded up) are counted; siblings of one core count once.
+/// The affinity mask and the quota of the control group (v1 and v2, rounded up) are counted; siblings of one core count once. On Linux,
+/// cores of less than half the capacity of the fastest one (Arm's LITTLE cores) and Intel's efficiency cores are not counted, unless the
+/// process may use no others.
+/// Other systems than Linux count logical processors.
 ///
 /// # Errors
 /// The variable holds something else than a whole number of at least 1.
@@ -56,7 +65,7 @@ mod linux {
         Some(cores.min(quota).max(1))
     }
 
-    /// Distinct cores among the processors that the affinity mask allows.
+    /// Distinct fast cores among the processors that the affinity mask allows.
     fn allowed_cores(read: &impl Fn(&Path) -> Option<String>) -> Option<usize> {
         let status = read(Path::new("/proc/self/status"))?;
         let list = status
@@ -68,8 +77,31 @@ mod linux {
             // Processors that share a core have the same list; without topology each is a core.
             siblings.map_or_else(|| cpu.to_string(), |list| list.trim().to_owned())
         };
-        let cores: BTreeSet<String> = parse_list(list)?.into_iter().map(core).collect();
+        let cores: BTreeSet<String> = fast(read, parse_list(list)?).into_iter().map(core).collect();
         (!cores.is_empty()).then_some(cores.len())
+    }
+
+    /// Those of `cpus` that are not on slow cores of a hybrid CPU; all of them where there is nothing else.
+    fn fast(read: &impl Fn(&Path) -> Option<String>, mut cpus: Vec<usize>) -> Vec<usize> {
+        // Relative to the fastest core, which has 1024. Clock rates would not tell: an efficiency core also does less in a cycle.
+        let capacity = |cpu: usize| {
+            let path = format!("/sys/devices/system/cpu/cpu{cpu}/cpu_capacity");
+            read(Path::new(&path))?.trim().parse::<u64>().ok()
+        };
+        let capacities: Option<Vec<u64>> = cpus.iter().map(|&cpu| capacity(cpu)).collect();
+        if let Some(capacities) = capacities {
+            let largest = capacities.iter().copied().max().unwrap_or(0);
+            let mut capacities = capacities.into_iter();
+            cpus.retain(|_| capacities.next().is_some_and(|capacity| 2 * capacity >= largest));
+            return cpus;
+        }
+        // Intel's hybrids: each kind of core has counters of its own.
+        let slow = read(Path::new("/sys/devices/cpu_atom/cpus")).and_then(|list| parse_list(&list));
+        let slow: BTreeSet<usize> = slow.unwrap_or_default().into_iter().collect();
+        if !cpus.iter().all(|cpu| slow.contains(cpu)) {
+            cpus.retain(|cpu| !slow.contains(cpu));
+        }
+        cpus
     }
 
     /// `0-3,8` and the like.
@@ -170,6 +202,47 @@ mod linux {
                 None
             );
             assert_eq!(allowed_cores(&files(&[])), None);
+        }
+
+        #[test]
+        fn little_cores_do_not_count() {
+            let read = files(&[
+                ("/proc/self/status", "Cpus_allowed_list:\t0-3\n"),
+                ("/sys/devices/system/cpu/cpu0/cpu_capacity", "398\n"),
+                ("/sys/devices/system/cpu/cpu1/cpu_capacity", "398\n"),
+                ("/sys/devices/system/cpu/cpu2/cpu_capacity", "1024\n"),
+                ("/sys/devices/system/cpu/cpu3/cpu_capacity", "700\n"),
+            ]);
+            assert_eq!(allowed_cores(&read), Some(2));
+            assert_eq!(fast(&read, vec![0, 1]), [0, 1]); // no others may be used
+            assert_eq!(fast(&read, vec![0, 2, 4]), [0, 2, 4]); // of one nothing is known
+        }
+
+        #[test]
+        fn efficiency_cores_do_not_count() {
+            let read = files(&[
+                ("/proc/self/status", "Cpus_allowed_list:\t0-7\n"),
+                ("/sys/devices/cpu_core/cpus", "0-3\n"),
+                ("/sys/devices/cpu_atom/cpus", "4-7\n"),
+                (
+                    "/sys/devices/system/cpu/cpu0/topology/thread_siblings_list",
+                    "0-1\n",
+                ),
+                (
+                    "/sys/devices/system/cpu/cpu1/topology/thread_siblings_list",
+                    "0-1\n",
+                ),
+                (
+                    "/sys/devices/system/cpu/cpu2/topology/thread_siblings_list",
+                    "2-3\n",
+                ),
+                (
+                    "/sys/devices/system/cpu/cpu3/topology/thread_siblings_list",
+                    "2-3\n",
+                ),
+            ]);
+            assert_eq!(allowed_cores(&read), Some(2));
+            assert_eq!(fast(&read, vec![5, 6]), [5, 6]);
         }
 
         #[test]

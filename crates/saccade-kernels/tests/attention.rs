@@ -3,7 +3,7 @@
 mod common;
 
 use common::attention::{Case, Kind, REMOVED, assert_close, best, kinds};
-use common::{Strided, bits, numbers, rows, rows_mut};
+use common::{Strided, bits, isas, numbers, rows, rows_mut};
 
 use proptest::prelude::*;
 use saccade_kernels::{Element, Isa, LogitBias, Mask, PackedKeyValues, attention, bf16};
@@ -289,7 +289,7 @@ fn widened_bf16_has_the_bits_of_float32() {
         let mut rounded = Case::new(12, queries, keys, 3, head_dim, 2);
         round(&mut rounded.keys);
         round(&mut rounded.values);
-        for isa in Isa::available() {
+        for isa in isas() {
             if isa.dot_products().contains(&"bf16") {
                 continue;
             }

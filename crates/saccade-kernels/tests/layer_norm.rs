@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{ROUNDING, Strided, bits, numbers, rows, rows_mut};
+use common::{ROUNDING, Strided, bits, isas, numbers, rows, rows_mut};
 use proptest::prelude::*;
 use saccade_kernels::{Isa, layer_norm};
 
@@ -32,7 +32,7 @@ proptest! {
         let values: Vec<f32> = numbers(seed, row_count * width, 2.0).iter().map(|x| x + offset).collect();
         let (scale, shift) = (numbers(seed + 1, width, 2.0), numbers(seed + 2, width, 2.0));
         let x = Strided::new(&values, row_count, width, gaps.0);
-        for isa in Isa::available() {
+        for isa in isas() {
             let mut out = Strided::new(&vec![0.0; values.len()], row_count, width, gaps.1);
             layer_norm(isa, threads, x.view(), 1e-5, affine.then_some((&scale[..], &shift[..])), out.view_mut());
             for (row, out) in values.chunks_exact(width).zip(out.values().chunks_exact(width)) {
@@ -67,7 +67,7 @@ fn bits_do_not_depend_on_threads_nor_on_other_rows() {
             );
             bits(&out)
         };
-        for isa in Isa::available() {
+        for isa in isas() {
             let all = norm(isa, 1, &x);
             for threads in [2, 3, 8] {
                 assert_eq!(norm(isa, threads, &x), all, "{isa}, {threads} threads");
@@ -86,7 +86,7 @@ fn bits_do_not_depend_on_threads_nor_on_other_rows() {
 
 #[test]
 fn a_constant_row_gives_the_shift_and_nan_stays_in_its_row() {
-    for isa in Isa::available() {
+    for isa in isas() {
         let mut x = vec![2.5; 5 * 50];
         x[2 * 50 + 49] = f32::NAN;
         x[3 * 50 + 1] = f32::INFINITY;

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{Strided, bits, gamma, numbers, rows, rows_mut};
+use common::{Strided, bits, gamma, isas, numbers, rows, rows_mut};
 use half::bf16;
 use proptest::prelude::*;
 use saccade_kernels::{
@@ -157,7 +157,7 @@ proptest! {
         let outputs = parts.iter().map(|part| part.outputs).sum();
         let x = Strided::new(&numbers(seed + 100, row_count * inputs, 1.0), row_count, inputs, gaps.0);
         let before = numbers(seed + 101, row_count * outputs, 1.0);
-        for isa in Isa::available() {
+        for isa in isas() {
             let layer = pack(isa, &parts, &weights, inputs);
             let stored = if parts.iter().all(|part| part.bf16) { Element::Bf16 } else { Element::F32 };
             prop_assert_eq!((layer.in_features(), layer.out_features(), layer.element(), layer.isa()), (inputs, outputs, stored, isa));
@@ -211,7 +211,7 @@ fn long_sums_agree_with_float64() {
     let weights = [weights(&part, inputs, 3)];
     let x = Strided::new(&numbers(4, 9 * inputs, 1.0), 9, inputs, 0);
     let before = vec![0.0; 9 * part.outputs];
-    for isa in Isa::available() {
+    for isa in isas() {
         let layer = pack(isa, std::slice::from_ref(&part), &weights, inputs);
         let out = apply(&layer, 1, &x.values(), Epilogue::Store);
         check(
@@ -229,7 +229,7 @@ fn long_sums_agree_with_float64() {
 fn bits_do_not_depend_on_threads() {
     for (inputs, outputs, row_count) in [(96, 500, 49), (1100, 200, 49), (2048, 130, 300)] {
         let x = numbers(8, row_count * inputs, 1.0);
-        for isa in Isa::available() {
+        for isa in isas() {
             for layer in layers(isa, inputs, outputs) {
                 for epilogue in EPILOGUES {
                     let one = bits(&apply(&layer, 1, &x, epilogue));
@@ -250,7 +250,7 @@ fn bits_do_not_depend_on_threads() {
 fn bits_of_a_row_do_not_depend_on_the_others() {
     for (inputs, outputs) in [(70, 99), (1500, 50), (3001, 49)] {
         let x = numbers(9, 210 * inputs, 1.0);
-        for isa in Isa::available() {
+        for isa in isas() {
             for layer in layers(isa, inputs, outputs) {
                 let all = bits(&apply(&layer, 2, &x, Epilogue::GeluTanh));
                 for (first, count) in [
@@ -277,6 +277,22 @@ fn bits_of_a_row_do_not_depend_on_the_others() {
 }
 
 #[test]
+fn bits_do_not_depend_on_the_order_of_panels() {
+    // Weights of 8 MB: blocks of 200 rows pass them in groups, one row passes all of them.
+    let (inputs, outputs, row_count) = (3001, 700, 200);
+    let x = numbers(10, row_count * inputs, 1.0);
+    for isa in Isa::available() {
+        for layer in layers(isa, inputs, outputs) {
+            let all = bits(&apply(&layer, 2, &x, Epilogue::Store));
+            for row in [0, 95, 96, 199] {
+                let alone = bits(&apply(&layer, 1, &x[row * inputs..][..inputs], Epilogue::Store));
+                assert_eq!(alone, all[row * outputs..][..outputs], "{isa}, row {row}");
+            }
+        }
+    }
+}
+
+#[test]
 fn bf16_storage_gives_the_bits_of_f32_storage() {
     for inputs in [1, 2, 63, 640, 1537] {
         let part = Part {
@@ -287,7 +303,7 @@ fn bf16_storage_gives_the_bits_of_f32_storage() {
         };
         let weights = [weights(&part, inputs, 10)];
         let x = numbers(11, 20 * inputs, 1.0);
-        for isa in Isa::available() {
+        for isa in isas() {
             let narrow = pack(isa, std::slice::from_ref(&part), &weights, inputs);
             let wide = pack(
                 isa,
@@ -312,7 +328,7 @@ fn bf16_storage_gives_the_bits_of_f32_storage() {
 fn nan_and_infinity_stay_in_their_row() {
     let (inputs, outputs) = (130, 70);
     let clean = numbers(12, 20 * inputs, 1.0);
-    for isa in Isa::available() {
+    for isa in isas() {
         for layer in layers(isa, inputs, outputs) {
             for epilogue in EPILOGUES {
                 let expected = bits(&apply(&layer, 1, &clean, epilogue));
@@ -346,7 +362,7 @@ fn nan_and_infinity_stay_in_their_row() {
 
 #[test]
 fn huge_and_tiny_values_survive() {
-    for isa in Isa::available() {
+    for isa in isas() {
         let weight = [f32::MAX, 1.0, f32::MIN_POSITIVE / 4.0];
         let layer = PackedLinear::pack(
             isa,
@@ -427,7 +443,7 @@ fn an_output_of_another_shape_panics() {
 
 #[test]
 fn the_size_of_a_packed_layer_is_known_before_packing() {
-    for isa in Isa::available() {
+    for isa in isas() {
         for (outputs, inputs) in [(0, 5), (1, 0), (1, 1), (47, 33), (48, 64), (49, 515), (200, 7)] {
             let f32 = vec![0.5; outputs * inputs];
             let bf16 = vec![bf16::ONE; outputs * inputs];
@@ -452,7 +468,7 @@ fn a_layer_without_inputs_gives_its_bias() {
     let weight = WeightRef::F32(Matrix::from(Rows::strided(&[], 3, 0, 0)));
     // Rows without elements, as far apart as they like.
     let x = Rows::strided(&[], 4, 0, 1 << 40);
-    for isa in Isa::available() {
+    for isa in isas() {
         for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
             let parts = [(weight, Some(&[1.0, 2.0, 3.0][..]))];
             let layer = PackedLinear::pack(isa, arithmetic, 1, &parts).unwrap();

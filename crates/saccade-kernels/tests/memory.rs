@@ -104,7 +104,7 @@ fn keys_and_values_without_memory_are_an_error() {
 
 #[test]
 fn measuring_memory_without_memory_is_an_error() {
-    assert!(limited(MORE, || peak::read_bytes_per_second(1).is_err()));
+    assert!(limited(MORE, || peak::read_bytes_per_second(1, 16).is_err()));
 }
 
 #[test]

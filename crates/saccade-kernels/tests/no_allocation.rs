@@ -6,7 +6,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Barrier;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use common::{numbers, rows, rows_mut};
+use common::{isas, numbers, rows, rows_mut};
 use saccade_kernels::{
     Arithmetic, Element, Epilogue, Isa, LinearScratch, LogitBias, Mask, Matrix, PackedKeyValues,
     PackedLinear, WeightRef, attention, gelu_erf, gelu_tanh, layer_norm, parallel_for, rms_norm_in_place,
@@ -48,7 +48,7 @@ fn the_second_call_of_a_shape_allocates_nothing() {
     let weight = numbers(1, WIDTH * WIDTH, 1.0);
     let x = numbers(2, 296 * WIDTH, 1.0);
     let bias = numbers(3, 296, 1.0);
-    for isa in Isa::available() {
+    for isa in isas() {
         let weight = WeightRef::F32(Matrix::new(&weight, WIDTH));
         let pack = |arithmetic| PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
         let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);
@@ -114,7 +114,13 @@ fn the_second_call_of_a_shape_allocates_nothing() {
             silu(isa, out);
             parallel_for(threads, 10, &|_| {});
         };
-        for threads in [1, 2, 5] {
+        // An emulator takes its time, and after a minute the test runner allocates to say so.
+        let all_threads = if isa == Isa::SoftwareTiles {
+            &[2][..]
+        } else {
+            &[1, 2, 5]
+        };
+        for &threads in all_threads {
             // Each thread holds one task until all are there: a worker that starts late would allocate what a new thread needs.
             let all = Barrier::new(threads);
             parallel_for(threads, threads, &|_| {

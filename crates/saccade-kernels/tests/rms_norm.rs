@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{ROUNDING, Strided, bits, numbers, rows, rows_mut};
+use common::{ROUNDING, Strided, bits, isas, numbers, rows, rows_mut};
 use proptest::prelude::*;
 use saccade_kernels::{Isa, rms_norm, rms_norm_in_place};
 
@@ -23,7 +23,7 @@ proptest! {
         let values = numbers(seed, row_count * width, scale);
         let weight = numbers(seed + 1, head_dim, 2.0);
         let x = Strided::new(&values, row_count, width, gaps.0);
-        for isa in Isa::available() {
+        for isa in isas() {
             let mut out = Strided::new(&vec![f32::NAN; values.len()], row_count, width, gaps.1);
             rms_norm(isa, threads, x.view(), 1e-6, &weight, out.view_mut());
             let out = out.values();
@@ -61,7 +61,7 @@ fn bits_depend_on_the_head_alone() {
             );
             bits(&out)
         };
-        for isa in Isa::available() {
+        for isa in isas() {
             let all = norm(isa, 1, &x, width);
             for threads in [2, 3, 8] {
                 assert_eq!(norm(isa, threads, &x, width), all, "{isa}, {threads} threads");
@@ -79,7 +79,7 @@ fn bits_depend_on_the_head_alone() {
 
 #[test]
 fn zeros_stay_and_nan_stays_in_its_head() {
-    for isa in Isa::available() {
+    for isa in isas() {
         let mut x = vec![2.5; 6 * 50];
         x[..50].fill(0.0);
         x[2 * 50 + 49] = f32::NAN;

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{ROUNDING, Strided, bits, numbers, rows, rows_mut};
+use common::{ROUNDING, Strided, bits, isas, numbers, rows, rows_mut};
 use proptest::prelude::*;
 use saccade_kernels::{Isa, rotary_embedding};
 
@@ -37,7 +37,7 @@ proptest! {
         let values = numbers(seed, row_count * width, 3.0);
         let positions: Vec<usize> = (0..row_count).map(|row| row * 7 + 3).collect();
         let [cos, sin] = tables(&positions, pairs);
-        for isa in Isa::available() {
+        for isa in isas() {
             let mut x = Strided::new(&values, row_count, width, gap);
             rotary_embedding(isa, threads, x.view_mut(), head_dim, rows(&cos, pairs), rows(&sin, pairs));
             let out = x.values();
@@ -72,7 +72,7 @@ fn bits_depend_on_the_pair_and_its_angle_alone() {
         rotary_embedding(isa, threads, rows_mut(&mut out, width), 2 * pairs, cos, sin);
         bits(&out)
     };
-    for isa in Isa::available() {
+    for isa in isas() {
         let all = rotated(isa, 1, 0, row_count);
         for threads in [2, 3, 8] {
             assert_eq!(

@@ -160,6 +160,34 @@ impl Backbone {
     }
 }
 
+/// A backbone in a checkpoint, before it is loaded.
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct PublishedBackbone(saccade::PublishedBackbone);
+
+#[pymethods]
+impl PublishedBackbone {
+    #[staticmethod]
+    fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
+        call(py, || {
+            saccade::PublishedBackbone::open(&source, config.as_deref())
+        })
+        .map(Self)
+    }
+
+    fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        backbone_config_dict(py, self.0.config())
+    }
+
+    #[getter]
+    fn prefix(&self) -> &'static str {
+        self.0.prefix()
+    }
+
+    fn nbytes(&self, precision: &str) -> PyResult<usize> {
+        self.0.nbytes(precision.parse().map_err(raise)?).map_err(raise)
+    }
+}
+
 fn options(
     config: Option<String>,
     precision: &str,

@@ -24,7 +24,7 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::backbone::{Backbone, BackboneFeatures};
+    use crate::backbone::{Backbone, BackboneFeatures, PublishedBackbone};
     #[pymodule_export]
     use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
@@ -37,11 +37,11 @@ mod _saccade {
     use crate::head::ActionHead;
     #[pymodule_export]
     use crate::machine::{
-        available_isas, default_num_threads, dot_products, measure_peaks, selected_isa, start_profile,
-        take_profile,
+        available_isas, cpu_report, default_num_threads, dot_products, measure_peaks, selected_isa,
+        start_profile, take_profile,
     };
     #[pymodule_export]
-    use crate::processor::Processor;
+    use crate::processor::{Processor, ProcessorSource};
     #[pymodule_export]
     use crate::rewrite::{convert, merge_future_tokens, quantize, resize};
 

@@ -4,7 +4,7 @@ use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade::peak::{self, PeakError};
-use saccade::{Arithmetic, Error, Isa, Part, Profile};
+use saccade::{Arithmetic, CpuReport, Error, Isa, Part, Profile};
 
 use crate::detached::call;
 use crate::error::raise;
@@ -34,8 +34,15 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
     }
     let peaks = PyDict::new(py);
     peaks.set_item("macs_per_second", rates)?;
-    let read = peak_or_raise(call(py, || Ok(peak::read_bytes_per_second(num_threads)))?)?;
-    peaks.set_item("read_bytes_per_second", read)?;
+    let (by_streams, mut fastest) = (PyDict::new(py), 0.0);
+    for streams in peak::READ_STREAMS {
+        let read = call(py, || Ok(peak::read_bytes_per_second(num_threads, streams)))?;
+        let rate = peak_or_raise(read)?;
+        by_streams.set_item(streams, rate)?;
+        fastest = f64::max(fastest, rate);
+    }
+    peaks.set_item("read_bytes_per_second", fastest)?;
+    peaks.set_item("read_bytes_per_second_by_streams", by_streams)?;
     peaks.set_item("clock_hz", call(py, || Ok(peak::clock_hz()))?)?;
     Ok(peaks)
 }
@@ -91,6 +98,15 @@ pub(crate) fn dot_products() -> PyResult<Vec<&'static str>> {
     Isa::from_env()
         .map(Isa::dot_products)
         .map_err(|error| raise(error.into()))
+}
+
+/// `(family, rates, tiles)`: what decides which kernels are used.
+#[pyfunction]
+pub(crate) fn cpu_report() -> (String, String, String) {
+    let CpuReport {
+        family, rates, tiles, ..
+    } = CpuReport::current();
+    (family, rates, tiles)
 }
 
 #[pyfunction]

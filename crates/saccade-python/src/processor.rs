@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
-use saccade::{Frame, Observation, OwnedArray, Preprocessing, ProcessorOptions, TokenizerFiles};
+use saccade::{Frame, Observation, OwnedArray, Preprocessing, ProcessorOptions, Tokenizer, TokenizerFiles};
 
 use crate::arrays::{to_numpy, view};
 use crate::detached::call;
@@ -40,6 +40,38 @@ type PyPrepared<'py> = (
     Option<Vec<String>>,
 );
 
+/// What a checkpoint says about its processor.
+#[pyclass(frozen, module = "saccade._saccade")]
+pub(crate) struct ProcessorSource(saccade::ProcessorSource);
+
+#[pymethods]
+impl ProcessorSource {
+    #[new]
+    fn new(py: Python<'_>, source: PathBuf) -> PyResult<Self> {
+        call(py, || saccade::ProcessorSource::open(&source)).map(Self)
+    }
+
+    #[getter]
+    fn version(&self) -> &'static str {
+        self.0.version()
+    }
+
+    #[getter]
+    fn has_tokenizer(&self) -> bool {
+        self.0.tokenizer().is_some()
+    }
+
+    #[getter]
+    fn published(&self) -> Vec<&'static str> {
+        self.0.published().to_vec()
+    }
+
+    #[getter]
+    fn needed_files(&self) -> Vec<&'static str> {
+        self.0.needed_files().to_vec()
+    }
+}
+
 #[pyclass(frozen, module = "saccade._saccade")]
 pub(crate) struct Processor(saccade::Processor);
 
@@ -69,8 +101,27 @@ impl Processor {
             options,
         };
         call(py, || {
-            let tokenizer = TokenizerFiles::at(&tokenizer)?.read()?;
+            let tokenizer = Tokenizer::read(&TokenizerFiles::at(&tokenizer)?)?;
             saccade::Processor::new(version, tokenizer, &options)
+        })
+        .map(Self)
+    }
+
+    /// That of a checkpoint, with these files and this path, or its own.
+    #[staticmethod]
+    fn load(
+        py: Python<'_>,
+        source: &ProcessorSource,
+        tokenizer: Option<PathBuf>,
+        preprocessing: Option<&str>,
+    ) -> PyResult<Self> {
+        let preprocessing = preprocessing
+            .map(Preprocessing::named)
+            .transpose()
+            .map_err(raise)?;
+        call(py, || {
+            let files = tokenizer.as_deref().map(TokenizerFiles::at).transpose()?;
+            source.0.processor(files.as_ref(), preprocessing)
         })
         .map(Self)
     }
@@ -116,6 +167,7 @@ impl Processor {
         &self,
         py: Python<'py>,
         observations: Vec<PyObservation<'py>>,
+        plain_text: bool,
     ) -> PyResult<PyPrepared<'py>> {
         let observations = observations
             .iter()
@@ -126,6 +178,7 @@ impl Processor {
                 Ok(Observation {
                     views: views.collect::<PyResult<_>>()?,
                     instruction: instruction.as_deref(),
+                    plain_text,
                 })
             })
             .collect::<PyResult<Vec<_>>>()?;

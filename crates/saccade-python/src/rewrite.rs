@@ -20,6 +20,7 @@ pub(crate) struct PyRewrite {
     out: PathBuf,
     config: Option<String>,
     head_only: bool,
+    keep_backbone: bool,
     force: bool,
     metadata: BTreeMap<String, String>,
     max_shard_bytes: Option<u64>,
@@ -38,6 +39,7 @@ impl PyRewrite {
         let mut options = RewriteOptions::new();
         options.config = self.config;
         options.head_only = self.head_only;
+        options.keep_backbone = self.keep_backbone;
         options.force = self.force;
         options.metadata = self.metadata;
         options.max_shard_bytes = self.max_shard_bytes;
@@ -76,6 +78,10 @@ pub(crate) fn quantize<'py>(py: Python<'py>, rewrite: PyRewrite) -> PyResult<Bou
     dict.set_item("num_copied", report.num_copied)?;
     dict.set_item("head_bytes_before", report.head_bytes_before)?;
     dict.set_item("head_bytes_after", report.head_bytes_after)?;
+    dict.set_item("num_quantized_backbone", report.num_quantized_backbone)?;
+    dict.set_item("backbone_bytes_before", report.backbone_bytes_before)?;
+    dict.set_item("backbone_bytes_after", report.backbone_bytes_after)?;
+    dict.set_item("backbone_copied", report.backbone_copied)?;
     Ok(dict)
 }
 

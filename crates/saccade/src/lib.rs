@@ -30,7 +30,7 @@ mod workspaces;
 pub use array::{Array, ArrayMut, OwnedArray};
 pub use backbone::{
     Backbone, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep, BackboneLoadOptions,
-    BackboneRecord, LanguageConfig, VisionConfig,
+    BackboneRecord, LanguageConfig, PublishedBackbone, VisionConfig,
 };
 pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};
@@ -49,7 +49,8 @@ pub use memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
 pub use processor::{
-    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, Tokenizer, TokenizerFiles, View,
+    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, ProcessorSource, Tokenizer,
+    TokenizerFiles, View,
 };
 pub use profile::{Counter, Part, Profile};
 pub use recognise::{Published, TensorFacts};
@@ -61,6 +62,6 @@ pub use rewrite::resize::{
 };
 pub use rewrite::{RewriteOptions, Written};
 pub use saccade_checkpoint::{self as files, Checkpoint, Elements};
-pub use saccade_kernels::{Arithmetic, Isa, default_num_threads, peak};
+pub use saccade_kernels::{Arithmetic, CpuReport, Isa, default_num_threads, peak};
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;

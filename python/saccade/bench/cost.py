@@ -8,7 +8,7 @@ of it that the kernels reach.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import saccade._saccade as _saccade
 from saccade.bench.work import ATTENTION, Call, Work, Works, encode_work, sample_work
@@ -33,8 +33,9 @@ class Machine:
         isa: The instruction set.
         num_threads: Threads that the rates are for.
         macs_per_second: Multiply-adds per second, by arithmetic.
-        read_bytes_per_second: Bandwidth of reading memory.
+        read_bytes_per_second: Bandwidth of reading memory, as that number of streams which is fastest.
         clock_hz: Clock rate, if it is known.
+        read_by_streams: Bandwidth by the number of streams that each thread reads.
     """
 
     isa: str
@@ -42,6 +43,7 @@ class Machine:
     macs_per_second: Mapping[str, float]
     read_bytes_per_second: float
     clock_hz: float | None = None
+    read_by_streams: Mapping[int, float] = field(default_factory=dict)
 
     @classmethod
     def measured(cls, isa: str, num_threads: int) -> Machine:
@@ -53,6 +55,7 @@ class Machine:
             peaks["macs_per_second"][isa],
             peaks["read_bytes_per_second"],
             peaks["clock_hz"],
+            peaks["read_bytes_per_second_by_streams"],
         )
 
 
@@ -95,6 +98,12 @@ def floor(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float
         multiply_adds / machine.macs_per_second[runs_in],
         num_bytes / machine.read_bytes_per_second,
     )
+
+
+def limit(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float) -> str:
+    """What sets `floor`: ``"arithmetic"`` or ``"memory"``."""
+    in_registers = multiply_adds / machine.macs_per_second[runs_in]
+    return "arithmetic" if in_registers >= num_bytes / machine.read_bytes_per_second else "memory"
 
 
 def floor_of(machine: Machine, precision: str, part: str, work: Work) -> float:

@@ -162,7 +162,7 @@ class BackboneSizes:
             CheckpointError: The version is unknown, or a size contradicts another.
         """
         version = _version(config)
-        whole = _merged(version, config)
+        whole = merged(version, config)
         text, vision = whole["text_config"], whole["vision_config"]
         is_siglip = version != "n1.7"
         merge = 1
@@ -234,8 +234,8 @@ def _version(config: Mapping[str, Any]) -> str:
     return MODEL_TYPES[model_type]
 
 
-def _merged(version: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """The released config, with what a config says instead."""
+def merged(version: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The released config, with what a config says instead, under the keys of `RELEASED`."""
     backbone = config.get("backbone_cfg") or {}
     whole = dict(RELEASED[version])
     for part in (config, config.get("eagle") or {}, backbone, backbone.get("eagle_config") or {}):

@@ -25,7 +25,7 @@ import numpy as np
 import saccade._saccade as _saccade
 from saccade._files import write_json
 from saccade.checkpoints import head_configs
-from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes
+from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes, merged
 from saccade.checkpoints.backbone_tensors import tensor_shapes, unread_tensor_shapes
 from saccade.checkpoints.prompt_tokenizer import FIRST_ADDED, token_id, tokenizer
 from saccade.checkpoints.random_tensors import Outliers, Tensor, pieces
@@ -133,8 +133,8 @@ def write(
         raise InputError(f"head_dtype: expected 'BF16' or 'F32', got {head_dtype!r}")
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected an empty directory")
-    config = {**RELEASED[version], **(backbone or {}), "kind": f"{version} backbone"}
-    sizes = BackboneSizes.from_config(config)
+    config = merged(version, backbone or {})
+    sizes = BackboneSizes.from_config({**config, "kind": f"{version} backbone"})
     head_config = dict(head_configs.CONFIGS[version] if head is None else head)
     width = head_config["backbone_embedding_dim"]
     if width != sizes.features_width:
@@ -215,7 +215,7 @@ def _config(
     """The content of `config.json`. It has sizes of the backbone only if they are not the published ones."""
     own: dict[str, Any] = {"select_layer": sizes.num_layers}
     if not released:
-        keys = ("kind", "select_layer", "project_to_dim", "image_token_index")
+        keys = ("select_layer", "project_to_dim", "image_token_index")
         own["eagle_config"] = {key: value for key, value in backbone.items() if key not in keys}
         if version == "n1.7":
             own["eagle_config"]["token_ids"] = {"image_token_id": sizes.image_token}

@@ -46,6 +46,15 @@ class QuantizeReport(Written):
     """Size of the head's tensors in the source, in bytes."""
     head_bytes_after: int
     """Size of the head's tensors in the copy, scales included, in bytes."""
+    num_quantized_backbone: int
+    """How many of the weights that were converted are a backbone's."""
+    backbone_bytes_before: int
+    """Size of the backbone's tensors in the source, in bytes; 0 if no backbone was quantised."""
+    backbone_bytes_after: int
+    """Size of the backbone's tensors in the copy, scales included, in bytes."""
+    backbone_copied: str | None
+    """Why the tensors outside the head were copied bit for bit; None if they are those of a backbone that
+    was quantised, or if there are none."""
 
 
 @dataclass(frozen=True)
@@ -100,20 +109,22 @@ def quantize(
     *,
     config: Config = None,
     head_only: bool = False,
+    keep_backbone: bool = False,
     force: bool = False,
     progress: Progress = None,
 ) -> QuantizeReport:
     """Writes a copy of a checkpoint with int8 weights: a quarter of the size of float32, half of bfloat16.
 
-    The weights of the attention and feed-forward layers of all blocks become int8. These are the weights that
-    precision ``"int8"`` computes with in int8. Such a weight is stored as row-major int8 ``X.weight
+    The weights of the attention and feed-forward layers of all blocks become int8: those of the head, and
+    those of a backbone that :class:`saccade.Backbone` loads. These are the weights that precision ``"int8"``
+    computes with in int8. Such a weight is stored as row-major int8 ``X.weight
     (out_features, in_features)`` with values from -127 to 127, and float32 ``X.weight_scale
     (out_features,)``. A row represents its integers times its scale, which is the largest magnitude of the
     row / 127. The result does not depend on the instruction set. All other tensors are copied bit for bit,
-    those outside the head (of a backbone) included unless ``head_only`` is set, and so are the other files of
-    the directory: statistics, processors, tokenizers.
+    and so are the other files of the directory: statistics, processors, tokenizers.
 
-    :meth:`saccade.ActionHead.load` reads the copy at every precision. At ``"int8"`` it gives the same bits as
+    :meth:`saccade.ActionHead.load`, :meth:`saccade.Backbone.load` and :meth:`saccade.Policy.load` read the
+    copy at every precision. At ``"int8"`` it gives the same bits as
     the source at ``"int8"``. At the others, the weights are those that the integers represent. No other
     program reads these weights.
 
@@ -125,6 +136,7 @@ def quantize(
         out: The directory to write. Parent directories are created.
         config: As for :meth:`saccade.ActionHead.load`. It becomes the ``config.json`` of the copy.
         head_only: Whether to leave out tensors outside the head.
+        keep_backbone: Whether to copy the tensors of a backbone bit for bit.
         force: Whether to replace an existing checkpoint. A directory that contains other files is never
             replaced.
         progress: Called after each tensor with the number of bytes that are done and the total number of
@@ -137,6 +149,7 @@ def quantize(
         InputError: ``out`` exists and ``force`` is not set, or it contains other files or the source.
     """
     rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
+    rewrite["keep_backbone"] = keep_backbone
     return QuantizeReport(**_paths(_saccade.quantize(rewrite)))
 
 
@@ -262,6 +275,7 @@ def _rewrite(
         "out": os.fspath(out),
         "config": config_text,
         "head_only": head_only,
+        "keep_backbone": False,
         "force": force,
         "metadata": {
             "format": "pt",

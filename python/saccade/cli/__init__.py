@@ -23,6 +23,7 @@ from saccade._arguments import UsageError
 COMMANDS: dict[str, str] = {
     "act": "run a whole checkpoint on pictures and an instruction",
     "rollout": "run a policy on the simulated robot and report how often it succeeds",
+    "serve": "serve a whole checkpoint to robots and simulators over the network",
     "demos": "record demonstrations of the tasks with scripted experts",
     "train": "train a policy on recorded demonstrations",
     "attention": "show what the rows of the action head attend to",
@@ -43,6 +44,7 @@ _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
 NEEDS: dict[str, tuple[str, ...]] = {
     "act": ("rich", "PIL"),
     "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
+    "serve": ("rich", "zmq", "msgpack"),
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),

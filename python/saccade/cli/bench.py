@@ -18,13 +18,15 @@ from typing import Any
 import saccade
 from saccade import _arguments as arguments
 from saccade._arguments import UsageError
-from saccade.bench import heads
+from saccade._extras import require
+from saccade.bench import heads, roofline
 from saccade.bench.cost import (
     PRECISIONS,
     Machine,
     arithmetic,
     floor,
     floors,
+    limit,
     predict,
 )
 from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
@@ -34,8 +36,8 @@ from saccade.hub import resolve
 
 HELP = "time the action head and compare it with the limits of this machine"
 EPILOG = """\
-The floor is the least time that the multiply-adds and the reading of weights take at this machine's measured
-peak rates.
+The floor of a part is the longer of two times: its multiply-adds at the peak rate of their arithmetic, and
+reading its weights at the bandwidth of memory. Both peaks are measured in the same run.
 
 examples:
   saccade bench                                  the bundled policy at every precision
@@ -43,6 +45,7 @@ examples:
                                                  a checkpoint with two camera views
   saccade bench --version n1.5 --profile         random weights at N1.5's size, time by part
   saccade bench --version n1.5 --cost-model      measured and expected times for other N, T_vl, steps, samples
+  saccade bench --version n1.5 --roofline        which part is bound by multiply-adds, and which by memory
   saccade bench --precisions int8 --future-refresh 4 --json
 """
 #: What `--cost-model` varies, one size at a time.
@@ -85,6 +88,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_integer(parser, "--rounds", default=7, help="measurements of each time")
     parser.add_argument("--profile", action="store_true", help="time by part, with the part's floor")
     parser.add_argument(
+        "--roofline", action="store_true", help="what each part reaches of its limits, as a picture in text"
+    )
+    parser.add_argument(
+        "--figure",
+        type=Path,
+        metavar="FILE",
+        help="the same as an image, whose format its name tells (needs matplotlib)",
+    )
+    parser.add_argument(
         "--cost-model", action="store_true", help="measured times and those that the cost model expects"
     )
     arguments.add_json(parser, "print JSON instead of tables")
@@ -111,6 +123,10 @@ def run(args: argparse.Namespace) -> int:
 
 def check(args: argparse.Namespace) -> None:
     """Refuses arguments that contradict each other before anything long has run."""
+    if args.figure is not None:
+        require("matplotlib")
+        if not args.figure.parent.is_dir():
+            raise FileNotFoundError(f"{args.figure.parent}: no such directory")
     if args.checkpoint is not None and args.version is not None:
         raise UsageError("--version describes random weights: leave out --checkpoint")
     arguments.check_known("--precisions", args.precisions, PRECISIONS)
@@ -142,15 +158,29 @@ def measure(
         "rounds": args.rounds,
         "results": timed(loaded, call, machine, args.rounds),
     }
-    if args.profile:
+    if args.profile or args.roofline or args.figure:
         report["profile"] = [
             profile(loaded[precision], precision, piece, call, machine, args.rounds)
             for precision in loaded
             for piece in ("encode", "sample")
         ]
+    if args.roofline or args.figure:
+        shown = rooflines(machine, report["profile"])
+        report["roofline"] = {title: [asdict(point) for point in parts] for title, parts in shown.items()}
+        if args.figure:
+            roofline.write_figure(machine, shown, args.figure)
+            note(f"wrote {args.figure}")
     if args.cost_model:
         report["model"] = modelled(loaded, call, machine, args.rounds)
     return report
+
+
+def rooflines(machine: Machine, profiles: list[dict[str, Any]]) -> dict[str, list[roofline.Point]]:
+    """The points of each profile, by its precision and piece."""
+    return {
+        f"{one['precision']} {one['piece']}": roofline.points(machine, one["precision"], one["parts"])
+        for one in profiles
+    }
 
 
 @contextlib.contextmanager
@@ -244,6 +274,7 @@ def profile(
             "multiply_adds": counter.multiply_adds,
             "bytes": counter.num_bytes,
             "floor_seconds": least,
+            "limit": limit(machine, arithmetic(name, precision), counter.multiply_adds, counter.num_bytes),
             "share": least / counter.seconds if counter.multiply_adds else None,
         }
 
@@ -295,7 +326,8 @@ def tables(report: dict[str, Any]) -> str:
         f"call      T_vl {call['num_vl_tokens']}, N {call['num_future_tokens']}, {call['num_steps']} steps, "
         f"{call['num_samples']} samples, future_refresh {call['future_refresh']}",
         f"machine   {machine['isa']}, {machine['num_threads']} threads; peak GMAC/s {peaks}; "
-        f"read {machine['read_bytes_per_second'] / 1e9:.1f} GB/s; saccade {report['saccade']}",
+        f"read {machine['read_bytes_per_second'] / 1e9:.1f} GB/s ({reading(machine)}); "
+        f"saccade {report['saccade']}",
         "",
         f"median (quartiles) of {report['rounds']} rounds, ms",
         f"{'':<20}{'time':>9}{'quartiles':>20}{'GMAC':>9}{'floor':>9}{'of it':>8}{'model':>9}",
@@ -310,9 +342,18 @@ def tables(report: dict[str, Any]) -> str:
         )
     for one in report.get("profile", []):
         lines += profile_table(one)
+    for title, parts in report.get("roofline", {}).items():
+        lines += ["", f"{title}, roofline", ""]
+        lines += roofline.text(Machine(**machine), [roofline.Point(**point) for point in parts])
     if "model" in report:
         lines += model_table(report["model"])
     return "\n".join(lines)
+
+
+def reading(machine: dict[str, Any]) -> str:
+    """The bandwidth by the number of streams, as text."""
+    rates = machine["read_by_streams"].items()
+    return ", ".join(f"{rate / 1e9:.1f} as {streams}" for streams, rate in rates) + " streams"
 
 
 def profile_table(one: dict[str, Any]) -> list[str]:
@@ -321,15 +362,17 @@ def profile_table(one: dict[str, Any]) -> list[str]:
     lines = [
         "",
         f"{one['precision']} {one['piece']}, by part",
-        f"{'':<20}{'calls':>7}{'ms':>10}{'of all':>8}{'GMAC':>9}{'MB read':>10}{'floor':>9}{'of it':>8}",
+        f"{'':<20}{'calls':>7}{'ms':>10}{'of all':>8}{'GMAC':>9}{'MB read':>10}{'floor':>9}"
+        f"{'of it':>8}  limit",
     ]
     for part in one["parts"]:
         seconds, least = part["seconds"], 1e3 * part["floor_seconds"]
         gmac, megabytes = part["multiply_adds"] / 1e9, part["bytes"] / 1e6
         reached = "" if part["share"] is None else f"{part['share']:.0%}"
+        bound = "" if part["share"] is None else f"  {part['limit']}"
         lines.append(
             f"{part['part']:<20}{part['calls']:>7}{1e3 * seconds:>10.3f}{seconds / whole:>8.1%}"
-            f"{gmac:>9.3f}{megabytes:>10.1f}{least:>9.3f}{reached:>8}"
+            f"{gmac:>9.3f}{megabytes:>10.1f}{least:>9.3f}{reached:>8}{bound}"
         )
     other = one["other_seconds"]
     lines.append(f"{'other':<20}{'':>7}{1e3 * other:>10.3f}{other / whole:>8.1%}")

@@ -12,10 +12,11 @@ HELP = "write a checkpoint with int8 weights"
 
 EPILOG = """\
 The weights X.weight of the attention and feed-forward layers of all blocks become int8, with a float32 scale
-for each output in X.weight_scale. All other tensors are copied bit for bit, those outside the head too unless
---head-only is given, and so are the other files of the checkpoint, such as statistics and processors.
-ActionHead.load(DIR, precision="int8") gives the same bits as loading CHECKPOINT at int8. The other precisions
-load it too, with the dequantized weights. docs/precision.md says how much int8 changes actions.
+for each output in X.weight_scale: those of the head, and those of the backbone unless --keep-backbone or
+--head-only is given. All other tensors are copied bit for bit, and so are the other files of the checkpoint,
+such as statistics, processors and tokenizers. Policy.load(DIR, precision="int8") gives the same bits as
+loading CHECKPOINT at int8. The other precisions load it too, with the dequantized weights. docs/precision.md
+says how much int8 changes actions.
 
 examples:
   saccade quantize GR00T-N1.5-3B/ --out GR00T-N1.5-3B-int8
@@ -29,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     add_copy_arguments(parser)
     parser.add_argument("--head-only", action="store_true", help="leave out the tensors outside the head")
+    parser.add_argument(
+        "--keep-backbone", action="store_true", help="copy the backbone's tensors as they are"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
             args.out,
             config=args.config,
             head_only=args.head_only,
+            keep_backbone=args.keep_backbone,
             force=args.force,
             progress=progress,
         )
@@ -52,5 +57,10 @@ def run(args: argparse.Namespace) -> int:
         f"{args.out}: {report.num_quantized} weights in int8, {report.num_copied} tensors copied, "
         f"{report.num_dropped} left out; the head has {after:.1f} MB (was {before:.1f} MB)"
     )
+    if report.num_quantized_backbone:
+        before, after = (size / 1e6 for size in (report.backbone_bytes_before, report.backbone_bytes_after))
+        print(f"the backbone has {after:.1f} MB (was {before:.1f} MB)")
+    elif report.backbone_copied is not None:
+        print(f"tensors outside the head were copied as they are: {report.backbone_copied}")
     print_files_not_copied(report)
     return EXIT_OK

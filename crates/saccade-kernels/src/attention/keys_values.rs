@@ -7,6 +7,7 @@ use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::rows::Rows;
+use crate::tiles::TILE;
 use crate::weights::Element;
 
 /// Elements from which packing on a second thread pays.
@@ -30,7 +31,8 @@ pub struct PackedKeyValues {
     /// Keys that each head has room for.
     capacity: usize,
     /// `[head][vector of keys][step of head_dim][lane]`; lanes beyond the last key are zero. A word is an f32, or a pair of bf16, the
-    /// even element in its low half: then a step is two elements, and an odd `head_dim` is padded with zero.
+    /// even element in its low half: then a step is two elements, and an odd `head_dim` is padded with zero. In tiles the steps of keys, and
+    /// the steps of `head_dim`, are padded to multiples of 16.
     keys: AlignedBuffer<u32>,
     /// `[head][step of keys][head_dim]`, each row padded with zeros to whole vectors; words as in `keys`, pairs being of two keys.
     values: AlignedBuffer<u32>,
@@ -121,6 +123,8 @@ impl PackedKeyValues {
             keys_to: self.keys.as_mut_ptr(),
             values_to: self.values.as_mut_ptr(),
             head_dim: self.head_dim,
+            key_steps: self.key_steps(),
+            value_group: self.value_group(),
         };
         let (isa, element) = (self.isa, self.element);
         let threads = if 2 * rows * width < ELEMENTS_FOR_THREADS {
@@ -310,19 +314,53 @@ impl PackedKeyValues {
 
     /// Words of one head's keys, where there is room for `capacity` of them.
     fn keys_of_head(&self, capacity: usize) -> usize {
-        capacity.next_multiple_of(self.isa.vectors().lanes) * self.head_dim.div_ceil(self.step())
+        capacity.next_multiple_of(self.isa.vectors().lanes) * self.key_steps()
     }
 
     /// Words of one head's values, where there is room for `capacity` of them.
     fn values_of_head(&self, capacity: usize) -> usize {
-        capacity.div_ceil(self.step()) * self.value_width()
+        capacity
+            .div_ceil(self.step())
+            .next_multiple_of(self.value_group())
+            * self.value_width()
     }
 
     /// Words of one head's keys and of its values, where there is room for `capacity` of them.
     fn sizes_of_head(&self, capacity: usize) -> Result<(usize, usize), AllocError> {
-        // More than padding adds.
-        elements(capacity, self.value_width().saturating_mul(4))?;
+        // More than padding adds, also to few keys.
+        let padded = capacity.checked_next_multiple_of(2 * TILE);
+        let padded = padded.ok_or(AllocError { bytes: usize::MAX })?;
+        elements(padded, self.value_width().saturating_mul(4))?;
         Ok((self.keys_of_head(capacity), self.values_of_head(capacity)))
+    }
+
+    /// Whether they are multiplied in tiles: then words are padded to whole ones.
+    fn is_tiled(&self) -> bool {
+        self.element == Element::Bf16 && self.isa.has_tiles()
+    }
+
+    /// Steps of `head_dim` in the keys, padded with zeros to whole tiles.
+    pub(super) fn key_steps(&self) -> usize {
+        let steps = self.head_dim.div_ceil(self.step());
+        if self.is_tiled() {
+            steps.next_multiple_of(TILE)
+        } else {
+            steps
+        }
+    }
+
+    /// Steps of keys that values are padded to, with zeros.
+    fn value_group(&self) -> usize {
+        if self.is_tiled() { TILE } else { 1 }
+    }
+
+    /// Queries that are taken together at most.
+    pub(super) fn tile_rows(&self) -> usize {
+        if self.is_tiled() {
+            TILE
+        } else {
+            self.isa.vectors().tile_rows
+        }
     }
 
     /// Words from one step of keys to the next in the values.

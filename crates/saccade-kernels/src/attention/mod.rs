@@ -1,7 +1,7 @@
 //! Fused attention: scores, bias, stable softmax and the value product, block of keys by block of keys, in registers and on the stack.
 //!
 //! Keys are packed vectors of keys wide and `head_dim`-major, so that scores of many keys come from one broadcast query element; values stay
-//! key-major. Both products are the same register tile. Softmax runs over fixed blocks of keys with a running maximum and sum
+//! key-major. Both products are the same register tile, or tiles of a unit for them. Softmax runs over fixed blocks of keys with a running maximum and sum
 //! for each query, so that a query's bits depend on its row, the keys and the instruction set only.
 
 mod arithmetic;
@@ -17,7 +17,7 @@ use crate::rows::{Rows, RowsMut};
 use crate::weights::Element;
 pub use keys_values::PackedKeyValues;
 pub use mask::{LogitBias, Mask};
-use tile::{Bf16Tile, Call, FloatTile, QueryTile};
+use tile::{Bf16Tile, Call, FloatTile, QueryTile, UnitTile};
 
 /// Multiply-adds from which a second thread pays: some 10 us of one core.
 const MACS_FOR_THREADS: usize = 1 << 19;
@@ -28,7 +28,7 @@ const MACS_FOR_THREADS: usize = 1 << 19;
 /// `num_heads / num_kv_heads` consecutive heads share a head of the keys and values (grouped-query attention). A query with no key left gets
 /// zeros. `weights`, if given, is `(num_heads, queries, len)` and receives the probabilities; otherwise they are never in memory together.
 ///
-/// Sums and the softmax are float32. Where the CPU multiplies pairs of bfloat16 and `kv` holds them, queries and probabilities are rounded to
+/// Sums and the softmax are float32. Where pairs of bfloat16 are multiplied, by vectors or in tiles, and `kv` holds them, queries and probabilities are rounded to
 /// bfloat16 too, the sum of a query's probabilities is that of the rounded ones, and denormals may count as zero; elsewhere nothing but
 /// `kv` is rounded.
 ///
@@ -94,7 +94,7 @@ pub fn attention(
         out_stride: out.row_stride() as isize,
         out: out.as_mut_ptr(),
     };
-    let tiles = rows.div_ceil(kv.isa().vectors().tile_rows);
+    let tiles = rows.div_ceil(kv.tile_rows());
     let threads = if 2 * rows * kv.len() * width < MACS_FOR_THREADS {
         1
     } else {
@@ -112,6 +112,7 @@ pub fn attention(
             rows: end - first,
         };
         match kv.element() {
+            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(tile)),
             Element::Bf16 => kv.isa().run(Bf16Tile(tile)),
             _ => kv.isa().run(FloatTile(tile)),
         }

@@ -11,6 +11,10 @@ pub(super) struct Pack<'a> {
     pub keys_to: *mut u32,
     pub values_to: *mut u32,
     pub head_dim: usize,
+    /// Steps of `head_dim` in the keys, with those that pad it.
+    pub key_steps: usize,
+    /// Steps of keys that values are padded to.
+    pub value_group: usize,
 }
 
 // SAFETY: tasks read the views and write different heads of the buffers.
@@ -161,7 +165,7 @@ impl Head<'_> {
     unsafe fn pack_keys<S: Simd<Vector = V>, V: Vector, W: Layout<S>>(&mut self) {
         let (first, head_dim) = (self.job.first, self.job.head_dim);
         let len = first + self.job.keys.num_rows();
-        let steps = head_dim.div_ceil(W::STEP);
+        let steps = self.job.key_steps;
         for panel in first / V::LANES..len.div_ceil(V::LANES) {
             let keys = panel * V::LANES..(panel + 1) * V::LANES;
             // Lanes before the first key given stay.
@@ -172,7 +176,7 @@ impl Head<'_> {
                 for (lane, to) in square.iter_mut().enumerate().take(end).skip(start) {
                     let row = self.row(self.job.keys, keys.start + lane - first);
                     let (from, most) = (step * W::STEP, V::LANES * W::STEP);
-                    let (row, count) = (row.wrapping_add(from), most.min(head_dim - from));
+                    let (row, count) = (row.wrapping_add(from), most.min(head_dim.saturating_sub(from)));
                     // SAFETY: the row has these elements; the caller has the instruction set.
                     unsafe { W::along(row, count, to.as_mut_ptr()) };
                 }
@@ -195,7 +199,7 @@ impl Head<'_> {
         let len = first + self.job.values.num_rows();
         let width = head_dim.next_multiple_of(V::LANES);
         let mut finite = true;
-        for step in first / W::STEP..len.div_ceil(W::STEP) {
+        for step in first / W::STEP..len.div_ceil(W::STEP).next_multiple_of(self.job.value_group) {
             let row = |part: usize| {
                 let key = step * W::STEP + part;
                 (part < W::STEP && first <= key && key < len).then(|| self.row(self.job.values, key - first))

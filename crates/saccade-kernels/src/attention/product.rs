@@ -5,6 +5,7 @@ use std::marker::PhantomData;
 use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
 use super::mask::Mask;
 use crate::simd::{Kernel, Simd, Vector};
+use crate::tiles::{Ahead, Operation, Product, Session, TILE, TileUnit};
 
 /// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
 pub(super) struct TileProduct {
@@ -27,25 +28,69 @@ pub(super) struct TileProduct {
     pub add: bool,
 }
 
-/// An [`TileArithmetic`] whose products are a piece of code of their own: their tiles are many, and compilers take minutes over them.
-pub(super) trait Multiply<S: Simd>: TileArithmetic<S> {
+/// What makes the products of a tile whose factors are `A`'s.
+pub(super) trait Multiply<S: Simd, A> {
+    /// Blocks of keys begin at multiples of so many.
+    const KEYS: usize;
+
     /// # Safety
     /// As [`TileProduct::run`].
-    unsafe fn multiply(simd: S, product: &TileProduct);
+    unsafe fn multiply(&mut self, simd: S, product: &TileProduct);
 }
 
-impl<S: Simd, H: Stored> Multiply<S> for Float32<H> {
+/// Vectors. Their products are a piece of code of their own for each arithmetic: their tiles are many, and compilers take minutes over them.
+pub(super) struct InVectors;
+
+impl<S: Simd, H: Stored> Multiply<S, Float32<H>> for InVectors {
+    const KEYS: usize = S::Vector::LANES;
+
     #[inline(always)]
-    unsafe fn multiply(simd: S, product: &TileProduct) {
+    unsafe fn multiply(&mut self, simd: S, product: &TileProduct) {
         let held = PhantomData::<H>;
         simd.run(FloatProduct { product, held });
     }
 }
 
-impl<S: Simd> Multiply<S> for Pairs {
+impl<S: Simd> Multiply<S, Pairs> for InVectors {
+    const KEYS: usize = S::Vector::LANES;
+
     #[inline(always)]
-    unsafe fn multiply(simd: S, product: &TileProduct) {
+    unsafe fn multiply(&mut self, simd: S, product: &TileProduct) {
         simd.run(PairProduct(product));
+    }
+}
+
+/// Tiles, where vectors have as many lanes. Factors and what they multiply hold zeros to whole steps.
+impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
+    const KEYS: usize = TILE * Operation::Bf16.per_word();
+
+    #[inline(always)]
+    unsafe fn multiply(&mut self, _: S, product: &TileProduct) {
+        const { assert!(S::Vector::LANES == TILE) }
+        let mut vector = 0;
+        while vector < product.vectors {
+            let are_together = product.b_vector == TILE && product.vectors - vector >= 3;
+            let columns = if are_together { 3 } else { 1 };
+            // SAFETY: the caller's promise.
+            unsafe {
+                self.multiply(&Product {
+                    operation: Operation::Bf16,
+                    rows: product.rows,
+                    x: product.factors.cast(),
+                    x_stride: product.factors_stride,
+                    w: product.b.add(vector * product.b_vector),
+                    w_stride: product.b_step,
+                    w_step: TILE * product.b_step,
+                    columns,
+                    steps: product.depth.div_ceil(<Self as Multiply<S, Pairs>>::KEYS),
+                    sums: product.out.add(vector * TILE).cast(),
+                    sums_stride: product.out_stride,
+                    add: product.add,
+                    ahead: Ahead::NOTHING,
+                });
+            }
+            vector += columns;
+        }
     }
 }
 
@@ -146,7 +191,23 @@ impl TileProduct {
             }
             let mut b = self.b.add(first * self.b_vector);
             let mut factors = self.factors;
-            for _ in 0..self.depth.div_ceil(A::STEP) {
+            let mut steps = self.depth.div_ceil(A::STEP);
+            if V::BY_LANE {
+                for _ in 0..steps * A::FACTORS / 4 {
+                    let mut rows = [A::four(factors); MR];
+                    for (r, row) in rows.iter_mut().enumerate().skip(1) {
+                        *row = A::four(factors.add(r * self.factors_stride));
+                    }
+                    self.lane::<S, A, MR, NV, 0>(&mut acc, &rows, b);
+                    self.lane::<S, A, MR, NV, 1>(&mut acc, &rows, b);
+                    self.lane::<S, A, MR, NV, 2>(&mut acc, &rows, b);
+                    self.lane::<S, A, MR, NV, 3>(&mut acc, &rows, b);
+                    b = b.wrapping_add(4 / A::FACTORS * self.b_step);
+                    factors = factors.wrapping_add(4);
+                }
+                steps %= 4 / A::FACTORS;
+            }
+            for _ in 0..steps {
                 for part in 0..A::FACTORS {
                     let mut columns = [A::column(b, part); NV];
                     for (v, column) in columns.iter_mut().enumerate().skip(1) {
@@ -165,6 +226,30 @@ impl TileProduct {
             for (r, row) in acc.iter().enumerate() {
                 for (v, sum) in row.iter().enumerate() {
                     sum.store(out.add(r * self.out_stride + v * V::LANES));
+                }
+            }
+        }
+    }
+
+    /// Adds the products of factor number `LANE` of four of each row and what it meets from `b` on.
+    ///
+    /// # Safety
+    /// As [`Self::run`], for the steps of four factors from `b` on.
+    #[inline(always)]
+    unsafe fn lane<S: Simd, A: TileArithmetic<S>, const MR: usize, const NV: usize, const LANE: i32>(
+        &self,
+        acc: &mut [[S::Vector; NV]; MR],
+        rows: &[A::Operand; MR],
+        b: *const u32,
+    ) {
+        let (step, part) = (LANE as usize / A::FACTORS, LANE as usize % A::FACTORS);
+        // SAFETY: the caller's promise.
+        unsafe {
+            let b = b.add(step * self.b_step);
+            for v in 0..NV {
+                let column = A::column(b.add(v * self.b_vector), part);
+                for (row, &factors) in acc.iter_mut().zip(rows) {
+                    row[v] = A::multiply_add_lane::<LANE>(factors, column, row[v]);
                 }
             }
         }

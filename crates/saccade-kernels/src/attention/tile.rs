@@ -6,9 +6,10 @@ use std::ops::Range;
 use super::arithmetic::{Float32, HeldBf16, HeldF32, Pairs, TileArithmetic};
 use super::keys_values::PackedKeyValues;
 use super::mask::Mask;
-use super::product::{Multiply, Removed, TileProduct};
+use super::product::{InVectors, Multiply, Removed, TileProduct};
 use super::softmax::{Row, Running};
 use crate::simd::{Dot, Dots, Kernel, MAX_TILE_ROWS, Simd, Vector, load, store};
+use crate::tiles::{Session, TILE, TileKernel, TileUnit};
 
 /// Keys between two updates of a query's running maximum, at most: whole pairs of vectors of every instruction set.
 const KEY_BLOCK: usize = 320;
@@ -50,13 +51,19 @@ pub(super) struct FloatTile<'a>(pub QueryTile<'a>);
 /// A tile of bfloat16 keys and values.
 pub(super) struct Bf16Tile<'a>(pub QueryTile<'a>);
 
+/// A tile of bfloat16 keys and values, for a unit that multiplies tiles.
+pub(super) struct UnitTile<'a>(pub QueryTile<'a>);
+
 impl Kernel for FloatTile<'_> {
     type Output = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self, simd: S) {
         // SAFETY: called within `Simd::run`; keys and values are float32.
-        unsafe { self.0.run_as::<S, Float32<HeldF32>>(simd) }
+        unsafe {
+            self.0
+                .run_as::<S, Float32<HeldF32>, _, MAX_TILE_ROWS>(simd, &mut InVectors)
+        }
     }
 }
 
@@ -69,19 +76,53 @@ impl Kernel for Bf16Tile<'_> {
         // SAFETY: called within `Simd::run`; keys and values are pairs of bfloat16.
         unsafe {
             if S::Dots::HAS_BF16 {
-                self.0.run_as::<S, Pairs>(simd);
+                self.0.run_as::<S, Pairs, _, MAX_TILE_ROWS>(simd, &mut InVectors);
             } else {
-                self.0.run_as::<S, Float32<HeldBf16>>(simd);
+                self.0
+                    .run_as::<S, Float32<HeldBf16>, _, MAX_TILE_ROWS>(simd, &mut InVectors);
             }
         }
     }
 }
 
-impl QueryTile<'_> {
-    /// # Safety
-    /// Called within [`Simd::run`] of `S`; keys and values are held as `A` reads them.
+impl TileKernel for UnitTile<'_> {
+    type Output = ();
+
+    fn run<U: TileUnit>(self, unit: U) {
+        unit.simd().run(BesideUnit { tile: self.0, unit });
+    }
+}
+
+/// The tile on the vectors beside its unit.
+struct BesideUnit<'a, U> {
+    tile: QueryTile<'a>,
+    unit: U,
+}
+
+impl<U: TileUnit> Kernel for BesideUnit<'_, U> {
+    type Output = ();
+
     #[inline(always)]
-    unsafe fn run_as<S: Simd, A: Multiply<S>>(&self, simd: S) {
+    unsafe fn run<S: Simd>(self, simd: S) {
+        // SAFETY: no other session is open; called within `Simd::run`; keys and values are pairs of bfloat16 in whole steps.
+        unsafe {
+            let mut session = Session::new(self.unit);
+            self.tile.run_as::<S, Pairs, _, TILE>(simd, &mut session);
+        }
+    }
+}
+
+impl QueryTile<'_> {
+    /// With at most `ROWS` rows.
+    ///
+    /// # Safety
+    /// Called within [`Simd::run`] of `S`; keys and values are held as `A` and `M` read them.
+    #[inline(always)]
+    unsafe fn run_as<S: Simd, A: TileArithmetic<S>, M: Multiply<S, A>, const ROWS: usize>(
+        &self,
+        simd: S,
+        multiplier: &mut M,
+    ) {
         let dims = self.call.kv.head_dim();
         for first in (0..dims).step_by(MAX_VALUES) {
             let columns = Columns {
@@ -89,7 +130,7 @@ impl QueryTile<'_> {
                 count: MAX_VALUES.min(dims - first),
             };
             // SAFETY: the rows and columns are in the call's views; the rest is the caller's promise.
-            unsafe { attend::<S, S::Vector, A>(simd, self, &columns) }
+            unsafe { attend::<S, S::Vector, A, M, ROWS>(simd, multiplier, self, &columns) }
         }
     }
 }
@@ -101,12 +142,12 @@ struct Columns {
 }
 
 #[repr(align(64))]
-struct Scratch<const N: usize>([MaybeUninit<f32>; N]);
+struct Scratch<const ROWS: usize, const N: usize>([[MaybeUninit<f32>; N]; ROWS]);
 
-impl<const N: usize> Scratch<N> {
+impl<const ROWS: usize, const N: usize> Scratch<ROWS, N> {
     #[inline(always)]
     fn new() -> Self {
-        Self([const { MaybeUninit::uninit() }; N])
+        Self([const { [const { MaybeUninit::uninit() }; N] }; ROWS])
     }
 
     #[inline(always)]
@@ -118,28 +159,36 @@ impl<const N: usize> Scratch<N> {
 /// Attention of a tile's queries.
 ///
 /// # Safety
-/// The tile's rows and the columns are in the call's views; called within [`Simd::run`] of `S`; keys and values are held as `A` reads them.
+/// The tile's rows, at most `ROWS`, and the columns are in the call's views; called within [`Simd::run`] of `S`; keys and values are held as
+/// `A` and `M` read them.
 #[inline(always)]
-unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
+unsafe fn attend<
+    S: Simd<Vector = V>,
+    V: Vector,
+    A: TileArithmetic<S>,
+    M: Multiply<S, A>,
+    const ROWS: usize,
+>(
     simd: S,
+    multiplier: &mut M,
     tile: &QueryTile<'_>,
     columns: &Columns,
 ) {
     let (call, kv) = (tile.call, tile.call.kv);
     let (len, padded) = (kv.len(), columns.count.next_multiple_of(V::LANES));
     let value_width = kv.value_width();
-    let mut factors = Scratch::<{ MAX_TILE_ROWS * MAX_DEPTH }>::new();
+    let mut factors = Scratch::<ROWS, MAX_DEPTH>::new();
     let factors = factors.pointer();
-    let mut probabilities = Scratch::<{ MAX_TILE_ROWS * KEY_BLOCK }>::new();
+    let mut probabilities = Scratch::<ROWS, KEY_BLOCK>::new();
     let probabilities = probabilities.pointer();
-    let mut sums = Scratch::<{ MAX_TILE_ROWS * MAX_VALUES }>::new();
+    let mut sums = Scratch::<ROWS, MAX_VALUES>::new();
     let sums = sums.pointer();
     let mut running = [Running {
         max: f32::NEG_INFINITY,
         sum: 0.0,
-    }; MAX_TILE_ROWS];
+    }; ROWS];
     let running = &mut running[..tile.rows];
-    let block = keys_of_block(&call.mask, len, V::LANES);
+    let block = keys_of_block(&call.mask, len, M::KEYS);
     // Keys beyond are seen by none of these queries.
     let visible = call.mask.visible(tile.first + tile.rows - 1, len);
     let kv_head = tile.head / call.heads_per_kv_head;
@@ -153,7 +202,14 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
         let values = kv.head_values(kv_head).as_ptr();
         for first in (0..visible).step_by(block) {
             let count = block.min(visible - first);
-            tile.scores::<S, V, A>(simd, keys, first..first + count, factors, probabilities);
+            tile.scores::<S, V, A, M>(
+                simd,
+                multiplier,
+                keys,
+                first..first + count,
+                factors,
+                probabilities,
+            );
             for (r, running) in running.iter_mut().enumerate() {
                 let row = Row {
                     mask: &call.mask,
@@ -189,7 +245,7 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
                 add: true,
             };
             if kv.is_finite() || matches!(call.mask, Mask::None) {
-                A::multiply(simd, &product);
+                multiplier.multiply(simd, &product);
             } else {
                 let removed = Removed {
                     mask: &call.mask,
@@ -206,12 +262,12 @@ unsafe fn attend<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
 }
 
 /// Keys between two updates of the running maximum.
-fn keys_of_block(mask: &Mask<'_>, len: usize, lanes: usize) -> usize {
+fn keys_of_block(mask: &Mask<'_>, len: usize, multiple: usize) -> usize {
     match (mask, len.div_ceil(KEY_BLOCK)) {
         // Where a block ends must not depend on how many keys follow.
         (Mask::Causal { .. }, _) | (_, 0) => KEY_BLOCK,
         // Blocks of equal size, so that the last one is not a small rest.
-        (_, blocks) => len.div_ceil(blocks).next_multiple_of(lanes),
+        (_, blocks) => len.div_ceil(blocks).next_multiple_of(multiple),
     }
 }
 
@@ -221,9 +277,10 @@ impl QueryTile<'_> {
     /// # Safety
     /// As [`attend`]. `keys` points to those of the head; `factors` and `scores` have room for the tile.
     #[inline(always)]
-    unsafe fn scores<S: Simd<Vector = V>, V: Vector, A: Multiply<S>>(
+    unsafe fn scores<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>, M: Multiply<S, A>>(
         &self,
         simd: S,
+        multiplier: &mut M,
         keys: *const u32,
         block: Range<usize>,
         factors: *mut f32,
@@ -238,7 +295,7 @@ impl QueryTile<'_> {
                 if block.start == 0 || head_dim > MAX_DEPTH {
                     self.queries::<S, V, A>(from, depth, factors);
                 }
-                let steps = head_dim.div_ceil(A::STEP);
+                let steps = self.call.kv.key_steps();
                 let product = TileProduct {
                     rows: self.rows,
                     factors,
@@ -252,7 +309,7 @@ impl QueryTile<'_> {
                     vectors: block.len().div_ceil(V::LANES),
                     add: from > 0,
                 };
-                A::multiply(simd, &product);
+                multiplier.multiply(simd, &product);
             }
         }
     }

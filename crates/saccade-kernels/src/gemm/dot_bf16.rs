@@ -48,10 +48,11 @@ unsafe impl<S: Simd> Gemm for DotBf16<S> {
 }
 
 /// Rows rounded to bfloat16.
-struct Narrowing<'a> {
-    source: &'a Source,
-    rows: Range<usize>,
-    stride: usize,
+pub(super) struct Narrowing<'a> {
+    pub source: &'a Source,
+    pub rows: Range<usize>,
+    /// Words from one converted row to the next.
+    pub stride: usize,
 }
 
 impl Kernel for Narrowing<'_> {

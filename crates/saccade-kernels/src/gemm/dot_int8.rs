@@ -123,10 +123,11 @@ impl<S: Simd<Vector = V>, V: Vector> Step<S> for QuadStep {
 }
 
 /// Rows quantised to bytes.
-struct Quantizing<'a> {
-    source: &'a Source,
-    rows: Range<usize>,
-    stride: usize,
+pub(super) struct Quantizing<'a> {
+    pub source: &'a Source,
+    pub rows: Range<usize>,
+    /// Words from one converted row to the next.
+    pub stride: usize,
 }
 
 impl Kernel for Quantizing<'_> {
@@ -167,6 +168,40 @@ unsafe fn quantize_row<V: Vector, D: Dots<V>>(
     bytes: *mut u8,
     apart: Option<*mut Outliers>,
 ) -> Quantized {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let Quantization { quantized, inverse } = row_quantization::<V, D>(x, width, apart);
+        let (inverse, most) = (V::splat(inverse), V::splat_int(i32::from(D::MAX_BYTE)));
+        let zero_byte = V::splat_int(quantized.zero);
+        for i in (0..width).step_by(V::LANES) {
+            let x = load::<V>(x.add(i), V::LANES.min(width - i));
+            x.mul(inverse).store_bytes(zero_byte, most, bytes.add(i));
+        }
+        if let Some(apart) = apart {
+            let outliers = (*apart).iter();
+            outliers.for_each(|(input, _)| bytes.add(input).write(quantized.zero as u8));
+        }
+        quantized
+    }
+}
+
+/// How a row is quantised, and what its elements are multiplied with.
+pub(super) struct Quantization {
+    pub quantized: Quantized,
+    /// One over the scale, or zero for a row that counts as zero.
+    pub inverse: f32,
+}
+
+/// What [`quantize_row`] makes a row's bytes by. If outliers are to be kept `apart`, they are found here.
+///
+/// # Safety
+/// `x` points to `width` elements, `apart` to the outliers of the row; the caller runs with `V`'s instruction set.
+#[inline(always)]
+pub(super) unsafe fn row_quantization<V: Vector, D: Dots<V>>(
+    x: *const f32,
+    width: usize,
+    apart: Option<*mut Outliers>,
+) -> Quantization {
     // SAFETY: the caller's promise.
     unsafe {
         // Chains of their own, which do not wait for each other.
@@ -212,30 +247,16 @@ unsafe fn quantize_row<V: Vector, D: Dots<V>>(
         let scale = high / f32::from(steps) - low / f32::from(steps);
         let is_zero = scale < f32::MIN_POSITIVE;
         let inverse = if is_zero { 0.0 } else { 1.0 / scale };
-        let offset = (-low * inverse).round_ties_even() as i32;
-        let (inverse, most) = (V::splat(inverse), V::splat_int(i32::from(steps)));
-        let zero_byte = V::splat_int(offset);
-        for i in (0..width).step_by(V::LANES) {
-            let x = load::<V>(x.add(i), V::LANES.min(width - i));
-            x.mul(inverse).store_bytes(zero_byte, most, bytes.add(i));
-        }
-        if let Some(apart) = apart {
-            (*apart)
-                .iter()
-                .for_each(|(input, _)| bytes.add(input).write(offset as u8));
-        }
-        let quantized = Quantized {
-            scale: if is_zero { 0.0 } else { scale },
-            zero: offset,
-        };
-        if not_finite.reduce_add().is_nan() {
-            Quantized {
-                scale: f32::NAN,
-                ..quantized
-            }
+        let scale = if not_finite.reduce_add().is_nan() {
+            f32::NAN
+        } else if is_zero {
+            0.0
         } else {
-            quantized
-        }
+            scale
+        };
+        let zero = (-low * inverse).round_ties_even() as i32;
+        let quantized = Quantized { scale, zero };
+        Quantization { quantized, inverse }
     }
 }
 

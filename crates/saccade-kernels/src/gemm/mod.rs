@@ -1,5 +1,6 @@
 //! Products of rows with packed weights, each on one instruction set and in one arithmetic: its shape, its packing, its rows and its tile.
 
+pub(crate) mod amx;
 pub(crate) mod broadcast;
 mod chains;
 #[allow(
@@ -8,8 +9,11 @@ mod chains;
 )]
 pub(crate) mod dot_bf16;
 pub(crate) mod dot_int8;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
 pub(crate) mod outliers;
 mod panel;
+mod streams;
 mod tile;
 
 use std::ops::Range;
@@ -51,8 +55,10 @@ pub(crate) const MAX_COLUMNS: usize = 64;
 /// past. 96 rows of 2048 are 768 kB, three quarters of a 1 MB cache.
 pub(crate) const ROW_BLOCK: usize = 96;
 
-/// Words of the sums of a block of rows and a panel.
-pub(crate) const MAX_SUMS: usize = (ROW_BLOCK + 32) * MAX_COLUMNS;
+/// Words of the sums of a block of rows and a panel: of 48 columns, where the block is the largest.
+pub(crate) const MAX_SUMS: usize = (amx::MAX_ROW_BLOCK + 32) * 48;
+
+const _: () = assert!(MAX_SUMS >= (ROW_BLOCK + 32) * MAX_COLUMNS);
 
 /// How a row was quantised: `x = scale * (byte - zero)`.
 #[derive(Clone, Copy, Debug, Default)]
@@ -131,6 +137,8 @@ pub(crate) struct Block<'a> {
     pub weights: &'a [u32],
     /// How many panels further the one is that this thread will probably take next.
     pub ahead: usize,
+    /// Whether to ask memory for weights as many streams, rather than for one line after the other.
+    pub streams: bool,
     /// Where the sums go: rows of [`Shape::columns`] words, from the first row of the block on.
     pub sums: *mut u32,
     /// Where row 0 of the results of this panel will be written afterwards.
@@ -156,6 +164,11 @@ pub(crate) unsafe trait Gemm: Send + Sync {
         Self: Sized;
 
     fn shape(&self) -> Shape;
+
+    /// Rows that go through a panel together, or a tile more.
+    fn row_block(&self, _in_features: usize) -> usize {
+        ROW_BLOCK
+    }
 
     /// Words of a panel.
     fn panel_words(&self, in_features: usize) -> usize;

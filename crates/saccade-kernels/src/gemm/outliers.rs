@@ -90,6 +90,8 @@ pub(crate) struct MultiplyOutliers<'a> {
     pub outliers: &'a [Outliers],
     pub panel: &'a [u32],
     pub columns: usize,
+    /// Words of a column next to each other in the panel.
+    pub run: usize,
     /// Rows of `columns` sums; those of rows that have outliers are written.
     pub sums: &'a mut [MaybeUninit<f32>],
 }
@@ -105,7 +107,9 @@ impl Kernel for MultiplyOutliers<'_> {
             // SAFETY: they were written.
             let sums = unsafe { &mut *(std::ptr::from_mut(sums) as *mut [f32]) };
             for (input, value) in outliers.iter() {
-                let words = &self.panel[input / 4 * self.columns..][..self.columns];
+                let (run, word) = (self.run, input / 4);
+                let words = &self.panel[word / run * run * self.columns..][..run * self.columns];
+                let words = words[word % run..].iter().step_by(run);
                 let shift = 24 - 8 * (input % 4) as u32;
                 for (sum, word) in sums.iter_mut().zip(words) {
                     let weight = (word << shift).cast_signed() >> 24;

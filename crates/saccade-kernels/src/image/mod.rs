@@ -2,6 +2,13 @@
 //!
 //! A size that is not the original's is reached in two passes, along the width and then along the height. Both run the same loop over rows:
 //! the pass along the width turns blocks of [`BLOCK`] rows on their side first. All instruction sets give the same bits.
+//!
+//! The loops are plain, over indices: a compiler makes vectors of them for every instruction set, and chains of iterators are not always inlined.
+
+#![allow(
+    clippy::needless_range_loop,
+    reason = "see above: several slices share an index"
+)]
 
 mod resize_area;
 mod resize_f32;
@@ -132,6 +139,22 @@ fn area(height: usize, width: usize) -> Result<usize, AllocError> {
     all.ok_or(AllocError { bytes: usize::MAX })
 }
 
+/// Elements of a row that are summed together: as many as fit into registers, and all of a block of the pass along the width.
+const TOGETHER: usize = CHANNELS * BLOCK;
+
+/// The elements of a row that are summed together, with zeros after the last one.
+#[inline(always)]
+fn padded(row: &[f32]) -> [f32; TOGETHER] {
+    match row.try_into() {
+        Ok(row) => row,
+        Err(_) => {
+            let mut padded = [0.0; TOGETHER];
+            padded[..row.len()].copy_from_slice(row);
+            padded
+        }
+    }
+}
+
 /// What becomes of one axis: each output is a sum over some neighbouring inputs.
 trait Sums {
     /// What is summed.
@@ -162,23 +185,36 @@ impl<S: Sums> Kernel for AlongWidth<'_, S> {
 
     #[inline(always)]
     unsafe fn run<I: Simd>(self, _: I) {
+        let Self {
+            sums,
+            image,
+            turned,
+            summed,
+            out,
+        } = self;
         let inner = CHANNELS * BLOCK;
-        let width = self.sums.num_outputs() * CHANNELS;
-        let blocks = self.out.chunks_mut(BLOCK * width).enumerate();
-        for (block, out) in blocks {
-            let rows = out.len() / width;
-            for row in 0..rows {
-                let from = self.image.row(block * BLOCK + row);
-                for (turned, &byte) in self.turned.chunks_exact_mut(BLOCK).zip(from) {
-                    turned[row] = S::value(byte);
+        let width = sums.num_outputs() * CHANNELS;
+        for block in (0..image.height).step_by(BLOCK) {
+            // Rows after the last one are the last one again.
+            let rows: [&[u8]; BLOCK] =
+                std::array::from_fn(|row| image.row((block + row).min(image.height - 1)));
+            for index in 0..image.width * CHANNELS {
+                for (row, from) in rows.iter().enumerate() {
+                    turned[index * BLOCK + row] = S::value(from[index]);
                 }
             }
-            for (index, summed) in self.summed.chunks_exact_mut(inner).enumerate() {
-                self.sums.sum(index, self.turned, inner, summed);
+            for index in 0..sums.num_outputs() {
+                sums.sum(
+                    index,
+                    turned,
+                    inner,
+                    &mut summed[index * inner..(index + 1) * inner],
+                );
             }
-            for (row, out) in out.chunks_exact_mut(width).enumerate() {
-                for (out, summed) in out.iter_mut().zip(self.summed.chunks_exact(BLOCK)) {
-                    *out = summed[row];
+            for row in 0..BLOCK.min(image.height - block) {
+                let out = &mut out[(block + row) * width..(block + row + 1) * width];
+                for index in 0..width {
+                    out[index] = summed[index * BLOCK + row];
                 }
             }
         }
@@ -213,8 +249,14 @@ impl<S: Sums> Kernel for AlongHeight<'_, S> {
 
     #[inline(always)]
     unsafe fn run<I: Simd>(self, _: I) {
-        for (index, out) in self.out.chunks_exact_mut(self.inner).enumerate() {
-            self.sums.sum(index, self.inputs, self.inner, out);
+        let (sums, inner) = (self.sums, self.inner);
+        for index in 0..sums.num_outputs() {
+            sums.sum(
+                index,
+                self.inputs,
+                inner,
+                &mut self.out[index * inner..(index + 1) * inner],
+            );
         }
     }
 }

@@ -1,7 +1,7 @@
 //! OpenCV's INTER_AREA of bytes.
 
 use super::taps::Taps;
-use super::{CHANNELS, Image, Sums, along_height, along_width, area, reserved};
+use super::{CHANNELS, Image, Sums, TOGETHER, along_height, along_width, area, blank, padded, reserved};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -34,9 +34,18 @@ pub fn resize_area(isa: Isa, image: Image<'_>, height: usize, width: usize) -> R
     }
     let narrow = along_width(isa, &Area::new(image.width, width)?, image)?;
     let sums = along_height(isa, &Area::new(image.height, height)?, &narrow, width)?;
-    let mut pixels = reserved(sums.len())?;
-    pixels.extend(sums.iter().map(|sum| sum.round_ties_even() as u8));
+    let mut pixels = blank(sums.len())?;
+    for index in 0..sums.len() {
+        pixels[index] = rounded(sums[index]);
+    }
     Ok(pixels)
+}
+
+/// To the nearest byte, ties to even. The sum has no bits for a fraction, so that it is rounded; that needs no call where an instruction set
+/// has no rounding of its own.
+fn rounded(value: f32) -> u8 {
+    const NO_FRACTION: f32 = 12_582_912.0;
+    (value + NO_FRACTION - NO_FRACTION) as u8
 }
 
 /// The mean of cells of whole pixels.
@@ -44,24 +53,22 @@ fn cells(image: Image<'_>, height: usize, width: usize) -> Result<Vec<u8>, Alloc
     let (down, across) = (image.height / height, image.width / width);
     let one = 1.0 / (down * across) as f32;
     let is_quad = (down, across) == (2, 2);
-    let mut pixels = reserved(area(height, width)?)?;
-    for y in 0..height {
-        for x in 0..width {
-            for channel in 0..CHANNELS {
-                let mut sum = 0_u64;
-                for row in y * down..(y + 1) * down {
-                    let cell = &image.row(row)[x * across * CHANNELS..(x + 1) * across * CHANNELS];
-                    sum += cell[channel..]
-                        .iter()
-                        .step_by(CHANNELS)
-                        .map(|&byte| u64::from(byte))
-                        .sum::<u64>();
-                }
-                pixels.push(match is_quad {
-                    true => ((sum + 2) >> 2) as u8,
-                    false => (sum as f32 * one).round_ties_even() as u8,
-                });
+    let mut pixels = blank(area(height, width)?)?;
+    let mut sums = blank::<u64>(area(1, width)?)?;
+    for (y, pixels) in pixels.chunks_exact_mut(sums.len()).enumerate() {
+        sums.fill(0);
+        for row in y * down..(y + 1) * down {
+            let row = image.row(row);
+            for index in 0..row.len() {
+                let (pixel, channel) = (index / CHANNELS, index % CHANNELS);
+                sums[pixel / across * CHANNELS + channel] += u64::from(row[index]);
             }
+        }
+        for index in 0..sums.len() {
+            pixels[index] = match is_quad {
+                true => ((sums[index] + 2) >> 2) as u8,
+                false => rounded(sums[index] as f32 * one),
+            };
         }
     }
     Ok(pixels)
@@ -100,9 +107,6 @@ impl Area {
     }
 }
 
-/// Elements of a row that are summed together.
-const TOGETHER: usize = 16;
-
 impl Sums for Area {
     type Value = f32;
 
@@ -119,16 +123,17 @@ impl Sums for Area {
     fn sum(&self, index: usize, inputs: &[f32], inner: usize, out: &mut [f32]) {
         let (first, weights) = self.0.of(index);
         let inputs = &inputs[first * inner..(first + weights.len()) * inner];
-        for (start, out) in (0..inner).step_by(TOGETHER).zip(out.chunks_mut(TOGETHER)) {
+        for start in (0..inner).step_by(TOGETHER) {
+            let len = TOGETHER.min(inner - start);
             let mut sums = [0.0; TOGETHER];
-            let mut values = [0.0; TOGETHER];
-            for (&weight, row) in weights.iter().zip(inputs.chunks_exact(inner)) {
-                values[..out.len()].copy_from_slice(&row[start..start + out.len()]);
-                for (sum, value) in sums.iter_mut().zip(values) {
-                    *sum += value * weight;
+            for tap in 0..weights.len() {
+                let weight = weights[tap];
+                let row = padded(&inputs[tap * inner + start..][..len]);
+                for index in 0..TOGETHER {
+                    sums[index] += row[index] * weight;
                 }
             }
-            out.copy_from_slice(&sums[..out.len()]);
+            out[start..start + len].copy_from_slice(&sums[..len]);
         }
     }
 }
@@ -138,16 +143,16 @@ fn grown(isa: Isa, image: Image<'_>, height: usize, width: usize) -> Result<Vec<
     let wide = along_width(isa, &Neighbours::new(image.width, width)?, image)?;
     let rows = Neighbours::new(image.height, height)?.0;
     let row_len = width * CHANNELS;
-    let mut pixels = reserved(area(height, width)?)?;
-    for output in 0..height {
+    let mut pixels = blank(area(height, width)?)?;
+    for (output, pixels) in pixels.chunks_exact_mut(row_len).enumerate() {
         let (first, weights) = rows.of(output);
         let row = |index: usize| &wide[index * row_len..][..row_len];
         let (upper, lower) = (row(first), row((first + 1).min(image.height - 1)));
         let part = |sum: i32, weight: i32| (weight * (sum >> 4)) >> 16;
-        pixels.extend(upper.iter().zip(lower).map(|(&upper, &lower)| {
-            let sum = (part(upper, weights[0]) + part(lower, weights[1]) + 2) >> 2;
-            sum.clamp(0, 255) as u8
-        }));
+        for index in 0..row_len {
+            let sum = (part(upper[index], weights[0]) + part(lower[index], weights[1]) + 2) >> 2;
+            pixels[index] = sum.clamp(0, 255) as u8;
+        }
     }
     Ok(pixels)
 }
@@ -194,8 +199,8 @@ impl Sums for Neighbours {
         let right = inputs
             .get((first + 1) * inner..(first + 2) * inner)
             .unwrap_or(left);
-        for (out, (left, right)) in out.iter_mut().zip(left.iter().zip(right)) {
-            *out = left * weights[0] + right * weights[1];
+        for index in 0..inner {
+            out[index] = left[index] * weights[0] + right[index] * weights[1];
         }
     }
 }

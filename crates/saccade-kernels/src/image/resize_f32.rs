@@ -1,7 +1,7 @@
 //! Linear, antialiased resizing in float32, as torch 2.9 for x86-64 does it.
 
 use super::taps::Taps;
-use super::{Image, Sums, along_height, along_width, reserved};
+use super::{Image, Sums, TOGETHER, along_height, along_width, blank, padded, reserved};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -22,8 +22,10 @@ impl FloatImage {
     /// # Errors
     /// If the system refuses the memory.
     pub fn truncated(&self) -> Result<Vec<u8>, AllocError> {
-        let mut bytes = reserved(self.pixels.len())?;
-        bytes.extend(self.pixels.iter().map(|value| (value * 255.0) as u8));
+        let mut bytes = blank(self.pixels.len())?;
+        for index in 0..bytes.len() {
+            bytes[index] = (self.pixels[index] * 255.0) as u8;
+        }
         Ok(bytes)
     }
 }
@@ -99,9 +101,6 @@ impl Linear {
     }
 }
 
-/// Elements of a row that are summed together.
-const TOGETHER: usize = 16;
-
 impl Sums for Linear {
     type Value = f32;
 
@@ -120,19 +119,24 @@ impl Sums for Linear {
         let inputs = &inputs[first * inner..(first + weights.len()) * inner];
         // The first tap, and as many fours of the others as there are.
         let rounded = 1 + (weights.len() - 1) / 4 * 4;
-        for (start, out) in (0..inner).step_by(TOGETHER).zip(out.chunks_mut(TOGETHER)) {
+        for start in (0..inner).step_by(TOGETHER) {
+            let len = TOGETHER.min(inner - start);
             let mut sums = [0.0; TOGETHER];
-            let mut values = [0.0; TOGETHER];
-            for (tap, (&weight, row)) in weights.iter().zip(inputs.chunks_exact(inner)).enumerate() {
-                values[..out.len()].copy_from_slice(&row[start..start + out.len()]);
-                let sums = sums.iter_mut().zip(values);
-                // Zero plus the first product is that product.
-                match tap < rounded {
-                    true => sums.for_each(|(sum, value)| *sum += value * weight),
-                    false => sums.for_each(|(sum, value)| *sum = f32::mul_add(value, weight, *sum)),
+            for tap in 0..weights.len() {
+                let weight = weights[tap];
+                let row = padded(&inputs[tap * inner + start..][..len]);
+                if tap < rounded {
+                    // Zero plus the first product is that product.
+                    for index in 0..TOGETHER {
+                        sums[index] += row[index] * weight;
+                    }
+                } else {
+                    for index in 0..TOGETHER {
+                        sums[index] = f32::mul_add(row[index], weight, sums[index]);
+                    }
                 }
             }
-            out.copy_from_slice(&sums[..out.len()]);
+            out[start..start + len].copy_from_slice(&sums[..len]);
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Cubic, antialiased resizing in whole numbers: torch's and Pillow's.
 
 use super::taps::Taps;
-use super::{Image, Sums, along_height, along_width};
+use super::{Image, Sums, TOGETHER, along_height, along_width};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -113,9 +113,6 @@ fn cubic(x: f64) -> f64 {
     }
 }
 
-/// Elements of a row that are summed together.
-const TOGETHER: usize = 48;
-
 impl Sums for Cubic {
     type Value = u8;
 
@@ -133,29 +130,26 @@ impl Sums for Cubic {
         let (first, weights) = self.taps.of(index);
         let half = (1 << self.bits) >> 1;
         let inputs = &inputs[first * inner..(first + weights.len()) * inner];
-        for (start, out) in (0..inner).step_by(TOGETHER).zip(out.chunks_mut(TOGETHER)) {
+        for start in (0..inner).step_by(TOGETHER) {
+            let len = TOGETHER.min(inner - start);
             let mut sums = [half; TOGETHER];
-            for (&weight, row) in weights.iter().zip(inputs.chunks_exact(inner)) {
-                let row = &row[start..start + out.len()];
-                match <&[u8; TOGETHER]>::try_from(row) {
-                    Ok(row) => add(&mut sums, weight, row),
-                    Err(_) => sums
-                        .iter_mut()
-                        .zip(row)
-                        .for_each(|(sum, &byte)| *sum += weight * i32::from(byte)),
+            for tap in 0..weights.len() {
+                let weight = weights[tap];
+                let row = &inputs[tap * inner + start..][..len];
+                if let Ok(row) = <&[u8; TOGETHER]>::try_from(row) {
+                    for index in 0..TOGETHER {
+                        sums[index] += weight * i32::from(row[index]);
+                    }
+                } else {
+                    for index in 0..len {
+                        sums[index] += weight * i32::from(row[index]);
+                    }
                 }
             }
-            for (out, sum) in out.iter_mut().zip(sums) {
-                *out = (sum >> self.bits).clamp(0, 255) as u8;
+            let out = &mut out[start..start + len];
+            for index in 0..len {
+                out[index] = (sums[index] >> self.bits).clamp(0, 255) as u8;
             }
         }
-    }
-}
-
-/// Adds a row times its weight.
-#[inline(always)]
-fn add(sums: &mut [i32; TOGETHER], weight: i32, row: &[u8; TOGETHER]) {
-    for (sum, &byte) in sums.iter_mut().zip(row) {
-        *sum += weight * i32::from(byte);
     }
 }

@@ -6,6 +6,7 @@
 
 mod epilogue;
 mod error;
+mod order;
 mod pack;
 mod rows;
 
@@ -13,8 +14,9 @@ use std::mem::MaybeUninit;
 use std::ops::Range;
 
 use crate::aligned::{AlignedBuffer, AllocError};
+use crate::cpu::Cpu;
 use crate::gemm::outliers::{MultiplyOutliers, Outliers};
-use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, ROW_BLOCK, Tiles};
+use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, Tiles};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
@@ -23,6 +25,7 @@ pub use epilogue::Epilogue;
 use epilogue::{Finish, Int8};
 pub use error::KernelError;
 use error::MAX_INT8_INPUTS;
+use order::Order;
 use pack::{Panels, pack_panels};
 use rows::Conversion;
 pub use rows::LinearScratch;
@@ -52,12 +55,18 @@ pub struct PackedLinear {
     panels: Panels,
     /// One for each column of the panels, zero in the padding.
     bias: AlignedBuffer<f32>,
+    /// Whether memory is asked for them as many streams.
+    streams: bool,
+    /// Whether the largest elements of a row are kept out of its quantisation.
     keeps_outliers: bool,
 }
 
 /// Below this many multiply-accumulates a second thread costs more than it saves: waking one takes about 5 us, in which a core does
 /// about 250 k of them.
 const MACS_FOR_THREADS: usize = 1 << 19;
+
+/// As many multiply-accumulates should each thread have, for the same reason.
+const MACS_OF_THREAD: usize = MACS_FOR_THREADS / 2;
 
 /// Tasks that each thread should have, if they are not smaller than that: one that begins its last task late keeps the others waiting for a
 /// quarter of the work at most.
@@ -136,8 +145,16 @@ impl PackedLinear {
             out_features,
             panels,
             bias,
+            streams: Cpu::current().wants_streams(),
             keeps_outliers: false,
         })
+    }
+
+    /// Asks memory for the weights as many streams, or in their order, instead of as was measured to be faster on this family of CPUs. For
+    /// programs that measure it: results have the same bits.
+    #[must_use]
+    pub fn with_streams(self, streams: bool) -> Self {
+        Self { streams, ..self }
     }
 
     /// The layer, keeping up to 8 elements of a row out of its quantisation if they are far larger than the others: they are multiplied in
@@ -250,7 +267,11 @@ impl PackedLinear {
         let macs = rows
             .saturating_mul(self.in_features)
             .saturating_mul(self.out_features);
-        let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
+        let threads = if macs < MACS_FOR_THREADS {
+            1
+        } else {
+            threads.min(macs / MACS_OF_THREAD)
+        };
         let shape = self.gemm.shape();
         let columns = shape.columns;
         let num_panels = self.out_features.div_ceil(columns);
@@ -260,7 +281,7 @@ impl PackedLinear {
             .div_ceil(num_panels)
             .min(macs / (num_panels * MACS_FOR_THREADS));
         let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
-        let blocks = rows.div_ceil(ROW_BLOCK).max(most);
+        let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
         let mut call = Call {
             x: x.as_ptr().cast(),
             x_stride: x.row_stride() as isize,
@@ -281,11 +302,12 @@ impl PackedLinear {
             (call.x, call.x_stride) = (converted.words, stride as isize);
             (call.quantized, call.outliers) = (converted.quantized, converted.outliers);
         }
-        // Row blocks outside, panels inside: threads then share a block of activations and walk the weights next to each other.
-        parallel_for(threads, blocks * num_panels, &|task| {
-            let (block, panel) = (task / num_panels, task % num_panels);
+        let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
+        let order = Order::new(blocks, num_panels, panel_bytes, TASKS_PER_THREAD * threads);
+        parallel_for(threads, order.tasks(), &|task| {
+            let (block, panel) = order.at(task);
             let range = tiles.count * block / blocks..tiles.count * (block + 1) / blocks;
-            self.run_panel(&call, range, columns, panel, threads);
+            self.run_panel(&call, range, columns, panel, order.ahead(task, threads));
         });
         Ok(())
     }
@@ -314,6 +336,7 @@ impl PackedLinear {
             range,
             weights: &self.panels.words[panel * size..][..size],
             ahead,
+            streams: self.streams,
             sums,
             out,
             out_stride: call.out_stride,
@@ -328,6 +351,7 @@ impl PackedLinear {
                 outliers,
                 panel: block.weights,
                 columns,
+                run: 1,
                 sums: &mut apart[..rows.len() * columns],
             });
         }

@@ -1,7 +1,8 @@
 //! The private thread pool: one loop over tasks, shared by the caller and by workers that live as long as the process.
 //!
 //! No thread is started until a call wants more than one. A call puts a [`Job`] on its own stack, offers it in one of a few slots, wakes
-//! workers, and takes tasks itself. Tasks are dealt from one counter: whichever thread is free takes the next. The caller never waits for a
+//! workers, and takes tasks itself. Tasks are dealt from one counter: whichever thread is free takes the next, so a slow core gets fewer of
+//! them. Near the end a worker that is so slow that the others are done without it takes no more. The caller never waits for a
 //! worker that has not begun. When no task is left it closes the slot, and waits only for the workers that are still inside.
 //!
 //! On a machine with more runnable threads than cores, a worker can lose its core within a task; the caller then waits for a tick of the
@@ -180,7 +181,8 @@ impl Pool {
         // Panics of tasks are kept in the job, so that this thread always comes to the end of this function.
         INSIDE.set(true);
         let since = Instant::now();
-        let taken = job.run(|| scope.is_some_and(Scope::asks_to_stop));
+        // The caller has no pace: it takes tasks to the end, whoever leaves.
+        let taken = job.run(None, || scope.is_some_and(Scope::asks_to_stop));
         INSIDE.set(false);
         if let Some(slot) = slot {
             // No worker can come to the job from here on, and those inside are waited for: after that nobody knows it but this thread.

@@ -24,10 +24,13 @@ pub(super) struct Job<'a> {
     pub panic: Mutex<Option<Box<dyn Any + Send>>>,
 }
 
+/// The last tasks of a job, for each of its threads: among them a worker asks whether it is worth taking another.
+const LAST_TASKS: usize = 16;
+
 impl Job<'_> {
     /// Takes tasks until none is left or `asks_to_stop` says so, and counts them. A task that panics counts as done; a question that
-    /// panics, as the answer to stop.
-    pub(super) fn run(&self, asks_to_stop: impl Fn() -> bool) -> u32 {
+    /// panics, as the answer to stop. With a `pace` until [`Self::ends_sooner_without`] the thread, too.
+    pub(super) fn run(&self, pace: Option<Pace>, asks_to_stop: impl Fn() -> bool) -> u32 {
         let mut taken = 0_u32;
         loop {
             let stop = catch_unwind(AssertUnwindSafe(&asks_to_stop)).unwrap_or_else(|panic| {
@@ -37,15 +40,46 @@ impl Job<'_> {
             if stop {
                 return taken;
             }
-            let task = self.next.fetch_add(1, Ordering::Relaxed);
-            if task >= self.tasks {
+            let Some(task) = self.deal(pace, taken) else {
                 return taken;
-            }
+            };
             taken = taken.saturating_add(1);
             if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.f)(task))) {
                 self.keep(panic);
             }
         }
+    }
+
+    /// The next task, if there is one for a thread that has `taken` some.
+    fn deal(&self, pace: Option<Pace>, taken: u32) -> Option<usize> {
+        let is_near_end =
+            self.tasks.saturating_sub(self.next.load(Ordering::Relaxed)) < LAST_TASKS * self.threads;
+        if let Some(pace) = pace.filter(|_| is_near_end) {
+            let taken = usize::try_from(taken).unwrap_or(usize::MAX);
+            let take = |dealt| {
+                (dealt < self.tasks && !self.ends_sooner_without(pace, taken, dealt)).then_some(dealt + 1)
+            };
+            return self
+                .next
+                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
+                .ok();
+        }
+        let task = self.next.fetch_add(1, Ordering::Relaxed);
+        (task < self.tasks).then_some(task)
+    }
+
+    /// Whether the others finish what is left before this thread finishes one task more, at the pace that all have had since it joined: it is
+    /// on a slow core, or shares its core with another program.
+    ///
+    /// While this thread did `taken` tasks, each of the others did `by_others / others`. They finish what is left in the time of
+    /// `1 + left / others` of their tasks, since the last one may have to wait for a thread that is free.
+    fn ends_sooner_without(&self, pace: Pace, taken: usize, dealt: usize) -> bool {
+        // Those that have joined, with the caller in place of this thread.
+        let others = self.threads - 1 - self.seats.load(Ordering::Relaxed).min(self.threads - 1);
+        let left = self.tasks - dealt;
+        // Tasks that they have begun but may not have done count for nothing.
+        let by_others = dealt.saturating_sub(pace.joined_at + taken + others);
+        taken > 0 && by_others > taken.saturating_mul(others + left)
     }
 
     /// Keeps the first panic for the caller.
@@ -62,6 +96,13 @@ impl Job<'_> {
     fn is_exhausted(&self) -> bool {
         self.next.load(Ordering::Relaxed) >= self.tasks
     }
+}
+
+/// What a worker compares its pace with.
+#[derive(Clone, Copy)]
+pub(super) struct Pace {
+    /// Tasks that were dealt before it joined.
+    pub joined_at: usize,
 }
 
 /// A place where a call offers its job.
@@ -110,7 +151,14 @@ impl Slot {
                     .is_ok()
             {
                 place.apart_from(job.processor, job.threads);
-                job.run(|| job.stop.is_some_and(|stop| stop.load(Ordering::Relaxed)));
+                let pace = Pace {
+                    joined_at: job.next.load(Ordering::Relaxed),
+                };
+                job.run(Some(pace), || {
+                    job.stop.is_some_and(|stop| stop.load(Ordering::Relaxed))
+                });
+                // A worker that has left does not come back to a job that is nearly done, nor does another one.
+                job.seats.store(0, Ordering::Relaxed);
                 helped = true;
             }
         }

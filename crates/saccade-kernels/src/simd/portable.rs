@@ -1,20 +1,23 @@
-//! Plain loops over eight lanes, which any compiler vectorises for its baseline.
+//! Plain loops over a few lanes, which any compiler vectorises for its baseline.
 
 use half::bf16;
 
 use super::{Kernel, NoDots, Simd, Vector};
 
-/// Eight lanes that the compiler spreads over whatever vectors the target has.
+/// `N` lanes that the compiler spreads over whatever vectors the target has.
 #[derive(Clone, Copy)]
-pub(crate) struct Lanes([f32; 8]);
+pub(crate) struct Lanes<const N: usize>([f32; N]);
 
 /// Plain loops; every CPU runs them.
+pub(crate) type Portable = Loops<8>;
+
+/// Plain loops over `N` lanes, a power of two.
 #[derive(Clone, Copy)]
-pub(crate) struct Portable;
+pub(crate) struct Loops<const N: usize>;
 
 // SAFETY: nothing is needed.
-unsafe impl Simd for Portable {
-    type Vector = Lanes;
+unsafe impl<const N: usize> Simd for Loops<N> {
+    type Vector = Lanes<N>;
     type Dots = NoDots;
 
     fn new() -> Option<Self> {
@@ -32,7 +35,7 @@ unsafe impl Simd for Portable {
 const ROUND: f32 = 12_582_912.0;
 
 #[inline(always)]
-fn zip(a: Lanes, b: Lanes, f: impl Fn(f32, f32) -> f32) -> Lanes {
+fn zip<const N: usize>(a: Lanes<N>, b: Lanes<N>, f: impl Fn(f32, f32) -> f32) -> Lanes<N> {
     // Loops, not `array::map`: these are spread over vectors more reliably.
     let mut out = a.0;
     for (out, &b) in out.iter_mut().zip(&b.0) {
@@ -42,7 +45,7 @@ fn zip(a: Lanes, b: Lanes, f: impl Fn(f32, f32) -> f32) -> Lanes {
 }
 
 #[inline(always)]
-fn zip_ints(a: [i32; 8], b: [i32; 8], f: impl Fn(i32, i32) -> i32) -> [i32; 8] {
+fn zip_ints<const N: usize>(a: [i32; N], b: [i32; N], f: impl Fn(i32, i32) -> i32) -> [i32; N] {
     let mut out = a;
     for (out, &b) in out.iter_mut().zip(&b) {
         *out = f(*out, b);
@@ -61,33 +64,34 @@ fn power_of_two(exponent: f32) -> f32 {
 }
 
 // SAFETY: plain arithmetic; pointers are read and written for the lanes named only.
-unsafe impl Vector for Lanes {
-    const LANES: usize = 8;
+unsafe impl<const N: usize> Vector for Lanes<N> {
+    const LANES: usize = N;
     const TILE_ROWS: usize = 4;
-    const TILE_VECTORS: usize = 1;
-    type Ints = [i32; 8];
+    // Sixteen lanes are laid out as those of AVX-512 are.
+    const TILE_VECTORS: usize = if N < 16 { 1 } else { 3 };
+    type Ints = [i32; N];
     const MAX_BYTE: u8 = 255;
 
     #[inline(always)]
     unsafe fn splat(x: f32) -> Self {
-        Self([x; 8])
+        Self([x; N])
     }
 
     #[inline(always)]
     unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the caller gives eight elements.
-        Self(unsafe { from.cast::<[f32; 8]>().read_unaligned() })
+        // SAFETY: the caller gives `N` elements.
+        Self(unsafe { from.cast::<[f32; N]>().read_unaligned() })
     }
 
     #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the caller gives eight elements.
-        unsafe { to.cast::<[f32; 8]>().write_unaligned(self.0) }
+        // SAFETY: the caller gives `N` elements.
+        unsafe { to.cast::<[f32; N]>().write_unaligned(self.0) }
     }
 
     #[inline(always)]
     unsafe fn load_partial(from: *const f32, n: usize) -> Self {
-        let mut out = [0.0; 8];
+        let mut out = [0.0; N];
         for (lane, element) in out.iter_mut().enumerate().take(n) {
             // SAFETY: the caller gives n elements.
             *element = unsafe { *from.add(lane) };
@@ -163,8 +167,15 @@ unsafe impl Vector for Lanes {
 
     #[inline(always)]
     unsafe fn reduce_add(self) -> f32 {
-        let [a, b, c, d, e, f, g, h] = self.0;
-        ((a + e) + (c + g)) + ((b + f) + (d + h))
+        let mut sums = self.0;
+        let mut half = N / 2;
+        while half > 0 {
+            for lane in 0..half {
+                sums[lane] += sums[lane + half];
+            }
+            half /= 2;
+        }
+        sums[0]
     }
 
     #[inline(always)]
@@ -175,12 +186,12 @@ unsafe impl Vector for Lanes {
     }
 
     #[inline(always)]
-    unsafe fn low_halves(pairs: [i32; 8]) -> Self {
+    unsafe fn low_halves(pairs: [i32; N]) -> Self {
         Self(pairs.map(|pair| f32::from_bits((pair as u32) << 16)))
     }
 
     #[inline(always)]
-    unsafe fn high_halves(pairs: [i32; 8]) -> Self {
+    unsafe fn high_halves(pairs: [i32; N]) -> Self {
         Self(pairs.map(|pair| f32::from_bits(pair as u32 & 0xffff_0000)))
     }
 
@@ -191,60 +202,60 @@ unsafe impl Vector for Lanes {
 
     #[inline(always)]
     unsafe fn store_bf16(self, to: *mut u16) {
-        // SAFETY: the caller gives room for eight elements.
+        // SAFETY: the caller gives room for `N` elements.
         unsafe {
-            to.cast::<[u16; 8]>()
+            to.cast::<[u16; N]>()
                 .write_unaligned(self.0.map(|x| bf16::from_f32(x).to_bits()))
         }
     }
 
     #[inline(always)]
-    unsafe fn store_bytes(self, zero: [i32; 8], most: [i32; 8], to: *mut u8) {
+    unsafe fn store_bytes(self, zero: [i32; N], most: [i32; N], to: *mut u8) {
         let whole = self.0.map(|x| ((x + ROUND) - ROUND) as i32);
         let bytes = zip_ints(zip_ints(whole, zero, i32::wrapping_add), most, i32::min);
-        // SAFETY: the caller gives room for eight elements.
-        unsafe { to.cast::<[u8; 8]>().write_unaligned(bytes.map(|byte| byte as u8)) }
+        // SAFETY: the caller gives room for `N` elements.
+        unsafe { to.cast::<[u8; N]>().write_unaligned(bytes.map(|byte| byte as u8)) }
     }
 
     #[inline(always)]
-    unsafe fn splat_int(x: i32) -> [i32; 8] {
-        [x; 8]
+    unsafe fn splat_int(x: i32) -> [i32; N] {
+        [x; N]
     }
 
     #[inline(always)]
-    unsafe fn load_ints(from: *const i32) -> [i32; 8] {
-        // SAFETY: the caller gives eight elements.
-        unsafe { from.cast::<[i32; 8]>().read_unaligned() }
+    unsafe fn load_ints(from: *const i32) -> [i32; N] {
+        // SAFETY: the caller gives `N` elements.
+        unsafe { from.cast::<[i32; N]>().read_unaligned() }
     }
 
     #[inline(always)]
-    unsafe fn store_ints(integers: [i32; 8], to: *mut i32) {
-        // SAFETY: the caller gives eight elements.
-        unsafe { to.cast::<[i32; 8]>().write_unaligned(integers) }
+    unsafe fn store_ints(integers: [i32; N], to: *mut i32) {
+        // SAFETY: the caller gives `N` elements.
+        unsafe { to.cast::<[i32; N]>().write_unaligned(integers) }
     }
 
     #[inline(always)]
-    unsafe fn add_ints(a: [i32; 8], b: [i32; 8]) -> [i32; 8] {
+    unsafe fn add_ints(a: [i32; N], b: [i32; N]) -> [i32; N] {
         zip_ints(a, b, i32::wrapping_add)
     }
 
     #[inline(always)]
-    unsafe fn sub_ints(a: [i32; 8], b: [i32; 8]) -> [i32; 8] {
+    unsafe fn sub_ints(a: [i32; N], b: [i32; N]) -> [i32; N] {
         zip_ints(a, b, i32::wrapping_sub)
     }
 
     #[inline(always)]
-    unsafe fn mul_ints(a: [i32; 8], b: [i32; 8]) -> [i32; 8] {
+    unsafe fn mul_ints(a: [i32; N], b: [i32; N]) -> [i32; N] {
         zip_ints(a, b, i32::wrapping_mul)
     }
 
     #[inline(always)]
-    unsafe fn from_ints(integers: [i32; 8]) -> Self {
+    unsafe fn from_ints(integers: [i32; N]) -> Self {
         Self(integers.map(|integer| integer as f32))
     }
 
     #[inline(always)]
-    unsafe fn dot_bytes(sum: [i32; 8], x: [i32; 8], w: [i32; 8]) -> [i32; 8] {
+    unsafe fn dot_bytes(sum: [i32; N], x: [i32; N], w: [i32; N]) -> [i32; N] {
         let mut sum = sum;
         for byte in [0, 8, 16, 24] {
             let products = zip_ints(x, w, |x, w| ((x >> byte) & 255) * ((w << (24 - byte)) >> 24));

@@ -4,7 +4,7 @@ use std::fmt;
 
 use saccade_kernels::{Element, Isa, Mask, PackedKeyValues, attention};
 
-use super::{ROUNDING, Strided, numbers};
+use super::{ROUNDING, Strided, isas, numbers};
 
 /// The bias that removes a key.
 pub const REMOVED: f32 = f32::NEG_INFINITY;
@@ -28,7 +28,7 @@ impl fmt::Display for Kind {
 /// All that this CPU has.
 pub fn kinds() -> impl Iterator<Item = Kind> {
     let of = |isa| [Element::F32, Element::Bf16].map(|element| Kind { isa, element });
-    Isa::available().into_iter().flat_map(of)
+    isas().into_iter().flat_map(of)
 }
 
 pub fn best() -> Kind {

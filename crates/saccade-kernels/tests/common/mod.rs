@@ -4,7 +4,14 @@
 
 pub mod attention;
 
-use saccade_kernels::{Rows, RowsMut};
+use saccade_kernels::{Isa, Rows, RowsMut};
+
+/// The instruction sets that this CPU has, and tiles in software: so what drives tiles is tested on every machine.
+pub fn isas() -> Vec<Isa> {
+    let mut isas = Isa::available();
+    isas.push(Isa::SoftwareTiles);
+    isas
+}
 
 /// Half a unit in the last place of 1.
 pub const ROUNDING: f64 = 1.0 / (1u64 << 24) as f64;

@@ -2,13 +2,14 @@
 
 use std::path::Path;
 
+use saccade_checkpoint::granted;
 use saccade_checkpoint::spec::Problem;
-use saccade_checkpoint::{Checkpoint, granted, read_text};
 
 use super::json::GivenConfig;
 use super::layers::BackboneLayers;
 use super::model::Backbone;
-use super::plan::{nbytes, plan};
+use super::plan::plan;
+use super::published::PublishedBackbone;
 use super::recognise::Found;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
@@ -71,21 +72,13 @@ impl Backbone {
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
-        let checkpoint = Checkpoint::open(source)?;
-        let given = match &options.config {
-            Some(text) => GivenConfig::parse(text)?,
-            None => GivenConfig::parse(&config_of(source)?)?,
-        };
-        let names: Vec<&str> = checkpoint.names().collect();
-        let found = Found::new(names.iter().copied(), &given)?;
-        let plan = plan(&found)?;
-        let is_unused = |name: &str, _: &[usize]| found.is_unused(name);
-        let problems = checkpoint.problems(found.prefix, &plan.specs, is_unused);
-        if !problems.is_empty() {
-            return Err(Error::Checkpoint(format!("source: {}", found.list(&problems))));
-        }
-        let dtype = |name: &str| Ok(checkpoint.dtype(&format!("{}{name}", found.prefix))?);
-        granted("source", nbytes(&found, engine, dtype)?)?;
+        let published = PublishedBackbone::open(source, options.config.as_deref())?;
+        granted("source", published.nbytes_in(engine)?)?;
+        let PublishedBackbone {
+            checkpoint,
+            found,
+            plan,
+        } = published;
         FileSource::read_ahead(&checkpoint, found.prefix, plan.wanted, |tensors| {
             Self::build(tensors, engine, &found)
         })
@@ -125,18 +118,5 @@ impl Backbone {
         let builder = Builder::new(source, engine);
         let layers = BackboneLayers::new(&builder.weights(), &found.names, &found.config)?;
         Ok(Self::new(found.config.clone(), engine, layers, builder.nbytes()))
-    }
-}
-
-/// The text of the config next to the weights; that of an empty one if there is none.
-fn config_of(source: &Path) -> Result<String> {
-    let directory = match source.is_dir() {
-        true => source,
-        false => source.parent().unwrap_or(Path::new("")),
-    };
-    let path = directory.join("config.json");
-    match path.exists() {
-        true => Ok(read_text("config", &path)?),
-        false => Ok("{}".to_owned()),
     }
 }

@@ -1,9 +1,11 @@
 //! Frames to `pixel_values`: crops, sizes and order of each version's processor.
 
+use std::borrow::Cow;
+
 use saccade_kernels::{CubicRule, Image, Isa, resize_area, resize_cubic_u8, resize_linear_f32};
 
 use super::settings::{Flexible, Preprocessing, Settings, Sizes};
-use crate::alloc::{collected, filled, product, reserve};
+use crate::alloc::{collected, filled, product};
 use crate::array::{Array, OwnedArray, first_not_finite};
 use crate::config::Version;
 use crate::error::{Error, Result, show_shape};
@@ -47,14 +49,22 @@ const N17_PATCH: usize = 16;
 const N17_MERGE: usize = 2;
 const N17_TIME: usize = 2;
 
-/// Bytes with their size.
-struct Bytes {
-    pixels: Vec<u8>,
+/// Bytes with their size: the caller's, or new ones.
+struct Bytes<'a> {
+    pixels: Cow<'a, [u8]>,
     height: usize,
     width: usize,
 }
 
-impl Bytes {
+impl Bytes<'_> {
+    fn new(pixels: Vec<u8>, height: usize, width: usize) -> Self {
+        Self {
+            pixels: pixels.into(),
+            height,
+            width,
+        }
+    }
+
     fn image(&self) -> Image<'_> {
         Image::new(&self.pixels, self.height, self.width)
     }
@@ -101,7 +111,7 @@ fn kernel<T>(result: std::result::Result<T, saccade_kernels::AllocError>) -> Res
 }
 
 /// The bytes of a frame.
-fn read(settings: &Settings, name: &str, frame: Frame<'_>) -> Result<Bytes> {
+fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Result<Bytes<'a>> {
     let takes_lerobot = settings.preprocessing == Preprocessing::Lerobot;
     let shape = match frame {
         Frame::U8(array) => array.shape(),
@@ -131,22 +141,22 @@ fn read(settings: &Settings, name: &str, frame: Frame<'_>) -> Result<Bytes> {
     if height == 0 || width == 0 {
         return wrong();
     }
-    let bytes = match frame {
-        Frame::U8(array) => collected(PIXELS, array.data().len(), array.data().iter().copied())?,
+    let pixels: Cow<'_, [u8]> = match frame {
+        Frame::U8(array) => array.data().into(),
         Frame::F32(array) => {
             check_finite(name, first_not_finite(array.data()))?;
             let byte = |value: &f32| (value.clamp(0.0, 1.0) * 255.0) as u8;
-            collected(PIXELS, array.data().len(), array.data().iter().map(byte))?
+            collected(PIXELS, array.data().len(), array.data().iter().map(byte))?.into()
         }
         Frame::F64(array) => {
             check_finite(name, array.data().iter().position(|value| !value.is_finite()))?;
             let byte = |value: &f64| (value.clamp(0.0, 1.0) * 255.0) as u8;
-            collected(PIXELS, array.data().len(), array.data().iter().map(byte))?
+            collected(PIXELS, array.data().len(), array.data().iter().map(byte))?.into()
         }
     };
     let pixels = match is_planar {
-        false => bytes,
-        true => interleaved(&bytes, height * width)?,
+        false => pixels,
+        true => interleaved(&pixels, height * width)?.into(),
     };
     Ok(Bytes {
         pixels,
@@ -166,8 +176,13 @@ fn check_finite(name: &str, bad: Option<usize>) -> Result<()> {
 
 /// Three planes as pixels.
 fn interleaved(planes: &[u8], len: usize) -> Result<Vec<u8>> {
-    let pixels = (0..len).flat_map(|pixel| (0..CHANNELS).map(move |channel| planes[channel * len + pixel]));
-    collected(PIXELS, planes.len(), pixels)
+    let mut pixels = filled(PIXELS, planes.len(), 0)?;
+    for channel in 0..CHANNELS {
+        for index in 0..len {
+            pixels[index * CHANNELS + channel] = planes[channel * len + index];
+        }
+    }
+    Ok(pixels)
 }
 
 /// `(byte - 127.5) / 127.5` for every byte.
@@ -178,11 +193,14 @@ fn normalized() -> [f32; 256] {
 /// Pixels as normalised planes of this shape.
 fn planes(pixels: &[u8], shape: &[usize]) -> Result<OwnedArray> {
     let table = normalized();
-    let values = (0..CHANNELS).flat_map(|channel| {
-        let plane = pixels[channel..].iter().step_by(CHANNELS);
-        plane.map(|&byte| table[usize::from(byte)])
-    });
-    OwnedArray::new(collected(PIXELS, pixels.len(), values)?, shape)
+    let len = pixels.len() / CHANNELS;
+    let mut values = filled(PIXELS, pixels.len(), 0.0)?;
+    for (channel, plane) in values.chunks_exact_mut(len).enumerate() {
+        for index in 0..len {
+            plane[index] = table[usize::from(pixels[index * CHANNELS + channel])];
+        }
+    }
+    OwnedArray::new(values, shape)
 }
 
 /// The centre of `fraction` of each side. Where it begins is rounded half to even.
@@ -206,13 +224,12 @@ fn crop_floor(image: Image<'_>, height: usize, width: usize) -> Image<'_> {
 
 /// N1.6 and N1.7.
 fn flexible_view(settings: &Settings, sizes: &Flexible, isa: Isa, name: &str, frame: Bytes) -> Result<View> {
-    check_ratio(name, frame.height, frame.width)?;
     let frame = match sizes.letter_box {
         true => letter_box(frame)?,
         false => frame,
     };
     let frame = match sizes.use_albumentations {
-        true => by_area(settings, sizes, isa, frame)?,
+        true => by_area(settings, sizes, isa, name, frame)?,
         false => by_cubic(settings, sizes, isa, frame)?,
     };
     check_ratio(name, frame.height, frame.width)?;
@@ -249,7 +266,7 @@ fn check_ratio(name: &str, height: usize, width: usize) -> Result<()> {
 }
 
 /// Black bars make it a square.
-fn letter_box(frame: Bytes) -> Result<Bytes> {
+fn letter_box(frame: Bytes<'_>) -> Result<Bytes<'_>> {
     let side = frame.height.max(frame.width);
     if frame.height == frame.width {
         return Ok(frame);
@@ -260,32 +277,35 @@ fn letter_box(frame: Bytes) -> Result<Bytes> {
         let start = ((top + row) * side + left) * CHANNELS;
         pixels[start..start + from.len()].copy_from_slice(from);
     }
-    Ok(Bytes {
-        pixels,
-        height: side,
-        width: side,
-    })
+    Ok(Bytes::new(pixels, side, side))
 }
 
 /// The path of checkpoints that say `use_albumentations`: OpenCV's INTER_AREA, a crop, and again.
-fn by_area(settings: &Settings, sizes: &Flexible, isa: Isa, frame: Bytes) -> Result<Bytes> {
+fn by_area<'a>(
+    settings: &Settings,
+    sizes: &Flexible,
+    isa: Isa,
+    name: &str,
+    frame: Bytes<'a>,
+) -> Result<Bytes<'a>> {
     let is_lerobot = settings.preprocessing == Preprocessing::Lerobot;
     // lerobot leaves frames alone where there is no target.
     if sizes.target_size.is_none() && (is_lerobot || sizes.shortest_edge.is_none()) {
         return Ok(frame);
     }
-    let resize = |image: Image<'_>| -> Result<Bytes> {
+    if sizes.shortest_edge.is_some() || is_lerobot {
+        // The ratio stays. Refused later, after the shorter side has grown, it could be gigabytes.
+        check_ratio(name, frame.height, frame.width)?;
+    }
+    let resize = |image: Image<'_>| -> Result<Bytes<'a>> {
         let (height, width) = match (sizes.shortest_edge, sizes.target_size) {
             (Some(edge), _) => edge_sizes(edge, image.height(), image.width()),
             (None, Some([height, _])) if is_lerobot => edge_sizes(height, image.height(), image.width()),
             (None, Some([height, width])) => (height, width),
             (None, None) => (image.height(), image.width()),
         };
-        Ok(Bytes {
-            pixels: kernel(resize_area(isa, image, height, width))?,
-            height,
-            width,
-        })
+        let pixels = kernel(resize_area(isa, image, height, width))?;
+        Ok(Bytes::new(pixels, height, width))
     };
     let frame = resize(frame.image())?;
     check_interrupted()?;
@@ -299,7 +319,7 @@ fn by_area(settings: &Settings, sizes: &Flexible, isa: Isa, frame: Bytes) -> Res
 }
 
 /// The path without albumentations: cubic to a square, a crop, and again.
-fn by_cubic(settings: &Settings, sizes: &Flexible, isa: Isa, frame: Bytes) -> Result<Bytes> {
+fn by_cubic<'a>(settings: &Settings, sizes: &Flexible, isa: Isa, frame: Bytes<'a>) -> Result<Bytes<'a>> {
     if settings.preprocessing == Preprocessing::Isaac {
         return Err(Error::Input(
             "options: use_albumentations: expected true: Isaac-GR00T's other path is not supported"
@@ -310,12 +330,9 @@ fn by_cubic(settings: &Settings, sizes: &Flexible, isa: Isa, frame: Bytes) -> Re
         return Ok(frame);
     };
     let edge = sizes.shortest_edge.unwrap_or(height);
-    let cubic = |image: Image<'_>, height: usize, width: usize| -> Result<Bytes> {
-        Ok(Bytes {
-            pixels: kernel(resize_cubic_u8(isa, image, height, width, CubicRule::Torch))?,
-            height,
-            width,
-        })
+    let cubic = |image: Image<'_>, height: usize, width: usize| -> Result<Bytes<'a>> {
+        let pixels = kernel(resize_cubic_u8(isa, image, height, width, CubicRule::Torch))?;
+        Ok(Bytes::new(pixels, height, width))
     };
     let square = cubic(frame.image(), edge, edge)?;
     let part = match crop_fraction(sizes) {
@@ -371,22 +388,23 @@ fn fitting(version: Version, sizes: &Flexible, factor: usize, height: usize, wid
 fn patches(pixels: &[u8], height: usize, width: usize) -> Result<OwnedArray> {
     let table = normalized();
     let (rows, columns) = (height / N17_PATCH, width / N17_PATCH);
-    let values = CHANNELS * N17_TIME * N17_PATCH * N17_PATCH;
-    let mut out = Vec::new();
-    reserve(PIXELS, &mut out, product(PIXELS, &[rows, columns, values])?)?;
-    for block_row in 0..rows / N17_MERGE {
-        for block_column in 0..columns / N17_MERGE {
-            for within in 0..N17_MERGE * N17_MERGE {
-                let row = (block_row * N17_MERGE + within / N17_MERGE) * N17_PATCH;
-                let column = (block_column * N17_MERGE + within % N17_MERGE) * N17_PATCH;
-                for plane in 0..CHANNELS * N17_TIME {
-                    for y in row..row + N17_PATCH {
-                        let start = (y * width + column) * CHANNELS + plane / N17_TIME;
-                        let line = pixels[start..].iter().step_by(CHANNELS).take(N17_PATCH);
-                        out.extend(line.map(|&byte| table[usize::from(byte)]));
-                    }
+    let plane = N17_PATCH * N17_PATCH;
+    let values = CHANNELS * N17_TIME * plane;
+    let mut out = filled(PIXELS, product(PIXELS, &[rows, columns, values])?, 0.0)?;
+    for (patch, out) in out.chunks_exact_mut(values).enumerate() {
+        let (block, within) = (patch / (N17_MERGE * N17_MERGE), patch % (N17_MERGE * N17_MERGE));
+        let (block_row, block_column) = (block / (columns / N17_MERGE), block % (columns / N17_MERGE));
+        let top = (block_row * N17_MERGE + within / N17_MERGE) * N17_PATCH;
+        let left = (block_column * N17_MERGE + within % N17_MERGE) * N17_PATCH;
+        for (channel, planes) in out.chunks_exact_mut(N17_TIME * plane).enumerate() {
+            let (first, second) = planes.split_at_mut(plane);
+            for (y, out) in first.chunks_exact_mut(N17_PATCH).enumerate() {
+                let line = &pixels[((top + y) * width + left) * CHANNELS..][..N17_PATCH * CHANNELS];
+                for (x, out) in out.iter_mut().enumerate() {
+                    *out = table[usize::from(line[x * CHANNELS + channel])];
                 }
             }
+            second.copy_from_slice(first);
         }
     }
     OwnedArray::new(out, &[rows * columns, values])

@@ -180,6 +180,11 @@ const WITH_EFFECT: [&str; 22] = [
     "use_tactile",
 ];
 
+/// Whether a key of a released file has an effect on a version.
+pub(super) fn is_read(version: Version, key: &str) -> bool {
+    WITH_EFFECT.contains(&key) && (version != Version::N15 || key == "formalize_language")
+}
+
 impl Settings {
     /// The settings of a version.
     ///
@@ -194,7 +199,7 @@ impl Settings {
         if version == Version::N16 && preprocessing == Preprocessing::Lerobot {
             options.problem("preprocessing: expected \"isaac\": lerobot has no N1.6".to_owned());
         }
-        let formalize_language = options.flag("formalize_language", true);
+        let formalize_language = options.flag("formalize_language", version != Version::N15);
         let sizes = match version {
             Version::N15 => square(given, &mut options),
             _ => flexible(version, given, &mut options),

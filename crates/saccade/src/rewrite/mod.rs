@@ -26,6 +26,8 @@ pub struct RewriteOptions {
     pub config: Option<String>,
     /// Whether tensors outside the head's prefix, such as a backbone's, are left out; otherwise they are copied.
     pub head_only: bool,
+    /// Whether [`quantize`](crate::quantize) copies the tensors of a backbone bit for bit, and quantises the head alone.
+    pub keep_backbone: bool,
     /// Whether to replace a checkpoint that exists.
     pub force: bool,
     /// Metadata of the files, added to the source's.

@@ -1,6 +1,6 @@
 //! Quantised checkpoints: the weights that are multiplied in int8, stored as int8.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use saccade_checkpoint::spec::SCALE_SUFFIX;
@@ -8,6 +8,7 @@ use saccade_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, Ten
 use saccade_kernels::quantize_rows;
 
 use crate::alloc::filled;
+use crate::backbone::PublishedBackbone;
 use crate::error::{Error, Result};
 use crate::head::plan::tensor_specs;
 use crate::nn::weights::weight_view;
@@ -28,11 +29,20 @@ pub struct QuantizeReport {
     pub head_bytes_before: u64,
     /// Bytes of the head's tensors after, including scales.
     pub head_bytes_after: u64,
+    /// How many of the quantised weights are those of a backbone.
+    pub num_quantized_backbone: usize,
+    /// Bytes of the backbone's tensors before; 0 without a backbone that is quantised.
+    pub backbone_bytes_before: u64,
+    /// Bytes of the backbone's tensors after, including scales.
+    pub backbone_bytes_after: u64,
+    /// Why the tensors outside the head were copied bit for bit; none if they are those of a backbone that is quantised, or if there are none.
+    pub backbone_copied: Option<String>,
 }
 
 /// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in int8, `X.weight (out, in)`
 /// and float32 `X.weight_scale (out)`, by [`quantize_rows`]: what [`Precision::Int8`](crate::Precision::Int8) computes with, so that
-/// loading the result at that precision gives the same bits as loading `source` at it. All other tensors are copied bit for bit.
+/// loading the result at that precision gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that
+/// [`Backbone`](crate::Backbone) loads. All other tensors are copied bit for bit.
 ///
 /// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is
 /// written.
@@ -48,18 +58,18 @@ pub fn quantize(
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<QuantizeReport> {
     let source = SourceCheckpoint::open(source, options.config.as_deref())?;
-    let specs = tensor_specs(&source.config)?;
-    let weights: BTreeSet<String> = specs
+    let backbone = backbone_of(&source, options)?;
+    let head_specs = tensor_specs(&source.config)?;
+    let of_backbone = backbone.as_ref().ok().and_then(Option::as_ref);
+    let backbone_prefix = of_backbone.map(PublishedBackbone::prefix);
+    let mut weights = Names::default();
+    weights.add(source.prefix, &head_specs);
+    if let Some(backbone) = of_backbone {
+        weights.add(backbone.prefix(), backbone.specs());
+    }
+    if let Some(name) = weights
+        .int8
         .iter()
-        .map(|spec| format!("{}{}", source.prefix, spec.name))
-        .collect();
-    let int8: BTreeMap<String, &TensorSpec> = specs
-        .iter()
-        .filter(|spec| spec.may_be_int8)
-        .map(|spec| (format!("{}{}", source.prefix, spec.name), spec))
-        .collect();
-    if let Some(name) = int8
-        .keys()
         .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
     {
         return Err(Error::Checkpoint(format!(
@@ -73,11 +83,17 @@ pub fn quantize(
         num_copied: 0,
         head_bytes_before: 0,
         head_bytes_after: 0,
+        num_quantized_backbone: 0,
+        backbone_bytes_before: 0,
+        backbone_bytes_after: 0,
+        backbone_copied: backbone.as_ref().err().cloned(),
     };
     for name in source.names(options) {
         let mut tensors = vec![source.as_it_is(name)?];
-        if int8.contains_key(name) {
+        let is_backbone = backbone_prefix.is_some_and(|prefix| name.starts_with(prefix));
+        if weights.int8.contains(name) {
             report.num_quantized += 1;
+            report.num_quantized_backbone += usize::from(is_backbone);
             tensors[0].dtype = Dtype::I8;
             tensors.push(PlannedTensor {
                 name: format!("{name}{SCALE_SUFFIX}"),
@@ -87,9 +103,14 @@ pub fn quantize(
         } else {
             report.num_copied += 1;
         }
+        let before = source.checkpoint.nbytes(name)?;
+        let after = tensors.iter().map(PlannedTensor::nbytes).sum::<usize>() as u64;
         if source.is_head(name) {
-            report.head_bytes_before += source.checkpoint.nbytes(name)?;
-            report.head_bytes_after += tensors.iter().map(PlannedTensor::nbytes).sum::<usize>() as u64;
+            report.head_bytes_before += before;
+            report.head_bytes_after += after;
+        } else if is_backbone {
+            report.backbone_bytes_before += before;
+            report.backbone_bytes_after += after;
         }
         planned.extend(tensors);
     }
@@ -100,22 +121,62 @@ pub fn quantize(
         &config,
         planned,
         &mut progress,
-        |name, writer| match int8.get(name) {
-            Some(spec) => write_quantized(&source.checkpoint, name, spec, writer),
-            None if weights.contains(name) => copy_finite(&source.checkpoint, name, writer),
-            None => source.copy(name, writer),
+        |name, writer| match weights.int8.contains(name) {
+            true => write_quantized(&source.checkpoint, name, source.shape(name), writer),
+            false if weights.all.contains(name) => copy_finite(&source.checkpoint, name, writer),
+            false => source.copy(name, writer),
         },
     )?;
     Ok(report)
 }
 
+/// Tensors of models, by their names in the checkpoint.
+#[derive(Default)]
+struct Names {
+    all: BTreeSet<String>,
+    /// Those that may be stored as int8.
+    int8: BTreeSet<String>,
+}
+
+impl Names {
+    fn add(&mut self, prefix: &str, specs: &[TensorSpec]) {
+        for spec in specs {
+            let name = format!("{prefix}{}", spec.name);
+            if spec.may_be_int8 {
+                self.int8.insert(name.clone());
+            }
+            self.all.insert(name);
+        }
+    }
+}
+
+/// The backbone that is quantised, or why tensors outside the head are only copied; neither if there are none, or if they are left out.
+fn backbone_of(
+    source: &SourceCheckpoint,
+    options: &RewriteOptions,
+) -> Result<std::result::Result<Option<PublishedBackbone>, String>> {
+    let has_others = source.checkpoint.names().any(|name| !source.is_head(name));
+    if options.head_only || !has_others {
+        return Ok(Ok(None));
+    }
+    if options.keep_backbone {
+        return Ok(Err("as requested".to_owned()));
+    }
+    match PublishedBackbone::open(&source.path, Some(&source.given_config)) {
+        Ok(backbone) => Ok(Ok(Some(backbone))),
+        // Not a backbone that saccade loads, such as one of a program's own.
+        Err(Error::Checkpoint(why)) => Ok(Err(why)),
+        Err(error) => Err(error),
+    }
+}
+
 fn write_quantized(
     checkpoint: &Checkpoint,
     name: &str,
-    spec: &TensorSpec,
+    shape: &[usize],
     writer: &mut CheckpointWriter,
 ) -> Result<()> {
-    let [out_features, in_features] = *spec.shape else {
+    let [out_features, in_features] = *shape else {
         unreachable!("a linear layer's weight has two axes")
     };
     check_interrupted()?;

@@ -4,6 +4,7 @@ use std::arch::x86_64::*;
 use std::mem::transmute;
 
 use super::{NEAREST, simd_type};
+use crate::cpu::Cpu;
 use crate::simd::{Dots, Kernel, NoDots, Simd, Vector};
 
 simd_type! {
@@ -17,8 +18,15 @@ simd_type! {
 }
 
 simd_type! {
-    /// AVX-512 with BF16.
-    Avx512Bf16, __m512, Bf16, "avx512f", "avx512vl", "avx512bw", "avx512dq", "avx2", "fma", "avx512bf16"
+    /// AVX-512 with BF16, where its products are faster than those of float32: on Intel's Sapphire Rapids they have half the rate.
+    Avx512Bf16, __m512, Bf16, "avx512f", "avx512vl", "avx512bw", "avx512dq", "avx2", "fma", "avx512bf16";
+    if Cpu::current().has_fast_bf16_dot()
+}
+
+simd_type! {
+    /// AVX-512 with what works beside the tiles of AMX: VNNI, and the conversions of BF16.
+    Avx512Amx, __m512, BesideTiles,
+    "avx512f", "avx512vl", "avx512bw", "avx512dq", "avx2", "fma", "avx512bf16", "avx512vnni"
 }
 
 /// AVX512-VNNI.
@@ -26,6 +34,7 @@ pub(crate) struct Vnni;
 
 // SAFETY: the caller has AVX512-VNNI.
 unsafe impl Dots<__m512> for Vnni {
+    const NAME: &'static str = "vnni";
     const MAX_BYTE: u8 = 255;
 
     #[inline(always)]
@@ -40,6 +49,7 @@ pub(crate) struct Bf16;
 
 // SAFETY: the caller has AVX512-BF16.
 unsafe impl Dots<__m512> for Bf16 {
+    const NAME: &'static str = "bf16";
     const HAS_BF16: bool = true;
 
     #[inline(always)]
@@ -61,6 +71,27 @@ unsafe impl Dots<__m512> for Bf16 {
             let pairs = transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(second, first));
             _mm512_storeu_si512(to.cast(), pairs);
         }
+    }
+}
+
+/// AVX512-VNNI, and AVX512-BF16 for conversions alone: the products of bfloat16 are those of tiles.
+pub(crate) struct BesideTiles;
+
+// SAFETY: the caller has AVX512-VNNI and AVX512-BF16.
+unsafe impl Dots<__m512> for BesideTiles {
+    const NAME: &'static str = "bf16";
+    const MAX_BYTE: u8 = 255;
+
+    #[inline(always)]
+    unsafe fn store_bf16(first: __m512, second: __m512, to: *mut u16) {
+        // SAFETY: the caller's promise.
+        unsafe { Bf16::store_bf16(first, second, to) }
+    }
+
+    #[inline(always)]
+    unsafe fn int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i {
+        // SAFETY: as above.
+        unsafe { Vnni::int8(sum, x, w) }
     }
 }
 

@@ -7,9 +7,10 @@ use std::arch::x86_64::{_MM_FROUND_NO_EXC, _MM_FROUND_TO_NEAREST_INT};
 
 const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
 
-/// A [`Simd`](crate::simd::Simd) type: its name, its vector, its dot products, and the features that it needs and turns on.
+/// A [`Simd`](crate::simd::Simd) type: its name, its vector, its dot products, the features that it needs and turns on, and what else must
+/// be true.
 macro_rules! simd_type {
-    ($(#[$doc:meta])* $name:ident, $vector:ty, $dots:ty, $($feature:tt),+) => {
+    ($(#[$doc:meta])* $name:ident, $vector:ty, $dots:ty, $($feature:tt),+ $(; if $condition:expr)?) => {
         $(#[$doc])*
         #[derive(Clone, Copy)]
         pub(crate) struct $name(());
@@ -21,7 +22,7 @@ macro_rules! simd_type {
 
             #[inline]
             fn new() -> Option<Self> {
-                ($(is_x86_feature_detected!($feature))&&+).then_some(Self(()))
+                ($(is_x86_feature_detected!($feature))&&+ $(&& $condition)?).then_some(Self(()))
             }
 
             #[inline]

@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use saccade_checkpoint::read_text;
 
-use super::Tokenizer;
 use crate::error::{Error, Result};
 
 const JSON: &str = "tokenizer.json";
@@ -23,6 +22,17 @@ pub enum TokenizerFiles {
     Json(PathBuf),
     /// A directory with `vocab.json` and `merges.txt`.
     Slow(PathBuf),
+}
+
+/// What is in the files of a tokenizer.
+pub(super) enum FilesText {
+    Json(String),
+    Slow {
+        vocab: String,
+        merges: String,
+        added: Option<String>,
+        config: Option<String>,
+    },
 }
 
 impl TokenizerFiles {
@@ -61,28 +71,27 @@ impl TokenizerFiles {
         }
     }
 
-    /// Reads them.
+    /// What is in them.
     ///
     /// # Errors
-    /// [`Error::File`] for a file that cannot be read, and those of [`Tokenizer::from_json`].
-    pub fn read(&self) -> Result<Tokenizer> {
-        let text = |path: PathBuf| Ok::<_, Error>(read_text("tokenizer", &path)?);
-        match self {
-            Self::Json(path) => Tokenizer::from_json(&text(path.clone())?),
+    /// [`Error::File`] for a file that cannot be read.
+    pub(super) fn text(&self) -> Result<FilesText> {
+        let text = |path: &Path| Ok::<_, Error>(read_text("tokenizer", path)?);
+        Ok(match self {
+            Self::Json(path) => FilesText::Json(text(path)?),
             Self::Slow(folder) => {
                 let optional = |file: &str| {
                     let path = folder.join(file);
-                    path.exists().then(|| text(path)).transpose()
+                    path.exists().then(|| text(&path)).transpose()
                 };
-                let (added, config) = (optional(ADDED)?, optional(CONFIG)?);
-                Tokenizer::from_slow(
-                    &text(folder.join(VOCAB))?,
-                    &text(folder.join(MERGES))?,
-                    added.as_deref(),
-                    config.as_deref(),
-                )
+                FilesText::Slow {
+                    vocab: text(&folder.join(VOCAB))?,
+                    merges: text(&folder.join(MERGES))?,
+                    added: optional(ADDED)?,
+                    config: optional(CONFIG)?,
+                }
             }
-        }
+        })
     }
 
     /// The directory that they are in.

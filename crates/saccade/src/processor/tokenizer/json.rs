@@ -1,14 +1,15 @@
 //! `tokenizer.json`, the format of the crate `tokenizers`: those of Qwen2's kind.
 
-use serde::Deserialize;
+use std::fmt;
+
+use serde::de::{Deserialize, Deserializer, Error as _, IgnoredAny, SeqAccess, Unexpected, Visitor};
 use serde_json::{Value, json};
-use tokenizers::models::bpe::Merges;
 
 use super::PATTERN;
 use super::parts::{Added, Ids, Parts, Problems};
 use crate::error::{Error, Result};
 
-#[derive(Deserialize)]
+#[derive(serde::Deserialize)]
 struct File {
     truncation: Option<Value>,
     padding: Option<Value>,
@@ -20,7 +21,7 @@ struct File {
     model: Model,
 }
 
-#[derive(Deserialize)]
+#[derive(serde::Deserialize)]
 struct FileAdded {
     id: u32,
     content: String,
@@ -36,7 +37,7 @@ struct FileAdded {
     special: bool,
 }
 
-#[derive(Deserialize)]
+#[derive(serde::Deserialize)]
 struct Model {
     #[serde(rename = "type")]
     kind: Option<String>,
@@ -53,11 +54,41 @@ struct Model {
 }
 
 /// A merge: two strings, or, in older files, one with a space between them.
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum Merge {
-    Pair(String, String),
-    Line(String),
+struct Merge(String, String);
+
+impl<'de> Deserialize<'de> for Merge {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        struct Pair;
+        impl<'de> Visitor<'de> for Pair {
+            type Value = Merge;
+
+            fn expecting(&self, formatter: &mut fmt::Formatter) -> fmt::Result {
+                formatter.write_str("two tokens")
+            }
+
+            fn visit_str<E: serde::de::Error>(self, line: &str) -> std::result::Result<Merge, E> {
+                match line.split_once(' ') {
+                    Some((left, right)) if !right.contains(' ') => {
+                        Ok(Merge(left.to_owned(), right.to_owned()))
+                    }
+                    _ => Err(E::invalid_value(Unexpected::Str(line), &self)),
+                }
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut pair: A) -> std::result::Result<Merge, A::Error> {
+                let mut token = |index| {
+                    let token = pair.next_element::<String>()?;
+                    token.ok_or_else(|| A::Error::invalid_length(index, &Pair))
+                };
+                let merge = Merge(token(0)?, token(1)?);
+                match pair.next_element::<IgnoredAny>()? {
+                    None => Ok(merge),
+                    Some(_) => Err(A::Error::invalid_length(3, &self)),
+                }
+            }
+        }
+        deserializer.deserialize_any(Pair)
+    }
 }
 
 /// The parts of a `tokenizer.json`.
@@ -71,18 +102,6 @@ pub(super) fn parse(text: &str) -> Result<Parts> {
     })?;
     let mut problems = Problems::default();
     check_kind(&file, &mut problems);
-    let mut merges = Merges::with_capacity(file.model.merges.len());
-    for (rank, merge) in file.model.merges.into_iter().enumerate() {
-        match merge {
-            Merge::Pair(left, right) => merges.push((left, right)),
-            Merge::Line(line) => match line.split_once(' ') {
-                Some((left, right)) if !right.contains(' ') => {
-                    merges.push((left.to_owned(), right.to_owned()))
-                }
-                _ => problems.add(|| format!("merges: {rank}: expected two tokens, got {line:?}")),
-            },
-        }
-    }
     problems.into_result()?;
     let added = file.added_tokens.into_iter().map(|token| Added {
         id: token.id,
@@ -95,14 +114,19 @@ pub(super) fn parse(text: &str) -> Result<Parts> {
     });
     Ok(Parts {
         vocab: file.model.vocab.0,
-        merges,
+        merges: file
+            .model
+            .merges
+            .into_iter()
+            .map(|merge| (merge.0, merge.1))
+            .collect(),
         added: added.collect(),
     })
 }
 
 /// That the file asks for nothing but what [`Tokenizer`](super::Tokenizer) does.
 fn check_kind(file: &File, problems: &mut Problems) {
-    let mut differs = |key: &str, expected: &str, got: &dyn std::fmt::Display| {
+    let mut differs = |key: &str, expected: &str, got: &dyn fmt::Display| {
         problems.add(|| format!("{key}: expected {expected}, got {got}"));
     };
     let model = &file.model;

@@ -16,6 +16,7 @@ use tokenizers::pre_tokenizers::split::{Split, SplitPattern};
 use tokenizers::{AddedToken, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl};
 
 use crate::error::{Error, Result};
+use find::FilesText;
 use parts::Parts;
 
 pub use find::TokenizerFiles;
@@ -69,6 +70,22 @@ impl Tokenizer {
         tokenizer_config: Option<&str>,
     ) -> Result<Self> {
         Self::build(slow::parse(vocab, merges, added_tokens, tokenizer_config)?)
+    }
+
+    /// The tokenizer in these files.
+    ///
+    /// # Errors
+    /// [`Error::File`] for a file that cannot be read, and those of [`from_json`](Self::from_json).
+    pub fn read(files: &TokenizerFiles) -> Result<Self> {
+        match files.text()? {
+            FilesText::Json(text) => Self::from_json(&text),
+            FilesText::Slow {
+                vocab,
+                merges,
+                added,
+                config,
+            } => Self::from_slow(&vocab, &merges, added.as_deref(), config.as_deref()),
+        }
     }
 
     fn build(parts: Parts) -> Result<Self> {

@@ -121,18 +121,23 @@ impl Parts {
 
     fn check_merges(&self, problems: &mut Problems) {
         let mut seen = HashSet::with_capacity(self.merges.len());
+        let mut merged = String::new();
         for (rank, pair) in self.merges.iter().enumerate() {
             let (left, right) = pair;
             if left.is_empty() || right.is_empty() {
                 problems.add(|| format!("merges: {rank}: expected two tokens, got {pair:?}"));
                 continue;
             }
-            for token in [left.clone(), right.clone(), format!("{left}{right}")] {
-                if !self.vocab.contains_key(&token) {
+            merged.clear();
+            merged.extend([left.as_str(), right]);
+            let ids = [left.as_str(), right, &merged].map(|token| {
+                let id = self.vocab.get(token).copied();
+                if id.is_none() {
                     problems.add(|| format!("merges: {rank}: {token:?} is not in the vocabulary"));
                 }
-            }
-            if !seen.insert(pair) {
+                id
+            });
+            if !seen.insert((ids[0], ids[1])) && ids.iter().all(Option::is_some) {
                 problems.add(|| format!("merges: {rank}: {pair:?} appears twice"));
             }
         }

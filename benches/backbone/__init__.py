@@ -1,0 +1,1 @@
+"""`python -m benches.backbone`: the vision-language backbone against transformers, its memory, its errors."""

@@ -1,0 +1,265 @@
+"""The report: docs/backbone.md, written from the JSON of the measurements."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benches.backbone import memory, reuse
+from benches.peers.results import TOLERANCE, rounded
+from benches.peers.text import plural, table
+from saccade.bench.backbone_work import backbone_work, floor_seconds
+from saccade.bench.cost import Machine
+from saccade.bench.timing import quartiles
+from saccade.checkpoints.backbone_sizes import BackboneSizes
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "backbone.md"
+COMMITTED = Path(__file__).with_name("results.json")
+
+#: Contender, the peer that it is compared with, the ratio to reach, and the ratio beyond.
+GOALS = (
+    ("saccade-bfloat16", "bfloat16", 1.3, 1.8),
+    ("saccade-int8", "bfloat16", 2.5, 4.0),
+    ("saccade-float32", "float32", 1.2, 1.5),
+)
+FLOOR_GOALS = (0.80, 0.88)
+
+Results = dict[str, Any]
+
+
+def command(path: Path, *, write: bool) -> int:
+    """Prints the report, or writes the page and keeps a copy of the measurements next to the program."""
+    path = path if path.exists() else COMMITTED
+    if not path.exists():
+        raise SystemExit("benches.backbone: nothing measured yet; run python -m benches.backbone")
+    results = json.loads(path.read_text())
+    if write:
+        COMMITTED.write_text(json.dumps(rounded(results), indent=1) + "\n")
+        PAGE.write_text(document(results))
+        print(PAGE)
+    else:
+        print(document(results))
+    return 0
+
+
+def document(results: Results) -> str:
+    """The whole page."""
+    parts = [
+        "# The backbone, measured",
+        "Written by `python -m benches.backbone report --write` from `benches/backbone/results.json`, which "
+        "`python -m benches.backbone` measured on the machine below: N1.5 at its published size with seeded "
+        "random weights, medians with quartiles.",
+        machine(results["machine"]),
+    ]
+    titles = {
+        "speed": ("## Speed", speed),
+        "reuse": ("## Unchanged views", unchanged),
+        "memory": ("## Memory and loading", loading),
+        "accuracy": ("## Errors", errors),
+    }
+    for section, (title, write) in titles.items():
+        if results.get(section):
+            parts += [title, *write(results)]
+    return "\n\n".join(parts) + "\n"
+
+
+def machine(held: Results) -> str:
+    """The machine in one sentence."""
+    versions = ", ".join(
+        f"{name} {held['versions'][name]}"
+        for name in ("saccade", "torch", "transformers", "numpy")
+        if held["versions"].get(name)
+    )
+    return (
+        f"{held['cpu']} ({held['family']}, {held['isa']}), {held['cores']} cores, {held['memory_gb']} GB, "
+        f"Linux {held['kernel']}; flags {', '.join(held['flags'])}. {versions}; commit {held['commit']}."
+    )
+
+
+def speed(results: Results) -> Iterator[str]:
+    """Tables by thread count and number of views, and the goals."""
+    yield (
+        "The backbone alone: pixels and token ids in, features out, the prompt `open the drawer`. "
+        "transformers is SigLIP, a linear layer and Qwen3 with 12 layers, without logits, pooling head and "
+        "cache, all tensors in the named dtype. The floor is the longer of two times: the multiply-adds at "
+        "the peak of the arithmetic, measured in the same rounds, and the weights at the memory's bandwidth. "
+        "The error is the largest difference from the reference in float32, relative to the largest feature."
+    )
+    goals: list[list[str]] = []
+    for entry in results["speed"]:
+        peak = peaks(entry, results["machine"]["isa"])
+        rates = ", ".join(f"{kind} {rate / 1e9:.0f}" for kind, rate in peak.macs_per_second.items())
+        group = "" if entry["group"] == "usual" else ", with torch.compile"
+        yield f"### {plural(entry['threads']).capitalize()}{group}"
+        yield f"Peaks: {rates} GMAC/s, {peak.read_bytes_per_second / 1e9:.0f} GB/s."
+        rows = list(speed_rows(entry, peak))
+        yield table(["ms", "views", "median (quartiles)", "share of the floor", "error"], rows)
+        failed = [
+            f"{name} failed: {works['failed']}."
+            for name, works in entry["contenders"].items()
+            if "failed" in works
+        ]
+        if failed:
+            yield " ".join(failed)
+        goals += goal_rows(entry)
+    if goals:
+        yield "### Targets"
+        yield table(["", "views", "threads", "times as fast", "target", "beyond"], goals)
+
+
+def peaks(entry: Results, isa: str) -> Machine:
+    """The medians of the peaks that were measured between the rounds."""
+    kinds = entry["peaks"][0]["macs_per_second"][isa]
+    return Machine(
+        isa,
+        entry["threads"],
+        {
+            kind: statistics.median(one["macs_per_second"][isa][kind] for one in entry["peaks"])
+            for kind in kinds
+        },
+        statistics.median(one["read_bytes_per_second"] for one in entry["peaks"]),
+    )
+
+
+def speed_rows(entry: Results, peak: Machine) -> Iterator[list[str]]:
+    """A row for each piece of each contender, by number of views."""
+    pieces = [
+        (int(work.split(", ")[-1]), name, work, measured)
+        for name, works in entry["contenders"].items()
+        if "failed" not in works
+        for work, measured in works.items()
+    ]
+    for views, name, work, measured in sorted(pieces, key=lambda piece: piece[0]):
+        seconds = measured["seconds"]
+        share = ""
+        if name.startswith("saccade"):
+            sizes = BackboneSizes.from_config(entry["config"])
+            side = round(sizes.vision.num_positions**0.5)
+            works = backbone_work(sizes, [(side, side)] * views, entry["tokens"][str(views)])
+            floor = floor_seconds(works, peak, name.split("-")[1])
+            share = f"{100 * floor / statistics.median(seconds):.0f} %"
+        setting = f" ({work.split(', ')[0]})" if ", " in work else ""
+        correct = "" if is_correct(name, measured) else ", wrong"
+        label = f"{name.replace('-', ' ')}{setting}"
+        yield [label, str(views), spread(seconds), share, f"{measured['error']:.0e}{correct}"]
+
+
+def is_correct(name: str, measured: Results) -> bool:
+    """Whether the error is within the tolerance of the arithmetic."""
+    return bool(measured["error"] <= TOLERANCE[name.split("-")[1]])
+
+
+def goal_rows(entry: Results) -> Iterator[list[str]]:
+    """How many times as fast as transformers' fastest correct setting, in the same rounds."""
+    for ours, dtype, goal, beyond in GOALS:
+        contenders = entry["contenders"]
+        if ours not in contenders or "failed" in contenders[ours]:
+            continue
+        for views in contenders[ours]:
+            candidates = [
+                (statistics.median(measured["seconds"]), name, work)
+                for name in (f"transformers-{dtype}", f"compiled-{dtype}")
+                if "failed" not in contenders.get(name, {"failed": ""})
+                for work, measured in contenders[name].items()
+                if work.split(", ")[-1] == views and is_correct(name, measured)
+            ]
+            if not candidates:
+                continue
+            _, name, work = min(candidates)
+            pairs = zip(contenders[name][work]["seconds"], contenders[ours][views]["seconds"], strict=True)
+            first, median, third = quartiles(theirs / mine for theirs, mine in pairs)
+            label = f"{ours.replace('-', ' ')} against {name.replace('-', ' ')} ({work.split(', ')[0]})"
+            ratio = f"{median:.2f} ({first:.2f} to {third:.2f})"
+            yield [label, views, str(entry["threads"]), ratio, f"{goal}", f"{beyond}"]
+
+
+def unchanged(results: Results) -> Iterator[str]:
+    """Time and share of a full step of each kind of step."""
+    yield (
+        "A whole policy with two views, head included: `encode` with the previous context and `sample`. The "
+        "percentage is the share of a full step in the same round."
+    )
+    rows = []
+    for entry in results["reuse"]:
+        full = entry["seconds"]["full step"]
+        cells = [spread(full)]
+        for piece in list(reuse.PIECES)[1:]:
+            seconds = entry["seconds"][piece]
+            share = quartiles(part / whole for part, whole in zip(seconds, full, strict=True))[1]
+            bits = "" if entry["same_bits"][piece] else ", other bits"
+            cells.append(f"{1e3 * statistics.median(seconds):.0f} ({100 * share:.0f} %{bits})")
+        rows.append([f"{entry['precision']}, {plural(entry['threads'])}", *cells])
+    rows.append(
+        [
+            "target",
+            "",
+            *(
+                f"{100 * reuse.GOALS[piece]:.0f} %" if piece in reuse.GOALS else ""
+                for piece in list(reuse.PIECES)[1:]
+            ),
+        ]
+    )
+    yield table(["ms", *reuse.PIECES], rows)
+
+
+def loading(results: Results) -> Iterator[str]:
+    """Peaks of memory, and cold loads against reading the files."""
+    yield (
+        "Peak memory of the process (`VmHWM`) in 10^9 bytes, and seconds of loading with the page cache "
+        "dropped, against reading all tensor files. The policy holds one embodiment. Targets: "
+        + ", ".join(f"{precision} at most {goal} GB" for precision, goal in memory.GOALS.items())
+        + f" loaded, and a load of at most {memory.LOAD_GOAL} times the reading."
+    )
+    rows = []
+    for entry in results["memory"]:
+        runs = entry["runs"]
+        held = runs[0]["nbytes"]
+
+        def peak(key: str, runs: list[Results] = runs) -> str:
+            return f"{max(run[key] for run in runs) / 1e9:.2f}"
+
+        load, read = ([run[key] for run in runs] for key in ("load", "read"))
+        ratio = statistics.median(a / b for a, b in zip(load, read, strict=True))
+        rows.append(
+            [
+                f"{entry['what']}, {entry['precision']}",
+                "" if held is None else f"{held / 1e9:.2f}",
+                *(peak(key) for key in ("before", "loaded", "called")),
+                f"{statistics.median(load):.1f}",
+                f"{statistics.median(read):.1f}",
+                f"{ratio:.2f}",
+            ]
+        )
+    head = ["", "held", "before", "loaded", "after a call", "load, s", "read, s", "load / read"]
+    yield table(head, rows)
+
+
+def errors(results: Results) -> Iterator[str]:
+    """Errors against float64."""
+    yield (
+        'Features of one view against the reference in float64. "Largest" is the largest error over the '
+        'largest feature, "rms" the root-mean-square error over that of the features, "worst token" the '
+        'largest rms error of a token over the token\'s rms. "Outliers" has four channels of 40 in the '
+        "vision tower's residual stream and four inputs of every down projection that are 32 times as large "
+        "as the others. transformers in bfloat16 is what the released code computes."
+    )
+    rows = []
+    for entry in results["accuracy"]:
+        layers = "" if entry["layers"] is None else f", {entry['layers'][0]} + {entry['layers'][1]} layers"
+        for run, measured in entry["runs"].items():
+            cells = (
+                [measured["failed"], "", ""]
+                if "failed" in measured
+                else [f"{measured[key]:.1e}" for key in ("largest", "rms", "worst")]
+            )
+            rows.append([f"{entry['model']}{layers}", run.replace("-", " "), *cells])
+    yield table(["model", "", "largest", "rms", "worst token"], rows)
+
+
+def spread(seconds: list[float]) -> str:
+    """Median and quartiles in milliseconds."""
+    first, median, third = (1e3 * each for each in quartiles(seconds))
+    return f"{median:.0f} ({first:.0f} to {third:.0f})"

@@ -1,0 +1,362 @@
+//! Tiles of AMX. Stable Rust has no intrinsics for them; `asm!` takes the instructions as they are.
+//!
+//! No sum is in a tile between two `asm!` blocks: only the sizes outlive a block, and the compiler uses no tiles.
+
+use std::mem::offset_of;
+
+use super::{Config, Job, Operation, Shape, TILE, TileUnit};
+use crate::cpu::tiles::permission;
+use crate::simd::Simd;
+use crate::simd::x86_64::avx512::Avx512Amx;
+
+/// The unit of this CPU.
+#[derive(Clone, Copy)]
+pub(crate) struct Amx(Avx512Amx);
+
+/// An `asm!` block that may change every tile.
+macro_rules! tiles {
+    ($($part:tt)*) => {
+        std::arch::asm!(
+            $($part)*,
+            out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
+            out("tmm4") _, out("tmm5") _, out("tmm6") _, out("tmm7") _,
+            options(nostack)
+        )
+    };
+}
+
+/// A few cache lines after a product: the CPU's own prefetching follows each of their streams. All at once they would stall it.
+macro_rules! ask_ahead {
+    () => {
+        concat!(
+            "mov {i}, [{job} + {lines}]\n",
+            "test {i}, {i}\n",
+            "jz 5f\n",
+            "4: prefetcht1 [{p}]\n",
+            "add {p}, {pitch}\n",
+            "dec {i}\n",
+            "jnz 4b\n",
+            "5:"
+        )
+    };
+}
+
+/// The tile of sums number `$sum` plus rows (tile 6) times the weights that are `$column` bytes from the first (into tile 7).
+macro_rules! product {
+    ($operation:literal, $sum:literal, $column:literal) => {
+        concat!(
+            "tileloadd tmm7, [{w} + {w_stride}*1 + ",
+            $column,
+            "]\n",
+            $operation,
+            " tmm",
+            $sum,
+            ", tmm6, tmm7\n",
+            ask_ahead!()
+        )
+    };
+}
+
+/// Tiles of sums to zero, or from memory, and back to it: each `tile, bytes from the first of its rows`. The first row is at `$rows` of the job.
+macro_rules! each_sum {
+    (zero: $($tile:literal),+) => {
+        concat!($("tilezero tmm", $tile, "\n"),+)
+    };
+    (load $rows:literal: $($tile:literal, $column:literal);+) => {
+        concat!(
+            "mov {p}, [{job} + {", $rows, "}]\n",
+            $("tileloadd tmm", $tile, ", [{p} + {i}*1 + ", $column, "]\n"),+
+        )
+    };
+    (store $rows:literal: $($tile:literal, $column:literal);+) => {
+        concat!(
+            "mov {p}, [{job} + {", $rows, "}]\n",
+            $("tilestored [{p} + {i}*1 + ", $column, "], tmm", $tile, "\n"),+
+        )
+    };
+}
+
+/// One or two tiles of rows by one or three of columns, as a function of the job: sums from zero or memory, the steps, sums to memory.
+macro_rules! kernel {
+    ($name:ident, zero $zero:expr, load $load:expr, step [$($step:expr),+], store $store:expr $(, $second:ident)?) => {
+        /// # Safety
+        /// AMX is permitted and its tiles have the sizes of the job, whose pointers are valid for them.
+        unsafe fn $name(job: &Job) {
+            // SAFETY: the caller's promise; prefetching is allowed at any address.
+            unsafe {
+                tiles!(
+                    "cmp qword ptr [{job} + {add}], 0",
+                    "jne 2f",
+                    $zero,
+                    "jmp 3f",
+                    "2:",
+                    "mov {i}, [{job} + {sums_stride}]",
+                    $load,
+                    "3:",
+                    "mov {p}, {ahead}",
+                    $($step,)+
+                    "add {x}, 64",
+                    "add {w}, [{job} + {w_step}]",
+                    "add {ahead}, [{job} + {advance}]",
+                    "dec {steps}",
+                    "jnz 3b",
+                    "mov {i}, [{job} + {sums_stride}]",
+                    $store,
+                    job = in(reg) job,
+                    x = inout(reg) job.x[0] => _,
+                    x_stride = in(reg) job.x_stride,
+                    w = inout(reg) job.w => _,
+                    w_stride = in(reg) job.w_stride,
+                    steps = inout(reg) job.steps => _,
+                    ahead = inout(reg) job.ahead => _,
+                    pitch = in(reg) job.ahead_pitch,
+                    p = out(reg) _,
+                    i = out(reg) _,
+                    add = const offset_of!(Job, add),
+                    w_step = const offset_of!(Job, w_step),
+                    advance = const offset_of!(Job, ahead_advance),
+                    lines = const offset_of!(Job, ahead_lines),
+                    sums_stride = const offset_of!(Job, sums_stride),
+                    sums = const offset_of!(Job, sums)
+                    $(, $second = inout(reg) job.x[1] => _,
+                    second_sums = const offset_of!(Job, sums) + size_of::<*mut u32>())?
+                );
+            }
+        }
+    };
+}
+
+/// The kernels of an operation.
+macro_rules! kernels {
+    ($operation:literal, $single:ident, $row:ident, $block:ident) => {
+        kernel!(
+            $single,
+            zero each_sum!(zero: "0"),
+            load each_sum!(load "sums": "0", "0"),
+            step ["tileloadd tmm6, [{x} + {x_stride}*1]", product!($operation, "0", "0")],
+            store each_sum!(store "sums": "0", "0")
+        );
+        kernel!(
+            $row,
+            zero each_sum!(zero: "0", "1", "2"),
+            load each_sum!(load "sums": "0", "0"; "1", "64"; "2", "128"),
+            step [
+                "tileloadd tmm6, [{x} + {x_stride}*1]",
+                product!($operation, "0", "0"),
+                product!($operation, "1", "64"),
+                product!($operation, "2", "128")
+            ],
+            store each_sum!(store "sums": "0", "0"; "1", "64"; "2", "128")
+        );
+        // Six tiles of sums, one of rows and one of weights, which are read twice from the nearest cache.
+        kernel!(
+            $block,
+            zero each_sum!(zero: "0", "1", "2", "3", "4", "5"),
+            load concat!(
+                each_sum!(load "sums": "0", "0"; "1", "64"; "2", "128"),
+                each_sum!(load "second_sums": "3", "0"; "4", "64"; "5", "128")
+            ),
+            step [
+                "tileloadd tmm6, [{x} + {x_stride}*1]",
+                product!($operation, "0", "0"),
+                product!($operation, "1", "64"),
+                product!($operation, "2", "128"),
+                "tileloadd tmm6, [{second} + {x_stride}*1]",
+                product!($operation, "3", "0"),
+                product!($operation, "4", "64"),
+                product!($operation, "5", "128"),
+                "add {second}, 64"
+            ],
+            store concat!(
+                each_sum!(store "sums": "0", "0"; "1", "64"; "2", "128"),
+                each_sum!(store "second_sums": "3", "0"; "4", "64"; "5", "128")
+            ),
+            second
+        );
+    };
+}
+
+kernels!("tdpbf16ps", bf16_single, bf16_row, bf16_block);
+kernels!("tdpbusd", int8_single, int8_row, int8_block);
+
+/// Independent products, from tiles that stay what they are: of zeros, whose speed is that of any numbers.
+macro_rules! chains {
+    ($name:ident, $operation:literal) => {
+        /// # Safety
+        /// AMX is permitted and its tiles have sizes.
+        unsafe fn $name(iterations: usize) {
+            // SAFETY: the caller's promise; no memory is involved.
+            unsafe {
+                tiles!(
+                    each_sum!(zero: "0", "1", "2", "3", "4", "5", "6", "7"),
+                    "2:",
+                    concat!($operation, " tmm0, tmm6, tmm7"),
+                    concat!($operation, " tmm1, tmm6, tmm7"),
+                    concat!($operation, " tmm2, tmm6, tmm7"),
+                    concat!($operation, " tmm3, tmm6, tmm7"),
+                    concat!($operation, " tmm4, tmm6, tmm7"),
+                    concat!($operation, " tmm5, tmm6, tmm7"),
+                    "dec {n}",
+                    "jnz 2b",
+                    n = inout(reg) iterations => _
+                );
+            }
+        }
+    };
+}
+
+chains!(bf16_chains, "tdpbf16ps");
+chains!(int8_chains, "tdpbusd");
+
+// SAFETY: a value exists only where the vectors do and AMX is permitted; the kernels keep to the job.
+unsafe impl TileUnit for Amx {
+    type Simd = Avx512Amx;
+    type Registers = ();
+
+    #[inline]
+    fn new() -> Option<Self> {
+        let simd = Avx512Amx::new()?;
+        permission().is_ok().then_some(Self(simd))
+    }
+
+    #[inline]
+    fn simd(self) -> Avx512Amx {
+        self.0
+    }
+
+    #[inline]
+    fn registers(self) {}
+
+    #[inline]
+    unsafe fn configure(self, (): &mut (), config: &Config) {
+        // SAFETY: there is a unit, so AMX is permitted; the sizes are those of palette 1.
+        unsafe { tiles!("ldtilecfg [{config}]", config = in(reg) config) }
+    }
+
+    #[inline]
+    unsafe fn release(self, (): &mut ()) {
+        // SAFETY: as above.
+        unsafe { tiles!("tilerelease") }
+    }
+
+    #[inline]
+    unsafe fn run(self, (): &mut (), operation: Operation, shape: Shape, job: &Job) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match (operation, shape) {
+                (Operation::Bf16, Shape::Single) => bf16_single(job),
+                (Operation::Bf16, Shape::Row) => bf16_row(job),
+                (Operation::Bf16, Shape::Block) => bf16_block(job),
+                (Operation::Int8, Shape::Single) => int8_single(job),
+                (Operation::Int8, Shape::Row) => int8_row(job),
+                (Operation::Int8, Shape::Block) => int8_block(job),
+            }
+        }
+    }
+
+    fn chains(self, operation: Operation) -> usize {
+        const ITERATIONS: usize = 1 << 17;
+        // SAFETY: there is a unit; the tiles have sizes until they are released.
+        unsafe {
+            self.configure(&mut (), &Config::of_rows(TILE));
+            match operation {
+                Operation::Bf16 => bf16_chains(ITERATIONS),
+                Operation::Int8 => int8_chains(ITERATIONS),
+            }
+            self.release(&mut ());
+        }
+        ITERATIONS * 6 * TILE * TILE * TILE * operation.per_word()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::super::software::tests::{pairs, product, words};
+    use super::super::{MAX_ROWS, Product, Session, Software};
+    use super::*;
+
+    /// What both units make of a product with these operands.
+    fn both(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &[u32], before: &[u32]) {
+        let amx = Amx::new().expect("looked at before");
+        let of = |columns: usize, add: bool| {
+            let [mut hard, mut soft] = [before.to_vec(), before.to_vec()];
+            let with = |sums| Product {
+                columns,
+                add,
+                ..product(operation, x, w, sums)
+            };
+            // SAFETY: the operands have these sizes.
+            unsafe {
+                Session::new(amx).multiply(&with(&mut hard));
+                Session::new(Software).multiply(&with(&mut soft));
+            }
+            let is_nan = |bits: u32| operation == Operation::Bf16 && f32::from_bits(bits).is_nan();
+            for (index, (&hard, &soft)) in hard.iter().zip(&soft).enumerate() {
+                let same = hard == soft || (is_nan(hard) && is_nan(soft));
+                let what =
+                    format!("{operation:?}, {rows} rows, {steps} steps, {columns} columns, number {index}");
+                assert!(same, "{what}: {hard:#x} in hardware, {soft:#x} in software");
+            }
+        };
+        for add in [false, true] {
+            of(3, add);
+            if rows <= TILE {
+                of(1, add);
+            }
+        }
+    }
+
+    #[test]
+    fn hardware_and_software_tiles_agree_bit_for_bit() {
+        if let Err(refusal) = permission() {
+            // Past the test runner, which keeps back what a test prints.
+            let _ = writeln!(
+                std::io::stderr(),
+                "SKIPPED: the tiles of AMX are not compared with software: {refusal}"
+            );
+            return;
+        }
+        for rows in 1..=MAX_ROWS {
+            let steps = 1 + rows % 4;
+            let (x_size, w_size, sums) = (rows * TILE * steps, 3 * TILE * TILE * steps, rows * 3 * TILE);
+            for seed in 0..8 {
+                let (x, w, before) = (
+                    words(seed, x_size),
+                    words(seed + 50, w_size),
+                    words(seed + 90, sums),
+                );
+                both(Operation::Int8, rows, steps, &x, &w, &before);
+                // Any bits; exponents far apart; denormals.
+                both(Operation::Bf16, rows, steps, &x, &w, &before);
+                for (keep, set) in [(0x83ff_83ff, 0x3000_3000), (0x81ff_81ff, 0)] {
+                    let masked =
+                        |words: &[u32]| words.iter().map(|word| word & keep | set).collect::<Vec<_>>();
+                    both(
+                        Operation::Bf16,
+                        rows,
+                        steps,
+                        &masked(&x),
+                        &masked(&w),
+                        &masked(&before),
+                    );
+                }
+                let numbers = [pairs(seed, x_size), pairs(seed + 50, w_size)];
+                let before: Vec<_> = before
+                    .iter()
+                    .map(|word| (*word as f32 * 1e-9).to_bits())
+                    .collect();
+                both(Operation::Bf16, rows, steps, &numbers[0], &numbers[1], &before);
+            }
+        }
+    }
+
+    #[test]
+    fn peaks_of_tiles_are_counted() {
+        if let Some(amx) = Amx::new() {
+            let [bf16, int8] = [Operation::Bf16, Operation::Int8].map(|operation| amx.chains(operation));
+            assert_eq!(int8, 2 * bf16);
+        }
+    }
+}

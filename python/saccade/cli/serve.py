@@ -1,0 +1,224 @@
+"""`saccade serve`: serves a whole checkpoint to clients that speak Isaac-GR00T's protocol."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from saccade import _arguments as arguments
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
+
+if TYPE_CHECKING:
+    from saccade.serve import Limits
+    from saccade.serve.logs import Log
+
+HELP = "serve a whole checkpoint to robots and simulators over the network"
+
+#: The default of --api-token, so that the secret is not in the list of processes.
+TOKEN_VARIABLE = "SACCADE_API_TOKEN"
+
+EPILOG = f"""\
+The clients of Isaac-GR00T N1.5, N1.6 and N1.7 work unchanged. Whoever can reach the port can use the policy:
+give another host than 127.0.0.1 only in a network that you trust, with --api-token (or {TOKEN_VARIABLE}).
+
+SIGTERM and Ctrl-C answer what was accepted, then end the server; a second one ends it at once.
+
+examples:
+  saccade serve GR00T-N1.5-3B/ --embodiment gr1 --precision int8
+  saccade serve my-policy/ --host 0.0.0.0 --max-batch 32 --log json >> serve.jsonl
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    from saccade.serve.limits import Limits
+
+    parser.epilog = EPILOG
+    limits = Limits()
+    arguments.add_checkpoint_argument(parser)
+    parser.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
+    parser.add_argument(
+        "--precision",
+        choices=arguments.PRECISIONS,
+        default="float32",
+        help="default: float32, which is exact",
+    )
+    parser.add_argument(
+        "--head-precision", choices=arguments.PRECISIONS, help="of the head (default: as --precision)"
+    )
+    parser.add_argument(
+        "--preprocessing",
+        choices=("lerobot", "isaac"),
+        help="the way in which frames and words are prepared (default: by version and layout)",
+    )
+    parser.add_argument(
+        "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
+    )
+    arguments.add_num_threads(parser, "threads (default: the physical cores)")
+    served = parser.add_argument_group("server")
+    served.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="NAME",
+        help="address; * for all (default: 127.0.0.1)",
+    )
+    arguments.add_integer(
+        served, "--port", minimum=0, default=5555, help="port; 0 takes one that is free and prints it"
+    )
+    arguments.add_integer(
+        served,
+        "--seed",
+        minimum=0,
+        help="seed of the noise of requests that bring none (default: different noise each time)",
+    )
+    served.add_argument(
+        "--api-token",
+        default=os.environ.get(TOKEN_VARIABLE),
+        metavar="TEXT",
+        help=f"refuse requests without this api_token (default: ${TOKEN_VARIABLE}, else none is needed)",
+    )
+    served.add_argument("--allow-kill", action="store_true", help="let clients stop the server")
+    served.add_argument(
+        "--modality-form",
+        choices=("text", "map"),
+        help="how get_modality_config is answered, which all releases request alike: as clients of N1.5 read "
+        "it (text), or those of N1.6 and N1.7 (map) (default: as for the client's last request, else the "
+        "checkpoint's release)",
+    )
+    served.add_argument(
+        "--log",
+        choices=("text", "json"),
+        default="text",
+        help="text on standard error, live on a terminal; or JSON lines on standard output (default: text)",
+    )
+    batching = parser.add_argument_group("requests of several clients are computed together")
+    arguments.add_integer(batching, "--max-batch", default=16, help="observations in a batch at most")
+    arguments.add_number(
+        batching,
+        "--max-wait-ms",
+        minimum=0,
+        below=60_000,
+        default=5.0,
+        help="time that a request waits for other clients at most; one client alone never waits",
+    )
+    most = parser.add_argument_group("limits, beyond which a request is answered with an error")
+    arguments.add_number(
+        most,
+        "--max-message-mb",
+        minimum=0.001,
+        below=4000,
+        default=limits.message_bytes / 1e6,
+        help="size of a request, in millions of bytes",
+    )
+    arguments.add_integer(
+        most, "--max-array-elements", default=limits.array_elements, help="elements of an array"
+    )
+    arguments.add_integer(
+        most, "--max-depth", default=limits.depth, help="nesting of maps and lists in a request"
+    )
+    arguments.add_integer(most, "--max-values", default=limits.objects, help="values in a request")
+    arguments.add_integer(most, "--max-rows", default=limits.rows, help="observations in a request")
+    arguments.add_integer(most, "--max-waiting", default=limits.waiting, help="requests that wait")
+    arguments.add_number(
+        most,
+        "--max-waiting-mb",
+        minimum=0.001,
+        below=1e6,
+        default=limits.waiting_bytes / 1e6,
+        help="size of all requests that wait or arrive, in millions of bytes",
+    )
+    arguments.add_integer(most, "--max-clients", default=limits.clients, help="connections")
+    arguments.add_number(
+        most,
+        "--stall-seconds",
+        minimum=0.1,
+        below=86_400,
+        default=limits.stall_seconds,
+        help="close a connection that stalls in the middle of a request or an answer",
+    )
+    arguments.add_integer(
+        most, "--max-sessions", default=limits.sessions, help="sessions; then the least used is forgotten"
+    )
+    arguments.add_number(
+        most,
+        "--session-seconds",
+        minimum=0.1,
+        below=1e9,
+        default=limits.session_seconds,
+        help="time after which an unused session is forgotten",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Takes the port, loads, and serves until it is stopped."""
+    require("serve")
+    import saccade
+    from saccade.serve import Server
+    from saccade.serve.connections import bind
+
+    listener = bind(args.host, args.port)  # before minutes may be spent on loading
+    policy = saccade.Policy.load(
+        args.checkpoint,
+        embodiment=embodiment(args.embodiment),
+        preprocessing=args.preprocessing,
+        tokenizer=args.tokenizer,
+        precision={"backbone": args.precision, "head": args.head_precision or args.precision},
+        num_threads=args.num_threads,
+    )
+    # What a first call sets up is not left to the first client.
+    policy.act(policy.example_observation(), seed=0)
+    log = make_log(args.log)
+    try:
+        server = Server(
+            policy,
+            listener,
+            log,
+            limits=limits_of(args),
+            max_batch=args.max_batch,
+            max_wait_ms=args.max_wait_ms,
+            seed=args.seed,
+            api_token=args.api_token,
+            allow_kill=args.allow_kill,
+            modality_form=args.modality_form,
+        )
+        server.stop_on_signals()
+        stopped_by = server.run()
+    finally:
+        log.close()
+    return EXIT_INTERRUPTED if stopped_by == "SIGINT" else EXIT_OK
+
+
+def embodiment(given: str | None) -> str | int | None:
+    """A tag, or an id if it is a number."""
+    return int(given) if given is not None and given.isdecimal() else given
+
+
+def make_log(form: str) -> Log:
+    """The log: JSON lines, or text, which is live on a terminal."""
+    from saccade.serve import logs
+
+    if form == "json":
+        return logs.JsonLog()
+    console = _output.console(stderr=True)
+    return logs.LiveLog(console) if console.is_terminal else logs.TextLog()
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """The limits that the arguments state."""
+    from saccade.serve import Limits
+
+    return Limits(
+        message_bytes=int(1e6 * args.max_message_mb),
+        array_elements=args.max_array_elements,
+        depth=args.max_depth,
+        objects=args.max_values,
+        rows=args.max_rows,
+        waiting=args.max_waiting,
+        waiting_bytes=int(1e6 * args.max_waiting_mb),
+        clients=args.max_clients,
+        sessions=args.max_sessions,
+        session_seconds=args.session_seconds,
+        stall_seconds=args.stall_seconds,
+    )

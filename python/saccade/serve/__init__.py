@@ -1,0 +1,33 @@
+"""A server for robots that speak Isaac-GR00T's protocol, and a small client. Needs the extra `serve`.
+
+A request passes through these files, from the bottom up: `zmtp` (frames of a connection), `connections`
+(sockets), `pickles` and `packing` with `npy` (bytes to values, within the `limits`), `requests` (values to
+calls), `batching` (which are computed together), `engine` with `sessions` (actions), and back. `server` joins
+them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from saccade.serve.limits import Limits
+
+if TYPE_CHECKING:
+    from saccade.serve.client import Client, ServerError
+    from saccade.serve.server import Server
+
+__all__ = ["Client", "Limits", "Server", "ServerError"]
+
+_MODULES = {"Client": "client", "ServerError": "client", "Server": "server"}
+
+# The limits are also shown by `saccade serve --help`, which needs no optional packages.
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        from saccade import _extras
+
+        if name not in _MODULES:
+            raise AttributeError(f"module 'saccade.serve' has no attribute {name!r}")
+        _extras.require("zmq", "msgpack")
+        return getattr(importlib.import_module(f"saccade.serve.{_MODULES[name]}"), name)

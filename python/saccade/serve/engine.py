@@ -1,0 +1,172 @@
+"""Computes the requests of a batch together, each with the bits that it has alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from saccade._arrays import Float32Array
+from saccade.chunking import Chunking
+from saccade.options import PolicyOptions, noise_or_draw
+from saccade.serve.batching import Job
+from saccade.serve.requests import action_answer
+from saccade.serve.sessions import Chunk, Session, Sessions
+
+if TYPE_CHECKING:
+    from saccade.policy import Policy
+
+#: The parts of which the time is reported, in their order. "wait" is the time in the queue.
+PARTS = ("wait", "inputs", "backbone", "head")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of a request.
+
+    Attributes:
+        job: The request.
+        answer: The answer, if ``error`` is None.
+        error: Why there is none.
+        batch: Number of observations that were computed together.
+    """
+
+    job: Job
+    answer: Any = None
+    error: BaseException | None = None
+    batch: int = 0
+
+
+@dataclass(eq=False)
+class _Work:
+    """A request while it is computed."""
+
+    job: Job
+    inputs: Sequence[Any]
+    noise: Float32Array
+    session: Session | None
+    continued: tuple[Chunk, Chunking] | None
+    features: Sequence[Any] = ()
+
+
+class Engine:
+    """Computes batches.
+
+    Args:
+        policy: The policy.
+        sessions: The sessions, whose chunks it continues.
+    """
+
+    def __init__(self, policy: Policy, sessions: Sessions) -> None:
+        self._policy = policy
+        self._sessions = sessions
+
+    def run(self, jobs: Sequence[Job]) -> list[Outcome]:
+        """Computes requests together. One that cannot be computed does not affect the others.
+
+        Returns:
+            What became of each, in no particular order.
+        """
+        outcomes, works = [], []
+        for job in jobs:
+            job.milliseconds["wait"] = 1e3 * (time.perf_counter() - job.received)
+            try:
+                with _timed([job], "inputs"):
+                    works.append(self._begin(job))
+            except BaseException as error:
+                outcomes.append(Outcome(job, error=error))
+        try:
+            return outcomes + self._together(works)
+        except BaseException as error:
+            if len(works) < 2:
+                return outcomes + [Outcome(work.job, error=error) for work in works]
+        # One of them is the cause, or there is not enough memory for all of them.
+        for work in works:
+            try:
+                outcomes += self._together([work])
+            except BaseException as error:
+                outcomes.append(Outcome(work.job, error=error))
+        return outcomes
+
+    def _begin(self, job: Job) -> _Work:
+        call = job.call
+        inputs = self._policy.inputs(call.observation)
+        config = self._policy.head.config
+        shape = (len(inputs), config.action_horizon, config.encoder_action_dim)
+        session = continued = None
+        if call.options.session is not None:
+            session = self._sessions.use(call.options.session, job.client)
+            continued = session.continued(call.options, len(inputs))
+        return _Work(job, inputs, noise_or_draw(None, call.options.seed, shape), session, continued)
+
+    def _together(self, works: Sequence[_Work]) -> list[Outcome]:
+        if not works:
+            return []
+        every = [one for work in works for one in work.inputs]
+        with _timed([work.job for work in works], "backbone"):
+            features = self._policy.features(every)
+        start = 0
+        for work in works:
+            work.features = features[start : start + len(work.inputs)]
+            start += len(work.inputs)
+        # Those that continue a chunk in the same way are sampled together.
+        groups: dict[Hashable, list[_Work]] = {}
+        for work in works:
+            groups.setdefault(None if work.continued is None else work.continued[1], []).append(work)
+        outcomes = []
+        for group in groups.values():
+            with _timed([work.job for work in group], "head"):
+                outcomes += self._sampled(group, len(every))
+        return outcomes
+
+    def _sampled(self, works: Sequence[_Work], batch: int) -> list[Outcome]:
+        options: PolicyOptions = {"noise": np.concatenate([work.noise for work in works])}
+        if works[0].continued is not None:
+            options["chunking"] = works[0].continued[1]
+            options["previous_chunk"] = [
+                work.continued[0].actions for work in works if work.continued is not None
+            ]
+        context = self._policy.context([one for work in works for one in work.features])
+        observations = [work.job.call.observation for work in works]
+        found = self._policy.sample(context, observations, **options)
+        outcomes = []
+        for work, actions in zip(works, found, strict=True):
+            if work.session is not None:
+                work.session.chunk = Chunk(actions, len(work.inputs), _horizon(actions))
+            outcomes.append(
+                Outcome(work.job, action_answer(work.job.call, actions, _info(work)), batch=batch)
+            )
+        return outcomes
+
+
+@contextmanager
+def _timed(jobs: Sequence[Job], part: str) -> Iterator[None]:
+    """Adds the time of a part to requests."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        elapsed = 1e3 * (time.perf_counter() - start)
+        for job in jobs:
+            job.milliseconds[part] = job.milliseconds.get(part, 0.0) + elapsed
+
+
+def _horizon(actions: Any) -> int:
+    """Number of actions in a chunk of any form."""
+    array = next(iter(actions.values())) if isinstance(actions, Mapping) else actions
+    return int(array.shape[-2])
+
+
+def _info(work: _Work) -> dict[str, Any]:
+    """What N1.6's and N1.7's clients are told besides the actions; empty for a plain request."""
+    options = work.job.call.options
+    info: dict[str, Any] = {}
+    if options.session is not None:
+        info = {"session": options.session, "continued": work.continued is not None}
+    if options.ignored:
+        info["ignored_options"] = list(options.ignored)
+    return info

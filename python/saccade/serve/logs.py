@@ -1,0 +1,236 @@
+"""The log of a server: lines for people, JSON lines for machines, or one live line on a terminal.
+
+Lines are written by a thread of their own, so a full disk or a reader that stalls does not hold up the
+server. Lines that cannot be written are counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any, Protocol
+
+from saccade._json import dumps
+from saccade.errors import printable
+from saccade.serve.statistics import line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Lines that wait to be written; more are lost, and counted.
+MOST_LINES = 10_000
+#: Warnings a second that are written; more are counted.
+MOST_WARNINGS = 20
+#: Seconds between two statistics in a log, and on a terminal.
+STATISTICS_SECONDS = 10.0
+LIVE_SECONDS = 1.0
+
+
+class Log(Protocol):
+    """Where a server says what happens."""
+
+    #: Seconds between two calls of `statistics`.
+    every: float
+
+    def event(self, name: str, **fields: Any) -> None:
+        """Something that happens rarely: ``listening``, ``warning``, ``stopping``, ``stopped``."""
+
+    def request(self, **fields: Any) -> None:
+        """A request was answered."""
+
+    def statistics(self, summary: dict[str, Any]) -> None:
+        """What was done so far."""
+
+    def close(self) -> None:
+        """Writes what waits, if that is possible."""
+
+
+class Writer:
+    """Writes lines to a file descriptor in a thread of its own.
+
+    Args:
+        descriptor: The file descriptor. It is not closed.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._lines: deque[bytes] = deque()
+        self._changed = threading.Condition()
+        self._is_closed = False
+        self.lost = 0
+        self._thread = threading.Thread(target=self._run, name="saccade-serve-log", daemon=True)
+        self._thread.start()
+
+    def write(self, text: str) -> None:
+        """Appends a line; never waits."""
+        with self._changed:
+            if len(self._lines) >= MOST_LINES:
+                self.lost += 1
+                return
+            self._lines.append(text.encode("utf-8", "backslashreplace") + b"\n")
+            self._changed.notify()
+
+    def close(self, seconds: float = 2.0) -> None:
+        """Writes what waits, for so many seconds at most."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()
+        self._thread.join(seconds)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._lines and not self._is_closed:
+                    self._changed.wait()
+                if not self._lines:
+                    return
+                data = self._lines.popleft()
+            try:
+                while data:
+                    data = data[os.write(self._descriptor, data) :]
+            except OSError:  # a full disk, a closed pipe
+                self.lost += 1
+
+
+class _Limited:
+    """Lets so many warnings a second pass."""
+
+    def __init__(self) -> None:
+        self._second, self._passed, self._held = 0, 0, 0
+
+    def passes(self) -> int | None:
+        """Whether one more may be written: the number of those before it that were not, or None."""
+        now = int(time.monotonic())
+        if now != self._second:
+            self._second, self._passed = now, 0
+        if self._passed >= MOST_WARNINGS:
+            self._held += 1
+            return None
+        self._passed += 1
+        held, self._held = self._held, 0
+        return held
+
+
+class JsonLog:
+    """JSON lines on standard output: an object with ``event`` and ``time`` (seconds since 1970) each.
+
+    Events: ``listening``, ``request``, ``statistics``, ``warning``, ``stopping``, ``stopped``.
+    """
+
+    every = STATISTICS_SECONDS
+
+    def __init__(self, descriptor: int = 1) -> None:
+        self._writer = Writer(descriptor)
+        self._limited = _Limited()
+
+    def event(self, name: str, **fields: Any) -> None:
+        """See :class:`Log`."""
+        if name == "warning":
+            held = self._limited.passes()
+            if held is None:
+                return
+            fields |= {"left_out": held} if held else {}
+        self._write(name, fields)
+
+    def request(self, **fields: Any) -> None:
+        """See :class:`Log`."""
+        self._write("request", fields)
+
+    def statistics(self, summary: dict[str, Any]) -> None:
+        """See :class:`Log`."""
+        self._write("statistics", {**summary, "lost_lines": self._writer.lost})
+
+    def close(self) -> None:
+        """See :class:`Log`."""
+        self._writer.close()
+
+    def _write(self, name: str, fields: dict[str, Any]) -> None:
+        self._writer.write(dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str))
+
+
+class TextLog:
+    """Lines on standard error: what happens, errors, and statistics where there are new requests."""
+
+    every = STATISTICS_SECONDS
+
+    def __init__(self, descriptor: int = 2) -> None:
+        self._writer = Writer(descriptor)
+        self._limited = _Limited()
+        self._last = ""
+
+    def event(self, name: str, **fields: Any) -> None:
+        """See :class:`Log`."""
+        text = _described(name, fields)
+        if name == "warning":
+            held = self._limited.passes()
+            if held is None:
+                return
+            text += f" (and {held} more)" if held else ""
+        self._line(text)
+
+    def request(self, **fields: Any) -> None:
+        """See :class:`Log`. Only errors are written."""
+        if fields.get("error"):
+            self.event("warning", client=fields.get("client", ""), message=fields["error"])
+
+    def statistics(self, summary: dict[str, Any]) -> None:
+        """See :class:`Log`."""
+        text = line(summary)
+        if summary["requests"] and (text.partition(";")[0] != self._last.partition(";")[0]):
+            self._line(text)
+        self._last = text
+
+    def close(self) -> None:
+        """See :class:`Log`."""
+        self._writer.close()
+
+    def _line(self, text: str) -> None:
+        self._writer.write(f"saccade serve: {printable(text)}")
+
+
+class LiveLog(TextLog):
+    """On a terminal: the lines of :class:`TextLog`, with one live line of statistics below them.
+
+    Args:
+        console: The terminal.
+    """
+
+    every = LIVE_SECONDS
+
+    def __init__(self, console: Console) -> None:
+        from rich.live import Live
+        from rich.text import Text
+
+        super().__init__()
+        self._text = Text
+        self._live = Live(console=console, auto_refresh=False)
+        self._live.start()
+
+    def statistics(self, summary: dict[str, Any]) -> None:
+        """See :class:`Log`."""
+        self._last = line(summary)
+        with contextlib.suppress(OSError):
+            self._live.update(self._text(self._last, no_wrap=True, overflow="ellipsis"), refresh=True)
+
+    def close(self) -> None:
+        """See :class:`Log`."""
+        with contextlib.suppress(OSError):
+            self._live.stop()
+        super().close()
+
+    def _line(self, text: str) -> None:
+        with contextlib.suppress(OSError):
+            self._live.console.print(f"saccade serve: {printable(text)}", markup=False, highlight=False)
+
+
+def _described(name: str, fields: dict[str, Any]) -> str:
+    if name == "warning":
+        client = fields.get("client")
+        return f"{client}: {fields['message']}" if client else str(fields["message"])
+    if name == "listening":
+        return f"listening on {fields['address']} ({fields['policy']})"
+    details = ", ".join(f"{key} {value}" for key, value in fields.items())
+    return f"{name}{f': {details}' if details else ''}"

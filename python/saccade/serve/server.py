@@ -1,0 +1,312 @@
+"""The server: answers requests of many clients, and computes their actions in batches."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import socket
+import threading
+import time
+from collections import OrderedDict, deque
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from saccade import hub
+from saccade.dialects import read_state
+from saccade.errors import InputError, SaccadeError, printable
+from saccade.serve import engine, modalities, pickles
+from saccade.serve.batching import Job, Queue
+from saccade.serve.connections import Connection, Connections, address_of
+from saccade.serve.limits import Limits
+from saccade.serve.logs import Log
+from saccade.serve.packing import pack, unpack
+from saccade.serve.requests import PING, UNAUTHORIZED, Call, Token, parse
+from saccade.serve.sessions import Sessions
+from saccade.serve.statistics import Statistics
+from saccade.serve.zmtp import Request
+
+if TYPE_CHECKING:
+    from saccade.policy import Policy
+
+#: Connections whose release is remembered, for `get_modality_config`.
+MOST_KNOWN = 4096
+#: Characters of an error that are sent.
+LONGEST_ERROR = 4000
+#: Seconds between two looks at the files of the checkpoint.
+WATCH_SECONDS = 5.0
+#: Time to send the last answers, once all are computed.
+FLUSH_SECONDS = 5.0
+
+
+class Server:
+    """Serves a policy to clients of Isaac-GR00T.
+
+    Args:
+        policy: The policy.
+        listener: The socket that clients will connect to, from :func:`saccade.serve.connections.bind`.
+        log: Where it says what happens.
+        limits: What it takes at most.
+        max_batch: Observations that are computed together.
+        max_wait_ms: Time that a request waits for others at most, in milliseconds.
+        seed: Seed of the noise of requests that bring none, or None for noise that is different each time.
+        api_token: A secret that every request must contain, or None.
+        allow_kill: Whether a client may stop the server.
+        modality_form: How `get_modality_config` is answered to a client that did not show its release:
+            ``"text"``, ``"map"``, or None for that of the checkpoint's release.
+
+    Attributes:
+        address: Its address, ``tcp://host:port``.
+
+    Raises:
+        CheckpointError: A file of the checkpoint is damaged.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        listener: socket.socket,
+        log: Log,
+        *,
+        limits: Limits = Limits(),  # noqa: B008 (it is immutable)
+        max_batch: int = 16,
+        max_wait_ms: float = 5.0,
+        seed: int | None = None,
+        api_token: str | None = None,
+        allow_kill: bool = False,
+        modality_form: str | None = None,
+    ) -> None:
+        self._policy, self._log, self._limits = policy, log, limits
+        self._token = Token(api_token)
+        self._allow_kill = allow_kill
+        self._seed = seed
+        self._modalities = modalities.answers(policy)
+        self._form = modality_form or modalities.form_of(policy.head.config.version)
+        self._forms: OrderedDict[Connection, str] = OrderedDict()
+        self._sessions = Sessions(limits.sessions, limits.session_seconds)
+        self._engine = engine.Engine(policy, self._sessions)
+        self._queue = Queue(max_batch, max_wait_ms / 1e3)
+        self._statistics = Statistics()
+        self.address = address_of(listener)
+        self._connections = Connections(
+            listener, limits, self._on_request, self._on_problem, lambda: self._queue.size
+        )
+        self._finished: deque[tuple[engine.Outcome, bytes]] = deque()
+        self._unanswered = 0
+        self._stopping: str | None = None
+        self._is_draining = False
+        self._watched = _stamps(policy.head.source)
+        self._worker = threading.Thread(target=self._compute, name="saccade-serve", daemon=True)
+
+    def stop(self, why: str) -> None:
+        """Ends :meth:`run` once all requests that were accepted are answered.
+
+        May be called by any thread, and by signal handlers.
+        """
+        self._stopping = self._stopping or why
+        self._connections.wake()
+
+    def stop_on_signals(self) -> None:
+        """SIGTERM and SIGINT call :meth:`stop`; a second one has its usual effect."""
+
+        def handle(number: int, frame: FrameType | None) -> None:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            self.stop(signal.Signals(number).name)
+
+        signal.signal(signal.SIGTERM, handle)
+        signal.signal(signal.SIGINT, handle)
+
+    def run(self) -> str:
+        """Serves until it is stopped.
+
+        Returns:
+            What stopped it: ``"SIGTERM"``, ``"SIGINT"``, ``"kill"``, or what :meth:`stop` was given.
+
+        Raises:
+            OSError: Another program took the address.
+        """
+        self._connections.listen()
+        self._log.event("listening", address=self.address, policy=repr(self._policy), pid=os.getpid())
+        self._worker.start()
+        spoken = watched = time.monotonic()
+        try:
+            while not self._is_done():
+                self._connections.poll(0.05 if self._stopping else 0.5)
+                self._send_finished()
+                now = time.monotonic()
+                if now - spoken >= self._log.every:
+                    spoken = now
+                    self._log.statistics(self._statistics.summary())
+                if now - watched >= WATCH_SECONDS:
+                    watched = now
+                    self._watch()
+        finally:
+            self._queue.close()
+            self._connections.close()
+        self._log.statistics(self._statistics.summary())
+        assert self._stopping is not None
+        self._log.event("stopped", requests=self._statistics.requests.total(), errors=self._statistics.errors)
+        return self._stopping
+
+    def _is_done(self) -> bool:
+        """Whether everything that was accepted is answered, once the server is to stop."""
+        if self._stopping is None:
+            return False
+        if not self._is_draining:
+            self._is_draining = True
+            self._flushed_by = float("inf")
+            self._log.event("stopping", reason=self._stopping, unanswered=self._unanswered)
+            self._connections.refuse_new()
+            self._queue.close()
+        if self._unanswered:
+            return False
+        self._flushed_by = min(self._flushed_by, time.monotonic() + FLUSH_SECONDS)
+        return not self._connections.num_unsent or time.monotonic() > self._flushed_by
+
+    def _on_request(self, connection: Connection, request: Request) -> None:
+        """Answers a request at once, or appends it to the queue."""
+        endpoint, error = "unreadable", None
+        try:
+            if not request.is_complete:
+                raise InputError(self._too_large(request.size))
+            if pickles.is_pickle(request.payload):
+                self._reply(connection, request, pickles.refusal(request.payload))
+                error = pickles.REFUSAL
+                return
+            message = unpack(request.payload, self._limits)
+            if not self._token.allows(message.value):
+                raise InputError(UNAUTHORIZED)
+            call = parse(message.value, self._seed)
+            endpoint = call.endpoint
+            if endpoint == "get_action":
+                self._enqueue(connection, request, call, message.is_msgpack_numpy)
+                return
+            self._reply(connection, request, pack(self._answer(connection, call)))
+        except Exception as caught:
+            error = describe(caught)
+            self._reply(connection, request, pack({"error": error}))
+        finally:
+            if error is not None or endpoint != "get_action":
+                self._note(connection, endpoint, error)
+
+    def _too_large(self, size: int) -> str:
+        if size > self._limits.message_bytes:
+            return f"message: expected at most {self._limits.message_bytes} bytes, got {size}"
+        return f"busy: {self._queue.size} bytes of requests wait, and {size} more are too many; try again"
+
+    def _answer(self, connection: Connection, call: Call) -> Any:
+        """The answer to everything but ``get_action``."""
+        if call.endpoint == "ping":
+            return PING
+        if call.endpoint == "get_modality_config":
+            return self._modalities[self._forms.get(connection, self._form)]
+        if call.endpoint == "reset":
+            self._sessions.reset(call.options.session, connection)
+            return {}
+        if not self._allow_kill:
+            raise InputError("kill: refused, since the server was started without --allow-kill")
+        self.stop("kill")
+        return {"status": "ok", "message": "Server is stopping"}
+
+    def _enqueue(self, connection: Connection, request: Request, call: Call, is_msgpack_numpy: bool) -> None:
+        if self._stopping is not None:
+            raise InputError("the server is stopping, and takes no more requests")
+        if len(self._queue) >= self._limits.waiting:
+            raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
+        # Only the state, which is small. The rest is checked before it is computed.
+        rows = len(read_state(call.observation, self._policy.requirements))
+        if rows > self._limits.rows:
+            raise InputError(f"observation: expected at most {self._limits.rows} rows, got {rows}")
+        self._forms[connection] = "text" if call.is_bare else "map"
+        self._forms.move_to_end(connection)
+        while len(self._forms) > MOST_KNOWN:
+            self._forms.popitem(last=False)
+        self._unanswered += 1
+        reply = (connection, request.address)
+        self._queue.put(Job(call, rows, connection, request.size, is_msgpack_numpy, reply=reply))
+
+    def _compute(self) -> None:
+        """The thread that computes."""
+        while (jobs := self._queue.take()) is not None:
+            for outcome in self._engine.run(jobs):
+                payload = None
+                if outcome.error is None:
+                    try:
+                        payload = pack(outcome.answer, as_msgpack_numpy=outcome.job.is_msgpack_numpy)
+                    except Exception as error:
+                        outcome = engine.Outcome(outcome.job, error=error)
+                if payload is None:
+                    assert outcome.error is not None
+                    payload = pack({"error": describe(outcome.error)})
+                self._finished.append((outcome, payload))
+            self._connections.wake()
+
+    def _send_finished(self) -> None:
+        while self._finished:
+            outcome, payload = self._finished.popleft()
+            connection, address = outcome.job.reply
+            self._connections.send(connection, address, payload)
+            self._unanswered -= 1
+            error = None if outcome.error is None else describe(outcome.error)
+            total = 1e3 * (time.perf_counter() - outcome.job.received)
+            if error is None:
+                self._statistics.computed(outcome, total)
+            milliseconds = {**outcome.job.milliseconds, "total": total}
+            self._note(
+                connection,
+                "get_action",
+                error,
+                batch=outcome.batch,
+                milliseconds={part: round(value, 3) for part, value in milliseconds.items()},
+            )
+
+    def _reply(self, connection: Connection, request: Request, payload: bytes) -> None:
+        self._connections.send(connection, request.address, payload)
+
+    def _note(self, connection: Connection, endpoint: str, error: str | None, **fields: Any) -> None:
+        self._statistics.count(endpoint, is_error=error is not None)
+        self._log.request(client=connection.name, endpoint=endpoint, error=error, **fields)
+
+    def _on_problem(self, client: str, message: str) -> None:
+        self._log.event("warning", client=client, message=message)
+
+    def _watch(self) -> None:
+        """Says once if the checkpoint was replaced; the policy is in memory."""
+        stamps = _stamps(self._policy.head.source)
+        if stamps != self._watched:
+            self._watched = stamps
+            self._log.event(
+                "warning",
+                message=f"{self._policy.head.source}: the checkpoint has changed; this server keeps what it "
+                "loaded. Restart it to serve the new one",
+            )
+
+
+def describe(error: BaseException) -> str:
+    """An error as it is sent: errors of saccade by their message, others with their type."""
+    text = str(error)
+    if not isinstance(error, SaccadeError | MemoryError) or not text:
+        text = f"{type(error).__name__}: {text}"
+    return printable(text)[:LONGEST_ERROR]
+
+
+@functools.cache
+def _folder(source: str) -> Path:
+    return hub.resolve(source)
+
+
+def _stamps(source: str | None) -> tuple[Any, ...]:
+    """What changes if the files of a checkpoint do."""
+    if source is None:
+        return ()
+    found: list[Any] = []
+    try:
+        folder = _folder(source)
+        for path in sorted(folder.iterdir()) if folder.is_dir() else [folder]:
+            stat = path.stat()
+            found.append((path.name, stat.st_ino, stat.st_size, stat.st_mtime_ns))
+    except OSError as error:
+        found.append(error.errno)
+    return tuple(found)

@@ -1,0 +1,91 @@
+"""What a server has done: counts, sizes of batches, and the latency of its answers by part."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from typing import Any
+
+import numpy as np
+
+from saccade.serve.engine import PARTS, Outcome
+
+#: Latencies are those of so many answers, the last ones.
+WINDOW = 1024
+
+
+class Statistics:
+    """Counts and latencies since the start; one thread uses it.
+
+    Attributes:
+        requests: Number of answers by endpoint; ``"unreadable"`` for requests that had none.
+        errors: Number of answers that were errors.
+    """
+
+    def __init__(self) -> None:
+        self.requests: Counter[str] = Counter()
+        self.errors = 0
+        self._started = time.monotonic()
+        self._milliseconds: dict[str, deque[float]] = {
+            part: deque(maxlen=WINDOW) for part in (*PARTS, "total")
+        }
+        self._batches: deque[int] = deque(maxlen=WINDOW)
+        self._times: deque[float] = deque(maxlen=WINDOW)
+
+    def count(self, endpoint: str, *, is_error: bool) -> None:
+        """Counts an answer."""
+        self.requests[endpoint] += 1
+        self.errors += is_error
+
+    def computed(self, outcome: Outcome, total: float) -> None:
+        """Takes notice of actions.
+
+        Args:
+            outcome: What was computed.
+            total: Milliseconds from the arrival of the request to its answer.
+        """
+        for part, milliseconds in {**outcome.job.milliseconds, "total": total}.items():
+            self._milliseconds[part].append(milliseconds)
+        self._batches.append(outcome.batch)
+        self._times.append(time.monotonic())
+
+    def summary(self) -> dict[str, Any]:
+        """Everything, for JSON.
+
+        Returns:
+            ``requests`` and ``errors`` since the start, ``per_second`` over the last actions, ``batch`` (mean
+            number of observations computed together, as a request sees it), and ``milliseconds``: ``p50`` and
+            ``p99`` by part.
+        """
+        span = time.monotonic() - self._times[0] if self._times else 0.0
+        return {
+            "seconds": round(time.monotonic() - self._started, 3),
+            "requests": dict(self.requests),
+            "errors": self.errors,
+            "per_second": round(len(self._times) / span, 3) if span > 0 else 0.0,
+            "batch": round(float(np.mean(self._batches)), 2) if self._batches else 0.0,
+            "milliseconds": {
+                part: {
+                    "p50": round(float(np.percentile(values, 50)), 3),
+                    "p99": round(float(np.percentile(values, 99)), 3),
+                }
+                for part, values in self._milliseconds.items()
+                if values
+            },
+        }
+
+
+def line(summary: dict[str, Any]) -> str:
+    """A summary on one line.
+
+    Example:
+        >>> line(Statistics().summary())
+        '0 requests, 0 errors'
+    """
+    text = f"{sum(summary['requests'].values())} requests, {summary['errors']} errors"
+    parts = summary["milliseconds"]
+    if parts:
+        shown = ", ".join(f"{part} {value['p50']:.1f}/{value['p99']:.1f}" for part, value in parts.items())
+        speed = f"{summary['per_second']:.1f} a second in batches of {summary['batch']:.1f}"
+        text += f"; {speed}; ms p50/p99: {shown}"
+    return text
