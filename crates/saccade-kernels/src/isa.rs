@@ -235,8 +235,8 @@ instruction_sets! {
     #[doc(hidden)]
     SoftwareTiles = "software_tiles" if all() {
         vectors: Loops<TILE>,
-        bf16: [Loops<TILE>],
-        int8: [Loops<TILE>],
+        bf16: [],
+        int8: [],
         gemm_bf16: [InTiles<Software, Pairs>],
         gemm_int8: [InTiles<Software, Quads>],
         needs: [Loops<TILE>],

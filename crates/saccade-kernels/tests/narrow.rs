@@ -90,7 +90,7 @@ impl Operand {
 
 /// Largest byte of activations: 8 bits where the instruction set has what multiplies them without saturating.
 fn steps(isa: Isa) -> f32 {
-    let seven_bits = cfg!(target_arch = "x86_64") && isa != Isa::Portable;
+    let seven_bits = cfg!(target_arch = "x86_64") && !matches!(isa, Isa::Portable | Isa::SoftwareTiles);
     if seven_bits && !isa.dot_products().contains(&"vnni") {
         129.0
     } else {
