@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,16 +20,19 @@ IMAGE, TOKENS = 300, 4
 
 
 class StandInProcessor:
-    """A token for each byte of the instruction, and a few for each view. Remembers what it was given."""
+    """A token for each byte of the instruction, and a few for each view. Remembers what it was told."""
 
     def __init__(self) -> None:
-        self.seen: list[tuple[list[str], str]] = []
+        self.seen: list[tuple[str | None, bool]] = []
 
-    def __call__(self, frames: Mapping[str, NDArray[np.uint8]], instruction: str) -> BackboneInputs:
-        self.seen.append((list(frames), instruction))
-        pixels = np.stack([np.resize(view, (3, 4, 4)) / np.float32(255) for view in frames.values()])
+    def __call__(
+        self, frames: Sequence[NDArray[np.uint8]], instruction: str | None, *, plain_text: bool = False
+    ) -> BackboneInputs:
+        self.seen.append((instruction, plain_text))
+        instruction = instruction or "default"
+        pixels = np.stack([np.resize(view, (3, 4, 4)) / np.float32(255) for view in frames])
         ids = np.concatenate([np.full(TOKENS * len(frames), IMAGE), list(instruction.encode())])
-        return BackboneInputs(pixels.astype(np.float32), ids[None], view_names=list(frames))
+        return BackboneInputs(pixels.astype(np.float32), ids[None])
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,8 @@ class StandInBackbone:
         self.table = np.random.default_rng(0).standard_normal((IMAGE + 1, width), np.float32)
         self.previous: list[Any] = []
 
-    def ragged(
-        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] | None = None
+    def _ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()
     ) -> list[StandInFeatures]:
         self.previous.append(previous)
         return [self._features(one) for one in inputs]
@@ -68,10 +71,12 @@ def policy(layout: str, cameras: CameraSources | None = None) -> Policy:
     """A policy with the head, the statistics and the cameras of a whole checkpoint, and stand-ins."""
     folder = whole_checkpoints.whole(layout)
     found = camera_sources(folder, whole_checkpoints.EMBODIMENT) if cameras is None else cameras
+    backbone: Any = StandInBackbone(head(layout).config.context_dim)
+    processor: Any = StandInProcessor()
     return Policy(
         head(layout),
         embodiment=whole_checkpoints.EMBODIMENT,
-        backbone=StandInBackbone(head(layout).config.context_dim),
-        processor=StandInProcessor(),
+        backbone=backbone,
+        processor=processor,
         cameras=found,
     )

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 import torch
 import whole_checkpoints
-from policy_cases import StandInProcessor, policy
+from policy_cases import policy
 
 import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
 from saccade.dialects import CameraSources
-from saccade.dialects.isaac import DEFAULT_INSTRUCTION as ISAAC_DEFAULT
-from saccade.dialects.lerobot import DEFAULT_INSTRUCTION as LEROBOT_DEFAULT
 
 Observation = dict[str, Any]
 
@@ -155,21 +153,21 @@ def test_one_string_a_row_of_a_batch_is_plain() -> None:
 def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() -> None:
     made = policy("lerobot")
     given = lerobot(nested(made, batch=2))
-    processor = made.processor
-    assert isinstance(processor, StandInProcessor)
+    processor: Any = made.processor
     for task, expected in (
-        (["a", ""], ["a", LEROBOT_DEFAULT]),
+        (["a", ""], ["a", None]),
         ("a", ["a", "a"]),
-        (None, [LEROBOT_DEFAULT] * 2),
+        (None, [None, None]),
     ):
         processor.seen.clear()
         made.act(given | {"task": task}, seed=0)
-        # Sorted by name, whatever the order of the observation.
-        assert processor.seen == [(["front", "wrist"], text) for text in expected]
+        assert processor.seen == [(text, False) for text in expected]
+    # Sorted by name, whatever the order of the observation.
+    assert made.inputs(given)[0].view_names == ("front", "wrist")
     isaac = policy("isaac")
     observation = flat(nested(isaac))
     del observation["annotation.human.action.task_description"]
-    assert isaac._read(observation)[1][0].instructions == (ISAAC_DEFAULT,)
+    assert isaac._read(observation)[1][0].instructions == (None,)
     observation["task"] = ["go"]
     assert isaac._read(observation)[1][0].instructions == ("go",)
 
@@ -336,8 +334,6 @@ def test_what_is_no_observation_is_an_error() -> None:
             made.act(given)
     with pytest.raises(InputError, match="previous: expected what encode returns, got str"):
         made.act(nested(made), previous="yes")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="previous: expected 1 observations, got 2"):
-        made.encode(nested(made), previous=made.encode(nested(made, batch=2)))
     with pytest.raises(InputError, match="seed: expected at least 0"):
         made.example_observation(-1)
 

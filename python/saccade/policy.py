@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from saccade._arrays import Array, ArrayLike, Float32Array, integer
+from saccade.backbone import Backbone
+from saccade.backbone_features import BackboneFeatures
 from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.context import Context
@@ -19,7 +21,8 @@ from saccade.errors import InputError
 from saccade.options import PolicyOptions, SampleOptions
 from saccade.policy_context import PolicyContext, encoded
 from saccade.policy_example import example_observation
-from saccade.policy_parts import Backbone, Features, Head, Processor, embodiment_of
+from saccade.policy_head import Head, embodiment_of
+from saccade.processor import Preprocessing, Processor
 from saccade.robots import Normalizer, padded
 
 if TYPE_CHECKING:
@@ -126,7 +129,7 @@ class Policy:
         source: str | os.PathLike[str],
         *,
         embodiment: str | int | None = None,
-        preprocessing: str | None = None,
+        preprocessing: Preprocessing | None = None,
         tokenizer: str | os.PathLike[str] | None = None,
         precision: str | Mapping[str, str] = "float32",
         num_threads: int | None = None,
@@ -228,9 +231,9 @@ class Policy:
 
                 Or a sequence of observations, which need not agree in form, size or length. They are computed
                 together, and each has the bits that it has alone.
-            previous: The context of earlier observations, one for each of these. Vision tokens of views with
-                the same frames, and the unchanged beginning of the prompt, are taken from it. The result has
-                the same bits without.
+            previous: The context of earlier observations of this policy. Vision tokens of views with the same
+                frames, and the unchanged beginning of a prompt, are taken from it. The result has the same
+                bits without.
 
         Raises:
             InputError, ShapeError, DtypeError: The observation does not fit the robot; the message lists what
@@ -252,7 +255,7 @@ class Policy:
 
     def features(
         self, inputs: Sequence[BackboneInputs], *, previous: PolicyContext | None = None
-    ) -> tuple[Features, ...]:
+    ) -> tuple[BackboneFeatures, ...]:
         """The backbone's features for each of its inputs.
 
         Args:
@@ -263,16 +266,11 @@ class Policy:
             InputError: This policy has no backbone, or ``previous`` does not fit.
         """
         backbone = self._whole("features", self.backbone)
-        held = None
-        if previous is not None:
-            if not isinstance(previous, PolicyContext):
-                raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
-            if previous.batch != len(inputs):
-                raise InputError(f"previous: expected {len(inputs)} observations, got {previous.batch}")
-            held = previous.features
-        return tuple(backbone.ragged(inputs, previous=held))
+        if previous is not None and not isinstance(previous, PolicyContext):
+            raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
+        return tuple(backbone._ragged(inputs, previous=() if previous is None else previous.features))
 
-    def context(self, features: Sequence[Features]) -> PolicyContext:
+    def context(self, features: Sequence[BackboneFeatures]) -> PolicyContext:
         """What the head encodes of features of any lengths.
 
         Args:
@@ -363,11 +361,14 @@ class Policy:
 
     def _inputs(self, readings: Sequence[Reading]) -> list[BackboneInputs]:
         processor = self._whole("inputs", self.processor)
-        return [
-            processor(frames, instruction)
-            for reading in readings
-            for frames, instruction in zip(reading.frames, reading.instructions, strict=True)
-        ]
+        found = []
+        for reading in readings:
+            for frames, instruction in zip(reading.frames, reading.instructions, strict=True):
+                # Without their names, by which lerobot's processor would sort them: they are in order.
+                inputs = processor(list(frames.values()), instruction, plain_text=reading.is_plain)
+                inputs.view_names = tuple(frames)
+                found.append(inputs)
+        return found
 
     def _encoded(self, readings: Sequence[Reading], previous: PolicyContext | None) -> PolicyContext:
         return self.context(self.features(self._inputs(readings), previous=previous))

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from saccade.backbone_features import BackboneFeatures
 from saccade.context import Context
-from saccade.policy_parts import Features, Head
+from saccade.policy_head import Head
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class PolicyContext:
     """
 
     context: Context
-    features: tuple[Features, ...]
+    features: tuple[BackboneFeatures, ...]
 
     @property
     def batch(self) -> int:
@@ -50,7 +51,7 @@ class PolicyContext:
         return f"<saccade.PolicyContext batch={self.batch} num_vl_tokens={self.num_vl_tokens}>"
 
 
-def encoded(head: Head, features: Sequence[Features]) -> PolicyContext:
+def encoded(head: Head, features: Sequence[BackboneFeatures]) -> PolicyContext:
     """What a head encodes of features of any lengths, each a batch of one."""
     # Shorter ones are padded, and their padding is dropped, which gives the bits without padding.
     lengths = [one.backbone_features.shape[1] for one in features]

@@ -155,6 +155,7 @@ class Processor:
         instruction: str | Sequence[str | None] | None = None,
         *,
         view_names: Sequence[str] | None = None,
+        plain_text: bool = False,
     ) -> BackboneInputs:
         """Prepares one observation, or a batch.
 
@@ -166,6 +167,8 @@ class Processor:
             instruction: What the robot is to do. For a batch: a list with one instruction for each
                 observation. None, and with lerobot's preprocessing an empty text: the released default.
             view_names: Names of the views of a sequence.
+            plain_text: N1.5: the instruction stands in the prompt as it is, also if this processor renders
+                instructions as lists.
 
         Raises:
             ShapeError, DtypeError: A frame is none. The message names it.
@@ -188,7 +191,8 @@ class Processor:
             [
                 (_views(observation, names), None if told is None else text("instruction", told))
                 for observation, told in zip(observations, instructions, strict=True)
-            ]
+            ],
+            bool(plain_text),
         )
         pixels, input_ids, attention_mask, grid, found = prepared
         return BackboneInputs(

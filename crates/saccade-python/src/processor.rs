@@ -167,6 +167,7 @@ impl Processor {
         &self,
         py: Python<'py>,
         observations: Vec<PyObservation<'py>>,
+        plain_text: bool,
     ) -> PyResult<PyPrepared<'py>> {
         let observations = observations
             .iter()
@@ -177,6 +178,7 @@ impl Processor {
                 Ok(Observation {
                     views: views.collect::<PyResult<_>>()?,
                     instruction: instruction.as_deref(),
+                    plain_text,
                 })
             })
             .collect::<PyResult<Vec<_>>>()?;

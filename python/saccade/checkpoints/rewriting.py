@@ -120,8 +120,8 @@ def quantize(
     computes with in int8. Such a weight is stored as row-major int8 ``X.weight
     (out_features, in_features)`` with values from -127 to 127, and float32 ``X.weight_scale
     (out_features,)``. A row represents its integers times its scale, which is the largest magnitude of the
-    row / 127. The result does not depend on the instruction set. All other tensors are copied bit for bit, and
-    so are the other files of the directory: statistics, processors, tokenizers.
+    row / 127. The result does not depend on the instruction set. All other tensors are copied bit for bit,
+    and so are the other files of the directory: statistics, processors, tokenizers.
 
     :meth:`saccade.ActionHead.load`, :meth:`saccade.Backbone.load` and :meth:`saccade.Policy.load` read the
     copy at every precision. At ``"int8"`` it gives the same bits as

@@ -11,9 +11,6 @@ from saccade._arrays import Float32Array, UInt8Array
 from saccade.dialects.checks import as_text, check_batch, check_cameras, check_frames, check_state, views
 from saccade.dialects.requirements import Requirements
 
-#: The instruction that Isaac-GR00T N1.5 uses if an observation has none.
-DEFAULT_INSTRUCTION = "Perform the default behavior."
-
 
 def read_frames(
     prefix: str, given: Mapping[str, Any], is_batched: bool, needs: Requirements

@@ -57,8 +57,8 @@ def _below(observation: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 def _language(
     observation: Mapping[str, Any], state: StateReading, needs: Requirements
-) -> tuple[tuple[str, ...], bool]:
-    """The instructions; without one, N1.5's default."""
+) -> tuple[tuple[str | None, ...], bool]:
+    """The instructions, and whether they are plain; without one, N1.5's default."""
     known = needs.language_key
     if known is None:
         keys = [key for key in observation if key.startswith("annotation.") or key == TASK]
@@ -70,4 +70,4 @@ def _language(
         return isaac.read_texts(keys[0], observation[keys[0]], state.is_batched, needs)
     if known is not None:
         raise needs.input_error(known, "an instruction", "none")
-    return (isaac.DEFAULT_INSTRUCTION,) * len(state), False
+    return (None,) * len(state), False

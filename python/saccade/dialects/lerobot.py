@@ -14,9 +14,6 @@ from saccade.dialects.requirements import Camera, Requirements
 
 IMAGES, IMAGE, STATE, TASK = "observation.images.", "observation.image", "observation.state", "task"
 
-#: The instruction that lerobot uses if an observation has none, or an empty one.
-DEFAULT_INSTRUCTION = "Perform the task."
-
 #: Float frames are clamped to 0 and 1, as lerobot does. Values further out are of another scale, and refused.
 LEAST, MOST = -1.0, 2.0
 
@@ -113,12 +110,12 @@ def _from_unit(name: str, frames: Any, needs: Requirements) -> Any:
     return scaled.byte() if is_torch(scaled) else scaled.astype(np.uint8)
 
 
-def _texts(given: Any, state: StateReading, needs: Requirements) -> tuple[str, ...]:
-    """The instruction of each row. One string is for every row."""
+def _texts(given: Any, state: StateReading, needs: Requirements) -> tuple[str | None, ...]:
+    """The instruction of each row. One string is for every row. None or an empty one is the default."""
     if given is None or isinstance(given, str):
         rows = [given] * len(state)
     elif isinstance(given, (list, tuple, np.ndarray)):
         rows = list(given)
     else:
         raise needs.input_error(TASK, "an instruction, or one for each row", repr(given))
-    return tuple(as_text(TASK, row if row else DEFAULT_INSTRUCTION, needs) for row in rows)
+    return tuple(as_text(TASK, row, needs) if row else None for row in rows)

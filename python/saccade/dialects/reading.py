@@ -38,13 +38,13 @@ class Reading(StateReading):
         frames: For each observation the frames ``(height, width, 3)`` by the name of the view, in the order
             of the prompt. With several frames a camera, the views are ``name[0]``, ``name[1]``, ..., oldest
             first, and ordered by time before camera.
-        instructions: The instruction of each observation.
+        instructions: The instruction of each observation; None for the released default.
         is_plain: Whether N1.5's prompt contains the instruction as it is, and not as ``['...']``. Isaac-GR00T
             renders a batch with one string a row in this way.
     """
 
     frames: tuple[dict[str, UInt8Array], ...]
-    instructions: tuple[str, ...]
+    instructions: tuple[str | None, ...]
     is_plain: bool
 
 

@@ -34,6 +34,8 @@ pub struct Observation<'a> {
     pub views: Vec<(Option<&'a str>, Frame<'a>)>,
     /// What the robot is to do. Without it the released default is taken, where there is one.
     pub instruction: Option<&'a str>,
+    /// N1.5: whether the instruction stands in the prompt as it is, even if the processor renders instructions as lists.
+    pub plain_text: bool,
 }
 
 /// Inputs of a backbone, of a batch of observations.
@@ -153,7 +155,7 @@ impl Processor {
                 views.push(view(&self.settings, self.isa, &name, frame)?);
             }
             let tokens: Vec<usize> = views[first..].iter().map(|view: &View| view.tokens).collect();
-            prompts.push(self.prompt_ids(observation.instruction, &tokens)?);
+            prompts.push(self.prompt_ids(observation, &tokens)?);
         }
         let (input_ids, attention_mask, length) = self.padded(&prompts)?;
         Ok(Prepared {
@@ -201,7 +203,7 @@ impl Processor {
     }
 
     /// The ids of a prompt.
-    fn prompt_ids(&self, instruction: Option<&str>, views: &[usize]) -> Result<Vec<u32>> {
+    fn prompt_ids(&self, observation: &Observation<'_>, views: &[usize]) -> Result<Vec<u32>> {
         let most = match self.settings.version {
             Version::N17 => N17_MAX_POSITIONS,
             _ => MAX_POSITIONS,
@@ -215,8 +217,8 @@ impl Processor {
                 views.len()
             )));
         }
-        check_length("instruction", instruction.unwrap_or_default())?;
-        let text = prompt(&self.settings, instruction, views)?;
+        check_length("instruction", observation.instruction.unwrap_or_default())?;
+        let text = prompt(&self.settings, observation.instruction, observation.plain_text, views)?;
         let ids = self.tokenizer.encode("instruction", &text)?;
         let found = ids.iter().filter(|id| **id == self.ids.image).count();
         if found != expected {

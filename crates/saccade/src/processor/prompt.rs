@@ -89,8 +89,13 @@ impl SpecialIds {
 ///
 /// # Errors
 /// [`Error::Input`] for an instruction that is missing where the released code has no default, and for one that holds a placeholder of a frame.
-pub(super) fn prompt(settings: &Settings, instruction: Option<&str>, views: &[usize]) -> Result<String> {
-    let text = text(settings, instruction)?;
+pub(super) fn prompt(
+    settings: &Settings,
+    instruction: Option<&str>,
+    plain_text: bool,
+    views: &[usize],
+) -> Result<String> {
+    let text = text(settings, instruction, plain_text)?;
     let view = view_tokens(settings.version);
     let images = views.iter().enumerate().map(|(index, tokens)| {
         let label = match settings.version {
@@ -108,7 +113,7 @@ pub(super) fn prompt(settings: &Settings, instruction: Option<&str>, views: &[us
 }
 
 /// The instruction as it stands in the prompt.
-fn text(settings: &Settings, instruction: Option<&str>) -> Result<String> {
+fn text(settings: &Settings, instruction: Option<&str>, plain_text: bool) -> Result<String> {
     let instruction = match (settings.preprocessing, instruction) {
         (Preprocessing::Lerobot, None | Some("")) => "Perform the task.",
         (Preprocessing::Isaac, None) if settings.version == Version::N15 => "Perform the default behavior.",
@@ -128,7 +133,7 @@ fn text(settings: &Settings, instruction: Option<&str>) -> Result<String> {
         true if is_n15 => formalized(instruction).replace('_', ""),
         true => formalized(instruction),
     };
-    let text = match is_n15 && !settings.plain_text {
+    let text = match is_n15 && !settings.plain_text && !plain_text {
         true => list_of(&text),
         false => text,
     };

@@ -1,15 +1,10 @@
-"""What a policy uses of its parts: the head, the backbone and the processor."""
+"""What a policy uses of its head, and which of the head's embodiments."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-from saccade._arrays import Array, ArrayLike, Float32Array, UInt8Array, integer
-from saccade.backbone_inputs import BackboneInputs
+from saccade._arrays import Array, ArrayLike, integer
 from saccade.config import HeadConfig
 from saccade.context import Context
 from saccade.errors import InputError
@@ -53,34 +48,6 @@ class Head(Protocol):
         **options: Unpack[SampleOptions],
     ) -> Array:
         """See :meth:`saccade.ActionHead.sample`."""
-
-
-class Features(Protocol):
-    """What a policy uses of a backbone's features, which are a :class:`saccade.BackboneFeatures`."""
-
-    @property
-    def backbone_features(self) -> Float32Array:
-        """``(batch, T, width)``."""
-
-    @property
-    def image_mask(self) -> npt.NDArray[np.bool_]:
-        """``(batch, T)``."""
-
-
-class Backbone(Protocol):
-    """What a policy uses of its backbone, which is a :class:`saccade.Backbone`."""
-
-    def ragged(
-        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] | None = None
-    ) -> Sequence[Features]:
-        """The features of observations of any lengths, each with the bits that it has alone."""
-
-
-class Processor(Protocol):
-    """What a policy uses of its processor, which is a :class:`saccade.Processor`."""
-
-    def __call__(self, frames: Mapping[str, UInt8Array], instruction: str) -> BackboneInputs:
-        """See :class:`saccade.Processor`."""
 
 
 def embodiment_of(head: Head, normalizer: Normalizer, embodiment: str | int | None) -> int:

@@ -1,0 +1,134 @@
+"""What a whole checkpoint holds besides its head: the backbone, its processor, the robots and cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import saccade._saccade as _saccade
+from saccade.backbone_config import BackboneConfig
+from saccade.dialects import Requirements, camera_sources
+from saccade.errors import SaccadeError
+from saccade.processor import Processor
+from saccade.robots import Normalizer, read_json
+
+PRECISIONS = ("float32", "bfloat16", "int8")
+
+
+@dataclass(frozen=True)
+class RobotFindings:
+    """One robot of a checkpoint's statistics."""
+
+    embodiment: str | None
+    """Its tag."""
+    embodiment_id: int | None
+    """Its id in the head."""
+    needs: Requirements | None
+    """What an observation of it must contain; None if the statistics cannot be used as they are."""
+    actions: tuple[tuple[str, int], ...]
+    """Key and width of each part of the action."""
+    problem: str | None
+    """Why the statistics cannot be used as they are."""
+
+
+@dataclass(frozen=True)
+class BackboneFindings:
+    """The backbone of a checkpoint, and what is needed to use it."""
+
+    config: BackboneConfig | None
+    """Its sizes; None if it is not one that saccade loads."""
+    problem: str | None
+    """Why it is not."""
+    memory: dict[str, int]
+    """Size of the loaded weights by precision, in bytes."""
+    processor: str | None
+    """How frames and words are prepared by default; None if something is missing."""
+    processor_problem: str | None
+    """What is missing: which files of which published id are needed."""
+
+
+def backbone_of(source: Path, config: str | None) -> BackboneFindings:
+    """The backbone of a checkpoint that has tensors outside its head. Reads no tensor.
+
+    Args:
+        source: The checkpoint.
+        config: Its config as JSON, or None for its ``config.json``.
+    """
+    try:
+        published = _saccade.PublishedBackbone.open(str(source), config)
+    except SaccadeError as error:
+        return BackboneFindings(None, str(error), {}, None, None)
+    processor, problem = None, None
+    try:
+        processor = repr(Processor.load(source))
+    except (SaccadeError, FileNotFoundError) as error:
+        problem = str(error)
+    return BackboneFindings(
+        config=BackboneConfig(**published.config()),
+        problem=None,
+        memory={precision: published.nbytes(precision) for precision in PRECISIONS},
+        processor=processor,
+        processor_problem=problem,
+    )
+
+
+def robots_of(source: Path) -> list[RobotFindings]:
+    """The robots whose statistics a checkpoint holds, with what an observation of each must contain."""
+    found = []
+    for tag in _tags(source):
+        try:
+            normalizer = Normalizer.load(source, tag)
+            cameras = camera_sources(source, normalizer.embodiment)
+        except (SaccadeError, FileNotFoundError) as error:
+            found.append(RobotFindings(tag, None, None, (), str(error)))
+            continue
+        needs = Requirements(
+            embodiment=normalizer.embodiment,
+            cameras=cameras.cameras,
+            state=tuple((group.key, group.size) for group in normalizer.state_groups),
+            video_horizon=cameras.video_horizon,
+            language_key=cameras.language_key,
+        )
+        actions = tuple((group.key, group.size) for group in normalizer.action_groups)
+        found.append(RobotFindings(tag, normalizer.embodiment_id, needs, actions, None))
+    return found
+
+
+def _tags(source: Path) -> list[str | None]:
+    """The tags of the robots, from the first file that has statistics; None for robots without a tag."""
+    for name, tags in TAGS.items():
+        try:
+            values = read_json(source / name)
+            found = tags(values)
+        except (OSError, SaccadeError, AttributeError, TypeError, ValueError):
+            continue
+        if found:
+            return found
+    return []
+
+
+def _processor_tags(values: Mapping[str, Any]) -> list[str | None]:
+    return list((values.get("processor_kwargs") or {}).get("modality_configs") or {})
+
+
+def _metadata_tags(values: Mapping[str, Any]) -> list[str | None]:
+    return [tag for tag, entry in values.items() if isinstance(entry, Mapping) and "statistics" in entry]
+
+
+def _lerobot_tags(values: Mapping[str, Any]) -> list[str | None]:
+    return [None] if values.get("steps") else []
+
+
+def _own_tags(values: Mapping[str, Any]) -> list[str | None]:
+    return [None] if "policy_cfg" in values else []
+
+
+#: Files with statistics, in the order in which `Normalizer.load` tries them, and how their robots are listed.
+TAGS: dict[str, Callable[[Mapping[str, Any]], list[str | None]]] = {
+    "policy_preprocessor.json": _lerobot_tags,
+    "processor_config.json": _processor_tags,
+    "experiment_cfg/metadata.json": _metadata_tags,
+    "config.json": _own_tags,
+}

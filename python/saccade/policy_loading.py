@@ -1,0 +1,137 @@
+"""Loads the parts of a whole policy from a checkpoint."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import saccade._saccade as _saccade
+from saccade.backbone import Backbone
+from saccade.checkpoints.description import open_published
+from saccade.config import HeadConfig
+from saccade.dialects import Camera, CameraSources, camera_sources
+from saccade.errors import CheckpointError, InputError
+from saccade.head import ActionHead
+from saccade.hub import resolve
+from saccade.policy_head import requested_id
+from saccade.processor import Preprocessing, Processor
+from saccade.robots import Normalizer
+
+#: What the names of a part's tensors begin with, in NVIDIA's and in lerobot's checkpoints.
+HEAD = ("action_head.", "_groot_model.action_head.")
+BACKBONE = ("backbone.", "_groot_model.backbone.")
+
+PARTS = ("backbone", "head")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The arguments of :class:`saccade.Policy`."""
+
+    head: ActionHead
+    normalizer: Normalizer
+    embodiment: str | int | None
+    backbone: Backbone
+    processor: Processor
+    cameras: CameraSources
+
+
+def load(
+    source: str | os.PathLike[str],
+    *,
+    embodiment: str | int | None,
+    preprocessing: Preprocessing | None,
+    tokenizer: str | os.PathLike[str] | None,
+    precision: str | Mapping[str, str],
+    num_threads: int | None,
+    normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None,
+    cameras: Sequence[str] | None,
+) -> Parts:
+    """The parts of a whole checkpoint; see :meth:`saccade.Policy.load`.
+
+    What is quick to load comes first, so that a mistake is found before gigabytes are read.
+    """
+    precisions = _precisions(precision)
+    path = resolve(source)
+    check_whole(path)
+    config = HeadConfig(**open_published(path).config())
+    if not isinstance(normalizer, Normalizer):
+        normalizer = Normalizer.load(
+            path if normalizer is None else normalizer,
+            embodiment,
+            state_dim=config.state_dim,
+            action_dim=config.encoder_action_dim,
+        )
+    found = camera_sources(path, normalizer.embodiment)
+    if cameras is not None:
+        found = replace(found, cameras=_chosen(cameras, found))
+    processor = Processor.load(path, preprocessing=preprocessing, tokenizer=tokenizer)
+    chosen = requested_id(normalizer, embodiment)
+    head = ActionHead.load(
+        path,
+        embodiment_ids=None if chosen is None else [chosen],
+        precision=precisions["head"],
+        num_threads=num_threads,
+    )
+    backbone = Backbone.load(path, precision=precisions["backbone"], num_threads=num_threads)
+    return Parts(head, normalizer, embodiment, backbone, processor, found)
+
+
+def check_whole(path: Path) -> None:
+    """Checks that a checkpoint holds a head and a backbone.
+
+    Raises:
+        FileNotFoundError, CheckpointError: It does not exist, is damaged, or lacks one of them. The message
+            says which.
+    """
+    names = _saccade.tensor_names(os.fspath(path))
+    has_backbone = any(name.startswith(BACKBONE) for name in names)
+    # A head alone may have no prefix.
+    has_head = any(name.startswith(HEAD) for name in names) or not has_backbone
+    if has_head and has_backbone:
+        return
+    if has_head:
+        raise CheckpointError(
+            f"{path}: expected a whole checkpoint, got an action head without a backbone (no tensor's name "
+            f"begins with {' or '.join(BACKBONE)}): pass features of your own to "
+            "saccade.ActionHead.load(checkpoint).policy()"
+        )
+    raise CheckpointError(
+        f"{path}: expected a whole checkpoint, got a backbone without an action head (no tensor's name "
+        f"begins with {' or '.join(HEAD)}): saccade.Backbone.load computes its features"
+    )
+
+
+def _precisions(precision: str | Mapping[str, str]) -> dict[str, str]:
+    """The precision of each part. The parts check the names."""
+    if isinstance(precision, Mapping):
+        if set(precision) != set(PARTS):
+            raise InputError(
+                f"precision: expected a name, or names for {' and '.join(PARTS)}, got {dict(precision)!r}"
+            )
+        return dict(precision)
+    return dict.fromkeys(PARTS, precision)
+
+
+def _chosen(names: Sequence[str], found: CameraSources) -> tuple[Camera, ...]:
+    """Cameras by name, with the sizes that the checkpoint says.
+
+    Raises:
+        InputError: A name is not one of the checkpoint's, or occurs twice.
+    """
+    chosen = () if isinstance(names, str) else tuple(names)
+    if not chosen or len(set(chosen)) != len(chosen) or not all(isinstance(name, str) for name in chosen):
+        raise InputError(f"cameras: expected distinct names, at least one, got {names!r}")
+    if found.cameras is None:
+        return tuple(Camera(name) for name in chosen)
+    known = {camera.name: camera for camera in found.cameras}
+    unknown = [name for name in chosen if name not in known]
+    if unknown:
+        raise InputError(
+            f"cameras: expected names among those of the checkpoint ({', '.join(known)}), got "
+            f"{', '.join(unknown)}"
+        )
+    return tuple(known[name] for name in chosen)
