@@ -68,6 +68,9 @@ const MACS_FOR_THREADS: usize = 1 << 19;
 /// As many multiply-accumulates should each thread have, for the same reason.
 const MACS_OF_THREAD: usize = MACS_FOR_THREADS / 2;
 
+/// A task has at least so many: a microsecond of work, against a tenth of one to deal it.
+const MACS_OF_TASK: usize = 1 << 16;
+
 /// Tasks that each thread should have, if they are not smaller than that: one that begins its last task late keeps the others waiting for a
 /// quarter of the work at most.
 const TASKS_PER_THREAD: usize = 4;
@@ -276,10 +279,11 @@ impl PackedLinear {
         let columns = shape.columns;
         let num_panels = self.out_features.div_ceil(columns);
         let tiles = Tiles::new(rows, shape);
-        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another.
+        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another: 49 x 128 x 128 has
+        // three panels of 48 columns, which two threads would take in the time of two.
         let wanted = (TASKS_PER_THREAD * threads)
             .div_ceil(num_panels)
-            .min(macs / (num_panels * MACS_FOR_THREADS));
+            .min(macs / (num_panels * MACS_OF_TASK));
         let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
         let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
         let mut call = Call {
