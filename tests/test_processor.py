@@ -155,7 +155,7 @@ def test_tokens_of_the_real_vocabulary() -> None:
     if tokenizer is None:
         pytest.skip(
             "needs the vocabulary of Qwen3: SACCADE_QWEN3_TOKENIZER, or "
-            "lerobot/eagle2hg-processor-groot-n1p5 or Qwen/Qwen3-VL-2B-Instruct in the local Hugging Face cache"
+            "lerobot/eagle2hg-processor-groot-n1p5 or Qwen/Qwen3-VL-2B-Instruct in the Hugging Face cache"
         )
     check_tokens("tokens_qwen3", tokenizer)
 

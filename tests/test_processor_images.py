@@ -43,7 +43,7 @@ def test_every_instruction_set_gives_the_same_bits(version: saccade.processor.Ve
 
 @pytest.mark.parametrize(("down", "across"), [(4, 3), (2, 2), (1, 5), (8, 8)])
 def test_area_of_whole_factors_is_the_mean(down: int, across: int) -> None:
-    """OpenCV is not in the environment of the tests: see benches/image_differences.py. A mean needs no peer."""
+    """OpenCV is not in the tests' environment: see benches/image_differences.py. A mean needs no peer."""
     image = np.random.default_rng(2).integers(0, 256, (32 * down, 32 * across, 3), np.uint8)
     options = AS_IT_IS | {"image_target_size": [32, 32]}
     found = from_patches(saccade.Processor("n1.7", TOKENIZER, options=options).frame(image), 32, 32)

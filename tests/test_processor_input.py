@@ -57,7 +57,9 @@ def test_floating_point_frames_become_bytes_as_torch_makes_them(dtype: type) -> 
     """Clamped, times 255, truncated; beyond 0 to 1 as lerobot has it."""
     import torch
 
-    values = np.concatenate([np.arange(256) / 255, np.linspace(-0.5, 1.5, 500)]).astype(dtype)
+    values: np.ndarray[Any, Any] = np.concatenate([np.arange(256) / 255, np.linspace(-0.5, 1.5, 500)]).astype(
+        dtype
+    )
     frame = np.repeat(values[:, None, None], 3, axis=2)[:, [0] * 4]
     planes = torch.from_numpy(np.moveaxis(frame, -1, 0).copy())
     expected = (planes.clamp(0, 1) * 255.0).to(torch.uint8)

@@ -83,7 +83,7 @@ def test_sizes_of_a_config_in_nvidias_layout(tmp_path: Path) -> None:
         return {"model_type": "gr00t_n1_5", "backbone_cfg": {"eagle_config": eagle}}
 
     assert load(checkpoint(tmp_path / "fits", "n15_one_view", config(56))).image_size == 56
-    with pytest.raises(CheckpointError, match="the image size is 224, but .* has 4 x 4 patches of 14"):
+    with pytest.raises(CheckpointError, match=r"the image size is 224, but .* has 4 x 4 patches of 14"):
         load(checkpoint(tmp_path / "differs", "n15_one_view", config(224)))
 
 

@@ -62,7 +62,7 @@ def test_any_text(text: str) -> None:
         assert found == expected
 
 
-@pytest.mark.parametrize("text", ["ΑΣ", "ΑΣ Σ", "ΣΑ", "Α.Σ", "ΑΣ\u0345", "AΣB", "İI", "ß ẞ", "Ǆ ǅ"])
+@pytest.mark.parametrize("text", ["ΑΣ", "ΑΣ Σ", "ΣΑ", "Α.Σ", "ΑΣ\u0345", "AΣB", "İI", "ß ẞ", "Ǆ ǅ"])  # noqa: RUF001
 def test_letters_whose_lower_case_depends_on_others(text: str) -> None:
     found, expected = formalized(text)
     assert found == expected

@@ -116,7 +116,7 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
     """Sets the value at a path such as `model.vocab.!`."""
     *folders, last = path.split(".")
 
-    def apply(whole: dict[str, Any]) -> None:
+    def apply(whole: Any) -> None:
         for folder in folders:
             whole = whole[int(folder)] if isinstance(whole, list) else whole[folder]
         if isinstance(whole, list):

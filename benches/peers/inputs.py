@@ -90,8 +90,8 @@ def inputs_of(case: Case, config: HeadConfig) -> Arrays:
 def expected_of(case: Case, folder: Path) -> Arrays:
     """The inputs of the case, and as `expected` what `saccade.reference` in float32 makes of them.
 
-    With the arrays of `times_of`. Of four blocks `rows` is what enters the first one; the noise is that of one
-    Euler step.
+    With the arrays of `times_of`. Of four blocks `rows` is what enters the first one; the noise is that of
+    one Euler step.
     """
     import torch
 
@@ -143,8 +143,8 @@ def expected_of(case: Case, folder: Path) -> Arrays:
 
 
 def times_of(head: Any, steps: int) -> Arrays:
-    """What depends on the time alone: `time0`, `modulations0`, ..., as `pieces.times` gives it for a reference
-    head.
+    """What depends on the time alone: `time0`, `modulations0`, ..., as `pieces.times` gives it for a
+    reference head.
     """
     from benches.peers.pieces import times
 

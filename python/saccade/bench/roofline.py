@@ -144,7 +144,7 @@ def text(machine: Machine, shown: Sequence[Point]) -> list[str]:
 
 
 def write_figure(machine: Machine, shown: Mapping[str, Sequence[Point]], path: Path) -> None:
-    """Writes the picture as an image, a panel for each piece of work; the name of the file tells its format."""
+    """Writes the picture as an image, a panel for each piece of work, in the format that the name says."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.5 * len(shown), 4.2), layout="tight")
