@@ -14,6 +14,7 @@ CLIENTS_ARGS ?=
 FUZZ_SECONDS ?= 1800
 WHEEL_VENV ?= .venv-wheel
 WHEEL_ARGS ?=
+WHEEL_TARGETS ?= x86_64-unknown-linux-gnu aarch64-unknown-linux-gnu
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
@@ -24,7 +25,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients fuzz setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients test-aarch64 test-aarch64-all fuzz setup-rollout setup-test clean
 
 help:
 	@echo "make rollout      run the bundled policy in simulation; table and videos in $(ROLLOUT_OUT)"
@@ -33,11 +34,12 @@ help:
 	@echo "make format       format all Rust and Python files"
 	@echo "make bench-peers  compare with other engines that run the same head; report in out/peers"
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
-	@echo "make fuzz         fuzz headers, indexes, configs and resizing, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
+	@echo "make fuzz         fuzz headers, indexes, configs, resizing, tokenizers and processors, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
 	@echo "make test-clients test saccade serve with Isaac-GR00T's clients: CLIENTS_ARGS=\"--clone PATH\" of its repository"
-	@echo "make wheel        build a manylinux wheel of the last commit in dist"
-	@echo "make test-wheel   test the wheel on CPythons, NumPys and emulated old CPUs; writes docs/wheels.md"
+	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
+	@echo "make wheel        build manylinux wheels of the last commit in dist, for x86-64 and 64-bit ARM (WHEEL_TARGETS)"
+	@echo "make test-wheel   test the wheels on CPythons, NumPys and emulated CPUs; writes docs/wheels.md"
 	@echo "make clean        remove the virtual environments and build outputs"
 
 rollout: setup-rollout
@@ -160,7 +162,7 @@ $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
 fuzz: setup-test
 	@cargo +nightly fuzz --version >/dev/null 2>&1 || { echo "make fuzz needs a nightly Rust (rustup toolchain install nightly) and cargo-fuzz (cargo install cargo-fuzz)"; exit 1; }
 	$(BIN)/python fuzz/seeds.py
-	@for target in header index config resize; do \
+	@for target in header index config resize tokenizer processor; do \
 		cargo +nightly fuzz run --sanitizer none $$target -- -dict=fuzz/words.dict -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=2048 || exit 1; \
 	done
 
@@ -171,11 +173,19 @@ test-compat: setup-test
 # Nothing is fetched: the clients are read from a clone of Isaac-GR00T.
 test-clients: setup-test
 	$(BIN)/python tests/compat/groot.py $(CLIENTS_ARGS)
+# On one emulated CPU, and on those that differ in what they have. docs/aarch64.md says more.
+test-aarch64:
+	.ci/aarch64/run.sh test
+
+test-aarch64-all:
+	CPUS="max,sve=off neoverse-n1 cortex-a72 max" .ci/aarch64/run.sh test
 
 wheel:
 	@$(PYTHON) .ci/needs.py python rust
 	@$(MAKE) -s $(WHEEL_VENV)/.tools
-	$(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist $(WHEEL_ARGS)
+	$(if $(filter aarch64-%,$(WHEEL_TARGETS)),.ci/aarch64/run.sh setup)
+	rm -rf dist
+	for target in $(WHEEL_TARGETS); do $(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist --target $$target $(WHEEL_ARGS) || exit 1; done
 
 test-wheel: wheel
 	@$(PYTHON) .ci/needs.py opengl qemu

@@ -58,6 +58,10 @@ def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path)
     try:
         arrays = inputs.inputs_of(case, saccade.HeadConfig.from_file(source / "config.json"))
         arrays["expected"] = arrays["noise"]  # of the result's shape
+        if CONTENDERS[name].engine not in ("saccade_head", "lerobot"):
+            from saccade.reference import ActionHead
+
+            arrays |= inputs.times_of(ActionHead.load(source), case.steps)
         engine = importlib.import_module(f"benches.peers.engines.{CONTENDERS[name].engine}")
         works = dict(engine.build(Task(case, dict(CONTENDERS[name].options), source, arrays, scratch)).works)
         encode, sample = works["encode"], works["sample"]

@@ -32,11 +32,15 @@ fn main() {
         let weight = WeightRef::F32(Matrix::new(&weight, inputs));
         for isa in Isa::available() {
             for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
-                let name = format!("{isa}, {}, {rows} x {inputs} x {outputs}", arithmetic_name(arithmetic));
+                let name = format!(
+                    "{isa}, {}, {rows} x {inputs} x {outputs}",
+                    arithmetic_name(arithmetic)
+                );
                 if isa == Isa::Portable || !options.wants(&name) {
                     continue;
                 }
-                let pack = || PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).expect("one part fits");
+                let pack =
+                    || PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).expect("one part fits");
                 let count = (WEIGHT_BYTES / pack().nbytes()).max(2);
                 let layers = [("in order", false), ("streams", true)].map(|(order, streams)| {
                     let layers: Vec<_> = (0..count).map(|_| pack().with_streams(streams)).collect();

@@ -145,6 +145,42 @@ def resizes() -> dict[str, bytes]:
     return seeds
 
 
+def tokenizers() -> dict[str, bytes]:
+    """A small tokenizer as one file, as four, and with old merges."""
+    value = json.loads((DATA / "backbone" / "tiny_tokenizer.json").read_text())
+    model, added = value["model"], value["added_tokens"]
+    slow = [
+        json.dumps(model["vocab"]),
+        "#version: 0.2\n" + "\n".join(map(" ".join, model["merges"])),
+        json.dumps({token["content"]: token["id"] for token in added}),
+        json.dumps({"added_tokens_decoder": {str(token["id"]): token for token in added}}),
+    ]
+    old = value | {"model": model | {"merges": [" ".join(pair) for pair in model["merges"]]}}
+    seeds = {"json": json.dumps(value), "old": json.dumps(old)}
+    for count in range(2, 5):
+        seeds[f"slow_{count}"] = BETWEEN.decode().join(slow[:count])
+    return {name: text.encode() for name, text in seeds.items()}
+
+
+def processors() -> dict[str, bytes]:
+    """Options as checkpoints have them, with instructions."""
+    options: list[dict[str, Any]] = [
+        {},
+        {"shortest_image_edge": 64, "crop_fraction": 0.95, "min_pixels": 4096, "use_albumentations": True},
+        {"image_crop_size": [58, 58], "image_target_size": [64, 64], "use_albumentations": False},
+        {"shortest_image_edge": None, "image_target_size": None, "letter_box_transform": True},
+        {"processor_kwargs": {"formalize_language": False, "modality_configs": {}}},
+        {"size": {"shortest_edge": 65536, "longest_edge": 16777216}, "image_mean": [0.5, 0.5, 0.5]},
+        {"steps": [{"registry_name": "groot_n1_7_vlm_encode_v1", "config": {"crop_fraction": 0.9}}]},
+    ]
+    texts = ["open the drawer", "Don't <|im_end|> <image-2>!", "<|image_pad|>", "\u0130\u03a3 '\"\\\t"]
+    seeds = {}
+    for number, option in enumerate(options):
+        pieces = [json.dumps(option).encode(), texts[number % len(texts)].encode()]
+        seeds[str(number)] = BETWEEN.join(pieces)
+    return seeds
+
+
 def checkpoint(folder: Path) -> tuple[bytes, bytes]:
     """`config.json` and the header of the head's tensors."""
     tensors: Tensors = {}
@@ -157,7 +193,14 @@ def checkpoint(folder: Path) -> tuple[bytes, bytes]:
 def main() -> None:
     """Writes all seeds under distinct names and prints their number."""
     files = headers()
-    targets = {"header": files, "index": indexes(files), "config": configs(), "resize": resizes()}
+    targets = {
+        "header": files,
+        "index": indexes(files),
+        "config": configs(),
+        "resize": resizes(),
+        "tokenizer": tokenizers(),
+        "processor": processors(),
+    }
     for target, seeds in targets.items():
         folder = HERE / "corpus" / target
         folder.mkdir(parents=True, exist_ok=True)

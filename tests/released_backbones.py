@@ -60,7 +60,8 @@ class ReleasedBackbone:
     @property
     def tolerance(self) -> NDArray[np.float64]:
         """How far float32 may be from the features: 4 x the released code's error, and rounding."""
-        return 4 * self.about["f32_max_abs_vs_f64"] + 1e-6 * np.maximum(1.0, np.abs(self.features))
+        own_error = float(self.about["f32_max_abs_vs_f64"])
+        return 4 * own_error + 1e-6 * np.maximum(1.0, np.abs(self.features))
 
     @property
     def image_token_id(self) -> int:

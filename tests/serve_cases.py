@@ -54,10 +54,10 @@ class MemoryPolicy:
 
     def inputs(self, observation: Mapping[str, Any]) -> list[Any]:
         reading = read(observation, self.requirements)
-        if "explode" in reading.instructions[0]:
+        if "explode" in str(reading.instructions[0]):
             raise RuntimeError("exploded")
         return [
-            (frames["front"].mean(dtype=np.float64), "crash" in text)
+            (frames["front"].mean(dtype=np.float64), "crash" in str(text))
             for frames, text in zip(reading.frames, reading.instructions, strict=True)
         ]
 

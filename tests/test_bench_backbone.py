@@ -14,7 +14,7 @@ import saccade
 import saccade._saccade as _saccade
 from benches.backbone import __main__ as program
 from benches.backbone import accuracy, memory, peer, report, setup
-from saccade.bench.backbone_work import backbone_work, floor_seconds
+from benches.backbone.work import backbone_work, floor_seconds
 from saccade.bench.cost import Machine
 from saccade.bench.work import total
 from saccade.checkpoints import random_checkpoint

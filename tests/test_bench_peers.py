@@ -20,6 +20,7 @@ from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.engines import Task
 from benches.peers.floors import floor, limits
+from benches.peers.machine import family_name
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
 from benches.peers.throughput import throughput
@@ -240,6 +241,14 @@ def test_throughput_of_known_numbers(tmp_path: Path) -> None:
     assert one[0] < one[1]
     assert many[0] == pytest.approx(32 * one[0], rel=1e-2)
     assert many[0] > many[1]
+
+
+def test_names_of_families() -> None:
+    assert family_name("Zen 4 (AuthenticAMD, family 25, model 17)") == "Zen 4"
+    assert (
+        family_name("unknown family (GenuineIntel, family 6, model 1)") == "GenuineIntel, family 6, model 1"
+    )
+    assert family_name("aarch64") == "aarch64"
 
 
 def test_forced_instruction_sets_are_those_that_the_machine_does_not_choose() -> None:

@@ -8,6 +8,7 @@ import os
 import pkgutil
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +31,7 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 #: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
-NEED_CHECKPOINTS = ("lerobot.md", "nvidia.md", "fork.md", "resize.md", "policy.md")
+NEED_CHECKPOINTS = ("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md")
 MODULES = sorted(
     info.name
     for info in pkgutil.walk_packages(saccade.__path__, "saccade.")
@@ -59,6 +60,10 @@ def page_id(page: Path) -> str:
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
+    # Files that examples name.
+    backbone = ROOT / "tests" / "data" / "backbone"
+    shutil.copy(backbone / "tiny_tokenizer.json", "tokenizer.json")
+    shutil.copy(backbone / "n15_two_views.safetensors", "n1.5-backbone.safetensors")
     result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.failed == 0
 

@@ -13,7 +13,8 @@ import pytest
 from published import published
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = ("lerobot", "nvidia", "fork", "resize", "policy")
+TOKENIZER = Path(__file__).resolve().parent / "data" / "backbone" / "tiny_tokenizer.json"
+PAGES = ("lerobot", "nvidia", "fork", "resize", "processor", "policy")
 #: Names on the pages, and the layouts of these checkpoints.
 CHECKPOINTS = {
     "GR00T-N1.5-3B": "nvidia",
@@ -53,6 +54,8 @@ def test_page_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     for folder, layout in CHECKPOINTS.items():
         if folder in page.read_text():
             shutil.copytree(published(layout), tmp_path / folder)
+    if "tokenizer.json" in page.read_text():
+        shutil.copy(TOKENIZER, tmp_path / "tokenizer.json")
     # Commands of the test's own environment take precedence.
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     for command in asked:

@@ -14,7 +14,7 @@ from saccade.errors import InputError
 def test_show_config_says_what_decides() -> None:
     config = saccade.show_config("dicts")
     family, rates, tiles = _saccade.cpu_report()
-    assert (config["cpu"], config["rates"], config["tiles"]) == (family, rates, tiles)
+    assert (config["family"], config["rates"], config["tiles"]) == (family, rates, tiles)
     assert config["cpu"]
     assert re.search(r"measured", rates)
     assert tiles == "yes" or tiles.startswith("no: ")

@@ -227,8 +227,8 @@ def test_a_precision_that_is_no_text(given: Any, tmp_path: Path) -> None:
 
 def test_show_config_names_the_dot_products(isa: str) -> None:
     products = saccade.show_config("dicts")["dot_products"]
-    assert set(products) <= {"bf16", "vnni"}
-    if isa in ("portable", "avx2", "avx512f"):
+    assert set(products) <= {"bf16", "vnni", "dotprod", "i8mm"}
+    if isa in ("portable", "avx2", "avx512f", "neon"):
         assert products == []
 
 

@@ -1,4 +1,4 @@
-"""Whole checkpoints behind the server: the bits of `Policy.act`, sessions, the command from start to SIGTERM."""
+"""Whole checkpoints behind the server: the bits of `Policy.act`, sessions, the command until SIGTERM."""
 
 from __future__ import annotations
 

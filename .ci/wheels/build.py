@@ -1,6 +1,6 @@
-"""Builds the wheel: one file for every CPython from 3.10 on, for x86-64 Linux with an old glibc.
+"""Builds a wheel: one file for every CPython from 3.10 on, for x86-64 or ARM Linux with an old glibc.
 
-    python .ci/wheels/build.py --out dist
+    python .ci/wheels/build.py --out dist [--target aarch64-unknown-linux-gnu]
 
 The sources are those of the last commit, unpacked into an empty folder, so that no other file of the checkout
 gets into the wheel. Its timestamps are the commit's. The same commit, Rust and tools give the same bytes;
@@ -26,6 +26,12 @@ BUILD = (
 )
 
 
+#: What wheels are built for.
+TARGETS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu")
+#: A compiler with the ARM standard library, which `.ci/aarch64/run.sh setup` puts there.
+ARM_COMPILER = ROOT / "target" / "aarch64" / "bin" / "rustc"
+
+
 def git(*args: str) -> str:
     """The output of a git command in the repository."""
     return subprocess.run(["git", *args], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
@@ -39,12 +45,21 @@ def unpack(commit: str, folder: Path) -> None:
     subprocess.run(["tar", "-x", "-C", str(folder)], input=archive, check=True)
 
 
-def build(commit: str, folder: Path) -> Path:
+def has_standard_library(target: str) -> bool:
+    """Whether the Rust on PATH can build for `target`."""
+    said = subprocess.run(
+        ["rustc", "--print", "target-libdir", "--target", target], capture_output=True, text=True
+    )
+    return said.returncode == 0 and Path(said.stdout.strip()).is_dir()
+
+
+def build(commit: str, folder: Path, target: str) -> Path:
     """Builds the wheel and returns it.
 
     Args:
         commit: The commit to build.
         folder: For the sources, the build outputs and the wheel.
+        target: One of `TARGETS`.
     """
     source, wheels = folder / "source", folder / "wheels"
     unpack(commit, source)
@@ -60,7 +75,9 @@ def build(commit: str, folder: Path) -> Path:
         # maturin looks here for the Python that has Zig.
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     }
-    command = [sys.executable, *BUILD.split(), "--out", str(wheels)]
+    if not has_standard_library(target):
+        environment["RUSTC"] = str(ARM_COMPILER)
+    command = [sys.executable, *BUILD.split(), "--target", target, "--out", str(wheels)]
     subprocess.run(command, cwd=source, env=environment, check=True)
     (wheel,) = wheels.glob("*.whl")
     return wheel
@@ -81,16 +98,23 @@ def main() -> int:
         "--work", type=Path, default=ROOT / "target" / "wheel", help="folder that is kept between builds"
     )
     parser.add_argument(
+        "--target", choices=TARGETS, default=TARGETS[0], help=f"what to build for (default: {TARGETS[0]})"
+    )
+    parser.add_argument(
         "--twice", action="store_true", help="build a second time from scratch; the bytes must be equal"
     )
     args = parser.parse_args()
     if git("status", "--porcelain", "--untracked-files=no"):
         print("note: building the last commit; uncommitted changes are not included", flush=True)
+    if not has_standard_library(args.target) and not ARM_COMPILER.exists():
+        how = f"rustup target add {args.target}, or on Debian: .ci/aarch64/run.sh setup"
+        print(f"this Rust has no standard library for {args.target}: {how}", file=sys.stderr)
+        return 1
     commit = git("rev-parse", "HEAD")  # another commit may be made during the build
-    built = build(commit, args.work.resolve())
+    built = build(commit, args.work.resolve(), args.target)
     if args.twice:
         with tempfile.TemporaryDirectory() as folder:
-            again = build(commit, Path(folder).resolve())
+            again = build(commit, Path(folder).resolve(), args.target)
             if digest(again) != digest(built):
                 shutil.copy2(again, built.with_suffix(".again.whl"))
                 print(f"the two wheels differ: {built}, {built.with_suffix('.again.whl')}", file=sys.stderr)

@@ -38,6 +38,15 @@ MATRIX = {
 }
 #: CPUs that qemu emulates; the first is x86-64-v2 and no more.
 CPUS = {"Nehalem": "no AVX", "Haswell": "AVX2, FMA", "max": "everything qemu has"}
+#: The same for 64-bit ARM.
+ARM_CPUS = {
+    "cortex-a72": "NEON",
+    "neoverse-n1": "int8 dot products",
+    "max,sve=off": "int8 and bfloat16 products",
+    "max": "everything qemu has",
+}
+#: An ARM Python with NumPy, which `.ci/aarch64/run.sh setup` puts there.
+ARM_ROOT = CHECK.parent.parent.parent / "target" / "aarch64" / "root"
 #: Tolerance of actions against the portable path, by precision; int8 may round to a neighbour.
 TOLERANCE = {"float32": 1e-5, "bfloat16": 0.05, "int8": 0.1}
 #: Stops with an illegal instruction without AVX2: shows that the emulated CPU refuses what it lacks.
@@ -212,6 +221,38 @@ def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
     return rows
 
 
+def try_arm_cpus(wheel: Path, work: Path) -> list[list[str]]:
+    """A row for the portable path and for each emulated ARM CPU."""
+    (site,) = ARM_ROOT.glob("usr/local/lib/python3.*/dist-packages")
+    (python,) = (path for path in ARM_ROOT.glob("usr/bin/python3.*") if path.suffix[1:].isdigit())
+    for old in site.glob("saccade*"):
+        shutil.rmtree(old)
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    arms: list[tuple[str, str, dict[str, str]]] = [
+        ("qemu max, `SACCADE_ISA=portable`", "max", {"SACCADE_ISA": "portable"})
+    ]
+    arms += [(f"qemu {cpu} ({has})", cpu, {}) for cpu, has in ARM_CPUS.items()]
+    rows = []
+    portable: Actions = {}
+    for name, cpu, variables in arms:
+        row = [name]
+        try:
+            qemu = ("qemu-aarch64-static", "-cpu", cpu, "-L", str(ARM_ROOT))
+            result, actions = check(python, work, *qemu, **variables)
+            portable = portable or actions  # the first row
+            apart = {key: float(np.abs(actions[key] - portable[key]).max()) for key in actions}
+            if far := [key for key in apart if apart[key] > TOLERANCE[key]]:
+                raise Failed(f"{', '.join(far)} differ from the portable path by {apart}")
+            row += [f"`{result['isa']}`", f"{result['cross_attention_error']:.1e}"]
+            row += [*(f"{apart[key]:.1e}" for key in TOLERANCE), "passed"]
+        except (Failed, FileNotFoundError) as error:
+            row += ["", "", "", "", "", f"FAILED: {error}"]
+        rows.append(row)
+        print("  ", *row, flush=True)
+    return rows
+
+
 def refuses_avx2(qemu: str, work: Path) -> str:
     """Whether the oldest emulated CPU stops at an AVX2 instruction; if not, the rows above prove nothing."""
     program = work / "avx2"
@@ -262,21 +303,31 @@ def table(header: str, rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def of_architecture(folder: Path, name: str) -> Path:
+    """The wheel in a folder for an architecture.
+
+    Raises:
+        Failed: there is none, or more than one.
+    """
+    wheels = sorted(folder.glob(f"*_{name}.whl"))
+    if len(wheels) != 1:
+        raise Failed(f"expected one wheel for {name} in {folder}, got {len(wheels)}")
+    return wheels[0]
+
+
 def main() -> int:
     """Runs everything, prints it, and writes the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("wheel", type=Path, help="the wheel, or a folder that holds one")
+    parser.add_argument("folder", type=Path, help="the folder of the wheels")
     parser.add_argument("--page", type=Path, help="where to write the page")
     args = parser.parse_args()
-    wheels = sorted(args.wheel.resolve().glob("*.whl")) if args.wheel.is_dir() else [args.wheel.resolve()]
-    if len(wheels) != 1:
-        parser.error(f"expected one wheel in {args.wheel}, got {len(wheels)}")
-    (wheel,) = wheels
+    wheel, arm_wheel = (of_architecture(args.folder.resolve(), name) for name in ("x86_64", "aarch64"))
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         inside = contents(wheel, work / "unpacked")
+        inside_arm = contents(arm_wheel, work / "unpacked-arm")
         megabytes = {key: f"{inside[key] / 1e6:.1f}" for key in ("library", "demo", "wheel")}
         page = PAGE.read_text().format(
             glibc=inside["glibc"],
@@ -288,7 +339,13 @@ def main() -> int:
             rollouts=table(
                 "CPython | NumPy | mujoco | metaworld | gymnasium | goal | ", try_rollouts(wheel, work)
             ),
-            machine=f"{wheel.name}, on {platform.system()} {platform.release()}",
+            arm_glibc=inside_arm["glibc"],
+            arm_wheel=f"{inside_arm['wheel'] / 1e6:.1f}",
+            arm_cpus=table(
+                "CPU | instruction set | cross-attention | float32 | bfloat16 | int8 | ",
+                try_arm_cpus(arm_wheel, work),
+            ),
+            machine=f"{wheel.name}, {arm_wheel.name}, on {platform.system()} {platform.release()}",
         )
         print(page, flush=True)
         if args.page is not None:

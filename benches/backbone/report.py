@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from benches.backbone import memory, reuse
+from benches.backbone.work import backbone_work, floor_seconds
 from benches.peers.results import TOLERANCE, rounded
 from benches.peers.text import plural, table
-from saccade.bench.backbone_work import backbone_work, floor_seconds
 from saccade.bench.cost import Machine
 from saccade.bench.timing import quartiles
 from saccade.checkpoints.backbone_sizes import BackboneSizes

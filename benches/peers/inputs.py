@@ -90,12 +90,11 @@ def inputs_of(case: Case, config: HeadConfig) -> Arrays:
 def expected_of(case: Case, folder: Path) -> Arrays:
     """The inputs of the case, and as `expected` what `saccade.reference` in float32 makes of them.
 
-    `time0`, `modulations0`, ... are what depends on the time alone, as `pieces.times` gives it. Of four
-    blocks `rows` is what enters the first one; the noise is that of one Euler step.
+    With the arrays of `times_of`. Of four blocks `rows` is what enters the first one; the noise is that of one
+    Euler step.
     """
     import torch
 
-    from benches.peers.pieces import times
     from saccade.reference import ActionHead
 
     path = folder / f"expected-{_slug(case)}.npz"
@@ -106,8 +105,7 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     arrays = inputs_of(case, HeadConfig.from_file(source / "config.json"))
     with torch.inference_mode():
         head: Any = ActionHead.load(source)
-        for step, (time, modulations) in enumerate(times(head, EMBODIMENT, case.steps)):
-            arrays |= {f"time{step}": time.numpy(), f"modulations{step}": modulations.numpy()}
+        arrays |= times_of(head, case.steps)
         if case.piece == "linear":
             products = [arrays[f"x{i}"] @ arrays[f"w{i}"].T for i in range(len(LINEAR_SHAPES))]
             arrays["expected"] = np.concatenate([product.ravel() for product in products])
@@ -141,6 +139,18 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     part = path.with_suffix(".part.npz")
     np.savez(part, allow_pickle=False, **arrays)
     part.rename(path)
+    return arrays
+
+
+def times_of(head: Any, steps: int) -> Arrays:
+    """What depends on the time alone: `time0`, `modulations0`, ..., as `pieces.times` gives it for a reference
+    head.
+    """
+    from benches.peers.pieces import times
+
+    arrays: Arrays = {}
+    for step, (time, modulations) in enumerate(times(head, EMBODIMENT, steps)):
+        arrays |= {f"time{step}": time.detach().numpy(), f"modulations{step}": modulations.detach().numpy()}
     return arrays
 
 

@@ -23,18 +23,17 @@ PACKAGES = ("saccade", "torch", "lerobot", "diffusers", "onnxruntime", "openvino
 def describe() -> dict[str, Any]:
     """CPU, its flags that matter here, cores, memory, versions of all engines, the build of saccade.
 
-    `name` is that of the CPU's family where saccade knows it, otherwise vendor and numbers: one record each.
+    `name` is that of the CPU's family, of which there is one record each.
     """
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpuinfo = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
     flags = set(cpuinfo.get("flags", "").split())
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     config = saccade.show_config("dicts")
-    family = f"family {cpuinfo.get('cpu family')}, model {cpuinfo.get('model')}"
     return {
         "cpu": cpuinfo.get("model name", platform.machine()),
-        "name": config.get("cpu_family") or f"{cpuinfo.get('vendor_id', platform.machine())}, {family}",
-        "family": family,
+        "name": family_name(config["cpu"]),
+        "family": f"family {cpuinfo.get('cpu family')}, model {cpuinfo.get('model')}",
         "flags": [flag for flag in FLAGS + AMX if flag in flags],
         "cores": len(os.sched_getaffinity(0)),
         "memory_gb": round(memory / 1e9),
@@ -49,6 +48,14 @@ def describe() -> dict[str, Any]:
         "build": hashlib.sha256(Path(saccade._saccade.__file__).read_bytes()).hexdigest()[:12],
         "commit": said("git", "describe", "--always", "--dirty", "--exclude", "*"),
     }
+
+
+def family_name(cpu: str) -> str:
+    """The family that `saccade.show_config` tells: `Zen 4` of `Zen 4 (AuthenticAMD, family 25, model 17)`;
+    vendor and numbers of an unknown one.
+    """
+    name, _, numbers = cpu.partition(" (")
+    return numbers.removesuffix(")") if name == "unknown family" else name
 
 
 def thread_counts() -> list[int]:

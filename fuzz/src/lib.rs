@@ -3,8 +3,13 @@
 use std::fs::{self, File};
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
-use saccade::{HeadConfig, Published, ResizeOptions, RewriteOptions, resize, resized_config, tensor_shapes};
+use saccade::{
+    Array, Frame, HeadConfig, Observation, Preprocessing, Processor, ProcessorOptions, ProcessorSource,
+    Published, ResizeOptions, RewriteOptions, Tokenizer, TokenizerFiles, resize, resized_config,
+    tensor_shapes,
+};
 use saccade_checkpoint::spec::TensorSpec;
 use saccade_checkpoint::{Checkpoint, Companions};
 
@@ -148,6 +153,110 @@ fn check_resized_config(text: &str, before: &HeadConfig, count: usize) {
     (expected.num_future_tokens, expected.future_key_bias) = (count, None);
     let after = HeadConfig::from_json(text).expect("a config stays a config");
     assert_eq!(after, expected);
+}
+
+/// A small tokenizer that works.
+const TOKENIZER: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../tests/data/backbone/tiny_tokenizer.json"
+);
+
+/// Makes a tokenizer of one file or of several, and tokens of some text.
+pub fn use_tokenizer(files: &[&str]) {
+    let read = match files {
+        [vocab, merges, others @ ..] => {
+            Tokenizer::from_slow(vocab, merges, others.first().copied(), others.get(1).copied())
+        }
+        _ => Tokenizer::from_json(files[0]),
+    };
+    let tokenizer = match read {
+        Ok(tokenizer) => tokenizer,
+        Err(error) => return check_message(&error),
+    };
+    for text in [
+        "",
+        "open the drawer",
+        "<|im_end|> e\u{301} \u{3000}\r\n 12",
+        files[0],
+    ] {
+        match tokenizer.encode(text) {
+            Ok(ids) => assert!(ids.len() <= 4 * text.len(), "more tokens than bytes"),
+            Err(error) => check_message(&error),
+        }
+    }
+    for version in ["n1.5", "n1.7"] {
+        let tokenizer = match files {
+            [json] => Tokenizer::from_json(json),
+            _ => return,
+        };
+        let tokenizer = tokenizer.expect("it was read before");
+        if let Err(error) = Processor::new(version, tokenizer, &ProcessorOptions::default()) {
+            check_message(&error);
+        }
+    }
+}
+
+/// Makes processors with these options, and with them inputs of a small frame and of the instruction.
+pub fn use_processor(options: &str, instruction: Option<&str>) {
+    let pixels: Vec<u8> = (0..5 * 7 * 3).collect();
+    let frame = Frame::U8(Array::new(&pixels, &[5, 7, 3]).expect("the sizes fit"));
+    for version in ["n1.5", "n1.6", "n1.7"] {
+        for preprocessing in [Preprocessing::Lerobot, Preprocessing::Isaac] {
+            let given = ProcessorOptions {
+                preprocessing: Some(preprocessing),
+                options: Some(options),
+                ..ProcessorOptions::default()
+            };
+            let processor = match Processor::new(version, tokenizer(), &given) {
+                Ok(processor) => processor,
+                Err(error) => {
+                    check_message(&error);
+                    continue;
+                }
+            };
+            let observation = Observation {
+                views: vec![(Some("front"), frame), (Some("wrist"), frame)],
+                instruction,
+                ..Observation::default()
+            };
+            match processor.process(&[observation]) {
+                Ok(inputs) => {
+                    assert_eq!(inputs.input_ids.len(), inputs.length);
+                    let image = i64::from(processor.image_token_id());
+                    let found = inputs.input_ids.iter().filter(|id| **id == image).count();
+                    let expected = 2 * processor.view(frame).expect("it was one before").tokens;
+                    assert_eq!(found, expected, "image tokens");
+                }
+                Err(error) => check_message(&error),
+            }
+        }
+    }
+}
+
+/// Reads the text as every file that a checkpoint may keep options in.
+pub fn use_processor_files(folder: &Path, text: &str) {
+    const HEADER: &[u8] =
+        br#"{"backbone.model.model.visual.x":{"dtype":"F32","shape":[],"data_offsets":[0,4]}}"#;
+    for name in [
+        "processor_config.json",
+        "preprocessor_config.json",
+        "policy_preprocessor.json",
+    ] {
+        write_checkpoint(folder, r#"{"type":"groot"}"#, HEADER, b"", 4);
+        fs::write(folder.join(name), text).expect("memory is not full");
+        let files = TokenizerFiles::at(Path::new(TOKENIZER)).expect("it is in the repository");
+        match ProcessorSource::open(folder).and_then(|source| source.processor(Some(&files), None)) {
+            Ok(processor) => assert_eq!(processor.version(), "n1.7"),
+            Err(error) => check_message(&error),
+        }
+        fs::remove_file(folder.join(name)).expect("it was just written");
+    }
+}
+
+fn tokenizer() -> Tokenizer {
+    static TEXT: LazyLock<String> =
+        LazyLock::new(|| fs::read_to_string(TOKENIZER).expect("it is in the repository"));
+    Tokenizer::from_json(&TEXT).expect("it works")
 }
 
 /// `config.json` and a file of this header, `bytes` behind it, repeated up to the length that the header promises, but not longer than `most`.

@@ -212,7 +212,9 @@ class Processor:
     def frame(self, image: _Frame) -> _Float32: ...
     def tokens(self, text: str) -> _Int64: ...
     def process(
-        self, observations: list[tuple[list[tuple[str | None, _Frame]], str | None]], plain_text: bool
+        self,
+        observations: list[tuple[list[tuple[str | None, _Frame]], bool, str | None]],
+        plain_text: bool,
     ) -> tuple[list[_Float32], _Int64, _Bool, _Int64 | None, list[str] | None]: ...
 
 @final

@@ -53,7 +53,7 @@ class Processor:
 
     Example:
         >>> import numpy as np, saccade
-        >>> processor = saccade.Processor("n1.5", "tests/data/backbone/tiny_tokenizer.json")
+        >>> processor = saccade.Processor("n1.5", "tokenizer.json")
         >>> inputs = processor({"front": np.zeros((480, 640, 3), np.uint8)}, "open the drawer")
         >>> inputs.pixel_values.shape, inputs.view_names
         ((1, 3, 224, 224), ('front',))
@@ -111,11 +111,7 @@ class Processor:
 
         Example:
             >>> import saccade
-            >>> processor = saccade.Processor.load(
-            ...     "tests/data/backbone/n15_two_views.safetensors",
-            ...     tokenizer="tests/data/backbone/tiny_tokenizer.json",
-            ... )
-            >>> processor
+            >>> saccade.Processor.load("n1.5-backbone.safetensors", tokenizer="tokenizer.json")
             <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
         """
         held = _saccade.ProcessorSource(os.fspath(resolve(source)))
@@ -179,7 +175,7 @@ class Processor:
 
         Example:
             >>> import numpy as np, saccade
-            >>> processor = saccade.Processor("n1.5", "tests/data/backbone/tiny_tokenizer.json")
+            >>> processor = saccade.Processor("n1.5", "tokenizer.json")
             >>> frames = {"front": np.zeros((480, 640, 3), np.uint8)}
             >>> inputs = processor([frames, frames], ["push", "open the drawer"])
             >>> inputs.input_ids.shape, inputs.attention_mask.sum(axis=1)
@@ -189,7 +185,11 @@ class Processor:
         names = None if view_names is None else [text("view_names", name) for name in view_names]
         prepared = self._processor.process(
             [
-                (_views(observation, names), None if told is None else text("instruction", told))
+                (
+                    _views(observation, names),
+                    not isinstance(observation, Mapping),
+                    None if told is None else text("instruction", told),
+                )
                 for observation, told in zip(observations, instructions, strict=True)
             ],
             bool(plain_text),
@@ -228,7 +228,7 @@ class Processor:
 
         Example:
             >>> import saccade
-            >>> saccade.Processor("n1.5", "tests/data/backbone/tiny_tokenizer.json").tokens("push")
+            >>> saccade.Processor("n1.5", "tokenizer.json").tokens("push")
             array([388])
         """
         return self._processor.tokens(_text("text", text))

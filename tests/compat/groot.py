@@ -51,13 +51,17 @@ _MESSAGES = (
     Part("gr00t/policy/server_client.py"),
 )
 _BASE = Part(
-    "gr00t/model/policy.py", ("BasePolicy",), "from abc import ABC, abstractmethod\nfrom typing import *\n"
+    "gr00t/model/policy.py",
+    ("BasePolicy",),
+    "from abc import ABC, abstractmethod\nfrom typing import *\n"
+    "from gr00t.data.dataset import ModalityConfig\n",
 )
 _CONFIG = Part("gr00t/data/dataset.py", ("ModalityConfig",), "from pydantic import BaseModel\n")
 
 #: What is read of each release: the client's own files as they are, and what they import.
 RELEASES = {
     "n1": (Part("gr00t/eval/service.py"),),
+    "n1.5-early": (Part("gr00t/eval/service.py"),),
     "n1.5": (Part("gr00t/eval/service.py"), Part("gr00t/eval/robot.py"), _CONFIG, _BASE),
     "n1.6": _MESSAGES,
     "n1.7": _MESSAGES,
@@ -86,7 +90,7 @@ def main() -> None:
 
 def commits() -> dict[str, str]:
     """The commit of each release, from the list of packages."""
-    return dict(re.findall(r"^# (n[\d.]+) +([0-9a-f]{40})", PACKAGES.read_text(), re.MULTILINE))
+    return dict(re.findall(r"^# (n[\w.-]+) +([0-9a-f]{40})", PACKAGES.read_text(), re.MULTILINE))
 
 
 def read(release: str, clones: list[Path]) -> None:

@@ -18,7 +18,9 @@ from typing import Any
 def main(release: str, port: int, work: Path, result: Path) -> None:
     """Runs a client."""
     given = pickle.loads(work.read_bytes())
-    calls = {"n1": early_calls, "n1.5": n15_calls}.get(release, later_calls)(port, given)
+    calls = {"n1": early_calls, "n1.5-early": early_calls, "n1.5": n15_calls}.get(release, later_calls)(
+        port, given
+    )
     result.write_bytes(pickle.dumps({name: outcome(call) for name, call in calls.items()}))
 
 
@@ -31,7 +33,7 @@ def outcome(call: Callable[[], Any]) -> Any:
 
 
 def early_calls(port: int, given: dict[str, Any]) -> dict[str, Callable[[], Any]]:
-    """N1 sends pickles."""
+    """N1 and early N1.5 send pickles."""
     service: Any = importlib.import_module("gr00t.eval.service")
     client = service.ExternalRobotInferenceClient(host="127.0.0.1", port=port)
     return {"get_action": lambda: client.get_action(given["flat"])}
@@ -56,16 +58,21 @@ def later_calls(port: int, given: dict[str, Any]) -> dict[str, Callable[[], Any]
     """N1.6's and N1.7's client."""
     server_client: Any = importlib.import_module("gr00t.policy.server_client")
     client = server_client.PolicyClient(host="127.0.0.1", port=port)
+    session = server_client.__file__  # another one for each release
     return {
         "ping": client.ping,
         "get_action": lambda: client.get_action(given["nested"]),
         "seeded": lambda: client.get_action(given["nested"], {"seed": 11}),
         "batch": lambda: client.get_action(given["nested batch"], {"seed": 12}),
         "flat": lambda: client.get_action(given["flat batch"], {"seed": 13}),
-        "session": lambda: client.get_action(given["nested"], {"seed": 14, "session": "a", "executed": 0}),
-        "continued": lambda: client.get_action(given["nested"], {"seed": 15, "session": "a", "executed": 3}),
+        "session": lambda: client.get_action(
+            given["nested"], {"seed": 14, "session": session, "executed": 0}
+        ),
+        "continued": lambda: client.get_action(
+            given["nested"], {"seed": 15, "session": session, "executed": 3}
+        ),
         "reset": client.reset,
-        "anew": lambda: client.get_action(given["nested"], {"seed": 16, "session": "a", "executed": 3}),
+        "anew": lambda: client.get_action(given["nested"], {"seed": 16, "session": session, "executed": 3}),
         "modality": lambda: plain(client.get_modality_config()),
         "bad": lambda: client.get_action(given["bad"]),
         "kill": client.kill_server,

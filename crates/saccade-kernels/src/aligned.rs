@@ -7,7 +7,8 @@ use std::ptr::NonNull;
 /// A cache line, and the widest vector.
 const ALIGNMENT: usize = 64;
 
-/// A huge page of x86-64 and most others.
+/// A huge page of x86-64, and of ARM with pages of 4 kB. Where pages have 64 kB, a huge one has 512 MB: memory is then aligned so in vain, but
+/// nobody waits for lookups either, of which 64 kB need few.
 const HUGE_PAGE: usize = 2 << 20;
 
 /// The system has refused memory.

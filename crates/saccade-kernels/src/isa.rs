@@ -12,20 +12,38 @@ use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
 )]
 use crate::gemm::dot_bf16::DotBf16;
 use crate::gemm::dot_int8::DotInt8;
+#[cfg(target_arch = "aarch64")]
+use crate::gemm::neon::{
+    bf16::Bfmmla,
+    float32::{Float32, RoundedBf16, WidenedBf16},
+    int8::{Sdot, Usmmla, Widening},
+};
 use crate::gemm::{Gemm, Product, available};
+#[cfg(target_arch = "aarch64")]
+use crate::simd::aarch64::neon::{Neon, NeonBf16, NeonDotprod, NeonI8mm};
 use crate::simd::portable::{Loops, Portable};
 #[cfg(target_arch = "x86_64")]
 use crate::simd::x86_64::{
     avx2::{Avx2, Avx2EvexVnni, Avx2VexVnni},
     avx512::{Avx512, Avx512Amx, Avx512Bf16, Avx512Vnni},
 };
-use crate::simd::{Dot, Kernel, MAX_LANES, MAX_TILE_ROWS, Simd, Vector};
+use crate::simd::{Dot, Dots, Kernel, MAX_LANES, MAX_TILE_ROWS, Simd, Vector};
 #[cfg(target_arch = "x86_64")]
 use crate::tiles::amx::Amx;
 use crate::tiles::{Software, TILE, TileKernel, TileUnit};
 
 /// Environment variable that forces an instruction set, so that every path can be tested on one machine.
 pub const ISA_VARIABLE: &str = "SACCADE_ISA";
+
+/// A product that is made of vectors, unless the instruction set has its own ones.
+macro_rules! of_vectors_unless {
+    ([] $product:ty) => {
+        available::<$product>()
+    };
+    ([$own:ty] $product:ty) => {
+        None
+    };
+}
 
 /// A line is an instruction set by the name that users give it, slowest first: `Name = "name" if CONDITION { ... }`, and in the braces
 /// - `vectors`: what every kernel runs on;
@@ -34,6 +52,8 @@ pub const ISA_VARIABLE: &str = "SACCADE_ISA";
 /// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last one listed are made of
 ///   `vectors` alone;
 /// - `needs`: of these types, the CPU must have at least one;
+/// - `gemm_f32`, `gemm_widened`: float32 rows with float32 weights, and with bfloat16 ones, where these products are not made of `vectors`
+///   either; then no product is.
 /// - `tiles`: the unit that multiplies tiles, where there is one, and which must be there: attention over bfloat16 uses it.
 macro_rules! instruction_sets {
     ($(
@@ -45,6 +65,7 @@ macro_rules! instruction_sets {
             gemm_bf16: [$($gemm_bf16:ty),*],
             gemm_int8: [$($gemm_int8:ty),*],
             needs: [$($needed:ty),+],
+            $(gemm_f32: $gemm_f32:ty, gemm_widened: $gemm_widened:ty,)?
             $(tiles: $tiles:ty,)?
         }
     )+) => {
@@ -83,15 +104,14 @@ macro_rules! instruction_sets {
                 }
             }
 
-            /// Whether this CPU has an instruction for `dot` that this instruction set uses.
-            fn has(self, dot: Dot) -> bool {
-                self.is_available() && match self {
-                    $(#[cfg($condition)] Self::$isa => match dot {
-                        Dot::Bf16 => false $(|| <$bf16 as Simd>::new().is_some())*,
-                        Dot::Int8 => false $(|| <$int8 as Simd>::new().is_some())*,
+            /// The instruction for `dot` that this instruction set uses on this CPU.
+            fn dot_product(self, dot: Dot) -> Option<&'static str> {
+                match self {
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => match dot {
+                        Dot::Bf16 => None $(.or_else(name_of::<$bf16>))*,
+                        Dot::Int8 => None $(.or_else(name_of::<$int8>))*,
                     },)+
-                    #[allow(unreachable_patterns, reason = "as above")]
-                    _ => false,
+                    _ => None,
                 }
             }
 
@@ -162,12 +182,14 @@ macro_rules! instruction_sets {
             pub(crate) fn gemm(self, product: Product) -> Box<dyn Gemm> {
                 let found: Option<Box<dyn Gemm>> = match self {
                     $(#[cfg($condition)] Self::$isa if self.is_available() => match product {
-                        Product::Float32 => available::<Plain<$vectors>>(),
-                        Product::WidenedBf16 => available::<Widened<$vectors>>(),
+                        Product::Float32 => None $(.or_else(available::<$gemm_f32>))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] Plain<$vectors>)),
+                        Product::WidenedBf16 => None $(.or_else(available::<$gemm_widened>))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] Widened<$vectors>)),
                         Product::Bf16 => None $(.or_else(available::<$gemm_bf16>))*
-                            .or_else(available::<RoundedRows<$vectors>>),
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] RoundedRows<$vectors>)),
                         Product::Int8 => None $(.or_else(available::<$gemm_int8>))*
-                            .or_else(available::<DotInt8<$vectors>>),
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] DotInt8<$vectors>)),
                     },)+
                     _ => None,
                 };
@@ -213,8 +235,8 @@ instruction_sets! {
     #[doc(hidden)]
     SoftwareTiles = "software_tiles" if all() {
         vectors: Loops<TILE>,
-        bf16: [Loops<TILE>],
-        int8: [Loops<TILE>],
+        bf16: [],
+        int8: [],
         gemm_bf16: [InTiles<Software, Pairs>],
         gemm_int8: [InTiles<Software, Quads>],
         needs: [Loops<TILE>],
@@ -230,6 +252,55 @@ instruction_sets! {
         needs: [Avx512Amx],
         tiles: Amx,
     }
+    /// NEON, which every 64-bit ARM has.
+    Neon = "neon" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [],
+        int8: [],
+        gemm_bf16: [RoundedBf16],
+        gemm_int8: [Widening],
+        needs: [Neon],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+    /// NEON with dot products of int8.
+    Dotprod = "dotprod" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [],
+        int8: [NeonDotprod],
+        gemm_bf16: [RoundedBf16],
+        gemm_int8: [Sdot],
+        needs: [NeonDotprod],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+    /// NEON with products of matrices of int8.
+    I8mm = "i8mm" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [],
+        int8: [NeonI8mm],
+        gemm_bf16: [RoundedBf16],
+        gemm_int8: [Usmmla],
+        needs: [NeonI8mm],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+    /// NEON with products of bfloat16, and whichever of int8 this CPU has.
+    Bf16 = "bf16" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [NeonBf16],
+        int8: [NeonI8mm, NeonDotprod],
+        gemm_bf16: [Bfmmla],
+        gemm_int8: [Usmmla, Sdot, Widening],
+        needs: [NeonBf16],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+}
+
+/// What users call the instructions of `S`, where this CPU has them.
+fn name_of<S: Simd>() -> Option<&'static str> {
+    S::new().map(|_| <S::Dots as Dots<S::Vector>>::NAME)
 }
 
 /// Sizes that data are laid out by.
@@ -280,17 +351,15 @@ impl Isa {
             .collect()
     }
 
-    /// The dot products that it uses on this CPU: `bf16` (pairs of bfloat16), `vnni` (quads of int8); in tiles, for [`Isa::Amx`].
+    /// The dot products that it uses on this CPU: `bf16` (of bfloat16); `vnni`, `dotprod` or `i8mm` (of int8); in tiles, for [`Isa::Amx`].
     ///
     /// ```
     /// assert!(saccade_kernels::Isa::Portable.dot_products().is_empty());
     /// ```
     #[must_use]
     pub fn dot_products(self) -> Vec<&'static str> {
-        [("bf16", Dot::Bf16), ("vnni", Dot::Int8)]
-            .into_iter()
-            .filter_map(|(name, dot)| self.has(dot).then_some(name))
-            .collect()
+        let dots = [Dot::Bf16, Dot::Int8].into_iter();
+        dots.filter_map(|dot| self.dot_product(dot)).collect()
     }
 
     /// The one that `SACCADE_ISA` names; the best where it is unset or empty.

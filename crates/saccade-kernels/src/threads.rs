@@ -23,6 +23,7 @@ pub struct NumThreadsError {
 /// The affinity mask and the quota of the control group (v1 and v2, rounded up) are counted; siblings of one core count once. On Linux,
 /// cores of less than half the capacity of the fastest one (Arm's LITTLE cores) and Intel's efficiency cores are not counted, unless the
 /// process may use no others.
+/// Other systems than Linux count logical processors.
 ///
 /// # Errors
 /// The variable holds something else than a whole number of at least 1.

@@ -290,7 +290,8 @@ fn widened_bf16_has_the_bits_of_float32() {
         round(&mut rounded.keys);
         round(&mut rounded.values);
         for isa in isas() {
-            if isa.dot_products().contains(&"bf16") {
+            // Where pairs are multiplied, by an instruction or in tiles, the other factor is rounded too.
+            if isa == Isa::SoftwareTiles || isa.dot_products().contains(&"bf16") {
                 continue;
             }
             let kind = |element| Kind { isa, element };

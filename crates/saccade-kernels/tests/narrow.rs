@@ -90,8 +90,12 @@ impl Operand {
 
 /// Largest byte of activations: 8 bits where the instruction set has what multiplies them without saturating.
 fn steps(isa: Isa) -> f32 {
-    let eight_bits = isa == Isa::Portable || isa.dot_products().contains(&"vnni");
-    if eight_bits { 255.0 } else { 129.0 }
+    let seven_bits = cfg!(target_arch = "x86_64") && !matches!(isa, Isa::Portable | Isa::SoftwareTiles);
+    if seven_bits && !isa.dot_products().contains(&"vnni") {
+        129.0
+    } else {
+        255.0
+    }
 }
 
 fn operands(
@@ -224,6 +228,26 @@ fn the_largest_sums_do_not_overflow() {
     let weight = WeightRef::F32(Matrix::new(&weight, inputs + 1));
     let packed = PackedLinear::pack(Isa::best(), Arithmetic::Int8, 1, &[(weight, None)]);
     assert!(matches!(packed, Err(KernelError::TooManyInputs { given }) if given == inputs + 1));
+}
+
+#[test]
+fn int8_has_the_bits_of_portable_where_bytes_are_as_large() {
+    for (inputs, outputs, rows) in [(1, 1, 1), (37, 25, 9), (1030, 70, 30)] {
+        let x = numbers(31, rows * inputs, 3.0);
+        let weight = numbers(32, outputs * inputs, 0.1);
+        let bias = numbers(33, outputs, 1.0);
+        let out = |isa| {
+            let layer = pack(isa, Arithmetic::Int8, &weight, &bias);
+            bits(&apply(&layer, 1, &x, Epilogue::Add))
+        };
+        let expected = out(Isa::Portable);
+        for isa in Isa::available() {
+            assert!(
+                steps(isa) < 255.0 || out(isa) == expected,
+                "{isa}, {inputs} x {outputs}"
+            );
+        }
+    }
 }
 
 #[test]

@@ -28,8 +28,8 @@ impl PyFrame<'_> {
     }
 }
 
-/// The views of an observation, with their names where they have any, and its instruction.
-type PyObservation<'py> = (Vec<(Option<String>, PyFrame<'py>)>, Option<String>);
+/// The views of an observation, with their names where they have any; whether they are in the order of the prompt; and its instruction.
+type PyObservation<'py> = (Vec<(Option<String>, PyFrame<'py>)>, bool, Option<String>);
 
 /// Arrays of pixels, ids `(batch, length)`, mask, grids `(views, 3)`, names of views.
 type PyPrepared<'py> = (
@@ -171,12 +171,13 @@ impl Processor {
     ) -> PyResult<PyPrepared<'py>> {
         let observations = observations
             .iter()
-            .map(|(views, instruction)| {
+            .map(|(views, is_ordered, instruction)| {
                 let views = views
                     .iter()
                     .map(|(name, frame)| Ok((name.as_deref(), frame.view()?)));
                 Ok(Observation {
                     views: views.collect::<PyResult<_>>()?,
+                    is_ordered: *is_ordered,
                     instruction: instruction.as_deref(),
                     plain_text,
                 })

@@ -12,6 +12,8 @@ use crate::error::{Error, Result};
 pub(crate) enum Role {
     /// Attention and feed-forward of the blocks: nearly all of the work.
     Block,
+    /// The same of a backbone, whose activations have outliers.
+    BackboneBlock,
     /// A function of the time alone, so computed once for each bucket.
     Time,
     /// Encoders, decoder and output: under one percent.
@@ -21,7 +23,14 @@ pub(crate) enum Role {
 impl Role {
     /// Whether its weights are large: they may be stored as int8, and the memory that they are read into is used again.
     pub(crate) fn is_given_back(self) -> bool {
-        self == Self::Block
+        matches!(self, Self::Block | Self::BackboneBlock)
+    }
+
+    /// Whether in int8 elements of a row that are far larger than the others are multiplied in float32. Vision towers and language models
+    /// have such channels: in the residual stream, and most of all before the second layer of a feed-forward. The action head has none, and
+    /// keeps its bits.
+    pub(crate) fn keeps_outliers(self) -> bool {
+        self == Self::BackboneBlock
     }
 }
 
@@ -47,7 +56,7 @@ impl Precision {
     pub(crate) fn arithmetic(self, role: Role) -> Arithmetic {
         match (self, role) {
             (Self::Float32, _) | (_, Role::Time) => Arithmetic::Float32,
-            (Self::Int8, Role::Block) => Arithmetic::Int8,
+            (Self::Int8, Role::Block | Role::BackboneBlock) => Arithmetic::Int8,
             (Self::Bfloat16, _) | (_, Role::Other) => Arithmetic::Bfloat16,
         }
     }

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade import _arguments as arguments
+from saccade._arguments import UsageError
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ SIGTERM and Ctrl-C answer what was accepted, then end the server; a second one e
 
 examples:
   saccade serve GR00T-N1.5-3B/ --embodiment gr1 --precision int8
-  saccade serve my-policy/ --host 0.0.0.0 --max-batch 32 --log json >> serve.jsonl
+  saccade serve my-policy/ --host 0.0.0.0 --max-batch 32 --log json
 """
 
 
@@ -75,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     served.add_argument(
         "--api-token",
-        default=os.environ.get(TOKEN_VARIABLE),
+        default=os.environ.get(TOKEN_VARIABLE) or None,
         metavar="TEXT",
         help=f"refuse requests without this api_token (default: ${TOKEN_VARIABLE}, else none is needed)",
     )
@@ -153,6 +154,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Takes the port, loads, and serves until it is stopped."""
+    if args.api_token == "":
+        raise UsageError("--api-token: expected some text, got none")
     require("serve")
     import saccade
     from saccade.serve import Server

@@ -32,6 +32,14 @@ pub(super) trait TileArithmetic<S: Simd> {
     unsafe fn column(from: *const u32, part: usize) -> Self::Operand;
     /// `sum` and the products of factor and column.
     unsafe fn multiply_add(factor: Self::Operand, column: Self::Operand, sum: S::Vector) -> S::Vector;
+    /// Four factors, where there is [`Vector::BY_LANE`].
+    unsafe fn four(from: *const f32) -> Self::Operand;
+    /// `sum` and the products of the factor in lane `LANE` of four and column.
+    unsafe fn multiply_add_lane<const LANE: i32>(
+        factors: Self::Operand,
+        column: Self::Operand,
+        sum: S::Vector,
+    ) -> S::Vector;
     /// Element number `part` of each word of values.
     unsafe fn widen(from: *const u32, part: usize) -> S::Vector;
     /// `exp(x)` for `x <= 0`, NaN where it is NaN.
@@ -131,6 +139,18 @@ impl<S: Simd<Vector = V>, V: Vector, H: Stored> TileArithmetic<S> for Float32<H>
     }
 
     #[inline(always)]
+    unsafe fn four(from: *const f32) -> V {
+        // SAFETY: as above.
+        unsafe { V::load(from) }
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_add_lane<const LANE: i32>(factors: V, column: V, sum: V) -> V {
+        // SAFETY: as above.
+        unsafe { column.fma_lane::<LANE>(factors, sum) }
+    }
+
+    #[inline(always)]
     unsafe fn widen(from: *const u32, part: usize) -> V {
         // SAFETY: as above.
         unsafe { H::widen(from, part) }
@@ -187,6 +207,18 @@ impl<S: Simd<Vector = V>, V: Vector> TileArithmetic<S> for Pairs {
     unsafe fn multiply_add(factor: V::Ints, column: V::Ints, sum: V) -> V {
         // SAFETY: as above.
         unsafe { S::Dots::bf16(sum, factor, column) }
+    }
+
+    #[inline(always)]
+    unsafe fn four(from: *const f32) -> V::Ints {
+        // SAFETY: as above.
+        unsafe { V::load_ints(from.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_add_lane<const LANE: i32>(factors: V::Ints, column: V::Ints, sum: V) -> V {
+        // SAFETY: as above.
+        unsafe { S::Dots::bf16_lane::<LANE>(sum, column, factors) }
     }
 
     #[inline(always)]

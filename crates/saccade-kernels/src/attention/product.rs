@@ -191,7 +191,23 @@ impl TileProduct {
             }
             let mut b = self.b.add(first * self.b_vector);
             let mut factors = self.factors;
-            for _ in 0..self.depth.div_ceil(A::STEP) {
+            let mut steps = self.depth.div_ceil(A::STEP);
+            if V::BY_LANE {
+                for _ in 0..steps * A::FACTORS / 4 {
+                    let mut rows = [A::four(factors); MR];
+                    for (r, row) in rows.iter_mut().enumerate().skip(1) {
+                        *row = A::four(factors.add(r * self.factors_stride));
+                    }
+                    self.lane::<S, A, MR, NV, 0>(&mut acc, &rows, b);
+                    self.lane::<S, A, MR, NV, 1>(&mut acc, &rows, b);
+                    self.lane::<S, A, MR, NV, 2>(&mut acc, &rows, b);
+                    self.lane::<S, A, MR, NV, 3>(&mut acc, &rows, b);
+                    b = b.wrapping_add(4 / A::FACTORS * self.b_step);
+                    factors = factors.wrapping_add(4);
+                }
+                steps %= 4 / A::FACTORS;
+            }
+            for _ in 0..steps {
                 for part in 0..A::FACTORS {
                     let mut columns = [A::column(b, part); NV];
                     for (v, column) in columns.iter_mut().enumerate().skip(1) {
@@ -210,6 +226,30 @@ impl TileProduct {
             for (r, row) in acc.iter().enumerate() {
                 for (v, sum) in row.iter().enumerate() {
                     sum.store(out.add(r * self.out_stride + v * V::LANES));
+                }
+            }
+        }
+    }
+
+    /// Adds the products of factor number `LANE` of four of each row and what it meets from `b` on.
+    ///
+    /// # Safety
+    /// As [`Self::run`], for the steps of four factors from `b` on.
+    #[inline(always)]
+    unsafe fn lane<S: Simd, A: TileArithmetic<S>, const MR: usize, const NV: usize, const LANE: i32>(
+        &self,
+        acc: &mut [[S::Vector; NV]; MR],
+        rows: &[A::Operand; MR],
+        b: *const u32,
+    ) {
+        let (step, part) = (LANE as usize / A::FACTORS, LANE as usize % A::FACTORS);
+        // SAFETY: the caller's promise.
+        unsafe {
+            let b = b.add(step * self.b_step);
+            for v in 0..NV {
+                let column = A::column(b.add(v * self.b_vector), part);
+                for (row, &factors) in acc.iter_mut().zip(rows) {
+                    row[v] = A::multiply_add_lane::<LANE>(factors, column, row[v]);
                 }
             }
         }

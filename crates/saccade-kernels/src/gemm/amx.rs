@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use super::dot_bf16::Narrowing;
 use super::dot_int8::Quantizing;
+use super::outliers::MultiplyOutliers;
 use super::streams::Parts;
 use super::{Block, Gemm, PanelMut, ROW_BLOCK, Shape, Source, odd_lines, panel};
 use crate::simd::Simd;
@@ -178,6 +179,10 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                 }
             }
         }
+    }
+
+    fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
+        self.unit.simd().run(outliers);
     }
 
     fn chains(&self) -> usize {

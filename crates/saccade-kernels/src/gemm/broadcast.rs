@@ -126,10 +126,10 @@ unsafe impl<S: Simd> Gemm for RoundedRows<S> {
 }
 
 /// Rows rounded to what bfloat16 can hold, as float32.
-struct Rounding<'a> {
-    source: &'a Source,
-    rows: Range<usize>,
-    stride: usize,
+pub(super) struct Rounding<'a> {
+    pub source: &'a Source,
+    pub rows: Range<usize>,
+    pub stride: usize,
 }
 
 impl Kernel for Rounding<'_> {

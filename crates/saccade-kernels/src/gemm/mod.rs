@@ -9,6 +9,9 @@ mod chains;
 )]
 pub(crate) mod dot_bf16;
 pub(crate) mod dot_int8;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
+pub(crate) mod outliers;
 mod panel;
 mod streams;
 mod tile;
@@ -17,6 +20,7 @@ use std::ops::Range;
 
 use crate::aligned::Zeroable;
 use crate::weights::WeightRef;
+use outliers::{MultiplyOutliers, Outliers};
 
 /// What is multiplied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,6 +91,8 @@ pub(crate) struct Source {
     pub words: *mut u32,
     /// How each row was quantised, for [`Product::Int8`].
     pub quantized: *mut Quantized,
+    /// Where the outliers of each row go, if they are to be kept apart.
+    pub outliers: Option<*mut Outliers>,
 }
 
 /// How the rows of a call are dealt to tiles: evenly and in whole groups, so that 49 are 7 tiles of 7, not 6 of 8 and one of 1.
@@ -177,7 +183,7 @@ pub(crate) unsafe trait Gemm: Send + Sync {
     ///
     /// # Safety
     /// [`Self::converted_stride`] is not `None`. The rows are in `source.x`; `source.words` has room for them in whole groups, and
-    /// `source.quantized` for [`Product::Int8`]. No other thread reads or writes these places.
+    /// for [`Product::Int8`] `source.quantized` and, if they are given, `source.outliers`. No other thread reads or writes these places.
     unsafe fn convert(&self, source: &Source, rows: Range<usize>);
 
     /// Writes the sums of a block of rows times a panel.
@@ -186,6 +192,11 @@ pub(crate) unsafe trait Gemm: Send + Sync {
     /// The panel was packed by this product. `block.x` holds the rows of the block, for converted rows also [`Shape::rows_beyond`] more;
     /// `block.sums` has room for the block, whose rows are at most [`MAX_SUMS`] words. `block.out` is not dereferenced.
     unsafe fn multiply(&self, block: &Block<'_>);
+
+    /// Multiplies what was kept apart of rows by a panel, for [`Product::Int8`].
+    fn multiply_outliers(&self, _outliers: MultiplyOutliers<'_>) {
+        unreachable!("nothing is kept apart of rows that are not quantised")
+    }
 
     /// Runs independent chains of the instruction that products are made of, from registers, for some milliseconds. Returns how many
     /// multiply-accumulates that were.

@@ -7,11 +7,11 @@ use crate::weights::{WeightRef, quantize, row_scale};
 /// Writes float32 columns from `first` on, one for each row of `weight`.
 pub(super) fn pack_f32(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
     match weight {
-        WeightRef::F32(view) => put::<_, 1>(words, columns, first, view, |_, value| value.to_bits()),
-        WeightRef::Bf16(view) => put::<_, 1>(words, columns, first, view, |_, value| {
+        WeightRef::F32(view) => put::<_, 1, 1>(words, columns, first, view, |_, value| value.to_bits()),
+        WeightRef::Bf16(view) => put::<_, 1, 1>(words, columns, first, view, |_, value| {
             u32::from(value.to_bits()) << 16
         }),
-        WeightRef::Int8 { values, scales } => put::<_, 1>(words, columns, first, values, |row, value| {
+        WeightRef::Int8 { values, scales } => put::<_, 1, 1>(words, columns, first, values, |row, value| {
             (f32::from(value) * scales[row]).to_bits()
         }),
     }
@@ -19,19 +19,41 @@ pub(super) fn pack_f32(weight: WeightRef<'_>, first: usize, columns: usize, word
 
 /// The same in pairs of bfloat16.
 pub(super) fn pack_bf16(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
-    match weight {
-        WeightRef::Bf16(view) => {
-            put::<_, 2>(words, columns, first, view, |_, value| u32::from(value.to_bits()))
-        }
-        WeightRef::F32(view) => put::<_, 2>(words, columns, first, view, |_, value| rounded(value)),
-        WeightRef::Int8 { values, scales } => put::<_, 2>(words, columns, first, values, |row, value| {
-            rounded(f32::from(value) * scales[row])
-        }),
-    }
+    put_bf16::<1>(weight, first, columns, words);
+}
+
+/// Two words of a column next to each other: `[k / 4][column][2]`.
+#[cfg(target_arch = "aarch64")]
+pub(super) fn pack_bf16_in_fours(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
+    put_bf16::<2>(weight, first, columns, words);
 }
 
 /// The same in quads of int8, with the scales of the columns and the sums of their weights.
 pub(super) fn pack_int8(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
+    put_int8::<1>(weight, first, columns, panel);
+}
+
+/// Two words of a column next to each other: `[k / 8][column][2]`.
+#[cfg(target_arch = "aarch64")]
+pub(super) fn pack_int8_in_eights(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
+    put_int8::<2>(weight, first, columns, panel);
+}
+
+fn put_bf16<const RUN: usize>(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
+    match weight {
+        WeightRef::Bf16(view) => {
+            put::<_, 2, RUN>(words, columns, first, view, |_, value| u32::from(value.to_bits()))
+        }
+        WeightRef::F32(view) => put::<_, 2, RUN>(words, columns, first, view, |_, value| rounded(value)),
+        WeightRef::Int8 { values, scales } => {
+            put::<_, 2, RUN>(words, columns, first, values, |row, value| {
+                rounded(f32::from(value) * scales[row])
+            })
+        }
+    }
+}
+
+fn put_int8<const RUN: usize>(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
     let rows = weight.shape().0;
     let scales = &mut panel.scales[first..first + rows];
     for (row, scale) in scales.iter_mut().enumerate() {
@@ -40,29 +62,31 @@ pub(super) fn pack_int8(weight: WeightRef<'_>, first: usize, columns: usize, pan
     let scales = &*scales;
     let byte = |row: usize, value: f32| u32::from(quantize(value, scales[row]).cast_unsigned());
     match weight {
-        WeightRef::Int8 { values, .. } => put::<_, 4>(panel.words, columns, first, values, |_, value| {
-            u32::from(value.cast_unsigned())
-        }),
-        WeightRef::F32(view) => put::<_, 4>(panel.words, columns, first, view, byte),
-        WeightRef::Bf16(view) => put::<_, 4>(panel.words, columns, first, view, |row, value| {
+        WeightRef::Int8 { values, .. } => {
+            put::<_, 4, RUN>(panel.words, columns, first, values, |_, value| {
+                u32::from(value.cast_unsigned())
+            })
+        }
+        WeightRef::F32(view) => put::<_, 4, RUN>(panel.words, columns, first, view, byte),
+        WeightRef::Bf16(view) => put::<_, 4, RUN>(panel.words, columns, first, view, |row, value| {
             byte(row, value.to_f32())
         }),
     }
     let sums = &mut panel.sums[first..first + rows];
     sums.fill(0);
-    for words in panel.words.chunks_exact(columns) {
-        for (sum, word) in sums.iter_mut().zip(&words[first..]) {
-            let bytes = word.to_le_bytes().map(u8::cast_signed);
-            *sum += bytes.iter().map(|&byte| i32::from(byte)).sum::<i32>();
+    for words in panel.words.chunks_exact(columns * RUN) {
+        for (sum, words) in sums.iter_mut().zip(words[first * RUN..].chunks_exact(RUN)) {
+            let bytes = words.iter().flat_map(|word| word.to_le_bytes());
+            *sum += bytes.map(|byte| i32::from(byte.cast_signed())).sum::<i32>();
         }
     }
 }
 
-/// Writes `bits(row, element)` of all elements, `STEP` of which make a word, the first one lowest.
+/// Writes `bits(row, element)` of all elements, `STEP` of which make a word, the first one lowest; `RUN` words of a column stay together.
 ///
 /// In blocks, so that neither the reading nor the writing side jumps through memory at every element; what is in a block is known to the
 /// compiler, which makes vectors of it.
-fn put<T: Copy, const STEP: usize>(
+fn put<T: Copy, const STEP: usize, const RUN: usize>(
     to_words: &mut [u32],
     columns: usize,
     first: usize,
@@ -104,10 +128,15 @@ fn put<T: Copy, const STEP: usize>(
                     }
                 }
             }
+            // Blocks begin with a run of words.
             let to = &mut to_words[first_word * columns..];
-            for (index, to) in to.chunks_mut(columns).take(block_words).enumerate() {
+            for index in 0..block_words {
                 let column: [u32; BLOCK] = std::array::from_fn(|row| block[row][index]);
-                to[first + first_row..][..block_rows].copy_from_slice(&column[..block_rows]);
+                let to = &mut to[index / RUN * RUN * columns..][index % RUN..];
+                let to = to[(first + first_row) * RUN..].iter_mut().step_by(RUN);
+                for (to, &word) in to.zip(&column[..block_rows]) {
+                    *to = word;
+                }
             }
         }
     }

@@ -1,9 +1,11 @@
 //! From the sums of a block to results: scales, bias, activation, and what is done with what `out` holds.
 
 use std::marker::PhantomData;
+use std::mem::MaybeUninit;
 use std::ops::Range;
 
 use crate::gemm::Quantized;
+use crate::gemm::outliers::Outliers;
 use crate::simd::math::{self, Activation};
 use crate::simd::{Kernel, Simd, Vector, load, store};
 
@@ -51,6 +53,11 @@ pub(super) struct Int8<'a> {
     pub scales: &'a [f32],
     pub sums: &'a [i32],
     pub quantized: &'a [Quantized],
+    /// Of each row of the block, if any row has some.
+    pub outliers: &'a [Outliers],
+    /// Their products with the whole numbers that weights are, in rows of the panel's columns, written for rows that have outliers; none if
+    /// no row has.
+    pub apart: Option<&'a [MaybeUninit<f32>]>,
 }
 
 impl Kernel for Finish<'_> {
@@ -108,13 +115,27 @@ impl Finish<'_> {
                     .add(column);
                 let mut sums = self.sums.add(column);
                 for row in self.rows.clone() {
-                    let value = M::value(sums, columns, &self.int8, row).add(bias);
+                    let mut value = M::value(sums, columns, &self.int8, row);
+                    if let Some(apart) = self.apart(row - self.rows.start) {
+                        value = M::with_outliers(value, columns, apart.add(column));
+                    }
+                    let value = value.add(bias);
                     store(R::of(value, out, lanes), out, lanes);
                     out = out.wrapping_offset(self.out_stride);
                     sums = sums.wrapping_add(self.columns);
                 }
             }
         }
+    }
+}
+
+impl Finish<'_> {
+    /// What the outliers of a row of the block add to it, if it has any.
+    #[inline(always)]
+    fn apart(&self, row: usize) -> Option<*const f32> {
+        let apart = self.int8.apart?;
+        let has_some = !self.int8.outliers[row].is_empty();
+        has_some.then(|| apart[row * self.columns..][..self.columns].as_ptr().cast())
     }
 }
 
@@ -131,6 +152,12 @@ trait Sums {
     /// `sums` points to a vector of words; the row was quantised, if sums are those of quantised rows.
     unsafe fn value<V: Vector>(sums: *const u32, columns: Self::Columns<V>, int8: &Int8<'_>, row: usize)
     -> V;
+
+    /// `value` and what outliers add to it.
+    ///
+    /// # Safety
+    /// `apart` points to a vector of products.
+    unsafe fn with_outliers<V: Vector>(value: V, columns: Self::Columns<V>, apart: *const f32) -> V;
 }
 
 /// Sums that are float32 already.
@@ -149,6 +176,11 @@ impl Sums for FloatSums {
     unsafe fn value<V: Vector>(sums: *const u32, (): (), _: &Int8<'_>, _: usize) -> V {
         // SAFETY: the caller gives a vector of words.
         unsafe { V::load(sums.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn with_outliers<V: Vector>(value: V, (): (), _: *const f32) -> V {
+        value
     }
 }
 
@@ -185,6 +217,12 @@ impl Sums for Int8Sums {
             // The weights' scale first: a row of huge values would overflow before weights make it small again.
             V::from_ints(sum).mul(scales).mul(V::splat(scale))
         }
+    }
+
+    #[inline(always)]
+    unsafe fn with_outliers<V: Vector>(value: V, (scales, _): (V, V::Ints), apart: *const f32) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { V::load(apart).fma(scales, value) }
     }
 }
 

@@ -15,6 +15,7 @@ use std::ops::Range;
 
 use crate::aligned::{AlignedBuffer, AllocError};
 use crate::cpu::Cpu;
+use crate::gemm::outliers::{MultiplyOutliers, Outliers};
 use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, Tiles};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
@@ -26,6 +27,7 @@ pub use error::KernelError;
 use error::MAX_INT8_INPUTS;
 use order::Order;
 use pack::{Panels, pack_panels};
+use rows::Conversion;
 pub use rows::LinearScratch;
 
 /// A linear layer whose weights were packed for one instruction set.
@@ -55,6 +57,8 @@ pub struct PackedLinear {
     bias: AlignedBuffer<f32>,
     /// Whether memory is asked for them as many streams.
     streams: bool,
+    /// Whether the largest elements of a row are kept out of its quantisation.
+    keeps_outliers: bool,
 }
 
 /// Below this many multiply-accumulates a second thread costs more than it saves: waking one takes about 5 us, in which a core does
@@ -63,6 +67,9 @@ const MACS_FOR_THREADS: usize = 1 << 19;
 
 /// As many multiply-accumulates should each thread have, for the same reason.
 const MACS_OF_THREAD: usize = MACS_FOR_THREADS / 2;
+
+/// A task has at least so many: a microsecond of work, against a tenth of one to deal it.
+const MACS_OF_TASK: usize = 1 << 16;
 
 /// Tasks that each thread should have, if they are not smaller than that: one that begins its last task late keeps the others waiting for a
 /// quarter of the work at most.
@@ -142,6 +149,7 @@ impl PackedLinear {
             panels,
             bias,
             streams: Cpu::current().wants_streams(),
+            keeps_outliers: false,
         })
     }
 
@@ -150,6 +158,18 @@ impl PackedLinear {
     #[must_use]
     pub fn with_streams(self, streams: bool) -> Self {
         Self { streams, ..self }
+    }
+
+    /// The layer, keeping up to 8 elements of a row out of its quantisation if they are far larger than the others: they are multiplied in
+    /// float32 by the same weights. For [`Arithmetic::Int8`]; no other arithmetic needs it.
+    ///
+    /// Costs a pass over the rows, and for rows that have such elements some percent of the products.
+    #[must_use]
+    pub fn keeping_outliers(self) -> Self {
+        Self {
+            keeps_outliers: self.element == Element::Int8,
+            ..self
+        }
     }
 
     /// The bytes that a layer of `(out_features, in_features)` holds when it is packed. `weights` is [`Element::Bf16`] if all its parts are
@@ -259,10 +279,11 @@ impl PackedLinear {
         let columns = shape.columns;
         let num_panels = self.out_features.div_ceil(columns);
         let tiles = Tiles::new(rows, shape);
-        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another.
+        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another: 49 x 128 x 128 has
+        // three panels of 48 columns, which two threads would take in the time of two.
         let wanted = (TASKS_PER_THREAD * threads)
             .div_ceil(num_panels)
-            .min(macs / (num_panels * MACS_FOR_THREADS));
+            .min(macs / (num_panels * MACS_OF_TASK));
         let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
         let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
         let mut call = Call {
@@ -270,15 +291,20 @@ impl PackedLinear {
             x_stride: x.row_stride() as isize,
             tiles,
             quantized: &[],
+            outliers: &[],
             out_stride: out.row_stride() as isize,
             out: out.as_mut_ptr(),
             epilogue,
         };
         if let Some(stride) = self.gemm.converted_stride(self.in_features) {
-            let is_int8 = self.element == Element::Int8;
-            let converted = scratch.convert(&*self.gemm, stride, is_int8, threads, x)?;
+            let conversion = match (self.element, self.keeps_outliers) {
+                (Element::Int8, true) => Conversion::QuantizedWithoutOutliers,
+                (Element::Int8, false) => Conversion::Quantized,
+                _ => Conversion::Rounded,
+            };
+            let converted = scratch.convert(&*self.gemm, stride, conversion, threads, x)?;
             (call.x, call.x_stride) = (converted.words, stride as isize);
-            call.quantized = converted.quantized;
+            (call.quantized, call.outliers) = (converted.quantized, converted.outliers);
         }
         let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
         let order = Order::new(blocks, num_panels, panel_bytes, TASKS_PER_THREAD * threads);
@@ -321,6 +347,18 @@ impl PackedLinear {
         };
         // SAFETY: the product has packed the panel and, where it does so, converted the rows; the block's sums fit.
         unsafe { self.gemm.multiply(&block) };
+        let mut apart = [const { MaybeUninit::uninit() }; MAX_SUMS];
+        let outliers = call.outliers.get(rows.clone()).unwrap_or_default();
+        let has_outliers = outliers.iter().any(|outliers| !outliers.is_empty());
+        if has_outliers {
+            self.gemm.multiply_outliers(MultiplyOutliers {
+                outliers,
+                panel: block.weights,
+                columns,
+                run: 1,
+                sums: &mut apart[..rows.len() * columns],
+            });
+        }
         let columns_of = first..first + columns;
         self.isa.run(Finish {
             epilogue: call.epilogue,
@@ -333,6 +371,8 @@ impl PackedLinear {
                 scales: self.panels.scales.get(columns_of.clone()).unwrap_or_default(),
                 sums: self.panels.sums.get(columns_of).unwrap_or_default(),
                 quantized: call.quantized,
+                outliers,
+                apart: has_outliers.then_some(&apart[..]),
             },
             out,
             out_stride: call.out_stride,
@@ -364,6 +404,8 @@ struct Call<'a> {
     x_stride: isize,
     tiles: Tiles,
     quantized: &'a [Quantized],
+    /// Of each row, if they are kept apart.
+    outliers: &'a [Outliers],
     out: *mut f32,
     out_stride: isize,
     epilogue: Epilogue,

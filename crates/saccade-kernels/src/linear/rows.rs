@@ -1,6 +1,7 @@
 //! Activations as a product reads them: rounded or quantised row by row, on several threads.
 
 use crate::aligned::{AlignedBuffer, AllocError, elements};
+use crate::gemm::outliers::Outliers;
 use crate::gemm::{Gemm, Quantized, Source};
 use crate::pool::parallel_for;
 use crate::rows::Rows;
@@ -10,6 +11,7 @@ use crate::rows::Rows;
 pub struct LinearScratch {
     words: AlignedBuffer<u32>,
     quantized: AlignedBuffer<Quantized>,
+    outliers: AlignedBuffer<Outliers>,
 }
 
 /// Rows in the scratch.
@@ -17,6 +19,16 @@ pub(super) struct Converted<'a> {
     pub words: *const u32,
     /// Of each row, for int8.
     pub quantized: &'a [Quantized],
+    /// Of each row, if they were kept apart; otherwise empty.
+    pub outliers: &'a [Outliers],
+}
+
+/// Whether rows are quantised, and what is kept apart then.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Conversion {
+    Rounded,
+    Quantized,
+    QuantizedWithoutOutliers,
 }
 
 /// Elements from which a second thread pays.
@@ -32,21 +44,24 @@ impl LinearScratch {
         Self {
             words: AlignedBuffer::empty(),
             quantized: AlignedBuffer::empty(),
+            outliers: AlignedBuffer::empty(),
         }
     }
 
     /// Bytes held.
     #[must_use]
     pub fn nbytes(&self) -> usize {
-        size_of::<u32>() * self.words.len() + size_of::<Quantized>() * self.quantized.len()
+        size_of::<u32>() * self.words.len()
+            + size_of::<Quantized>() * self.quantized.len()
+            + size_of::<Outliers>() * self.outliers.len()
     }
 
-    /// The rows of `x` as `gemm` reads them, `stride` words apart; `is_int8` says whether they are quantised.
+    /// The rows of `x` as `gemm` reads them, `stride` words apart.
     pub(super) fn convert(
         &mut self,
         gemm: &dyn Gemm,
         stride: usize,
-        is_int8: bool,
+        conversion: Conversion,
         threads: usize,
         x: Rows<'_>,
     ) -> Result<Converted<'_>, AllocError> {
@@ -57,8 +72,12 @@ impl LinearScratch {
         if self.words.len() < words {
             self.words = AlignedBuffer::zeroed(words)?;
         }
-        if is_int8 && self.quantized.len() < rows {
+        if conversion != Conversion::Rounded && self.quantized.len() < rows {
             self.quantized = AlignedBuffer::zeroed(rows)?;
+        }
+        let keeps_outliers = conversion == Conversion::QuantizedWithoutOutliers;
+        if keeps_outliers && self.outliers.len() < rows {
+            self.outliers = AlignedBuffer::zeroed(rows)?;
         }
         let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).clamp(1, groups.max(1));
         let threads = if rows * width < ELEMENTS_FOR_THREADS {
@@ -72,6 +91,7 @@ impl LinearScratch {
             in_features: width,
             words: self.words.as_mut_ptr(),
             quantized: self.quantized.as_mut_ptr(),
+            outliers: keeps_outliers.then(|| self.outliers.as_mut_ptr()),
         });
         parallel_for(threads, tasks, &|task| {
             let source = &source;
@@ -82,6 +102,11 @@ impl LinearScratch {
         Ok(Converted {
             words: self.words.as_ptr(),
             quantized: &self.quantized,
+            outliers: if keeps_outliers {
+                &self.outliers[..rows]
+            } else {
+                &[]
+            },
         })
     }
 }

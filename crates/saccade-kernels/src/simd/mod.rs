@@ -3,6 +3,8 @@
 //! A value of a [`Simd`] type proves that this CPU has an instruction set. [`Simd::run`] is the only place that turns target features on;
 //! a [`Kernel`] is inlined into it whole, so that every operation below becomes one instruction.
 
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod aarch64;
 pub(crate) mod math;
 pub(crate) mod portable;
 #[cfg(target_arch = "x86_64")]
@@ -90,6 +92,13 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn dot_bytes(sum: Self::Ints, x: Self::Ints, w: Self::Ints) -> Self::Ints;
     /// Asks for the cache line at `at`, which may be any address. A hint: it may do nothing.
     unsafe fn prefetch(at: *const u8);
+    /// Whether multiply-adds take a factor from a lane of four: [`Self::fma_lane`] and [`Dots::bf16_lane`].
+    const BY_LANE: bool = false;
+    /// `self * factors[LANE] + addend`, rounded once.
+    #[inline(always)]
+    unsafe fn fma_lane<const LANE: i32>(self, _factors: Self, _addend: Self) -> Self {
+        unreachable!("only where there is BY_LANE")
+    }
 }
 
 /// The first `lanes` elements, by the plain load where that is all of them.
@@ -165,6 +174,8 @@ pub(crate) enum Dot {
 /// # Safety
 /// Every method needs a CPU that has the instruction set of `V` and the dot products of the implementation.
 pub(crate) unsafe trait Dots<V: Vector> {
+    /// What users call the instructions; empty where there are none.
+    const NAME: &'static str = "";
     /// Up to where [`Self::int8`] takes unsigned bytes.
     const MAX_BYTE: u8 = V::MAX_BYTE;
     /// Whether [`Self::bf16`] is one instruction.
@@ -179,6 +190,12 @@ pub(crate) unsafe trait Dots<V: Vector> {
             let low = V::low_halves(a).fma(V::low_halves(b), sum);
             V::high_halves(a).fma(V::high_halves(b), low)
         }
+    }
+
+    /// The same of `a` and lane `LANE` of `b`, where there is [`Vector::BY_LANE`].
+    #[inline(always)]
+    unsafe fn bf16_lane<const LANE: i32>(_sum: V, _a: V::Ints, _b: V::Ints) -> V {
+        unreachable!("only where there is BY_LANE")
     }
 
     /// `first` and then `second`, `2 * LANES` elements, rounded to bfloat16 as [`Vector::round_to_bf16`] does; a native conversion may take

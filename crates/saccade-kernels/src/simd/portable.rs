@@ -67,7 +67,8 @@ fn power_of_two(exponent: f32) -> f32 {
 unsafe impl<const N: usize> Vector for Lanes<N> {
     const LANES: usize = N;
     const TILE_ROWS: usize = 4;
-    const TILE_VECTORS: usize = 1;
+    // Sixteen lanes are laid out as those of AVX-512 are.
+    const TILE_VECTORS: usize = if N < 16 { 1 } else { 3 };
     type Ints = [i32; N];
     const MAX_BYTE: u8 = 255;
 

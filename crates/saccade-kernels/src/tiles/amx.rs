@@ -321,7 +321,7 @@ mod tests {
         for rows in 1..=MAX_ROWS {
             let steps = 1 + rows % 4;
             let (x_size, w_size, sums) = (rows * TILE * steps, 3 * TILE * TILE * steps, rows * 3 * TILE);
-            for seed in 0..20 {
+            for seed in 0..8 {
                 let (x, w, before) = (
                     words(seed, x_size),
                     words(seed + 50, w_size),

@@ -144,9 +144,12 @@ impl Backbone {
     ) -> Result<Vec<Vec<Arc<View>>>> {
         let mut found: Vec<Vec<Option<Arc<View>>>> = Vec::new();
         let mut new: Vec<ViewPixels<'_>> = Vec::new();
+        let count = inputs.iter().map(|inputs| inputs.views.len()).sum();
+        reserve("views", &mut new, count)?;
         let mut number = 0;
         for inputs in inputs {
             let mut of_inputs = Vec::new();
+            reserve("views", &mut of_inputs, inputs.views.len())?;
             for prompt in &inputs.prompts {
                 for (place, view) in inputs.views[prompt.views.clone()].iter().enumerate() {
                     let same = same_view(previous, (number, place), view);
@@ -177,6 +180,8 @@ impl Backbone {
         previous: &[&'a BackboneFeatures],
     ) -> Result<Vec<Sequence<'a>>> {
         let mut sequences = Vec::new();
+        let count = inputs.iter().map(|inputs| inputs.prompts.len()).sum();
+        reserve("prompts", &mut sequences, count)?;
         for (index, (inputs, views)) in inputs.iter().zip(views).enumerate() {
             for (row, prompt) in inputs.prompts.iter().enumerate() {
                 let views = views[prompt.views.clone()].to_vec();
@@ -214,9 +219,11 @@ impl Backbone {
                     .push(OwnedArray::new(filled("record", len, 0.0)?, &shape)?);
             }
         }
+        let mut prompts = Vec::new();
+        reserve("prompts", &mut prompts, inputs.prompts.len())?;
         Ok(BackboneFeatures {
             backbone: self.id,
-            prompts: Vec::new(),
+            prompts,
             num_tokens: inputs.num_tokens,
             feature_dim: self.config.feature_dim(),
             recorded,
@@ -243,7 +250,7 @@ impl Backbone {
             });
         }
         sized(&mut buffers.language.x, rows * width)?;
-        let deepstack = self.embed(group, &mut buffers.language.x);
+        let deepstack = self.embed(group, &mut buffers.language.x)?;
         let turns = language_turns(&self.config);
         let rotation = Rotation::new(self.config.language.head_dim, &turns, &positions)?;
         if rows > 0 {
@@ -291,9 +298,16 @@ impl Backbone {
     }
 
     /// Writes the tokens of words and views to `x (rows, width)`; what is added to them after the first layers.
-    fn embed<'a>(&self, group: &'a [Sequence<'_>], x: &mut [f32]) -> Vec<Additions<'a>> {
+    fn embed<'a>(&self, group: &'a [Sequence<'_>], x: &mut [f32]) -> Result<Vec<Additions<'a>>> {
         let width = self.config.language.width;
         let mut deepstack: Vec<Additions<'a>> = vec![Vec::new(); self.config.vision.deepstack.len()];
+        let count = group
+            .iter()
+            .map(|sequence| sequence.prompt.image_tokens.len())
+            .sum();
+        for additions in &mut deepstack {
+            reserve("activations", additions, count)?;
+        }
         let mut first_row = 0;
         for sequence in group {
             let first = sequence.first();
@@ -319,7 +333,7 @@ impl Backbone {
             }
             first_row += sequence.num_rows();
         }
-        deepstack
+        Ok(deepstack)
     }
 
     /// The features of rows that have passed the language model, and all that is held of their prompts.

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
-use crate::alloc::collected;
+use crate::alloc::{collected, filled, reserve};
 use crate::array::Array;
 use crate::error::{Error, Result, show_shape};
 
@@ -109,6 +109,7 @@ impl<'a> Checked<'a> {
         check_ids(config, &inputs.input_ids)?;
         let views = views(config, inputs)?;
         let mut prompts = Vec::new();
+        reserve("prompts", &mut prompts, batch)?;
         let mut first = 0;
         for row in 0..batch {
             let tokens = row * num_tokens..(row + 1) * num_tokens;
@@ -129,7 +130,7 @@ impl<'a> Checked<'a> {
                     Some(mask) => {
                         collected("attention_mask", num_tokens, mask.data()[tokens].iter().copied())?
                     }
-                    None => crate::alloc::filled("attention_mask", num_tokens, true)?,
+                    None => filled("attention_mask", num_tokens, true)?,
                 },
                 views: first..end,
                 image_tokens: collected("image_mask", count, places)?,
@@ -256,7 +257,10 @@ fn images<'a>(config: &VisionConfig, inputs: &BackboneInputs<'a>) -> Result<Vec<
             )));
         }
         let (height, width) = (array.shape()[2], array.shape()[3]);
-        for pixels in array.data().chunks_exact(CHANNELS * height * width) {
+        let of_array = array.data().chunks_exact(CHANNELS * height * width);
+        let count = views.len() + of_array.len();
+        reserve("views", &mut views, count)?;
+        for pixels in of_array {
             views.push(ViewPixels {
                 pixels,
                 grid: [height / config.patch_size, width / config.patch_size],
@@ -293,6 +297,7 @@ fn patches<'a>(
         )));
     }
     let mut views = Vec::new();
+    reserve("views", &mut views, grid.shape()[0])?;
     let mut left = array.data();
     for (index, sizes) in grid.data().chunks_exact(3).enumerate() {
         let side = |side: i64| {

@@ -9,7 +9,7 @@ use super::qwen3_vl::Qwen3Vl;
 use super::released::Names;
 use super::siglip::Siglip;
 use super::vision_block::BlockBuffers;
-use crate::alloc::{collected, filled};
+use crate::alloc::{collected, filled, reserve};
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::weights::Weights;
@@ -72,7 +72,8 @@ impl Vision {
         record: bool,
         buffers: &mut VisionBuffers,
     ) -> Result<Vec<Arc<View>>> {
-        let mut encoded = Vec::with_capacity(views.len());
+        let mut encoded = Vec::new();
+        reserve("views", &mut encoded, views.len())?;
         let mut left = views;
         while !left.is_empty() {
             let mut rows = 0;

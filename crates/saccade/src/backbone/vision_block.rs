@@ -11,6 +11,7 @@ use crate::nn::mlp::FeedForward;
 use crate::nn::norm::LayerNorm;
 use crate::nn::rotary::Rotation;
 use crate::nn::weights::Weights;
+use crate::precision::Role;
 
 /// What the parts of a block are called.
 pub(super) struct BlockNames {
@@ -57,6 +58,7 @@ impl VisionBlock {
                 names.mlp,
                 [width, config.hidden_dim],
                 Epilogue::GeluTanh,
+                Role::BackboneBlock,
             )?,
         })
     }

@@ -160,6 +160,7 @@ impl Block {
                 DIFFUSERS,
                 [width, 4 * width],
                 Epilogue::GeluTanh,
+                Role::Block,
             )?,
         })
     }

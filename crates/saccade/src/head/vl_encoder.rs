@@ -15,6 +15,7 @@ use crate::nn::mlp::{DIFFUSERS, FeedForward};
 use crate::nn::norm::LayerNorm;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
+use crate::precision::Role;
 use crate::profile::Part;
 
 /// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate
@@ -89,6 +90,7 @@ impl VlBlock {
                 DIFFUSERS,
                 [width, 4 * width],
                 Epilogue::GeluTanh,
+                Role::Block,
             )?,
         })
     }

@@ -28,7 +28,12 @@ impl GatedMlp {
         has_bias: bool,
     ) -> Result<Self> {
         let linear = |name: &str, inputs, outputs| {
-            Linear::stacked(&[(weights.at(name), outputs)], inputs, Role::Block, has_bias)
+            Linear::stacked(
+                &[(weights.at(name), outputs)],
+                inputs,
+                Role::BackboneBlock,
+                has_bias,
+            )
         };
         Ok(Self {
             gate: linear("gate_proj", width, hidden)?.counted(Part::FeedForwardIn),

@@ -98,9 +98,9 @@ impl GroupedAttention {
             ],
             Qkv::Stacked(qkv) => vec![(weights.at(qkv), queries + 2 * keys)],
         };
-        let qkv = Linear::stacked(&parts, width, Role::Block, projections.qkv_bias)?;
+        let qkv = Linear::stacked(&parts, width, Role::BackboneBlock, projections.qkv_bias)?;
         let out = [(weights.at(projections.out), width)];
-        let out = Linear::stacked(&out, queries, Role::Block, projections.out_bias)?;
+        let out = Linear::stacked(&out, queries, Role::BackboneBlock, projections.out_bias)?;
         let norms = match norm_eps {
             Some(eps) => Some([
                 RmsNorm::new(&weights.at("q_norm"), head_dim, eps)?,

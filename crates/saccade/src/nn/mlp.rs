@@ -27,9 +27,10 @@ impl FeedForward {
         [proj, out]: [&str; 2],
         [width, hidden]: [usize; 2],
         activation: Epilogue,
+        role: Role,
     ) -> Result<Self> {
-        let proj = Linear::new(&weights.at(proj), width, hidden, Role::Block)?;
-        let out = Linear::new(&weights.at(out), hidden, width, Role::Block)?;
+        let proj = Linear::new(&weights.at(proj), width, hidden, role)?;
+        let out = Linear::new(&weights.at(out), hidden, width, role)?;
         Ok(Self {
             proj: proj.counted(Part::FeedForwardIn),
             out: out.counted(Part::FeedForwardOut),

@@ -178,7 +178,7 @@ fn feed_forwards_of_any_hidden_width_and_activation() {
             .zip(&x)
             .for_each(|(sum, x)| *sum += f64::from(*x));
         for (engine, layer) in
-            named.layers(|weights| FeedForward::new(weights, DIFFUSERS, [6, 11], activation))
+            named.layers(|weights| FeedForward::new(weights, DIFFUSERS, [6, 11], activation, Role::Block))
         {
             let (mut out, scratch) = (x.clone(), &mut LinearScratch::new());
             layer.add(engine, &y, &mut Vec::new(), scratch, &mut out).unwrap();
@@ -436,7 +436,7 @@ fn the_layers_of_siglip_are_those_of_transformers() {
     );
     assert_released(
         "siglip.mlp",
-        |weights| FeedForward::new(weights, ["fc1", "fc2"], [24, 36], Epilogue::GeluTanh),
+        |weights| FeedForward::new(weights, ["fc1", "fc2"], [24, 36], Epilogue::GeluTanh, Role::Block),
         |engine, layer, y, x| layer.add(engine, y, &mut Vec::new(), &mut LinearScratch::new(), x),
     );
 }

@@ -325,6 +325,10 @@ impl Weights<'_> {
         }
         let packed =
             PackedLinear::pack(engine.isa, arithmetic, engine.threads, &held).map_err(packing_error)?;
+        let packed = match role.keeps_outliers() {
+            true => packed.keeping_outliers(),
+            false => packed,
+        };
         if outline.is_none() {
             self.count(packed.nbytes());
         }

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use saccade_kernels::{CubicRule, Image, Isa, resize_area, resize_cubic_u8, resize_linear_f32};
 
-use super::settings::{Flexible, Preprocessing, Settings, Sizes};
+use super::settings::{Flexible, MAX_AREA, Preprocessing, Settings, Sizes};
 use crate::alloc::{collected, filled, product};
 use crate::array::{Array, OwnedArray, first_not_finite};
 use crate::config::Version;
@@ -50,14 +50,14 @@ const N17_MERGE: usize = 2;
 const N17_TIME: usize = 2;
 
 /// Bytes with their size: the caller's, or new ones.
-struct Bytes<'a> {
-    pixels: Cow<'a, [u8]>,
-    height: usize,
-    width: usize,
+pub(super) struct Bytes<'a> {
+    pub pixels: Cow<'a, [u8]>,
+    pub height: usize,
+    pub width: usize,
 }
 
 impl Bytes<'_> {
-    fn new(pixels: Vec<u8>, height: usize, width: usize) -> Self {
+    pub(super) fn new(pixels: Vec<u8>, height: usize, width: usize) -> Self {
         Self {
             pixels: pixels.into(),
             height,
@@ -225,7 +225,7 @@ fn crop_floor(image: Image<'_>, height: usize, width: usize) -> Image<'_> {
 /// N1.6 and N1.7.
 fn flexible_view(settings: &Settings, sizes: &Flexible, isa: Isa, name: &str, frame: Bytes) -> Result<View> {
     let frame = match sizes.letter_box {
-        true => letter_box(frame)?,
+        true => letter_box(name, frame)?,
         false => frame,
     };
     let frame = match sizes.use_albumentations {
@@ -265,12 +265,25 @@ fn check_ratio(name: &str, height: usize, width: usize) -> Result<()> {
     Ok(())
 }
 
+/// That a frame on its way to a view does not become larger than any view.
+fn check_area(name: &str, frame: &Bytes<'_>, height: usize, width: usize) -> Result<()> {
+    let most = MAX_AREA.max(frame.height * frame.width);
+    match height.checked_mul(width) {
+        Some(area) if area <= most => Ok(()),
+        _ => Err(Error::Input(format!(
+            "{name}: expected a frame that is less elongated than {} x {}, which becomes {height} x {width}",
+            frame.height, frame.width
+        ))),
+    }
+}
+
 /// Black bars make it a square.
-fn letter_box(frame: Bytes<'_>) -> Result<Bytes<'_>> {
+fn letter_box<'a>(name: &str, frame: Bytes<'a>) -> Result<Bytes<'a>> {
     let side = frame.height.max(frame.width);
     if frame.height == frame.width {
         return Ok(frame);
     }
+    check_area(name, &frame, side, side)?;
     let (top, left) = ((side - frame.height) / 2, (side - frame.width) / 2);
     let mut pixels = filled(PIXELS, product(PIXELS, &[side, side, CHANNELS])?, 0)?;
     for (row, from) in frame.pixels.chunks_exact(frame.width * CHANNELS).enumerate() {
@@ -281,7 +294,7 @@ fn letter_box(frame: Bytes<'_>) -> Result<Bytes<'_>> {
 }
 
 /// The path of checkpoints that say `use_albumentations`: OpenCV's INTER_AREA, a crop, and again.
-fn by_area<'a>(
+pub(super) fn by_area<'a>(
     settings: &Settings,
     sizes: &Flexible,
     isa: Isa,
@@ -293,17 +306,16 @@ fn by_area<'a>(
     if sizes.target_size.is_none() && (is_lerobot || sizes.shortest_edge.is_none()) {
         return Ok(frame);
     }
-    if sizes.shortest_edge.is_some() || is_lerobot {
-        // The ratio stays. Refused later, after the shorter side has grown, it could be gigabytes.
-        check_ratio(name, frame.height, frame.width)?;
-    }
+    let resized = |height: usize, width: usize| match (sizes.shortest_edge, sizes.target_size) {
+        (Some(edge), _) => edge_sizes(edge, height, width),
+        (None, Some([edge, _])) if is_lerobot => edge_sizes(edge, height, width),
+        (None, Some([height, width])) => (height, width),
+        (None, None) => (height, width),
+    };
+    let (height, width) = resized(frame.height, frame.width);
+    check_area(name, &frame, height, width)?;
     let resize = |image: Image<'_>| -> Result<Bytes<'a>> {
-        let (height, width) = match (sizes.shortest_edge, sizes.target_size) {
-            (Some(edge), _) => edge_sizes(edge, image.height(), image.width()),
-            (None, Some([height, _])) if is_lerobot => edge_sizes(height, image.height(), image.width()),
-            (None, Some([height, width])) => (height, width),
-            (None, None) => (image.height(), image.width()),
-        };
+        let (height, width) = resized(image.height(), image.width());
         let pixels = kernel(resize_area(isa, image, height, width))?;
         Ok(Bytes::new(pixels, height, width))
     };
@@ -357,7 +369,13 @@ fn edge_sizes(edge: usize, height: usize, width: usize) -> (usize, usize) {
 }
 
 /// The multiples of `factor` nearest to a frame's sides, between the least and the greatest area.
-fn fitting(version: Version, sizes: &Flexible, factor: usize, height: usize, width: usize) -> (usize, usize) {
+pub(super) fn fitting(
+    version: Version,
+    sizes: &Flexible,
+    factor: usize,
+    height: usize,
+    width: usize,
+) -> (usize, usize) {
     let (least, most) = (sizes.min_pixels as f64, sizes.max_pixels as f64);
     let (height, width, factor) = (height as f64, width as f64, factor as f64);
     let is_n16 = version == Version::N16;

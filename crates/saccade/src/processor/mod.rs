@@ -5,6 +5,8 @@ mod prompt;
 mod python_text;
 mod settings;
 mod source;
+#[cfg(test)]
+mod tests;
 mod tokenizer;
 
 use saccade_kernels::Isa;
@@ -32,6 +34,8 @@ const N17_MAX_POSITIONS: usize = 262_144;
 pub struct Observation<'a> {
     /// The frame of each camera, and the camera's name where it has one.
     pub views: Vec<(Option<&'a str>, Frame<'a>)>,
+    /// Whether the views stand in the order of the prompt, also where the preprocessing would sort them by name.
+    pub is_ordered: bool,
     /// What the robot is to do. Without it the released default is taken, where there is one.
     pub instruction: Option<&'a str>,
     /// N1.5: whether the instruction stands in the prompt as it is, even if the processor renders instructions as lists.
@@ -132,8 +136,7 @@ impl Processor {
     /// # Errors
     /// [`Error::Input`] for text that is too long for any model.
     pub fn tokens(&self, text: &str) -> Result<Vec<u32>> {
-        check_length("text", text)?;
-        self.tokenizer.encode("text", text)
+        self.tokenizer.encode(text)
     }
 
     /// The inputs of a batch of observations.
@@ -151,7 +154,7 @@ impl Processor {
             for &index in order {
                 let (name, frame) = observation.views[index];
                 let name =
-                    name.map_or_else(|| format!("frames[{index}]"), |name| format!("frames[{name:?}]"));
+                    name.map_or_else(|| format!("frames[{index}]"), |name| format!("frames['{name}']"));
                 views.push(view(&self.settings, self.isa, &name, frame)?);
             }
             let tokens: Vec<usize> = views[first..].iter().map(|view: &View| view.tokens).collect();
@@ -184,7 +187,7 @@ impl Processor {
                 ));
             }
             let mut order: Vec<usize> = (0..views.len()).collect();
-            if self.settings.preprocessing == Preprocessing::Lerobot {
+            if self.settings.preprocessing == Preprocessing::Lerobot && !observation.is_ordered {
                 order.sort_by_key(|&index| views[index].0);
             }
             if let Some(expected) = orders.first() {
@@ -224,7 +227,7 @@ impl Processor {
             observation.plain_text,
             views,
         )?;
-        let ids = self.tokenizer.encode("instruction", &text)?;
+        let ids = self.tokenizer.ids("instruction", &text)?;
         let found = ids.iter().filter(|id| **id == self.ids.image).count();
         if found != expected {
             return Err(Error::Input(format!(

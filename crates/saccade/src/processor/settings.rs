@@ -99,8 +99,9 @@ pub(super) const PATCH_SIZE: usize = 14;
 /// The centre that the published checkpoints keep.
 const CROP_FRACTION: f64 = 0.95;
 
-/// A larger side is hostile: the table of positions of N1.5 would need a million rows.
-const MAX_SIDE: usize = 1 << 14;
+/// Larger sides, and larger areas, are hostile: the greatest area that is published is this one.
+const MAX_SIDE: usize = 1 << 12;
+pub(super) const MAX_AREA: usize = MAX_SIDE * MAX_SIDE;
 
 /// Keys of the released files that say nothing about one observation at inference.
 const WITHOUT_EFFECT: [&str; 48] = [
@@ -219,7 +220,7 @@ impl Settings {
 fn square(given: &ProcessorOptions<'_>, options: &mut Options) -> Sizes {
     let of_file = options.square_size();
     let size = given.image_size.or(of_file).unwrap_or(IMAGE_SIZE);
-    let of_file = options.count("tokens_per_tile", MAX_SIDE * MAX_SIDE);
+    let of_file = options.count("tokens_per_tile", MAX_AREA);
     let published = (size / PATCH_SIZE).pow(2);
     // The file of a published processor does not know of a smaller image.
     let of_file = of_file.filter(|_| given.image_size.is_none());
@@ -418,11 +419,11 @@ impl Options {
         };
         let mut limit = |key: &str, of_size: &str, default: usize| {
             if self.has(key) {
-                return self.count(key, 1 << 28).unwrap_or(default);
+                return self.count(key, MAX_AREA).unwrap_or(default);
             }
             let of_size = self.keys.get("size").and_then(|size| size.get(of_size));
             let limit = of_size.and_then(Value::as_u64).unwrap_or(default as u64);
-            usize::try_from(limit).unwrap_or(usize::MAX).clamp(1, 1 << 28)
+            usize::try_from(limit).unwrap_or(usize::MAX).clamp(1, MAX_AREA)
         };
         let least = limit("min_pixels", "shortest_edge", least);
         let most = limit("max_pixels", "longest_edge", most);

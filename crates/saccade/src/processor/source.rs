@@ -52,8 +52,8 @@ const SLOW_FILES: [&str; 4] = [
     "tokenizer_config.json",
 ];
 
-/// lerobot's step that resizes N1.7's frames, and the one that reads the instruction.
-const LEROBOT_STEPS: [&str; 2] = ["groot_n1_7_vlm_encode", "groot_n1_7_pack_inputs"];
+/// lerobot's step that resizes N1.7's frames, and those that read the instruction.
+const LEROBOT_STEPS: [&str; 3] = ["groot_n1_7_vlm_encode", "groot_n1_7_pack_inputs", "groot_pack_inputs"];
 
 /// The processor of a checkpoint, before its tokenizer is read.
 pub struct ProcessorSource {

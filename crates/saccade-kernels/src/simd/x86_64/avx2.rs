@@ -25,6 +25,7 @@ pub(crate) struct VexVnni;
 
 // SAFETY: the caller has AVX-VNNI.
 unsafe impl Dots<__m256> for VexVnni {
+    const NAME: &'static str = "vnni";
     const MAX_BYTE: u8 = 255;
 
     #[inline(always)]
@@ -39,6 +40,7 @@ pub(crate) struct EvexVnni;
 
 // SAFETY: the caller has AVX512-VNNI and VL.
 unsafe impl Dots<__m256> for EvexVnni {
+    const NAME: &'static str = "vnni";
     const MAX_BYTE: u8 = 255;
 
     #[inline(always)]

@@ -34,6 +34,7 @@ pub(crate) struct Vnni;
 
 // SAFETY: the caller has AVX512-VNNI.
 unsafe impl Dots<__m512> for Vnni {
+    const NAME: &'static str = "vnni";
     const MAX_BYTE: u8 = 255;
 
     #[inline(always)]
@@ -48,6 +49,7 @@ pub(crate) struct Bf16;
 
 // SAFETY: the caller has AVX512-BF16.
 unsafe impl Dots<__m512> for Bf16 {
+    const NAME: &'static str = "bf16";
     const HAS_BF16: bool = true;
 
     #[inline(always)]
@@ -77,6 +79,7 @@ pub(crate) struct BesideTiles;
 
 // SAFETY: the caller has AVX512-VNNI and AVX512-BF16.
 unsafe impl Dots<__m512> for BesideTiles {
+    const NAME: &'static str = "bf16";
     const MAX_BYTE: u8 = 255;
 
     #[inline(always)]

@@ -126,19 +126,27 @@ impl Tokenizer {
         Ok(Self { inner, len })
     }
 
-    /// The ids of `text`, which errors call `name`. Nothing is added at either end, and a special token's own string becomes that token.
-    /// [`check_length`] comes before it, where the text is a user's.
+    /// The ids of `text`. Nothing is added at either end, and a special token's own string becomes that token.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for more than 256 kB of text.
+    pub fn encode(&self, text: &str) -> Result<Vec<u32>> {
+        check_length("text", text)?;
+        self.ids("text", text)
+    }
+
+    /// The ids of `text`, which errors call `name`, however long it is.
     ///
     /// # Errors
     /// [`Error::Input`] for text that the crate refuses.
-    pub(crate) fn encode(&self, name: &str, text: &str) -> Result<Vec<u32>> {
+    pub(super) fn ids(&self, name: &str, text: &str) -> Result<Vec<u32>> {
         let encoding = self.inner.encode_fast(text, false);
         let encoding = encoding.map_err(|problem| Error::Input(format!("{name}: {problem}")))?;
         Ok(encoding.get_ids().to_vec())
     }
 
     /// The id of a special token, found by its string.
-    pub(crate) fn id_of(&self, token: &str) -> Option<u32> {
+    pub(super) fn id_of(&self, token: &str) -> Option<u32> {
         let added = self.inner.get_added_vocabulary();
         added.get_vocab().get(token).copied()
     }

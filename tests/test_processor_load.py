@@ -1,0 +1,279 @@
+"""The processor of a checkpoint: what its files and tensors say, and where its tokenizer is found."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from processor_cases import AS_IT_IS, DATA, TOKENIZER, assert_same
+from published import published
+
+import saccade
+from saccade import hub
+from saccade.errors import CheckpointError, InputError
+
+NOISE = np.random.default_rng(0).integers(0, 256, (90, 120, 3), np.uint8)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache in place of the user's."""
+    folder = tmp_path / "hub"
+    monkeypatch.setenv("HF_HUB_CACHE", str(folder))
+    return folder
+
+
+def checkpoint(folder: Path, fixture: str, config: dict[str, Any] | None = None) -> Path:
+    """A checkpoint that holds only a backbone."""
+    folder.mkdir(exist_ok=True)
+    shutil.copy(DATA / f"{fixture}.safetensors", folder / "model.safetensors")
+    if config is not None:
+        (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def load(source: Path, **options: Any) -> saccade.Processor:
+    return saccade.Processor.load(source, tokenizer=TOKENIZER, **options)
+
+
+@pytest.mark.parametrize(
+    ("fixture", "version", "preprocessing", "size"),
+    [
+        ("n15_one_view", "n1.5", "isaac", (56, 16)),
+        ("n15_two_views", "n1.5", "lerobot", (56, 16)),
+        ("n15_pixel_shuffle", "n1.5", "isaac", (56, 4)),
+        ("n16_two_views", "n1.6", "isaac", (None, None)),
+        ("n17_one_view", "n1.7", "isaac", (None, None)),
+    ],
+)
+def test_a_backbone_alone(
+    tmp_path: Path, fixture: str, version: str, preprocessing: str, size: tuple[int | None, int | None]
+) -> None:
+    for source in (DATA / f"{fixture}.safetensors", checkpoint(tmp_path / "one", fixture)):
+        processor = load(source)
+        assert (processor.version, processor.preprocessing) == (version, preprocessing)
+        assert (processor.image_size, processor.tokens_per_view) == size
+
+
+@pytest.mark.parametrize(
+    ("layout", "preprocessing"), [("nvidia", "isaac"), ("isaac", "isaac"), ("lerobot", "lerobot")]
+)
+def test_whole_checkpoints(layout: str, preprocessing: str) -> None:
+    processor = load(published(layout))
+    assert (processor.version, processor.preprocessing) == ("n1.5", preprocessing)
+
+
+def test_the_preprocessing_may_be_another() -> None:
+    source = DATA / "n15_two_views.safetensors"
+    isaac = load(source, preprocessing="isaac")
+    assert isaac.preprocessing == "isaac"
+    expected = saccade.Processor("n1.5", TOKENIZER, preprocessing="isaac", image_size=56)
+    assert_same(isaac.frame(NOISE), expected.frame(NOISE))
+    with pytest.raises(InputError, match="preprocessing: expected"):
+        load(source, preprocessing="n1.5")
+
+
+def test_sizes_of_a_config_in_nvidias_layout(tmp_path: Path) -> None:
+    def config(size: int) -> dict[str, Any]:
+        eagle = {"force_image_size": size, "vision_config": {"patch_size": 14}}
+        return {"model_type": "gr00t_n1_5", "backbone_cfg": {"eagle_config": eagle}}
+
+    assert load(checkpoint(tmp_path / "fits", "n15_one_view", config(56))).image_size == 56
+    with pytest.raises(CheckpointError, match="the image size is 224, but .* has 4 x 4 patches of 14"):
+        load(checkpoint(tmp_path / "differs", "n15_one_view", config(224)))
+
+
+def test_a_config_of_another_version(tmp_path: Path) -> None:
+    source = checkpoint(tmp_path / "other", "n15_one_view", {"model_type": "Gr00tN1d7"})
+    with pytest.raises(CheckpointError, match=r"model_type .* but the tensors are those of N1\.5"):
+        load(source)
+
+
+# --- options ---
+
+
+@pytest.mark.parametrize("folder", [".", "processor"])
+def test_options_of_isaac(tmp_path: Path, folder: str) -> None:
+    source = checkpoint(tmp_path / "isaac", "n17_one_view")
+    (source / folder).mkdir(exist_ok=True)
+    options = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    kwargs = options | {"modality_configs": {}, "a key of a later release": 1}
+    (source / folder / "processor_config.json").write_text(json.dumps({"processor_kwargs": kwargs}))
+    limits = {"size": {"shortest_edge": 4096, "longest_edge": 1 << 24}, "patch_size": 16}
+    (source / "preprocessor_config.json").write_text(json.dumps(limits))
+    expected = saccade.Processor("n1.7", TOKENIZER, options=options | {"min_pixels": 4096})
+    assert_same(load(source).frame(NOISE), expected.frame(NOISE))
+
+
+def test_options_of_lerobot(tmp_path: Path) -> None:
+    source = checkpoint(tmp_path / "lerobot", "n17_one_view", {"type": "groot"})
+    expected = saccade.Processor(
+        "n1.7", TOKENIZER, preprocessing="lerobot", options={"use_albumentations": False}
+        | {"image_crop_size": [230, 230], "image_target_size": [256, 256]},
+    )  # fmt: skip
+    assert_same(load(source).frame(NOISE), expected.frame(NOISE))
+    step = {"image_target_size": [64, 64], "image_crop_size": [58, 58], "use_albumentations": True}
+    (source / "policy_preprocessor.json").write_text(
+        json.dumps(
+            {
+                "steps": [
+                    {"registry_name": "groot_n1_7_pack_inputs_v1", "config": {"formalize_language": False}},
+                    {"registry_name": "groot_n1_7_vlm_encode_v1", "config": step | {"device": "cpu"}},
+                ]
+            }
+        )
+    )
+    options = step | {"formalize_language": False}
+    expected = saccade.Processor("n1.7", TOKENIZER, preprocessing="lerobot", options=options)
+    found = load(source)([NOISE], "Push!")
+    assert_same(found.input_ids, expected([NOISE], "Push!").input_ids)
+    assert_same(np.asarray(found.pixel_values), np.asarray(expected([NOISE], "Push!").pixel_values))
+
+
+def test_lerobot_may_formalize_the_instructions_of_n15(tmp_path: Path) -> None:
+    source = checkpoint(tmp_path / "n15", "n15_two_views", {"type": "groot"})
+    steps = [{"registry_name": "groot_pack_inputs_v3", "config": {"formalize_language": True}}]
+    (source / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    found = load(source)([NOISE], "Pick_up, THEN push!").input_ids
+    plain = load(DATA / "n15_two_views.safetensors")([NOISE], "pickup then push").input_ids
+    assert_same(found, plain)
+
+
+@pytest.mark.parametrize("file", ["processor_config.json", "preprocessor_config.json", "config.json"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "7", '{"a": NaN}', "\udcff", '{"a":' * 10_000])
+def test_files_that_are_none(tmp_path: Path, file: str, text: str) -> None:
+    source = checkpoint(tmp_path / "broken", "n17_one_view")
+    (source / file).write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(CheckpointError):
+        load(source)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"crop_fraction": "1"},
+        {"shortest_image_edge": 1 << 60},
+        {"image_target_size": [[1], 2]},
+        {"use_albumentations": "yes"},
+        {"formalize_language": {}},
+        {"min_pixels": -5},
+    ],
+)
+def test_values_that_are_none(tmp_path: Path, kwargs: dict[str, Any]) -> None:
+    source = checkpoint(tmp_path / "broken", "n17_one_view")
+    (source / "processor_config.json").write_text(json.dumps({"processor_kwargs": kwargs}))
+    with pytest.raises(InputError, match=next(iter(kwargs))):
+        load(source)
+
+
+# --- tokenizers ---
+
+
+def test_the_checkpoints_own_tokenizer(tmp_path: Path) -> None:
+    source = checkpoint(tmp_path / "own", "n15_one_view")
+    for folder in (source, source / "tokenizer", source / "processor"):
+        folder.mkdir(exist_ok=True)
+        shutil.copy(TOKENIZER, folder / "tokenizer.json")
+        assert "tokens=443" in repr(saccade.Processor.load(source))
+        (folder / "tokenizer.json").unlink()
+
+
+def in_cache(cache: Path, name: str, file: str = "tokenizer.json") -> Path:
+    """A tokenizer in the cache, as `hf download` puts it there."""
+    repository = cache / f"models--{name.replace('/', '--')}"
+    snapshot = repository / "snapshots" / "4af2b622"
+    snapshot.mkdir(parents=True)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("4af2b622")
+    shutil.copy(TOKENIZER, snapshot / file)
+    return snapshot
+
+
+@pytest.mark.parametrize(
+    ("fixture", "name"),
+    [
+        ("n15_one_view", "lerobot/eagle2hg-processor-groot-n1p5"),
+        ("n16_two_views", "aravindhs-NV/eagle3-processor-groot-n1d6"),
+        ("n16_two_views", "lerobot/eagle2hg-processor-groot-n1p5"),
+        ("n17_one_view", "nvidia/Cosmos-Reason2-2B"),
+        ("n17_one_view", "Qwen/Qwen3-VL-2B-Instruct"),
+    ],
+)
+def test_the_released_tokenizer_in_the_cache(cache: Path, fixture: str, name: str) -> None:
+    source = DATA / f"{fixture}.safetensors"
+    with pytest.raises(FileNotFoundError, match="Download that of N1") as error:
+        saccade.Processor.load(source)
+    assert f"hf download {name} " in str(error.value)
+    assert "tokenizer=" in str(error.value)
+    assert str(cache) in str(error.value)
+    snapshot = in_cache(cache, name)
+    assert "tokens=443" in repr(saccade.Processor.load(source))
+    assert hub.cached(name) == snapshot
+    assert "tokens=443" in repr(saccade.Processor.load(source, tokenizer=name))
+    assert "tokens=443" in repr(saccade.Processor.load(source, tokenizer=f"{name}@4af2b622"))
+    (snapshot / "tokenizer.json").unlink()  # an incomplete download
+    with pytest.raises(FileNotFoundError, match="Download that of N1"):
+        saccade.Processor.load(source)
+
+
+def test_limits_of_the_released_processor(cache: Path) -> None:
+    """N1.7's least area comes from the repository of its tokenizer."""
+    snapshot = in_cache(cache, "nvidia/Cosmos-Reason2-2B")
+    (snapshot / "preprocessor_config.json").write_text(json.dumps({"min_pixels": 4096}))
+    source = DATA / "n17_one_view.safetensors"
+    expected = saccade.Processor("n1.7", TOKENIZER, options={"min_pixels": 4096})
+    assert_same(saccade.Processor.load(source).frame(NOISE), expected.frame(NOISE))
+
+
+def test_where_the_cache_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from huggingface_hub import constants
+
+    for variable in ("HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "HF_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert hub.cache() == tmp_path / ".cache" / "huggingface" / "hub"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert hub.cache() == tmp_path / "xdg" / "huggingface" / "hub"
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
+    assert hub.cache() == tmp_path / "home" / "hub"
+    monkeypatch.setenv("HF_HUB_CACHE", "~/cache")
+    assert hub.cache() == tmp_path / "cache"
+    assert constants.REPO_ID_SEPARATOR == "--"
+
+
+@pytest.mark.parametrize("name", ["no/such", "no-such.json", "../no/such", "no/such@main"])
+def test_no_such_tokenizer(name: str) -> None:
+    with pytest.raises(FileNotFoundError, match="tokenizer: no such file or directory"):
+        saccade.Processor("n1.5", name)
+
+
+def test_a_directory_without_a_tokenizer(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"holds neither tokenizer\.json nor vocab\.json and"):
+        saccade.Processor("n1.5", tmp_path)
+
+
+def test_sources_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="source"):
+        load(tmp_path / "nothing")
+    with pytest.raises(CheckpointError, match="source"):
+        load(tmp_path)
+    with pytest.raises(InputError, match="source: expected a path"):
+        saccade.Processor.load(7)  # type: ignore[arg-type]
+
+
+def test_head_alone() -> None:
+    """Its config says which version it is of."""
+    processor = load(published("saccade"))
+    assert processor.version in ("n1.5", "n1.6", "n1.7")
+
+
+def test_frames_pass_unchanged_where_nothing_is_asked_for() -> None:
+    """What the other tests of N1.7 build on."""
+    image = NOISE[:64, :96]
+    found = saccade.Processor("n1.7", TOKENIZER, options=AS_IT_IS).frame(image)
+    assert found.shape == (24, 1536)
+    assert found.max() == (image.max() - 127.5) / 127.5

@@ -1,0 +1,80 @@
+"""ZMTP as the server reads it: in pieces of any size, and from clients that send anything."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from saccade.serve.zmtp import COMMAND, GREETING, MORE, Peer, ProtocolError, Request, message
+
+READY = b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ"
+PARTS = st.lists(st.binary(max_size=255), max_size=4)
+
+
+def feed(peer: Peer, data: bytes, sizes: Sequence[int]) -> list[Request]:
+    """Gives a peer bytes in pieces of at most these sizes, in turn."""
+    found, position, turn = [], 0, 0
+    while position < len(data):
+        with peer.space() as space:
+            count = min(len(space), sizes[turn % len(sizes)], len(data) - position)
+            space[:count] = data[position : position + count]
+        found += peer.filled(count)
+        position += count
+        turn += 1
+    return found
+
+
+@given(
+    st.lists(st.tuples(PARTS, st.binary(max_size=2000)), max_size=6),
+    st.lists(st.integers(1, 700), min_size=1, max_size=5),
+)
+def test_requests_arrive_in_pieces_of_any_size(
+    requests: list[tuple[list[bytes], bytes]], sizes: list[int]
+) -> None:
+    most = 1000
+    peer = Peer(lambda size: size <= most)
+    data = GREETING + READY + b"".join(b"".join(message(*request)) for request in requests)
+    found = feed(peer, data, sizes)
+    assert bytes(peer.output).startswith(GREETING)
+    assert peer.is_between_requests
+    for (address, payload), request in zip(requests, found, strict=True):
+        assert request.address == tuple(address)
+        assert request.size == len(payload)
+        assert request.is_complete == (len(payload) <= most)
+        assert bytes(request.payload) == (payload if request.is_complete else b"")
+
+
+@given(st.binary(max_size=300), st.integers(0, 3), st.integers(1, 50))
+def test_anything_is_a_request_or_a_protocol_error(data: bytes, kept: int, size: int) -> None:
+    peer = Peer(lambda size: size < 1_000_000)
+    start = (b"", GREETING[:20], GREETING, GREETING + READY)[kept]
+    with contextlib.suppress(ProtocolError):
+        feed(peer, start + data, [size])
+    assert peer.held < 1_000_000
+
+
+def test_memory_grows_with_what_arrives() -> None:
+    peer = Peer(lambda size: True)
+    feed(peer, GREETING + READY + b"\x02" + (60_000_000).to_bytes(8, "big") + bytes(1000), [4096])
+    assert peer.held < 100_000
+    feed(peer, bytes(3_000_000), [1 << 16])
+    assert 3_000_000 < peer.held < 8_000_000
+
+
+def test_a_ping_gets_its_context_back() -> None:
+    peer = Peer(lambda size: True)
+    feed(peer, GREETING + READY, [1000])
+    peer.output.clear()
+    body = b"\x04PING\x00\x64context"
+    feed(peer, bytes([COMMAND, len(body)]) + body, [3])
+    assert bytes(peer.output) == b"\x04\x0c\x04PONGcontext"
+
+
+def test_the_frames_of_an_answer() -> None:
+    assert b"".join(message([b"id", b""], b"x")) == b"\x01\x02id\x01\x00\x00\x01x"
+    long = b"".join(message([], bytes(300)))
+    assert long[:9] == b"\x02" + (300).to_bytes(8, "big")
+    assert MORE == 1
