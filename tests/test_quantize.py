@@ -134,8 +134,15 @@ def test_sources_in_half_precision(dtype: torch.dtype, tmp_path: Path) -> None:
 
 def test_large_checkpoints_are_cut_into_files(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "shards"
-    rewrite = {"source": str(source), "out": str(out), "config": None, "head_only": False, "force": False}
-    report = _saccade.quantize({**rewrite, "metadata": {}, "max_shard_bytes": 100_000, "progress": None})
+    rewrite: dict[str, Any] = {
+        "source": str(source),
+        "out": str(out),
+        "config": None,
+        "metadata": {},
+        "progress": None,
+    }
+    rewrite |= {"head_only": False, "keep_backbone": False, "force": False, "max_shard_bytes": 100_000}
+    report = _saccade.quantize(rewrite)
     files = sorted(out.glob("*.safetensors"))
     assert len(files) > 2
     assert sorted(report["files"]) == files

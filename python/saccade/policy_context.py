@@ -58,11 +58,16 @@ def encoded(head: Head, features: Sequence[BackboneFeatures]) -> PolicyContext:
     longest = max(lengths)
     dropped = np.arange(longest) >= np.array(lengths)[:, None]
     context = head.encode(
-        np.concatenate([_longer(one.backbone_features, longest) for one in features]),
-        image_mask=np.concatenate([_longer(one.image_mask, longest) for one in features]),
+        _joined([_longer(one.backbone_features, longest) for one in features]),
+        image_mask=_joined([_longer(one.image_mask, longest) for one in features]),
         drop_vl=dropped if dropped.any() else None,
     )
     return PolicyContext(context, tuple(features))
+
+
+def _joined(arrays: list[Any]) -> Any:
+    """Batches of one as one batch. A single one is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _longer(array: Any, length: int) -> Any:

@@ -70,13 +70,14 @@ def load(
         found = replace(found, cameras=_chosen(cameras, found))
     processor = Processor.load(path, preprocessing=preprocessing, tokenizer=tokenizer)
     chosen = requested_id(normalizer, embodiment)
+    # The larger part first: what loading needs for a while then adds to less.
+    backbone = Backbone.load(path, precision=precisions["backbone"], num_threads=num_threads)
     head = ActionHead.load(
         path,
         embodiment_ids=None if chosen is None else [chosen],
         precision=precisions["head"],
         num_threads=num_threads,
     )
-    backbone = Backbone.load(path, precision=precisions["backbone"], num_threads=num_threads)
     return Parts(head, normalizer, embodiment, backbone, processor, found)
 
 
