@@ -109,14 +109,24 @@ impl Kernel for MultiplyOutliers<'_> {
             for (input, value) in outliers.iter() {
                 let (run, word) = (self.run, input / 4);
                 let words = &self.panel[word / run * run * self.columns..][..run * self.columns];
-                let words = words[word % run..].iter().step_by(run);
                 let shift = 24 - 8 * (input % 4) as u32;
-                for (sum, word) in sums.iter_mut().zip(words) {
-                    let weight = (word << shift).cast_signed() >> 24;
-                    *sum += value * weight as f32;
+                if run == 1 {
+                    // Words next to each other: compilers make vectors of them.
+                    add(sums, words.iter(), shift, value);
+                } else {
+                    add(sums, words[word % run..].iter().step_by(run), shift, value);
                 }
             }
         }
+    }
+}
+
+/// `sums += value * weight` for the weights that are the byte of these words that ends `shift` bits below the top.
+#[inline(always)]
+fn add<'a>(sums: &mut [f32], words: impl Iterator<Item = &'a u32>, shift: u32, value: f32) {
+    for (sum, word) in sums.iter_mut().zip(words) {
+        let weight = (word << shift).cast_signed() >> 24;
+        *sum += value * weight as f32;
     }
 }
 
