@@ -58,7 +58,8 @@ impl WeightRef<'_> {
     }
 
     /// The rows in `rows`.
-    pub(crate) fn rows(&self, rows: Range<usize>) -> Self {
+    #[must_use]
+    pub fn rows(&self, rows: Range<usize>) -> Self {
         match self {
             Self::F32(view) => Self::F32(view.rows(rows)),
             Self::Bf16(view) => Self::Bf16(view.rows(rows)),

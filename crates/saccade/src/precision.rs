@@ -66,6 +66,12 @@ impl Precision {
         self != Self::Float32
     }
 
+    /// Whether tables whose rows are looked up are held as int8, with a scale for each row. That of N1.5 then takes 0.31 GB, not 0.62, and
+    /// its rows have a relative error of 0.8 %, where the features of int8 have one of 3 %.
+    pub(crate) fn quantizes_tables(self) -> bool {
+        self == Self::Int8
+    }
+
     /// What keys and values are held in.
     pub(crate) fn keys_values(self) -> Element {
         match self {

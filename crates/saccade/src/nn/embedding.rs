@@ -1,4 +1,4 @@
-//! Tables of which only a few rows are read in a call: held as they are stored, never packed.
+//! Tables of which only a few rows are read in a call: never packed.
 
 use half::bf16;
 use saccade_checkpoint::Elements;
@@ -15,6 +15,7 @@ pub(crate) struct Embedding {
 enum Table {
     F32(Vec<f32>),
     Bf16(Vec<bf16>),
+    Int8 { values: Vec<i8>, scales: Vec<f32> },
 }
 
 impl Embedding {
@@ -22,6 +23,7 @@ impl Embedding {
     pub(crate) fn new(weights: &Weights<'_>, [num_rows, width]: [usize; 2]) -> Result<Self> {
         let rows = match weights.looked_up([num_rows, width])? {
             Tensor::Held(Elements::Bf16(rows)) => Table::Bf16(rows),
+            Tensor::Held(Elements::Int8 { values, scales }) => Table::Int8 { values, scales },
             other => Table::F32(other.into_f32()?),
         };
         Ok(Self { rows, width })
@@ -35,6 +37,11 @@ impl Embedding {
             Table::Bf16(rows) => {
                 for (out, element) in out.iter_mut().zip(&rows[row]) {
                     *out = element.to_f32();
+                }
+            }
+            Table::Int8 { values, scales } => {
+                for (out, value) in out.iter_mut().zip(&values[row]) {
+                    *out = f32::from(*value) * scales[id];
                 }
             }
         }

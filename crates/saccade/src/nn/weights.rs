@@ -6,9 +6,9 @@ use std::ops::Range;
 
 use half::bf16;
 use saccade_checkpoint::{Elements, TensorSpec};
-use saccade_kernels::{Matrix, PackedLinear, WeightRef};
+use saccade_kernels::{Matrix, PackedLinear, WeightRef, quantize_rows};
 
-use crate::alloc::collected;
+use crate::alloc::{collected, filled, product};
 use crate::array::{first_not_finite, unravel};
 use crate::engine::Engine;
 use crate::error::{Error, Result, show_shape};
@@ -271,19 +271,27 @@ impl Weights<'_> {
         table.into_f32()
     }
 
-    /// The table `weight`, whose rows are looked up: in bf16 if that is how it is stored or what is computed in, else in float32.
+    /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is computed in, in bf16 if that is
+    /// how it is stored or what is computed in, else in float32.
     pub(crate) fn looked_up(&self, shape: [usize; 2]) -> Result<Tensor> {
         let table = self.read(Request {
             spec: TensorSpec::plain(&self.name("weight"), &shape),
             slices: None,
             is_given_back: false,
         })?;
-        let table = table.rounded(self.engine())?;
-        let size = match &table {
-            Tensor::Held(Elements::Bf16(_)) | Tensor::Outline(Stored::Bf16) => size_of::<bf16>(),
-            _ => size_of::<f32>(),
+        let [rows, width] = shape;
+        let is_int8 = self.engine().precision.quantizes_tables();
+        let table = match table {
+            Tensor::Held(elements) if is_int8 => quantized(&elements, shape)?,
+            table => table.rounded(self.engine())?,
         };
-        self.count(size * shape[0] * shape[1]);
+        self.count(match &table {
+            _ if is_int8 => rows * (size_of::<i8>() * width + size_of::<f32>()),
+            Tensor::Held(Elements::Bf16(_)) | Tensor::Outline(Stored::Bf16) => {
+                size_of::<bf16>() * rows * width
+            }
+            _ => size_of::<f32>() * rows * width,
+        });
         Ok(table)
     }
 
@@ -356,6 +364,22 @@ impl Weights<'_> {
         }
         Ok(tensor)
     }
+}
+
+/// The rows of a table as int8, each with its scale.
+fn quantized(table: &Elements, [num_rows, width]: [usize; 2]) -> Result<Tensor> {
+    /// Rows between two looks at whether the call is to stop.
+    const TOGETHER: usize = 4096;
+    let mut values = filled("weights", product("weights", &[num_rows, width])?, 0_i8)?;
+    let mut scales = filled("weights", num_rows, 0.0)?;
+    let view = weight_view(table, num_rows, width);
+    for first in (0..num_rows).step_by(TOGETHER) {
+        check_interrupted()?;
+        let rows = first..num_rows.min(first + TOGETHER);
+        let values = &mut values[rows.start * width..rows.end * width];
+        quantize_rows(view.rows(rows.clone()), values, &mut scales[rows]);
+    }
+    Ok(Tensor::Held(Elements::Int8 { values, scales }))
 }
 
 /// That weights are finite. One that is not spoils every action, without a sign of where it comes from.
