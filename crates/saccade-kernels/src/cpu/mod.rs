@@ -1,13 +1,14 @@
 //! Which CPU this is, what was measured on its family, and whether the system lets this process use tiles.
 
 pub(crate) mod family;
+mod once;
 mod signature;
 pub(crate) mod tiles;
 
 use std::fmt;
-use std::sync::OnceLock;
 
 use family::{Family, Rates};
+use once::Once;
 use signature::Signature;
 
 /// What is known of a CPU.
@@ -33,8 +34,8 @@ impl Cpu {
 
     /// That of this process, looked at once.
     pub(crate) fn current() -> &'static Self {
-        static CURRENT: OnceLock<Cpu> = OnceLock::new();
-        CURRENT.get_or_init(|| Self::new(Signature::current()))
+        static CURRENT: Once<Cpu> = Once::new();
+        CURRENT.get_or_make(|| Self::new(Signature::current()))
     }
 
     fn rates(&self) -> Option<&Rates> {

@@ -1,6 +1,6 @@
 //! Whether this process may use tiles (AMX): asked once, and if the answer is no, why.
 
-use std::sync::OnceLock;
+use super::once::Once;
 
 /// Why tiles cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -98,8 +98,8 @@ const ENOSPC: i32 = 28;
 /// Whether this process may use tiles. Asked once: the answer holds for all threads, also for those that run already, and for forked
 /// children. XCR0 shows the state without permission too, and the first instruction on a tile would then be SIGILL.
 pub(crate) fn permission() -> Result<(), Refusal> {
-    static ANSWER: OnceLock<Result<(), Refusal>> = OnceLock::new();
-    *ANSWER.get_or_init(|| {
+    static ANSWER: Once<Result<(), Refusal>> = Once::new();
+    *ANSWER.get_or_make(|| {
         #[cfg(target_arch = "x86_64")]
         {
             ask(&ThisMachine)
