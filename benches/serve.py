@@ -160,7 +160,7 @@ def server(
     Raises:
         RuntimeError: It does not start, or does not end with status 0.
     """
-    log = args.out.parent / f"serve-{clients}.jsonl"
+    log = args.out.with_name(f"{args.out.stem}-{clients}.jsonl")
     log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "saccade", "serve", str(checkpoint), "--port", "0", "--log", "json"]
     command += ["--precision", args.precision, *args.serve_args.split()]

@@ -46,7 +46,7 @@ class MemoryPolicy:
     def __post_init__(self) -> None:
         self.gate.set()
         config = SimpleNamespace(action_horizon=HORIZON, encoder_action_dim=WIDTH, version=self.version)
-        self.head = SimpleNamespace(config=config, source=None)
+        self.head = SimpleNamespace(config=config, source=None, num_threads=2)
         self.normalizer = SimpleNamespace(state_groups=GROUPS, action_groups=GROUPS, action_horizon=HORIZON)
         self.requirements = Requirements(
             "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_key="annotation.task"

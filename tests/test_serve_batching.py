@@ -17,7 +17,7 @@ from serve_cases import HORIZON, MemoryPolicy, ask, get_action, observation, req
 from saccade.errors import InputError
 from saccade.serve import Client, ServerError
 from saccade.serve.batching import Job, Queue
-from saccade.serve.logs import MOST_LINES, MOST_WARNINGS, JsonLog, TextLog, Writer
+from saccade.serve.logs import MOST_LINES, MOST_WARNINGS, JsonLog, LiveLog, TextLog, Writer
 from saccade.serve.requests import Call, Options
 from saccade.serve.sessions import Chunk, Sessions
 from saccade.serve.statistics import Statistics, line
@@ -255,6 +255,20 @@ def test_json_lines(tmp_path: Path) -> None:
         "value": None,
         "lost_lines": 0,
     }
+
+
+def test_a_live_line_is_written_again_below_other_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    with (tmp_path / "log").open("wb") as file:
+        log = LiveLog(file.fileno())
+        log.statistics(Statistics().summary())
+        log.event("warning", client="c", message="dies")
+        log.close()
+    erase, live = b"\r\x1b[2K", b"0 requests, 0 error"
+    expected = erase + live + erase + b"saccade serve: c: dies\n" + live + b"\n"
+    assert (tmp_path / "log").read_bytes() == expected
 
 
 def test_lines_of_text(tmp_path: Path) -> None:

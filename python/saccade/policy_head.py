@@ -30,6 +30,10 @@ class Head(Protocol):
     def embodiment_ids(self) -> tuple[int, ...]:
         """The loaded embodiments."""
 
+    @property
+    def num_threads(self) -> int:
+        """Number of threads of a call."""
+
     def encode(
         self,
         backbone_features: ArrayLike,

@@ -44,7 +44,7 @@ _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
 NEEDS: dict[str, tuple[str, ...]] = {
     "act": ("rich", "PIL"),
     "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
-    "serve": ("rich", "zmq", "msgpack"),
+    "serve": ("zmq", "msgpack"),
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),

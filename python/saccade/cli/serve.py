@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade import _arguments as arguments
 from saccade._arguments import UsageError
-from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
 
 if TYPE_CHECKING:
     from saccade.serve import Limits
@@ -204,8 +205,7 @@ def make_log(form: str) -> Log:
 
     if form == "json":
         return logs.JsonLog()
-    console = _output.console(stderr=True)
-    return logs.LiveLog(console) if console.is_terminal else logs.TextLog()
+    return logs.LiveLog() if sys.stderr.isatty() else logs.TextLog()
 
 
 def limits_of(args: argparse.Namespace) -> Limits:

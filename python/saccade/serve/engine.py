@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -64,6 +65,12 @@ class Engine:
     def __init__(self, policy: Policy, sessions: Sessions) -> None:
         self._policy = policy
         self._sessions = sessions
+        # Frames of one observation are resized by one thread.
+        self._threads = ThreadPoolExecutor(policy.head.num_threads, "saccade-serve-inputs")
+
+    def close(self) -> None:
+        """Ends its threads."""
+        self._threads.shutdown(wait=False)
 
     def run(self, jobs: Sequence[Job]) -> list[Outcome]:
         """Computes requests together. One that cannot be computed does not affect the others.
@@ -71,14 +78,11 @@ class Engine:
         Returns:
             What became of each, in no particular order.
         """
-        outcomes, works = [], []
         for job in jobs:
             job.milliseconds["wait"] = 1e3 * (time.perf_counter() - job.received)
-            try:
-                with _timed([job], "inputs"):
-                    works.append(self._begin(job))
-            except BaseException as error:
-                outcomes.append(Outcome(job, error=error))
+        begun = list((map if len(jobs) == 1 else self._threads.map)(self._begun, jobs))
+        outcomes = [one for one in begun if isinstance(one, Outcome)]
+        works = [one for one in begun if isinstance(one, _Work)]
         try:
             return outcomes + self._together(works)
         except BaseException as error:
@@ -91,6 +95,14 @@ class Engine:
             except BaseException as error:
                 outcomes.append(Outcome(work.job, error=error))
         return outcomes
+
+    def _begun(self, job: Job) -> _Work | Outcome:
+        """A request that can be computed, or why it cannot."""
+        try:
+            with _timed([job], "inputs"):
+                return self._begin(job)
+        except BaseException as error:
+            return Outcome(job, error=error)
 
     def _begin(self, job: Job) -> _Work:
         call = job.call

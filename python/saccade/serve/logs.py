@@ -6,24 +6,23 @@ server. Lines that cannot be written are counted.
 
 from __future__ import annotations
 
-import contextlib
 import os
+import shutil
 import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from saccade._json import dumps
 from saccade.errors import printable
 from saccade.serve.statistics import line
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
 #: Lines that wait to be written; more are lost, and counted.
 MOST_LINES = 10_000
 #: Warnings a second that are written; more are counted.
 MOST_WARNINGS = 20
+#: Back to the start of the line of a terminal, and erases it.
+ERASE = "\r\x1b[2K"
 #: Seconds between two statistics in a log, and on a terminal.
 STATISTICS_SECONDS = 10.0
 LIVE_SECONDS = 1.0
@@ -65,12 +64,12 @@ class Writer:
         self._thread.start()
 
     def write(self, text: str) -> None:
-        """Appends a line; never waits."""
+        """Appends text, with its line break; never waits."""
         with self._changed:
             if len(self._lines) >= MOST_LINES:
                 self.lost += 1
                 return
-            self._lines.append(text.encode("utf-8", "backslashreplace") + b"\n")
+            self._lines.append(text.encode("utf-8", "backslashreplace"))
             self._changed.notify()
 
     def close(self, seconds: float = 2.0) -> None:
@@ -148,7 +147,9 @@ class JsonLog:
         self._writer.close()
 
     def _write(self, name: str, fields: dict[str, Any]) -> None:
-        self._writer.write(dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str))
+        self._writer.write(
+            dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str) + "\n"
+        )
 
 
 class TextLog:
@@ -188,42 +189,30 @@ class TextLog:
         self._writer.close()
 
     def _line(self, text: str) -> None:
-        self._writer.write(f"saccade serve: {printable(text)}")
+        self._writer.write(f"saccade serve: {printable(text)}\n")
 
 
 class LiveLog(TextLog):
-    """On a terminal: the lines of :class:`TextLog`, with one live line of statistics below them.
-
-    Args:
-        console: The terminal.
-    """
+    """On a terminal: the lines of :class:`TextLog`, with one live line of statistics below them."""
 
     every = LIVE_SECONDS
-
-    def __init__(self, console: Console) -> None:
-        from rich.live import Live
-        from rich.text import Text
-
-        super().__init__()
-        self._text = Text
-        self._live = Live(console=console, auto_refresh=False)
-        self._live.start()
 
     def statistics(self, summary: dict[str, Any]) -> None:
         """See :class:`Log`."""
         self._last = line(summary)
-        with contextlib.suppress(OSError):
-            self._live.update(self._text(self._last, no_wrap=True, overflow="ellipsis"), refresh=True)
+        self._writer.write(ERASE + self._shown())
 
     def close(self) -> None:
         """See :class:`Log`."""
-        with contextlib.suppress(OSError):
-            self._live.stop()
+        self._writer.write("\n")
         super().close()
 
     def _line(self, text: str) -> None:
-        with contextlib.suppress(OSError):
-            self._live.console.print(f"saccade serve: {printable(text)}", markup=False, highlight=False)
+        self._writer.write(f"{ERASE}saccade serve: {printable(text)}\n{self._shown()}")
+
+    def _shown(self) -> str:
+        """The live line, as wide as the terminal at most."""
+        return self._last[: shutil.get_terminal_size().columns - 1]
 
 
 def _described(name: str, fields: dict[str, Any]) -> str:

@@ -145,6 +145,7 @@ class Server:
         finally:
             self._queue.close()
             self._connections.close()
+            self._engine.close()
         self._log.statistics(self._statistics.summary())
         assert self._stopping is not None
         self._log.event("stopped", requests=self._statistics.requests.total(), errors=self._statistics.errors)
