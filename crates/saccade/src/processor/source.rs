@@ -147,7 +147,7 @@ impl ProcessorSource {
     /// The processor, with these files or the checkpoint's own, and with this path or the checkpoint's own.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] if no tokenizer is given and the checkpoint has none; those of [`TokenizerFiles::read`] and [`Processor::new`].
+    /// [`Error::Checkpoint`] if no tokenizer is given and the checkpoint has none; those of reading a [`TokenizerFiles`] and [`Processor::new`].
     pub fn processor(
         &self,
         tokenizer: Option<&TokenizerFiles>,
