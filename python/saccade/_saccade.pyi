@@ -28,6 +28,7 @@ __all__ = [
     "Processor",
     "ProcessorSource",
     "Published",
+    "PublishedBackbone",
     "__version__",
     "available_isas",
     "convert",
@@ -45,6 +46,7 @@ __all__ = [
     "selected_isa",
     "start_profile",
     "take_profile",
+    "tensor_names",
     "tensor_shapes",
 ]
 
