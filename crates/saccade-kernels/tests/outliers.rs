@@ -75,7 +75,7 @@ fn outliers_do_not_spoil_the_rest_of_their_row() {
             let spoiled = relative_error(&apply(&plain, 2, &x, Epilogue::Store), &x, &weight, inputs);
             let kept = plain.keeping_outliers();
             let error = relative_error(&apply(&kept, 2, &x, Epilogue::Store), &x, &weight, inputs);
-            assert!(spoiled > 1.0, "{isa}, {inputs}: {spoiled}");
+            assert!(spoiled > 0.5, "{isa}, {inputs}: {spoiled}");
             assert!(error < 0.02, "{isa}, {inputs}: {error}");
         }
     }

@@ -19,6 +19,9 @@ pub(crate) const MAX_OUTLIERS: usize = 8;
 /// with 12 0.068 and 0.11. Thresholds of 6 and 8, and 4 or 16 elements, change these by less than a tenth.
 const FACTOR: f32 = 12.0;
 
+/// What is larger is not kept apart: as many products with 127 must not overflow.
+const LARGEST: f32 = f32::MAX / (128 * MAX_OUTLIERS) as f32;
+
 /// What is kept apart of a row.
 #[derive(Clone, Copy)]
 pub(crate) struct Outliers {
@@ -40,7 +43,9 @@ impl Outliers {
             values: [0.0; MAX_OUTLIERS],
         };
         let limit = FACTOR * (sum / row.len() as f32);
-        if largest <= limit || !largest.is_finite() {
+        // Not with infinity or NaN; nor where products with bytes could overflow, as those with weights do not.
+        let can_be_multiplied = largest < LARGEST;
+        if largest <= limit || !can_be_multiplied {
             return (found, f32::INFINITY);
         }
         let limit = limit.max(ninth(row, limit));
