@@ -229,7 +229,7 @@ class Processor:
         Example:
             >>> import saccade
             >>> saccade.Processor("n1.5", "tokenizer.json").tokens("push")
-            array([388])
+            array([389])
         """
         return self._processor.tokens(_text("text", text))
 
