@@ -234,6 +234,30 @@ def add_seed(parser: Arguments, help: str) -> None:
     add_integer(parser, "--seed", minimum=0, default=0, help=help)
 
 
+def add_policy_options(parser: Arguments) -> None:
+    """Declares how a whole checkpoint is loaded: both precisions, preprocessing and tokenizer."""
+    parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        default="float32",
+        help="default: float32, which is exact",
+    )
+    parser.add_argument("--head-precision", choices=PRECISIONS, help="of the head (default: as --precision)")
+    parser.add_argument(
+        "--preprocessing",
+        choices=("lerobot", "isaac"),
+        help="the way in which frames and words are prepared (default: by version and layout)",
+    )
+    parser.add_argument(
+        "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
+    )
+
+
+def precisions(args: argparse.Namespace) -> dict[str, str]:
+    """The precision of each part of a policy, from `add_policy_options`."""
+    return {"backbone": args.precision, "head": args.head_precision or args.precision}
+
+
 def add_num_threads(
     parser: Arguments,
     help: str = "threads of the action head (default: the physical cores)",

@@ -61,23 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     seen.add_argument("--instruction", metavar="TEXT", help="what to do")
     seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
     seen.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
-    parser.add_argument(
-        "--precision",
-        choices=arguments.PRECISIONS,
-        default="float32",
-        help="default: float32, which is exact",
-    )
-    parser.add_argument(
-        "--head-precision", choices=arguments.PRECISIONS, help="of the head (default: as --precision)"
-    )
-    parser.add_argument(
-        "--preprocessing",
-        choices=("lerobot", "isaac"),
-        help="the way in which frames and words are prepared (default: by version and layout)",
-    )
-    parser.add_argument(
-        "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
-    )
+    arguments.add_policy_options(parser)
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_num_steps(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
@@ -98,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             embodiment=embodiment(args.embodiment),
             preprocessing=args.preprocessing,
             tokenizer=args.tokenizer,
-            precision={"backbone": args.precision, "head": args.head_precision or args.precision},
+            precision=arguments.precisions(args),
             num_threads=args.num_threads,
         )
     clock.done("load")
@@ -259,7 +243,7 @@ def report(
         "checkpoint": str(args.checkpoint),
         "embodiment": policy.normalizer.embodiment,
         "embodiment_id": policy.embodiment_id,
-        "precision": {"backbone": args.precision, "head": args.head_precision or args.precision},
+        "precision": arguments.precisions(args),
         "num_vl_tokens": num_tokens,
         "actions": {key: part[0].tolist() for key, part in actions.items()},
         "milliseconds": clock.milliseconds,

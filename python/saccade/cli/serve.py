@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade import _arguments as arguments
@@ -41,23 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limits = Limits()
     arguments.add_checkpoint_argument(parser)
     parser.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
-    parser.add_argument(
-        "--precision",
-        choices=arguments.PRECISIONS,
-        default="float32",
-        help="default: float32, which is exact",
-    )
-    parser.add_argument(
-        "--head-precision", choices=arguments.PRECISIONS, help="of the head (default: as --precision)"
-    )
-    parser.add_argument(
-        "--preprocessing",
-        choices=("lerobot", "isaac"),
-        help="the way in which frames and words are prepared (default: by version and layout)",
-    )
-    parser.add_argument(
-        "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
-    )
+    arguments.add_policy_options(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
     served = parser.add_argument_group("server")
     served.add_argument(
@@ -168,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
         embodiment=embodiment(args.embodiment),
         preprocessing=args.preprocessing,
         tokenizer=args.tokenizer,
-        precision={"backbone": args.precision, "head": args.head_precision or args.precision},
+        precision=arguments.precisions(args),
         num_threads=args.num_threads,
     )
     # What a first call sets up is not left to the first client.

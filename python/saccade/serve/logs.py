@@ -73,7 +73,7 @@ class Writer:
             self._changed.notify()
 
     def close(self, seconds: float = 2.0) -> None:
-        """Writes what waits, for so many seconds at most."""
+        """Writes the waiting lines, for at most the given number of seconds."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()
@@ -95,7 +95,7 @@ class Writer:
 
 
 class _Limited:
-    """Lets so many warnings a second pass."""
+    """Limits the number of warnings a second."""
 
     def __init__(self) -> None:
         self._second, self._passed, self._held = 0, 0, 0
