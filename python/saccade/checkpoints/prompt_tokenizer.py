@@ -1,4 +1,4 @@
-"""A small tokenizer with the published special tokens, for random checkpoints.
+"""A small tokenizer with the published special tokens, for random checkpoints and small policies.
 
 Its vocabulary are the 256 bytes, the words of the released prompts and a few more. With the published ids,
 prompts of these words have exactly the ids of the published tokenizer; other text is spelled in bytes.
@@ -6,6 +6,8 @@ prompts of these words have exactly the ids of the published tokenizer; other te
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 #: Words as byte-level BPE spells them ("Ġ" is a space), and their published ids.
@@ -104,14 +106,18 @@ PATTERN = (
 )
 
 
-def tokenizer(*, published_ids: bool) -> dict[str, Any]:
+def tokenizer(*, published_ids: bool, words: Sequence[str] = ()) -> dict[str, Any]:
     """The content of ``tokenizer.json``.
 
     Args:
         published_ids: whether tokens have their published ids, for a table of 151680 rows. Otherwise the ids
-            have no gaps: there are fewer than 512.
+            have no gaps; without `words` there are fewer than 512.
+        words: words that are one token each, at the beginning of a text and after a space, in addition to
+            `WORDS`. Only without published ids.
     """
-    merges, parts = _merges()
+    known = [word for spelled in words for word in (f"Ġ{spelled}", spelled)]
+    known = list(dict.fromkeys((*WORDS, *known)))
+    merges, parts = _merges(known)
     vocabulary = {character: index for index, character in enumerate(_alphabet())}
     if published_ids:
         vocabulary |= WORDS
@@ -120,7 +126,7 @@ def tokenizer(*, published_ids: bool) -> dict[str, Any]:
         vocabulary |= dict(zip(parts, free, strict=True))
         first = FIRST_ADDED
     else:
-        for token in (*WORDS, *parts):
+        for token in (*known, *parts):
             vocabulary[token] = len(vocabulary)
         first = len(vocabulary)
     ids = {token: first + index for index, token in enumerate(ADDED)}
@@ -163,26 +169,46 @@ def tokenizer(*, published_ids: bool) -> dict[str, Any]:
     }
 
 
-def token_id(token: str, *, published_ids: bool) -> int:
-    """The id of a token.
+def token_id(token: str, *, published_ids: bool, words: Sequence[str] = ()) -> int:
+    """The id of a token of :func:`tokenizer`.
 
     Example:
         >>> token_id("<IMG_CONTEXT>", published_ids=True)
         151669
     """
-    return int(tokenizer(published_ids=published_ids)["model"]["vocab"][token])
+    return int(tokenizer(published_ids=published_ids, words=words)["model"]["vocab"][token])
 
 
-def _merges() -> tuple[list[str], list[str]]:
-    """The merges that spell each word from the left, and the parts that are no words themselves."""
-    merges: dict[str, None] = {}
+def _merges(words: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Merges that make each word one token, and the parts that are no words themselves.
+
+    A word is spelled with the merges of the words before it, and what remains is joined from the left. Later
+    merges do not change how an earlier word is spelled, because the earliest merge always comes first.
+    """
+    ranks: dict[tuple[str, str], int] = {}
     parts: dict[str, None] = {}
-    for word in WORDS:
-        for end in range(1, len(word)):
-            merges[f"{word[:end]} {word[end]}"] = None
-            if word[: end + 1] not in WORDS:
-                parts[word[: end + 1]] = None
-    return list(merges), list(parts)
+    wanted = list(words)
+    for word in wanted:
+        spelled = _spelled(word, ranks)
+        while len(spelled) > 1:
+            ranks[spelled[0], spelled[1]] = len(ranks)
+            spelled = [spelled[0] + spelled[1], *spelled[2:]]
+            parts[spelled[0]] = None
+    return [" ".join(pair) for pair in ranks], [part for part in parts if part not in wanted]
+
+
+def _spelled(word: str, ranks: Mapping[tuple[str, str], int]) -> list[str]:
+    """The tokens of a word: byte-pair encoding."""
+    tokens = list(word)
+    while pairs := [pair for pair in pairwise(tokens) if pair in ranks]:
+        first = min(pairs, key=lambda pair: ranks[pair])
+        joined: list[str] = []
+        while tokens:
+            length = 2 if tuple(tokens[:2]) == first else 1
+            joined.append("".join(tokens[:length]))
+            tokens = tokens[length:]
+        tokens = joined
+    return tokens
 
 
 def _alphabet() -> list[str]:

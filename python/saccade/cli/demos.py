@@ -26,6 +26,8 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
+    from saccade.sim.cameras import DEFAULT_IMAGE_SIZE
+
     parser.epilog = EPILOG
     arguments.add_out(parser, None, "directory of the recording")
     arguments.add_tasks(parser, "tasks to record (default: the five of the demo)")
@@ -35,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "demonstrations per task (default: 100; 300 of reach, 200 of each of the harder tasks)",
     )
     arguments.add_integer(
-        parser, "--image-size", minimum=8, default=64, help="pixels along each side of an image"
+        parser, "--image-size", minimum=8, default=DEFAULT_IMAGE_SIZE, help="pixels along each side of an image"
     )
     arguments.add_integer(
         parser, "--frame-stride", default=3, help="control steps between recorded observations"

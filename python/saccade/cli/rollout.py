@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--engine",
         choices=("rust", "torch"),
         default="rust",
-        help="what computes the action head (default: rust)",
+        help="what computes backbone and head (default: rust)",
     )
     arguments.add_tasks(parser)
     arguments.add_episodes(parser, 4)
@@ -185,7 +185,7 @@ def show(session: Session) -> None:
     if not session.episodes:
         print("no episode was completed")
         return
-    engine = session.policy.engine.describe()
+    engine = session.policy.describe()
     described = ", ".join(f"{key} {value}" for key, value in engine.items() if key != "name")
     table = make_table(f"{engine['name']} engine ({described})")
     for summary in summarize_tasks(session.episodes):

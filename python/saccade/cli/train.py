@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 HELP = "train a policy on recorded demonstrations"
 
 EPILOG = """\
-Writes config.json and model.safetensors (the policy, for `saccade rollout --checkpoint DIR`), settings.json,
-history.json, loss.png and training.pt about once a minute. If the command is interrupted, run it again: it
-continues where it stopped, and the weights at the end are the same as those of an uninterrupted run. The
-bundled policy was trained by the first two examples, one after the other.
+Trains a small whole checkpoint of GR00T N1.5's kind, a SigLIP, a Qwen3 and an action head, and writes it in
+NVIDIA's layout for `saccade rollout --checkpoint DIR` and `saccade.Policy.load`. DIR also receives
+settings.json, history.json, loss.png and training.pt. All are written about once a minute. If the command is
+interrupted, run it again: it continues where it stopped, and the weights at the end are the same as those of
+an uninterrupted run. The defaults are those of the bundled policy; `make demo-policy` trains it anew.
 
 examples:
-  saccade train --demos out/demos --out out/first
-  saccade train --demos out/demos --start-from out/first --absent-share 0.1 --training-steps 1200 \\
-    --learning-rate 3e-4 --ema-decay 0.99 --seed 1 --out out/policy
+  saccade train --demos out/demos --out out/policy
+  saccade train --demos out/more --start-from out/policy --training-steps 1200 --learning-rate 3e-4 --out out/next
   saccade train --demos out/demos --out out/n0 --num-future-tokens 0
   saccade train --demos out/demos --out out/aligned --alignment-weight 0.2
   saccade train --demos out/demos --out out/quick --training-steps 2000 --num-threads 2
@@ -37,9 +37,9 @@ INTEGERS = (
     ("--batch-size", 1, "observations per step"),
     ("--seed", 0, "seed of weights, order and noise"),
     ("--num-future-tokens", 0, "number of learned query tokens, N"),
-    ("--patch-size", 2, "pixels along each side of an image token's patch"),
+    ("--patch-size", 2, "pixels along each side of the patch behind an image token, even"),
     ("--vl-num-layers", 0, "blocks of the head's VL self-attention"),
-    ("--width", 8, "width of backbone and head"),
+    ("--width", 8, "width of language model and head"),
     ("--num-layers", 1, "blocks of the head"),
 )
 

@@ -466,6 +466,7 @@ class ActionHead(nn.Module):
         action_mask: Tensor | np.ndarray | None = None,
         attention_mask: Mask = None,
         image_mask: Mask = None,
+        drop_vl: Mask = None,
     ) -> Tensor:
         """Flow-matching loss: between noise and actions, the velocity should be `actions - noise`.
 
@@ -479,7 +480,7 @@ class ActionHead(nn.Module):
             noise: the same shape, standard normal.
             time: `(B,)`, from `sample_time`.
             action_mask: weights of the squared errors, broadcast to `actions`. Default: equal weights.
-            attention_mask, image_mask: as in `trace`.
+            attention_mask, image_mask, drop_vl: as in `trace`.
 
         Returns:
             A scalar.
@@ -489,13 +490,14 @@ class ActionHead(nn.Module):
         noisy = (1 - t) * noise + t * actions  # (B, T, action_dim)
         bucket = torch.floor(time * self.config.num_timestep_buckets).long()  # (B,)
         predicted = self.velocity(
-            self.encode(backbone_features),
+            self.encode(backbone_features, drop_vl=drop_vl),
             state,
             embodiment_id,
             F.pad(noisy, (0, self.config.encoder_action_dim - self.config.action_dim)),
             bucket,
             attention_mask=attention_mask,
             image_mask=image_mask,
+            drop_vl=drop_vl,
         )
         mask = None if action_mask is None else self.as_input(action_mask)
         return flow_matching_error(predicted, actions, noise, mask)

@@ -41,5 +41,6 @@ DEFAULT_CAMERAS = (
     Camera("right", CENTRE, 0.95, 35.0, -35.0),
     Camera("top", CENTRE, 0.8, 90.0, -75.0),
 )
-DEFAULT_IMAGE_SIZE = 64  # pixels along each side
+# Pixels along each side. Isaac-GR00T's preprocessing crops 68 to 64, which is then not resampled.
+DEFAULT_IMAGE_SIZE = 68
 VIDEO_CAMERA = Camera("video", (0.0, 0.68, 0.15), 1.25, 140.0, -28.0)

@@ -1,4 +1,8 @@
-"""Demonstrations as training samples: one observation and the chunk of expert actions that follows it."""
+"""Demonstrations as training samples: one observation and the chunk of expert actions that follows it.
+
+Frames and words are prepared by the processor that runs the policy later, so that training and inference see
+the same.
+"""
 
 import hashlib
 import json
@@ -11,21 +15,23 @@ import numpy.typing as npt
 
 from saccade._arrays import Float32Array
 from saccade.errors import InputError
+from saccade.processor import Processor
+from saccade.robots import Normalizer
 from saccade.sim import demos
-from saccade.sim.settings import Statistics
 from saccade.sim.tasks import TASKS
 
 VALIDATION_EVERY = 20  # every 20th demonstration of a task is held out
+PIXEL_CENTRE = np.float32(127.5)  # pixels are scaled as (u8 - 127.5) / 127.5
 MIN_VALID_ACTIONS = 4  # a frame with fewer usable actions is left out
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Observations with their chunks, as recorded (nothing is normalised).
+    """Observations with their chunks. Only the frames are prepared; nothing else is normalised.
 
     Attributes:
-        images: `(frames, cameras, H, W, 3)` uint8, every recorded frame once, including those that are only
-            the later frame of a sample.
+        images: `(frames, cameras, 3, H, W)` uint8, see `prepared`: every recorded frame once, including those
+            that are only the later frame of a sample.
         now: `(samples,)` the index in `images` of the observation.
         later: `(samples,)` the index of the observation after the chunk was executed, see `later_frames`.
         state: `(samples, 4)` float32, proprioception.
@@ -78,7 +84,24 @@ def later_frames(demonstration: demos.Demonstration, horizon: int) -> npt.NDArra
     return np.minimum(np.searchsorted(steps, steps + horizon), len(steps) - 1)
 
 
-def load_samples(directory: Path, tasks: list[str], horizon: int) -> tuple[Samples, Samples]:
+def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray[np.uint8]:
+    """Frames as the vision tower sees them, before they are scaled to [-1, 1].
+
+    Args:
+        images: `(frames, cameras, H, W, 3)`.
+        processor: processor of the policy.
+
+    Returns:
+        `(frames, cameras, 3, image_size, image_size)`.
+    """
+    views = [processor.frame(image) for image in images.reshape(-1, *images.shape[2:])]
+    pixels = np.rint(np.stack(views) * PIXEL_CENTRE + PIXEL_CENTRE).astype(np.uint8)
+    return pixels.reshape(*images.shape[:2], *pixels.shape[1:])
+
+
+def load_samples(
+    directory: Path, tasks: list[str], horizon: int, processor: Processor
+) -> tuple[Samples, Samples]:
     """Training and validation samples, split by demonstration.
 
     Raises:
@@ -92,7 +115,7 @@ def load_samples(directory: Path, tasks: list[str], horizon: int) -> tuple[Sampl
             actions, mask = chunks(demonstration, horizon)
             keep = mask[..., 0].sum(axis=1) >= MIN_VALID_ACTIONS
             samples = Samples(
-                images=demonstration.images,
+                images=prepared(demonstration.images, processor),
                 now=np.flatnonzero(keep),
                 later=later_frames(demonstration, horizon)[keep],
                 state=demonstration.proprio[keep],
@@ -132,11 +155,8 @@ def join(parts: list[Samples]) -> Samples:
     return Samples(**{name: np.concatenate([getattr(part, name) for part in moved]) for name in fields})
 
 
-def statistics(samples: Samples) -> dict[str, Statistics]:
-    """Statistics of state, valid actions and targets."""
-    valid = samples.mask[..., 0] > 0
-    return {
-        "state": Statistics.of(samples.state),
-        "action": Statistics.of(samples.actions[valid]),
-        "targets": Statistics.of(samples.targets),
-    }
+def normalized_actions(normalizer: Normalizer, actions: Float32Array) -> Float32Array:
+    """`(..., T, action_dim)` in the robot's units to what the head is trained on."""
+    flat = actions.reshape(-1, *actions.shape[-2:])
+    state = np.zeros((len(flat), normalizer.state_width), np.float32)  # no action is relative to it
+    return np.asarray(normalizer.previous_chunk(flat, state)).reshape(actions.shape)

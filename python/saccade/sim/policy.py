@@ -1,138 +1,56 @@
-"""The policy: from an observation to a chunk of actions, by the NumPy backbone and either head engine."""
+"""A policy in the simulator: a whole checkpoint, and the cameras and tasks that it was trained on."""
 
 from __future__ import annotations
 
+import copy
 import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
-import threadpoolctl  # type: ignore[import-untyped]
 
 import saccade
 from saccade._arrays import Float32Array
 from saccade._files import sha256_of
-from saccade.checkpoints import read_tensors
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.intervention import Intervention
-from saccade.sim.backbone import Backbone, stack_images
-from saccade.sim.instructions import Tokenizer
-from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig
+from saccade.policy_head import Head
+from saccade.processor import Processor
+from saccade.sim.settings import CONFIG_FILE, FILES, GROUPS, SimulationConfig
+from saccade.sim.tasks import find_task
 
 #: One intervention, several that act together, or none.
 Interventions: TypeAlias = Intervention | Sequence[Intervention] | None
 
 DEMO_CHECKPOINT = Path(__file__).parent / "demo"
-EMBODIMENT_ID = 0
 ENGINES = ("rust", "torch")
+LANGUAGE_KEY = "annotation.human.action.task_description"
 
 
-class HeadEngine(Protocol):
-    """An action head, computed by one of `ENGINES`."""
-
-    def encode(self, features: Float32Array) -> Any:
-        """The context for `sample`, from features `(1, T_vl, width)`."""
-
-    def sample(
-        self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
-    ) -> Float32Array:
-        """Normalised actions `(1, horizon, action_dim)` from state `(1, state_dim)` and noise of their shape.
-
-        For `intervention` see `saccade.Intervention`.
-        """
-
-    def describe(self) -> dict[str, Any]:
-        """The engine, for a result file."""
-
-
-class RustEngine:
-    """The head in Rust.
+def load_whole(checkpoint: Path, engine: str = "rust", num_threads: int | None = None) -> saccade.Policy:
+    """The policy of a checkpoint, computed by one of `ENGINES`.
 
     Args:
-        checkpoint: directory of a policy.
-        num_threads: as `saccade.ActionHead.load` takes it.
-    """
-
-    def __init__(self, checkpoint: Path, num_threads: int | None = None) -> None:
-        self._head = saccade.ActionHead.load(checkpoint, num_threads=num_threads)
-
-    def encode(self, features: Float32Array) -> Any:
-        """See `HeadEngine`."""
-        return self._head.encode(features)
-
-    def sample(
-        self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
-    ) -> Float32Array:
-        """See `HeadEngine`."""
-        actions = self._head.sample(context, state, EMBODIMENT_ID, noise=noise, intervention=intervention)
-        return np.asarray(actions)
-
-    def describe(self) -> dict[str, Any]:
-        """See `HeadEngine`."""
-        return {
-            "name": "rust",
-            "saccade": saccade.__version__,
-            "isa": self._head.isa,
-            "num_threads": self._head.num_threads,
-        }
-
-
-class TorchEngine:
-    """The same head in plain torch. Only this engine needs torch.
-
-    Args:
-        checkpoint: directory of a policy.
-        num_threads: threads of torch, for the whole process; None leaves torch's default.
-    """
-
-    def __init__(self, checkpoint: Path, num_threads: int | None = None) -> None:
-        import torch
-
-        from saccade.reference import ActionHead
-
-        self._torch = torch
-        if num_threads is not None:
-            torch.set_num_threads(num_threads)
-        self._head = ActionHead.load(checkpoint)
-
-    def encode(self, features: Float32Array) -> Any:
-        """See `HeadEngine`."""
-        with self._torch.no_grad():
-            return self._head.encode(features)
-
-    def sample(
-        self, context: Any, state: Float32Array, noise: Float32Array, intervention: Interventions = None
-    ) -> Float32Array:
-        """See `HeadEngine`."""
-        with self._torch.no_grad():
-            actions = self._head.sample(context, state, EMBODIMENT_ID, noise=noise, intervention=intervention)
-            return np.asarray(actions.numpy())
-
-    def describe(self) -> dict[str, Any]:
-        """See `HeadEngine`."""
-        return {
-            "name": "torch",
-            "torch": self._torch.__version__,
-            "num_threads": self._torch.get_num_threads(),
-        }
-
-
-def make_engine(name: str, checkpoint: Path, num_threads: int | None = None) -> HeadEngine:
-    """The engine of that name, with the head of a checkpoint.
+        checkpoint: a directory.
+        engine: `"rust"`, or `"torch"` for `saccade.reference`, which needs torch.
+        num_threads: number of threads; for torch, of the whole process.
 
     Raises:
+        FileNotFoundError, CheckpointError: as `saccade.Policy.load`.
         InputError: unknown engine, or `num_threads` below 1.
     """
     if num_threads is not None and num_threads < 1:
         raise InputError(f"num_threads: given {num_threads}, expected at least 1")
-    if name == "rust":
-        return RustEngine(checkpoint, num_threads)
-    if name == "torch":
-        return TorchEngine(checkpoint, num_threads)
-    raise InputError(f"engine: unknown name {name!r}, expected one of {', '.join(ENGINES)}")
+    if engine == "rust":
+        return saccade.Policy.load(checkpoint, num_threads=num_threads)
+    if engine == "torch":
+        from saccade.sim.torch_engine import load_policy
+
+        return load_policy(checkpoint, num_threads)
+    raise InputError(f"engine: unknown name {engine!r}, expected one of {', '.join(ENGINES)}")
 
 
 @dataclass(frozen=True)
@@ -141,7 +59,7 @@ class Chunk:
 
     Attributes:
         actions: `(horizon, action_dim)` float32 in [-1, 1].
-        milliseconds: Time of each part: backbone, encode, sample.
+        milliseconds: Time of each part: backbone (with the preparation of frames and words), encode, sample.
     """
 
     actions: Float32Array
@@ -149,13 +67,13 @@ class Chunk:
 
 
 class Policy:
-    """A language-conditioned policy on camera pixels.
+    """A whole policy that drives the simulated robot.
 
     Args:
-        config: its config.
-        backbone: its backbone.
-        engine: engine that computes its head.
+        whole: the policy.
+        config: how it is run in the simulator.
         checkpoint: the directory that it was loaded from.
+        engine: which of `ENGINES` computes it.
 
     Example:
         >>> import gymnasium, saccade.sim
@@ -168,15 +86,12 @@ class Policy:
     """
 
     def __init__(
-        self, config: PolicyConfig, backbone: Backbone, engine: HeadEngine, checkpoint: Path
+        self, whole: saccade.Policy, config: SimulationConfig, checkpoint: Path, engine: str = "rust"
     ) -> None:
+        self.whole = whole
         self.config = config
-        self.backbone = backbone
-        self.engine = engine
         self.checkpoint = checkpoint
-        self._tokenizer = Tokenizer(config.vocabulary, config.backbone.text_length)
-        self._camera_names = [camera.name for camera in config.cameras]
-        self._libraries = threadpoolctl.ThreadpoolController()
+        self.engine = engine
 
     @classmethod
     def load(
@@ -189,9 +104,9 @@ class Policy:
         """Loads a policy.
 
         Args:
-            checkpoint: a directory with `config.json` and `model.safetensors`. Default: the bundled policy.
+            checkpoint: a directory that `saccade train` wrote. Default: the bundled policy.
             engine: `"rust"` or `"torch"`.
-            num_threads: number of threads of the head.
+            num_threads: number of threads.
 
         Raises:
             FileNotFoundError: a file is not there.
@@ -201,76 +116,153 @@ class Policy:
         directory = Path(checkpoint)
         if not directory.is_dir():
             raise FileNotFoundError(f"{directory}: no such checkpoint directory")
-        config = PolicyConfig.from_file(directory / CONFIG_FILE)
-        if not (directory / TENSOR_FILE).is_file():
-            raise FileNotFoundError(f"{directory / TENSOR_FILE}: no such file")
-        backbone = Backbone(config.backbone, read_tensors(directory / TENSOR_FILE, "backbone."))
-        return cls(config, backbone, make_engine(engine, directory, num_threads), directory)
+        config = SimulationConfig.from_file(directory / CONFIG_FILE)
+        for name in FILES:
+            if not (directory / name).is_file():
+                raise FileNotFoundError(f"{directory / name}: no such file")
+        whole = load_whole(directory, engine, num_threads)
+        found = {group.key: group.size for group in whole.normalizer.state_groups}
+        if found != GROUPS:
+            raise CheckpointError(f"{directory}: expected a state of {GROUPS}, got {found}")
+        return cls(whole, config, directory, engine)
+
+    @property
+    def head(self) -> Head:
+        """The action head."""
+        return self.whole.head
 
     @property
     def horizon(self) -> int:
         """Actions in a chunk."""
-        return int(self.config.head["action_horizon"])
+        return self.head.config.action_horizon
+
+    def with_head(self, head: Head) -> Policy:
+        """The same policy with another head."""
+        whole = copy.copy(self.whole)
+        whole.head = head
+        return Policy(whole, self.config, self.checkpoint, self.engine)
+
+    def num_vl_tokens(self, instruction: str | None = None) -> int:
+        """T_vl with an instruction. Default: the most that one of the tasks' instructions gives."""
+        assert self.whole.processor is not None
+        return num_vl_tokens(self.whole.processor, self.config, instruction)
 
     def noise(self, rng: np.random.Generator) -> Float32Array:
         """The noise that a chunk starts from, `(1, horizon, action_dim)`."""
-        return rng.standard_normal((1, self.horizon, len(self.config.action.mean)), dtype=np.float32)
+        return rng.standard_normal((1, self.horizon, self.head.config.encoder_action_dim), dtype=np.float32)
 
-    def features(self, observation: Mapping[str, Any]) -> Float32Array:
-        """Backbone features of one observation, `(1, T_vl, width)`."""
-        images = stack_images(observation["images"], self._camera_names)
-        # NumPy's BLAS would use every core, and its threads wait by spinning. With one other busy process
-        # these small products took up to a hundred times longer than on one thread.
-        with self._libraries.limit(limits=1, user_api="blas"):
-            return self.backbone(images, self._tokenizer(observation["instruction"])[None])
+    def observation(self, seen: Mapping[str, Any]) -> dict[str, Any]:
+        """What the simulator shows, in Isaac-GR00T's nested form with a batch of one.
 
-    def state(self, observation: Mapping[str, Any]) -> Float32Array:
-        """Normalised proprioception, `(1, state_dim)`.
+        Args:
+            seen: `images` by camera name `(H, W, 3)` uint8, `proprio (4,)`, `instruction`.
 
         Raises:
-            ShapeError: `observation["proprio"]` has another shape than in training.
+            ShapeError: a camera is missing, or `proprio` has another shape.
         """
-        proprio = np.asarray(observation["proprio"], dtype=np.float32)
-        if proprio.shape != (len(self.config.state.mean),):
-            raise ShapeError(f"proprio: shape {proprio.shape}, expected ({len(self.config.state.mean)},)")
-        return self.config.state.normalize(proprio)[None]
+        missing = [camera.name for camera in self.config.cameras if camera.name not in seen["images"]]
+        if missing:
+            raise ShapeError(
+                f"images: none of camera {', '.join(missing)}; there are {', '.join(seen['images'])}"
+            )
+        state = np.asarray(seen["proprio"], dtype=np.float32)
+        if state.shape != (sum(GROUPS.values()),):
+            raise ShapeError(f"proprio: shape {state.shape}, expected ({sum(GROUPS.values())},)")
+        parts = np.split(state[None, None], np.cumsum(list(GROUPS.values()))[:-1], axis=-1)
+        return {
+            "video": {
+                camera.name: np.asarray(seen["images"][camera.name])[None, None]
+                for camera in self.config.cameras
+            },
+            "state": dict(zip(GROUPS, parts, strict=True)),
+            "language": {LANGUAGE_KEY: [[seen["instruction"]]]},
+        }
+
+    def features(self, seen: Mapping[str, Any]) -> Float32Array:
+        """Backbone features of what the simulator shows, `(1, T_vl, width)`."""
+        (found,) = self.whole.features(self.whole.inputs(self.observation(seen)))
+        return np.asarray(found.backbone_features)
+
+    def state(self, seen: Mapping[str, Any]) -> Float32Array:
+        """Normalised proprioception, `(1, state_dim)`."""
+        parts = self.observation(seen)["state"].values()
+        return np.asarray(self.whole.normalizer.state(np.concatenate([part[0] for part in parts], axis=-1)))
+
+    def robot_actions(self, chunk: Float32Array) -> Float32Array:
+        """Actions of the head `(..., horizon, action_dim)` as the robot takes them, in [-1, 1]."""
+        return np.clip(np.asarray(self.whole.normalizer.actions(chunk)), -1.0, 1.0)
 
     def act(
-        self, observation: Mapping[str, Any], *, noise: Float32Array, intervention: Interventions = None
+        self, seen: Mapping[str, Any], *, noise: Float32Array, intervention: Interventions = None
     ) -> Chunk:
         """Computes a chunk of actions.
 
         Args:
-            observation: `images` by camera name `(H, W, 3)` uint8, `proprio (4,)`, `instruction`.
+            seen: see `observation`.
             noise: the result of `noise`.
             intervention: a change inside the head, see `saccade.Intervention`.
         """
+        observation = self.observation(seen)
         times = [time.perf_counter()]
-        features = self.features(observation)
+        features = self.whole.features(self.whole.inputs(observation))
         times.append(time.perf_counter())
-        context = self.engine.encode(features)
+        context = self.whole.context(features)
         times.append(time.perf_counter())
-        normalised = self.engine.sample(context, self.state(observation), noise, intervention)[0]
+        answer = self.whole.sample(context, observation, noise=noise, intervention=intervention)
         times.append(time.perf_counter())
         spent = {
             part: 1e3 * (after - before)
             for part, before, after in zip(("backbone", "encode", "sample"), times, times[1:], strict=False)
         }
-        return Chunk(np.clip(self.config.action.restore(normalised), -1.0, 1.0), spent)
+        actions = np.concatenate([answer[name][0] for name in GROUPS], axis=-1)
+        return Chunk(np.clip(actions, -1.0, 1.0), spent)
+
+    def blank(self, instruction: str) -> dict[str, Any]:
+        """What a black room would show, with the hand in the middle of its range."""
+        size = self.config.image_size
+        middle = self.whole.normalizer.unstate(np.zeros((1, self.head.config.state_dim), np.float32))
+        return {
+            "images": {camera.name: np.zeros((size, size, 3), np.uint8) for camera in self.config.cameras},
+            "proprio": np.asarray(middle)[0],
+            "instruction": instruction,
+        }
 
     def warmup(self) -> None:
-        """Acts once on a black observation, so that the first real call is not slow."""
-        size = self.config.backbone.image_size
-        observation = {
-            "images": {name: np.zeros((size, size, 3), np.uint8) for name in self._camera_names},
-            "proprio": np.array(self.config.state.mean, dtype=np.float32),
-            "instruction": "",
+        """Acts once on black images, so that the first real call is not slow."""
+        instruction = find_task(self.config.tasks[0]).instructions[0]
+        self.act(self.blank(instruction), noise=self.noise(np.random.default_rng(0)))
+
+    def describe(self) -> dict[str, Any]:
+        """What computes the policy, for a result file."""
+        if self.engine == "torch":
+            from saccade.sim.torch_engine import describe
+
+            return describe()
+        return {
+            "name": "rust",
+            "saccade": saccade.__version__,
+            "isa": saccade.show_config()["isa"],
+            "num_threads": self.head.num_threads,
         }
-        self.act(observation, noise=self.noise(np.random.default_rng(0)))
 
     def checkpoint_sha256(self) -> str:
-        """SHA-256 of config and tensors, in this order."""
-        return sha256_of(self.checkpoint / CONFIG_FILE, self.checkpoint / TENSOR_FILE)
+        """SHA-256 of all files of the policy, in the order of `FILES`."""
+        return checkpoint_sha256(self.checkpoint)
+
+
+def num_vl_tokens(processor: Processor, config: SimulationConfig, instruction: str | None = None) -> int:
+    """T_vl of a policy with an instruction. Default: the most that one of its tasks' instructions gives."""
+    blank = np.zeros((config.image_size, config.image_size, 3), np.uint8)
+    frames = [blank] * len(config.cameras)
+    texts = [text for name in config.tasks for text in find_task(name).instructions]
+    if instruction is not None:
+        texts = [instruction]
+    return max(processor(frames, text).input_ids.shape[1] for text in texts)
+
+
+def checkpoint_sha256(directory: Path) -> str:
+    """SHA-256 of all files of a policy, in the order of `FILES`."""
+    return sha256_of(*(directory / name for name in FILES))
 
 
 def check_trained_on(policy: Policy, tasks: list[str]) -> None:

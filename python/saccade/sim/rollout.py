@@ -96,7 +96,7 @@ def environment_for(
     """The task with the policy's cameras and image size; images of the cameras in `blanked` are black."""
     return TaskEnvironment(
         task,
-        image_size=policy.config.backbone.image_size,
+        image_size=policy.config.image_size,
         cameras=policy.config.cameras,
         render_mode=render_mode,
         blanked=blanked,

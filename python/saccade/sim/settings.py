@@ -1,94 +1,70 @@
-"""A policy's config.json: the published head config, the backbone's sizes, cameras, words, statistics."""
+"""What describes a small policy besides its weights: config, tokenizer and statistics, in NVIDIA's files."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from saccade._arrays import Float32Array
+from saccade._files import write_json
+from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.checkpoints.prompt_tokenizer import token_id, tokenizer
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
-from saccade.sim.backbone import BackboneConfig
+from saccade.processor import Processor
+from saccade.robots import Normalizer
 from saccade.sim.cameras import Camera
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
+TOKENIZER_FILE, METADATA_FILE = "tokenizer.json", "experiment_cfg/metadata.json"
+#: Every file of a policy, in the order in which they are hashed.
+FILES = (CONFIG_FILE, TENSOR_FILE, TOKENIZER_FILE, METADATA_FILE)
+
+EMBODIMENT = "metaworld_sawyer"
+EMBODIMENT_ID = 0
+#: The parts of state and action, and how many numbers each has.
+GROUPS = {"hand": 3, "gripper": 1}
+CROP_SHARE = 0.95  # of each side of a frame; Isaac-GR00T's preprocessing crops to it
 
 
 @dataclass(frozen=True)
-class Statistics:
-    """Mean and standard deviation per dimension, over the demonstrations.
-
-    Example:
-        >>> Statistics(mean=(1.0,), std=(2.0,)).normalize(np.array([[3.0]]))
-        array([[1.]], dtype=float32)
-    """
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    @classmethod
-    def of(cls, values: npt.NDArray[np.floating[Any]]) -> "Statistics":
-        """The statistics of `(samples, dimensions)`; the deviation is at least 0.001."""
-        std = np.maximum(values.std(axis=0, dtype=np.float64), 1e-3)
-        return cls(mean=rounded(values.mean(axis=0, dtype=np.float64)), std=rounded(std))
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Statistics":
-        """Reads a dict with the lists `mean` and `std`."""
-        return cls(*(tuple(float(value) for value in values[key]) for key in ("mean", "std")))
-
-    def normalize(self, values: npt.ArrayLike) -> Float32Array:
-        """Normalises `(..., dimensions)` to zero mean and unit standard deviation."""
-        given: Float32Array = np.asarray(values, dtype=np.float32)
-        mean, std = np.array(self.mean, dtype=np.float32), np.array(self.std, dtype=np.float32)
-        normalised: Float32Array = (given - mean) / std
-        return normalised
-
-    def restore(self, values: Float32Array) -> Float32Array:
-        """The inverse of `normalize`."""
-        mean, std = np.array(self.mean, dtype=np.float32), np.array(self.std, dtype=np.float32)
-        restored: Float32Array = values * std + mean
-        return restored
-
-
-@dataclass(frozen=True)
-class PolicyConfig:
-    """The whole config of a policy.
+class SimulationConfig:
+    """How a policy is run in the simulator: `simulation_cfg` in its config.
 
     Attributes:
-        head: The published head config, as in `config.json` under `action_head_cfg`.
-        backbone: The sizes of the backbone.
-        cameras: The cameras, in the order of the image tokens.
-        vocabulary: The words of the tokenizer.
-        execute_steps: Actions of a chunk that are executed before the next observation.
         tasks: The tasks it was trained on.
-        state: Statistics of the proprioception.
-        action: Statistics of the actions.
+        cameras: The cameras, in the order of the prompt.
+        image_size: Pixels along each side of a frame.
+        execute_steps: Actions of a chunk that are executed before the next observation.
     """
 
-    head: Mapping[str, Any]
-    backbone: BackboneConfig
-    cameras: tuple[Camera, ...]
-    vocabulary: tuple[str, ...]
-    execute_steps: int
     tasks: tuple[str, ...]
-    state: Statistics
-    action: Statistics
+    cameras: tuple[Camera, ...]
+    image_size: int
+    execute_steps: int
 
     @classmethod
-    def from_file(cls, path: Path) -> "PolicyConfig":
-        """Reads `config.json`.
+    def from_file(cls, path: Path) -> "SimulationConfig":
+        """Reads it from a `config.json`.
 
         Raises:
-            FileNotFoundError: there is none.
-            CheckpointError: a key is missing, or values do not fit each other.
+            FileNotFoundError: there is no such file.
+            CheckpointError: a key is missing, or values do not fit.
         """
         try:
-            return cls.from_dict(json.loads(path.read_text(encoding="utf-8")))
+            whole = json.loads(path.read_text(encoding="utf-8"))
+            values = whole["simulation_cfg"]
+            config = cls(
+                tasks=tuple(str(task) for task in values["tasks"]),
+                cameras=tuple(Camera.from_dict(camera) for camera in values["cameras"]),
+                image_size=int(values["image_size"]),
+                execute_steps=int(values["execute_steps"]),
+            )
+            horizon = int(whole["action_head_cfg"]["action_horizon"])
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"{path}: no such config; a policy is a directory with {CONFIG_FILE}"
@@ -99,60 +75,148 @@ class PolicyConfig:
             ) from None
         except (TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: {error}") from None
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "PolicyConfig":
-        """Reads a dict that `to_dict` returned; any other may raise `KeyError`, `TypeError` or similar."""
-        policy = values["policy_cfg"]
-        config = cls(
-            head=dict(values["action_head_cfg"]),
-            backbone=BackboneConfig.from_dict(values["backbone_cfg"]),
-            cameras=tuple(Camera.from_dict(camera) for camera in policy["cameras"]),
-            vocabulary=tuple(str(word) for word in policy["vocabulary"]),
-            execute_steps=int(policy["execute_steps"]),
-            tasks=tuple(str(task) for task in policy["tasks"]),
-            state=Statistics.from_dict(policy["statistics"]["state"]),
-            action=Statistics.from_dict(policy["statistics"]["action"]),
-        )
-        config.check()
+        problems = []
+        if not config.cameras:
+            problems.append("cameras: expected at least one")
+        if config.image_size < 8:
+            problems.append(f"image_size: expected at least 8, got {config.image_size}")
+        if not 1 <= config.execute_steps <= horizon:
+            problems.append(f"execute_steps: expected 1 to {horizon}, got {config.execute_steps}")
+        if problems:
+            raise CheckpointError(f"{path}: simulation_cfg: {'; '.join(problems)}")
         return config
 
-    def check(self) -> None:
-        """Raises `CheckpointError` that lists every inconsistency."""
-        head = HeadConfig.from_dict(self.head)
-        pairs = {
-            "backbone width and backbone_embedding_dim": (self.backbone.width, head.context_dim),
-            "cameras and num_cameras": (len(self.cameras), self.backbone.num_cameras),
-            "vocabulary and vocabulary_size": (len(self.vocabulary), self.backbone.vocabulary_size),
-            "state statistics and max_state_dim": (len(self.state.mean), head.state_dim),
-            "action statistics and action_dim": (len(self.action.mean), head.action_dim),
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "tasks": list(self.tasks),
+            "cameras": [camera.to_dict() for camera in self.cameras],
+            "image_size": self.image_size,
+            "execute_steps": self.execute_steps,
         }
-        problems = [f"{what} differ: {a} and {b}" for what, (a, b) in pairs.items() if a != b]
-        if not 1 <= self.execute_steps <= head.action_horizon:
-            problems.append(f"execute_steps {self.execute_steps} is not in 1..{head.action_horizon}")
-        if problems:
-            raise CheckpointError("; ".join(problems))
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """All of a small policy that is decided before its training.
+
+    Attributes:
+        head: Config of the head, in the published keys.
+        backbone: Config of the backbone, in the keys of `saccade.checkpoints.backbone_sizes.RELEASED`.
+        simulation: How it is run in the simulator.
+        words: Words that are one token each.
+        statistics: Statistics of `state` and `action`, by group, see `statistics_of`; empty before the
+            demonstrations are read.
+    """
+
+    head: Mapping[str, Any]
+    backbone: Mapping[str, Any]
+    simulation: SimulationConfig
+    words: tuple[str, ...]
+    statistics: Mapping[str, Mapping[str, Mapping[str, list[float]]]] = field(default_factory=dict)
+
+    @property
+    def head_config(self) -> HeadConfig:
+        """The head's config."""
+        return HeadConfig.from_dict(self.head)
+
+    @property
+    def backbone_sizes(self) -> BackboneSizes:
+        """The backbone's sizes."""
+        return BackboneSizes.from_config({**self.backbone, "kind": "n1.5 backbone"})
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """What the policy's states and actions are normalised by."""
+        head = self.head_config
+        return Normalizer.load(
+            self.metadata(), EMBODIMENT, state_dim=head.state_dim, action_dim=head.action_dim
+        )
+
+    def processor(self) -> Processor:
+        """What prepares frames and words, the same that :meth:`saccade.Policy.load` finds."""
+        vision = self.backbone["vision_config"]
+        merged = 2 * vision["patch_size"]
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / TOKENIZER_FILE
+            write_json(path, tokenizer(published_ids=False, words=self.words))
+            return Processor(
+                "n1.5",
+                path,
+                preprocessing="isaac",
+                image_size=vision["image_size"],
+                tokens_per_view=(vision["image_size"] // merged) ** 2,
+            )
 
     def to_dict(self) -> dict[str, Any]:
-        """For `config.json`; the head's part has the keys of published checkpoints."""
+        """The content of `config.json`: the published keys, and `simulation_cfg`."""
+        outer = ("select_layer", "project_to_dim", "image_token_index")
+        eagle = {key: value for key, value in self.backbone.items() if key not in outer}
         return {
             "model_type": "gr00t_n1_5",
+            "architectures": ["GR00T_N1_5"],
             "action_dim": self.head["action_dim"],
             "action_horizon": self.head["action_horizon"],
             "hidden_size": self.head["backbone_embedding_dim"],
             "action_head_cfg": dict(self.head),
-            "backbone_cfg": vars(self.backbone),
-            "policy_cfg": {
-                "tasks": list(self.tasks),
-                "cameras": [camera.to_dict() for camera in self.cameras],
-                "vocabulary": list(self.vocabulary),
-                "execute_steps": self.execute_steps,
-                "statistics": {
-                    "state": {"mean": list(self.state.mean), "std": list(self.state.std)},
-                    "action": {"mean": list(self.action.mean), "std": list(self.action.std)},
+            "backbone_cfg": {
+                "select_layer": self.backbone["select_layer"],
+                "project_to_dim": None,
+                "eagle_config": {
+                    **eagle,
+                    "image_token_index": self.backbone["image_token_index"],
+                    "select_layer": -1,
                 },
             },
+            "simulation_cfg": self.simulation.to_dict(),
         }
+
+    def metadata(self) -> dict[str, Any]:
+        """The content of `experiment_cfg/metadata.json`: statistics, joints and cameras."""
+        size = self.simulation.image_size
+        joint = {"absolute": True, "rotation_type": None, "continuous": True}
+        video = {"resolution": [size, size], "channels": 3, "fps": 80.0}
+        modalities = {
+            "video": {camera.name: video for camera in self.simulation.cameras},
+            **{
+                kind: {name: {**joint, "shape": [width]} for name, width in GROUPS.items()}
+                for kind in ("state", "action")
+            },
+        }
+        entry = {"statistics": self.statistics, "modalities": modalities, "embodiment_tag": EMBODIMENT}
+        return {EMBODIMENT: entry}
+
+    def write(self, folder: Path) -> None:
+        """Writes all files of the policy except its weights."""
+        (folder / METADATA_FILE).parent.mkdir(parents=True, exist_ok=True)
+        write_json(folder / METADATA_FILE, self.metadata())
+        write_json(folder / TOKENIZER_FILE, tokenizer(published_ids=False, words=self.words))
+        write_json(folder / CONFIG_FILE, self.to_dict())
+
+
+def statistics_of(values: npt.NDArray[np.floating[Any]]) -> dict[str, dict[str, list[float]]]:
+    """Statistics by group, as `metadata.json` has them.
+
+    Args:
+        values: `(samples, 4)`, the groups of `GROUPS` one after the other.
+    """
+    found, first = {}, 0
+    for name, width in GROUPS.items():
+        group = values[:, first : first + width].astype(np.float64)
+        first += width
+        low, high = np.quantile(group, (0.01, 0.99), axis=0)
+        found[name] = {
+            key: [round(float(value), 6) for value in numbers]
+            for key, numbers in {
+                "min": group.min(axis=0),
+                "max": group.max(axis=0),
+                "mean": group.mean(axis=0),
+                "std": group.std(axis=0),
+                "q01": low,
+                "q99": high,
+            }.items()
+        }
+    return found
 
 
 def head_config(
@@ -202,6 +266,57 @@ def head_config(
     }
 
 
-def rounded(values: Sequence[float] | npt.NDArray[np.floating[Any]]) -> tuple[float, ...]:
-    """Rounds to six decimals, so that a config stays readable."""
-    return tuple(round(float(value), 6) for value in values)
+def backbone_config(
+    *,
+    width: int,
+    num_layers: int,
+    num_heads: int,
+    vision_width: int,
+    vision_layers: int,
+    vision_heads: int,
+    image_size: int,
+    patch_size: int,
+    words: tuple[str, ...],
+) -> dict[str, Any]:
+    """A backbone config with the published keys: a small SigLIP and a small Qwen3.
+
+    The tower's patches have half the side of an image token's, four of which the connector joins
+    (`use_pixel_shuffle`). A fine grid locates objects; few tokens keep the language model and the head fast.
+
+    Args:
+        width, num_layers, num_heads: of the language model.
+        vision_width, vision_layers, vision_heads: of the tower.
+        image_size: pixels along each side of a frame, before preprocessing crops it.
+        patch_size: pixels along each side of the patch behind an image token, after preprocessing.
+        words: see `PolicyConfig`.
+    """
+    view = max(1, round(CROP_SHARE * image_size / patch_size)) * patch_size
+    vocabulary = tokenizer(published_ids=False, words=words)["model"]["vocab"]
+    return {
+        "select_layer": num_layers,
+        "project_to_dim": None,
+        "use_pixel_shuffle": True,
+        "downsample_ratio": 0.5,
+        "mlp_connector_layers": 1,
+        "image_token_index": token_id("<IMG_CONTEXT>", published_ids=False, words=words),
+        "text_config": {
+            "hidden_size": width,
+            "intermediate_size": 2 * width,
+            "num_hidden_layers": num_layers,
+            "num_attention_heads": num_heads,
+            "num_key_value_heads": max(1, num_heads // 2),
+            "head_dim": width // num_heads,
+            "vocab_size": len(vocabulary),
+            "rms_norm_eps": 1e-6,
+            "rope_theta": 1e4,
+        },
+        "vision_config": {
+            "hidden_size": vision_width,
+            "intermediate_size": 2 * vision_width,
+            "num_hidden_layers": vision_layers,
+            "num_attention_heads": vision_heads,
+            "patch_size": patch_size // 2,
+            "image_size": view,
+            "layer_norm_eps": 1e-6,
+        },
+    }

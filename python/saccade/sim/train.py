@@ -11,7 +11,9 @@ number of the step, so that a continued run gives the same weights as an uninter
 # mypy: disable-error-code="no-untyped-call"
 
 import io
+import json
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -19,20 +21,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from safetensors.torch import load_file
 from safetensors.torch import save as serialize
 from torch import Tensor
 
+from saccade._arrays import Float32Array
 from saccade._files import sha256_of, write_atomically, write_json
-from saccade.config import HeadConfig
+from saccade.backbone_inputs import BackboneInputs
 from saccade.errors import InputError
+from saccade.processor import Processor
 from saccade.sim import demos
-from saccade.sim.backbone import BackboneConfig
-from saccade.sim.dataset import Samples, describe, load_samples, statistics
-from saccade.sim.instructions import Tokenizer, build_vocabulary, words
-from saccade.sim.learner import Learner
-from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE, PolicyConfig, Statistics, head_config
+from saccade.sim.dataset import PIXEL_CENTRE, Samples, describe, load_samples, normalized_actions
+from saccade.sim.learner import Batch, Learner
+from saccade.sim.settings import (
+    CONFIG_FILE,
+    METADATA_FILE,
+    TENSOR_FILE,
+    PolicyConfig,
+    SimulationConfig,
+    backbone_config,
+    head_config,
+    statistics_of,
+)
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
 from saccade.sim.training_settings import TrainingSettings
 
@@ -43,6 +55,7 @@ WARMUP_STEPS = 200
 MAX_GRADIENT_NORM = 1.0
 WEIGHT_DECAY = 0.01
 BETAS = (0.9, 0.95)
+SMALLEST_DEVIATION = 1e-3  # metres; added where a position never changes
 
 
 @dataclass
@@ -71,15 +84,12 @@ class Run:
 
 
 def policy_config(
-    settings: TrainingSettings,
-    recording: demos.RecordingSettings,
-    tasks: list[str],
-    found: dict[str, Statistics],
+    settings: TrainingSettings, recording: demos.RecordingSettings, tasks: list[str]
 ) -> PolicyConfig:
-    """The config of the policy that a run trains."""
-    instructions = [text for name in tasks for text in find_task(name).instructions]
-    vocabulary = build_vocabulary(instructions)
-    config = PolicyConfig(
+    """The config of the policy that a run trains, without statistics."""
+    said = " ".join(text for name in tasks for text in find_task(name).instructions)
+    vocabulary = tuple(sorted(set(re.findall("[a-z]+", said))))
+    return PolicyConfig(
         head=head_config(
             width=settings.width,
             num_layers=settings.num_layers,
@@ -91,31 +101,31 @@ def policy_config(
             state_dim=PROPRIO_DIM,
             action_dim=ACTION_DIM,
         ),
-        backbone=BackboneConfig(
+        backbone=backbone_config(
             width=settings.width,
-            num_layers=settings.backbone_layers,
+            num_layers=settings.language_layers,
             num_heads=settings.num_heads,
+            vision_width=settings.vision_width,
+            vision_layers=settings.vision_layers,
+            vision_heads=settings.vision_heads,
             image_size=recording.image_size,
             patch_size=settings.patch_size,
-            num_cameras=len(recording.cameras),
-            text_length=max(len(words(text)) for text in instructions),
-            vocabulary_size=len(vocabulary),
+            words=vocabulary,
         ),
-        cameras=recording.cameras,
-        vocabulary=vocabulary,
-        execute_steps=settings.execute_steps,
-        tasks=tuple(tasks),
-        state=found["state"],
-        action=found["action"],
+        simulation=SimulationConfig(
+            tasks=tuple(tasks),
+            cameras=recording.cameras,
+            image_size=recording.image_size,
+            execute_steps=settings.execute_steps,
+        ),
+        words=vocabulary,
     )
-    config.check()
-    return config
 
 
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
     """A run before its first step; for `demonstrations` see `dataset.describe`."""
     torch.manual_seed(settings.seed)
-    learner = Learner(config.backbone, HeadConfig.from_dict(config.head), settings.aligned_block)
+    learner = Learner(config.backbone_sizes, config.head_config, settings.aligned_block)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
     optimizer = torch.optim.AdamW(
@@ -135,23 +145,26 @@ def learning_rate(settings: TrainingSettings, step: int) -> float:
 
 
 class Batches:
-    """Draws normalised batches.
+    """Draws batches.
 
     Args:
         samples: the samples to draw from.
-        config: config of the policy, with statistics and vocabulary.
-        target_statistics: statistics of the positions.
+        config: config of the policy.
+        processor: processor of the policy.
+        targets: mean and standard deviation of the positions, `(6,)` each.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
-        with_later: whether batches contain the images after the chunk was executed.
+        with_later: whether batches contain the observations after the chunk was executed.
     """
 
     def __init__(
         self,
         samples: Samples,
         config: PolicyConfig,
-        target_statistics: Statistics,
+        processor: Processor,
+        targets: tuple[Float32Array, Float32Array],
         batch_size: int,
+        *,
         absent_share: float = 0.0,
         with_later: bool = False,
     ) -> None:
@@ -159,21 +172,23 @@ class Batches:
         self._with_later = with_later
         self._batch_size = batch_size
         self._absent_share = absent_share
-        self._state = config.state.normalize(samples.state)
-        self._actions = config.action.normalize(samples.actions) * samples.mask
-        self._targets = target_statistics.normalize(samples.targets)
-        tokenizer = Tokenizer(config.vocabulary, config.backbone.text_length)
-        self._wordings = [
-            np.stack([tokenizer(text) for text in task.instructions]) for task in TASKS.values()
-        ]  # per task (wordings, text_length)
-        known = [list(TASKS).index(name) for name in config.tasks]
+        normalizer = config.normalizer
+        self._state = np.asarray(normalizer.state(samples.state))
+        self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
+        self._targets = (samples.targets - targets[0]) / targets[1]
+        shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
+        frames = [shown] * len(config.simulation.cameras)
+        self._prompts = [
+            [processor(frames, text).input_ids[0] for text in task.instructions] for task in TASKS.values()
+        ]  # per task and wording, (T,)
+        known = [list(TASKS).index(name) for name in config.simulation.tasks]
         self._impossible = [
             [other for other in known if list(TASKS.values())[other].objects != task.objects]
             for task in TASKS.values()
         ]  # per task, the tasks that cannot be done in its scene
-        self._still = config.action.normalize(np.zeros(samples.actions.shape[1:], np.float32))
+        self._still = normalized_actions(normalizer, np.zeros(samples.actions.shape[1:], np.float32))
 
-    def draw(self, *key: int) -> dict[str, Tensor]:
+    def draw(self, *key: int) -> Batch:
         """The batch of `key`, with a wording drawn for each frame."""
         rng = np.random.default_rng(key)
         rows = rng.integers(len(self._samples), size=self._batch_size)
@@ -184,18 +199,26 @@ class Batches:
                 tasks[row] = rng.choice(self._impossible[tasks[row]])
                 actions[row], mask[row] = self._still, 1.0
                 later[row] = self._samples.now[rows[row]]
-        said = [self._wordings[task] for task in tasks]
-        arrays = {
-            "images": self._samples.images[self._samples.now[rows]],
-            "words": np.stack([wordings[rng.integers(len(wordings))] for wordings in said]),
-            "state": self._state[rows],
-            "actions": actions,
-            "mask": mask,
-            "targets": self._targets[rows],
-        }
-        if self._with_later:
-            arrays["later_images"] = self._samples.images[later]
-        return {name: torch.from_numpy(array) for name, array in arrays.items()}
+        said = [self._prompts[task] for task in tasks]
+        prompts = [prompts[rng.integers(len(prompts))] for prompts in said]
+        return Batch(
+            inputs=self._inputs(self._samples.now[rows], prompts),
+            state=torch.from_numpy(self._state[rows]),
+            actions=torch.from_numpy(actions),
+            mask=torch.from_numpy(mask),
+            targets=torch.from_numpy(self._targets[rows]),
+            later=self._inputs(later, prompts) if self._with_later else None,
+        )
+
+    def _inputs(self, frames: npt.NDArray[np.int64], prompts: list[npt.NDArray[np.int64]]) -> BackboneInputs:
+        """The inputs of the backbone for frames and prompts, which are padded on the left."""
+        images = self._samples.images[frames].astype(np.float32)
+        longest = max(map(len, prompts))
+        ids, mask = np.zeros((len(prompts), longest), np.int64), np.zeros((len(prompts), longest), np.bool_)
+        for row, prompt in enumerate(prompts):
+            ids[row, longest - len(prompt) :], mask[row, longest - len(prompt) :] = prompt, True
+        pixels = (images - PIXEL_CENTRE) / PIXEL_CENTRE
+        return BackboneInputs(pixels.reshape(-1, *pixels.shape[2:]), ids, mask)
 
 
 def train_step(run: Run, batches: Batches) -> dict[str, float]:
@@ -241,7 +264,7 @@ def export(run: Run, out: Path) -> None:
     tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
     with write_atomically(out / TENSOR_FILE) as temporary:
         temporary.write_bytes(serialize(tensors, metadata={"format": "pt"}))
-    write_json(out / CONFIG_FILE, run.config.to_dict())
+    run.config.write(out)
 
 
 def save(run: Run, out: Path) -> None:
@@ -249,7 +272,7 @@ def save(run: Run, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     state = {
         "settings": asdict(run.settings),
-        "config": run.config.to_dict(),
+        "config": [run.config.to_dict(), run.config.metadata()],
         "step": run.step,
         "history": run.history,
         "learner": run.learner.state_dict(),
@@ -278,7 +301,7 @@ def resume(run: Run, path: Path) -> None:
             name for name, value in asdict(run.settings).items() if state["settings"].get(name) != value
         ]
         raise InputError(f"{path}: the run was started with other settings ({', '.join(changed)})")
-    if state["config"] != run.config.to_dict():
+    if state["config"] != [run.config.to_dict(), run.config.metadata()]:
         raise InputError(f"{path}: the run was started with other demonstrations")
     run.step, run.history = state["step"], state["history"]
     run.learner.load_state_dict(state["learner"])
@@ -293,7 +316,8 @@ def start_from(run: Run, policy: Path) -> None:
         FileNotFoundError: there is no policy.
         InputError: the policy has other sizes, tasks or statistics.
     """
-    if PolicyConfig.from_file(policy / CONFIG_FILE) != run.config:
+    found = [json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE)]
+    if found != [run.config.to_dict(), run.config.metadata()]:
         raise InputError(f"{policy}: was trained with other sizes or other demonstrations")
     tensors = load_file(policy / TENSOR_FILE)
     run.learner.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, strict=False)
@@ -326,9 +350,14 @@ def train(
     """
     tasks = demos.recorded_tasks(demonstrations)
     recording = demos.read_settings(demonstrations, tasks)
-    training, validation = load_samples(demonstrations, tasks, settings.horizon)
-    found = statistics(training)
-    config = policy_config(settings, recording, tasks, found)
+    config = policy_config(settings, recording, tasks)
+    processor = config.processor()
+    training, validation = load_samples(demonstrations, tasks, settings.horizon, processor)
+    valid = training.mask[..., 0] > 0
+    recorded = {"state": training.state, "action": training.actions[valid]}
+    config = replace(
+        config, statistics={kind: statistics_of(values) for kind, values in recorded.items()}
+    )
     if start is not None:
         settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
     run = new_run(settings, config, describe(demonstrations, tasks))
@@ -337,10 +366,17 @@ def train(
     if (out / STATE_FILE).exists():
         resume(run, out / STATE_FILE)
     with_later = settings.aligned_block is not None
+    targets = (training.targets.mean(axis=0), training.targets.std(axis=0) + SMALLEST_DEVIATION)
     batches = Batches(
-        training, config, found["targets"], settings.batch_size, settings.absent_share, with_later
+        training,
+        config,
+        processor,
+        targets,
+        settings.batch_size,
+        absent_share=settings.absent_share,
+        with_later=with_later,
     )
-    held_out = Batches(validation, config, found["targets"], VALIDATION_FRAMES, with_later=with_later)
+    held_out = Batches(validation, config, processor, targets, VALIDATION_FRAMES, with_later=with_later)
     try:
         loop(run, batches, held_out, out, on_step)
     finally:

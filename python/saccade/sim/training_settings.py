@@ -27,14 +27,15 @@ class TrainingSettings:
             the words.
         start_sha256: Hash of the tensors that the run starts from; empty for random ones. `train` sets it.
         seed: Seed of initial weights, order and noise.
-        width, num_layers, num_heads: Sizes of the head; the backbone has the same width and heads.
-        backbone_layers: Transformer blocks of the backbone.
+        width, num_layers, num_heads: Sizes of the head; the language model has the same width and heads.
+        language_layers: Layers of the language model.
+        vision_width, vision_layers, vision_heads: Sizes of the vision tower.
         vl_num_layers: Blocks of the head's VL self-attention.
         num_future_tokens: N.
         horizon: Actions per chunk.
         execute_steps: Actions of a chunk that are executed before the next observation.
         num_steps: Euler steps at run time.
-        patch_size: Pixels along each side of an image token's patch.
+        patch_size: Pixels along each side of the patch behind an image token, an even number.
     """
 
     steps: int = 8000
@@ -44,13 +45,16 @@ class TrainingSettings:
     target_weight: float = 1.0
     alignment_weight: float = 0.0
     alignment_block: int | None = None
-    absent_share: float = 0.0
+    absent_share: float = 0.1
     start_sha256: str = ""
     seed: int = 0
     width: int = 128
     num_layers: int = 4
     num_heads: int = 4
-    backbone_layers: int = 2
+    language_layers: int = 2
+    vision_width: int = 96
+    vision_layers: int = 3
+    vision_heads: int = 3
     vl_num_layers: int = 1
     num_future_tokens: int = 32
     horizon: int = 16
@@ -59,6 +63,8 @@ class TrainingSettings:
     patch_size: int = 16
 
     def __post_init__(self) -> None:
+        if self.patch_size < 2 or self.patch_size % 2:
+            raise InputError(f"patch_size: given {self.patch_size}, expected an even number, at least 2")
         if not 0 <= self.alignment_weight < math.inf:
             raise InputError(f"alignment_weight: given {self.alignment_weight}, expected at least 0")
         if self.alignment_weight and self.num_future_tokens == 0:

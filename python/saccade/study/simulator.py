@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
-from saccade._arrays import Float32Array
+from saccade._arrays import ArrayLike, Float32Array
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
 from saccade.head import ActionHead
 from saccade.intervention import Intervention
-from saccade.observation import Observation
+from saccade.observation import BoolArray, Observation
+from saccade.policy_head import Head
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, HeadEngine, Policy, check_trained_on
+from saccade.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
 from saccade.sim.rollout import Episode, environment_for, run_episode
+from saccade.sim.settings import EMBODIMENT_ID
 from saccade.study.source import Source, episode_rng
 
 
@@ -49,7 +52,7 @@ class Simulator(Source):
                 "num_future_tokens": self.config.num_future_tokens,
                 "num_layers": self.config.num_layers,
                 "num_steps": self.config.num_steps,
-                "num_vl_tokens": policy.config.backbone.num_tokens,
+                "num_vl_tokens": policy.num_vl_tokens(),
             }
         }
 
@@ -61,7 +64,7 @@ class Simulator(Source):
     @property
     def config(self) -> HeadConfig:
         """See `Source`."""
-        return HeadConfig.from_dict(self.policy.config.head)
+        return self.policy.head.config
 
     @property
     def engine_name(self) -> str:
@@ -100,24 +103,25 @@ class Simulator(Source):
 
     def encode(self, observation: Observation) -> Any:
         """See `Source`."""
-        return self.policy.engine.encode(observation.backbone_features)
+        return self.policy.head.encode(observation.backbone_features)
 
     def actions(
         self, observation: Observation, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
         """Actions of the robot, in [-1, 1]; see `Source`."""
         assert observation.noise is not None
-        found = self.policy.engine.sample(
+        found = self.policy.head.sample(
             self.encode(observation) if context is None else context,
             observation.state,
-            observation.noise,
-            intervention,
+            EMBODIMENT_ID,
+            noise=observation.noise,
+            intervention=intervention,
         )
-        return self.comparable(found)[:, None]
+        return self.comparable(np.asarray(found))[:, None]
 
     def comparable(self, chunk: Float32Array) -> Float32Array:
         """See `Source`."""
-        return np.clip(self.policy.config.action.restore(chunk), -1.0, 1.0)
+        return self.policy.robot_actions(chunk)
 
     def outcome(self, task: str, seed: int, intervention: Intervention | None) -> dict[str, Any]:
         """See `Source`."""
@@ -197,54 +201,65 @@ class Recorded:
 
 
 class Recorder:
-    """A head engine that records its inputs and passes them to another engine.
+    """A head that records its inputs and passes them on; a `saccade.policy_head.Head`.
 
     Args:
-        engine: engine that computes.
+        head: head that computes.
         environment: environment whose positions are recorded at every observation.
     """
 
-    def __init__(self, engine: HeadEngine, environment: TaskEnvironment) -> None:
-        self._engine = engine
+    def __init__(self, head: Head, environment: TaskEnvironment) -> None:
+        self._head = head
         self._environment = environment
-        self._given: list[tuple[Float32Array, ...]] = []
-        self._features = np.empty((1, 0, 0), np.float32)
+        self._given: list[tuple[npt.NDArray[Any], ...]] = []
+        self._encoded: tuple[Float32Array, BoolArray] | None = None
 
-    def encode(self, features: Float32Array) -> Any:
-        """See `HeadEngine`."""
-        self._features = features.copy()
-        return self._engine.encode(features)
+    @property
+    def config(self) -> HeadConfig:
+        """See `Head`."""
+        return self._head.config
 
-    def sample(
-        self,
-        context: Any,
-        state: Float32Array,
-        noise: Float32Array,
-        intervention: Intervention | Sequence[Intervention] | None = None,
-    ) -> Float32Array:
-        """See `HeadEngine`."""
+    @property
+    def source(self) -> str | None:
+        """See `Head`."""
+        return self._head.source
+
+    @property
+    def embodiment_ids(self) -> tuple[int, ...]:
+        """See `Head`."""
+        return self._head.embodiment_ids
+
+    @property
+    def num_threads(self) -> int:
+        """See `Head`."""
+        return self._head.num_threads
+
+    def encode(self, backbone_features: ArrayLike, **masks: Any) -> Any:
+        """See `Head`."""
+        self._encoded = np.array(backbone_features), np.array(masks["image_mask"])
+        return self._head.encode(backbone_features, **masks)
+
+    def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Any:
+        """See `Head`."""
         targets = self._environment.privileged_targets()
         proprio = self._environment.last_observation["proprio"]
         known = (targets[None, :3], targets[None, 3:6], proprio[None, :3], proprio[None, 3:4])
-        self._given.append((self._features, state.copy(), noise.copy(), *known))
-        return self._engine.sample(context, state, noise, intervention)
-
-    def describe(self) -> dict[str, Any]:
-        """See `HeadEngine`."""
-        return self._engine.describe()
+        assert self._encoded is not None
+        self._given.append((*self._encoded, np.array(state), np.array(options["noise"]), *known))
+        return self._head.sample(context, state, embodiment_id, **options)
 
     def recorded(self, episode: Episode) -> Recorded:
         """The recording, when the episode is over."""
-        features, state, noise, *known = (np.concatenate(arrays) for arrays in zip(*self._given, strict=True))
+        features, images, state, noise, *known = map(np.concatenate, zip(*self._given, strict=True))
         ids = np.full(len(features), EMBODIMENT_ID)
-        return Recorded(episode, Observation(features, state, ids, noise), PrivilegedState(*known))
+        observation = Observation(features, state, ids, noise, image_mask=images)
+        return Recorded(episode, observation, PrivilegedState(*known))
 
 
 def record_episode(environment: TaskEnvironment, policy: Policy, seed: int) -> Recorded:
     """Runs and records one episode. Recording does not change it."""
-    recorder = Recorder(policy.engine, environment)
-    watched = Policy(policy.config, policy.backbone, recorder, policy.checkpoint)
-    return recorder.recorded(run_episode(environment, watched, seed))
+    recorder = Recorder(policy.head, environment)
+    return recorder.recorded(run_episode(environment, policy.with_head(recorder), seed))
 
 
 # Caches of a worker process, so that consecutive cells do not load or compute the same things twice.

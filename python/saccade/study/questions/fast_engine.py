@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import Float32Array
+from saccade._arrays import ArrayLike, Float32Array
+from saccade.config import HeadConfig
 from saccade.context import Context
 from saccade.errors import InputError
 from saccade.observation import Observation
-from saccade.sim.policy import EMBODIMENT_ID, Interventions, Policy
+from saccade.sim.policy import Policy
+from saccade.sim.settings import EMBODIMENT_ID
 from saccade.study.questions.fast_modes import Calibration, Mode, encode, sample
 from saccade.study.simulator import head_of, policy_of
 
 
-class ModeEngine:
-    """A policy's head in one of the modes, on one thread; a `saccade.sim.policy.HeadEngine`.
+class ModeHead:
+    """A policy's head in one of the modes, on one thread; a `saccade.policy_head.Head`.
 
     Args:
         checkpoint: Directory of the policy.
@@ -30,24 +32,39 @@ class ModeEngine:
         self._mode = mode
         self._calibration = calibration
 
-    def encode(self, features: Float32Array) -> Context:
-        """See `HeadEngine`."""
+    @property
+    def config(self) -> HeadConfig:
+        """See `Head`."""
+        return self._head.config
+
+    @property
+    def source(self) -> str | None:
+        """See `Head`."""
+        return self._head.source
+
+    @property
+    def embodiment_ids(self) -> tuple[int, ...]:
+        """See `Head`."""
+        return self._head.embodiment_ids
+
+    @property
+    def num_threads(self) -> int:
+        """See `Head`."""
+        return self._head.num_threads
+
+    def encode(self, backbone_features: ArrayLike, **masks: Any) -> Context:
+        """See `Head`. The masks change nothing in N1.5, and are not read."""
+        features = np.asarray(backbone_features)
         return encode(
             self._head, self._mode, self._calibration, given(features, np.empty((1, 0), np.float32))
         )
 
-    def sample(
-        self, context: Context, state: Float32Array, noise: Float32Array, intervention: Interventions = None
-    ) -> Float32Array:
-        """See `HeadEngine`; takes no intervention."""
-        if intervention is not None:
+    def sample(self, context: Context, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
+        """See `Head`; takes noise and no intervention."""
+        if options.get("intervention") is not None:
             raise InputError("intervention: given one, expected None with a faster mode")
-        observation = given(np.empty((1, 0, 0), np.float32), state, noise)
+        observation = given(np.empty((1, 0, 0), np.float32), np.asarray(state), options["noise"])
         return sample(self._head, self._mode, self._calibration, context, observation)
-
-    def describe(self) -> dict[str, Any]:
-        """See `HeadEngine`."""
-        return {"name": "rust", "mode": self._mode.name, "isa": self._head.isa, "num_threads": 1}
 
 
 def given(features: Float32Array, state: Float32Array, noise: Float32Array | None = None) -> Observation:
@@ -59,5 +76,4 @@ def given(features: Float32Array, state: Float32Array, noise: Float32Array | Non
 def policy_in(checkpoint: str, mode: Mode, calibration: Calibration) -> Policy:
     """The policy with its head in a mode. Policies of up to 64 modes are cached; they share the weights."""
     policy = policy_of(checkpoint)
-    engine = ModeEngine(checkpoint, mode, calibration)
-    return Policy(policy.config, policy.backbone, engine, policy.checkpoint)
+    return policy.with_head(ModeHead(checkpoint, mode, calibration))

@@ -200,7 +200,7 @@ class Gradients(Study):
     def of_loss(self, task: str, seed: int) -> Rows:
         """A demonstration."""
         from saccade.sim import demos
-        from saccade.sim.dataset import chunks
+        from saccade.sim.dataset import chunks, normalized_actions
         from saccade.sim.tasks import find_task
         from saccade.study import derivatives
 
@@ -209,6 +209,7 @@ class Gradients(Study):
         generator = self.generator(task, seed)
         demonstration = demos.load(Path(self.demonstrations) / task / f"{seed}.npz")
         actions, mask = chunks(demonstration, policy.horizon)
+        wanted = normalized_actions(policy.whole.normalizer, actions)
         usable = np.flatnonzero(mask[..., 0].any(axis=1))
         names = [camera.name for camera in policy.config.cameras]
         measured = []
@@ -223,7 +224,7 @@ class Gradients(Study):
                     head,
                     head.as_input(policy.features(seen)),
                     head.as_input(policy.state(seen)),
-                    head.as_input(policy.config.action.normalize(actions[frame]) * mask[frame])[None],
+                    head.as_input(wanted[frame] * mask[frame])[None],
                     head.as_input(mask[frame])[None],
                     generator,
                     self.projections,

@@ -193,8 +193,11 @@ def frames_of(head: ActionHead, recorded: Recorded, step: int) -> Frames:
         context = observation.encode(head)
         trace = observation.trace(head, context, record=("hidden",), steps=[step])
         add(PROPRIO[0], -1, observation.state)
-        add("features", -1, observation.backbone_features[0])
-        add(VL[0], -1, np.asarray(context.vl_embs)[0])
+        # Image tokens only: instructions differ in length, and a probe reads as many tokens in every episode.
+        assert observation.image_mask is not None
+        images = observation.image_mask[0]
+        add("features", -1, observation.backbone_features[0, images])
+        add(VL[0], -1, np.asarray(context.vl_embs)[0, images])
         for (_, block), hidden in trace.hidden.items():
             for group in ROW_GROUPS:
                 tokens = np.asarray(hidden)[0, trace.rows[group]]

@@ -150,7 +150,7 @@ class Sweep(Study):
     def from_arguments(cls, args: argparse.Namespace) -> Sweep:
         """See `Study`."""
         from saccade.sim import demos, graphics
-        from saccade.sim.settings import CONFIG_FILE, PolicyConfig
+        from saccade.sim.settings import CONFIG_FILE, SimulationConfig
         from saccade.sim.tasks import check_evaluation_seeds
 
         seeds = check_evaluation_seeds(args.seed, args.episodes)
@@ -163,7 +163,7 @@ class Sweep(Study):
         if args.policies is not None:
             runs = find_runs(args.policies, cls.varied.names)
             cls.check_comparable(runs)
-            known = [PolicyConfig.from_file(run.directory / CONFIG_FILE).tasks for run in runs]
+            known = [SimulationConfig.from_file(run.directory / CONFIG_FILE).tasks for run in runs]
         else:
             if len(args.demos) > 1 and not cls.other_pictures:
                 raise InputError("demos: given several, expected one: all runs see the same pictures")

@@ -26,13 +26,16 @@ def cost(runs: Sequence[Run]) -> Rows:
     Returns:
         A row for each run: medians in milliseconds, and ratios with 95 % intervals over rounds.
     """
-    from saccade.sim.settings import CONFIG_FILE, PolicyConfig
+    from saccade.processor import Processor
+    from saccade.sim.policy import num_vl_tokens
+    from saccade.sim.settings import CONFIG_FILE, SimulationConfig
 
     rng = np.random.default_rng(0)
     heads, inputs = [], []
     for run in runs:
         head = ActionHead.load(run.directory, num_threads=1)
-        tokens = int(PolicyConfig.from_file(run.directory / CONFIG_FILE).backbone.num_tokens)
+        config = SimulationConfig.from_file(run.directory / CONFIG_FILE)
+        tokens = num_vl_tokens(Processor.load(run.directory), config)
         head.warmup(tokens)
         heads.append(head)
         inputs.append(Observation.random(head.config, tokens, rng))

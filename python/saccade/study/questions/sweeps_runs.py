@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saccade._files import sha256_of
 from saccade.errors import InputError
 
 SETTINGS_FILE = "settings.json"
@@ -44,10 +43,10 @@ class Run:
 
     @property
     def checkpoint_sha256(self) -> str:
-        """Hash of config and tensors, equal to `Policy.checkpoint_sha256`."""
-        from saccade.sim.settings import CONFIG_FILE, TENSOR_FILE
+        """Hash of all files of the policy."""
+        from saccade.sim.policy import checkpoint_sha256
 
-        return sha256_of(self.directory / CONFIG_FILE, self.directory / TENSOR_FILE)
+        return checkpoint_sha256(self.directory)
 
     @property
     def finished(self) -> bool:
@@ -62,7 +61,9 @@ def read_run(directory: Path, varied: Sequence[str]) -> Run:
         FileNotFoundError: There is none.
         InputError: Its files are not what `saccade train` writes.
     """
-    from saccade.sim.settings import CONFIG_FILE, PolicyConfig
+    from saccade.processor import Processor
+    from saccade.sim.policy import num_vl_tokens
+    from saccade.sim.settings import CONFIG_FILE, SimulationConfig
 
     if not (directory / SETTINGS_FILE).is_file():
         raise FileNotFoundError(
@@ -72,8 +73,13 @@ def read_run(directory: Path, varied: Sequence[str]) -> Run:
         settings = json.loads((directory / SETTINGS_FILE).read_text(encoding="utf-8"))
         history_file = directory / "history.json"
         history = json.loads(history_file.read_text(encoding="utf-8")) if history_file.exists() else []
-        backbone = PolicyConfig.from_file(directory / CONFIG_FILE).backbone
-        known = {**settings, **vars(backbone), "num_vl_tokens": backbone.num_tokens}
+        config = SimulationConfig.from_file(directory / CONFIG_FILE)
+        known = {
+            **settings,
+            "image_size": config.image_size,
+            "num_cameras": len(config.cameras),
+            "num_vl_tokens": num_vl_tokens(Processor.load(directory), config),
+        }
         return Run(directory.name, directory, settings, history, {name: known[name] for name in varied})
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{directory}: not written by `saccade train`: {error}") from None
