@@ -39,8 +39,9 @@ from saccade._files import writable_directory, write_json
 from saccade.environment import cpu_name
 from saccade.errors import InputError
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import DEMO_CHECKPOINT, EMBODIMENT_ID, Policy
+from saccade.sim.policy import Policy
 from saccade.sim.rollout import Episode, environment_for
+from saccade.sim.settings import EMBODIMENT_ID
 from saccade.sim.tasks import DEMO_TASKS, TASKS, check_evaluation_seeds
 from saccade.sim.video import VideoWriter
 from saccade.study.figures import COLOURS, WIDTH
@@ -60,7 +61,6 @@ class Thinker:
 
     def __init__(self) -> None:
         self.policy = Policy.load(num_threads=1)
-        self._head = saccade.ActionHead.load(DEMO_CHECKPOINT, num_threads=1)
 
     def chunk(
         self,
@@ -71,9 +71,10 @@ class Thinker:
     ) -> Float32Array:
         """The chunk `(1, horizon, action_dim)`, normalised as the head returns it; `previous` likewise."""
         observation = environment.observe()
+        head = self.policy.head
         return np.asarray(
-            self._head(
-                self.policy.features(observation),
+            head.sample(
+                head.encode(self.policy.features(observation)),
                 self.policy.state(observation),
                 EMBODIMENT_ID,
                 noise=self.policy.noise(rng),
@@ -84,7 +85,7 @@ class Thinker:
 
     def commands(self, chunk: Float32Array) -> Float32Array:
         """The commands of a chunk, `(horizon, 4)` in [-1, 1]."""
-        return np.clip(self.policy.config.action.restore(chunk[0]), -1.0, 1.0)
+        return self.policy.robot_actions(chunk[0])
 
 
 @dataclass
@@ -320,7 +321,7 @@ def run(args: argparse.Namespace, seeds: range) -> None:
     file = writable_directory(args.out) / "results.json"
     record = {
         "checkpoint_sha256": thinker.policy.checkpoint_sha256(),
-        "engine": thinker.policy.engine.describe(),
+        "engine": thinker.policy.describe(),
         "machine": {"cpu": cpu_name(), "system": platform.platform(), "python": platform.python_version()},
         "max_steps": args.max_steps,
         "episodes": [],

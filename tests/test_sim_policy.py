@@ -14,19 +14,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+import saccade
 from saccade import CheckpointError, InputError, Intervention, ShapeError
-from saccade.sim import learner
-from saccade.sim.backbone import Backbone, BackboneConfig
-from saccade.sim.instructions import Tokenizer, build_vocabulary
 from saccade.sim.policy import DEMO_CHECKPOINT, Interventions, Policy, check_trained_on
 from saccade.sim.rollout import environment_for, run_episode
-from saccade.sim.settings import PolicyConfig, Statistics
+from saccade.sim.settings import statistics_of
 
-CONFIGS = [
-    BackboneConfig(24, 2, 3, image_size=16, patch_size=4, num_cameras=2, text_length=5, vocabulary_size=7),
-    BackboneConfig(8, 0, 1, image_size=8, patch_size=2, num_cameras=1, text_length=1, vocabulary_size=1),
-    BackboneConfig(vocabulary_size=40),
-]
+Seen = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
@@ -51,24 +45,38 @@ def edit_config(checkpoint: Path, *keys: str, value: Any) -> None:
     path.write_text(json.dumps(config))
 
 
-@pytest.mark.parametrize("config", CONFIGS)
-def test_numpy_backbone_equals_torch(config: BackboneConfig) -> None:
-    torch.manual_seed(0)
-    module = learner.Backbone(config)
-    with torch.no_grad():
-        for parameter in module.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))  # also what starts at zero
+def seen(policy: Policy, *, fill: int = 0, size: int = 68, instruction: str = "open the drawer") -> Seen:
+    """What a simulator with even pictures would show."""
+    images = {camera.name: np.full((size, size, 3), fill, np.uint8) for camera in policy.config.cameras}
+    return {**policy.blank(instruction), "images": images}
+
+
+def test_the_demo_is_a_whole_checkpoint_that_anyone_can_load(demo: Policy) -> None:
+    """`saccade.Policy` gives the actions of the simulator's policy, from an observation of Isaac-GR00T's."""
+    whole = saccade.Policy.load(DEMO_CHECKPOINT, num_threads=1)
+    assert whole.embodiment_id == 0
+    assert whole.requirements.cameras is not None
+    assert [camera.name for camera in whole.requirements.cameras] == ["left", "right", "top"]
+    given, noise = seen(demo, fill=90), demo.noise(np.random.default_rng(2))
+    answer = whole.act(demo.observation(given), noise=noise)
+    assert {name: part.shape for name, part in answer.items()} == {"hand": (1, 16, 3), "gripper": (1, 16, 1)}
+    expected = np.concatenate([answer["hand"][0], answer["gripper"][0]], axis=-1).clip(-1, 1)
+    np.testing.assert_array_equal(demo.act(given, noise=noise).actions, expected)
+
+
+def test_features_are_those_of_the_reference(demo: Policy) -> None:
+    other = Policy.load(engine="torch", num_threads=1)
     rng = np.random.default_rng(1)
-    size = config.image_size
-    images = rng.integers(256, size=(3, config.num_cameras, size, size, 3), dtype=np.uint8)
-    words = rng.integers(config.vocabulary_size, size=(3, config.text_length))
-    with torch.no_grad():
-        expected = module(torch.from_numpy(images), torch.from_numpy(words)).numpy()
-    tensors = {name: tensor.numpy() for name, tensor in module.state_dict().items()}
-    features = Backbone(config, tensors)(images, words)
-    assert features.dtype == np.float32
-    assert features.shape == (3, config.num_tokens, config.width)
-    np.testing.assert_allclose(features, expected, atol=1e-5)
+    given = seen(demo)
+    given["images"] = {
+        name: rng.integers(256, size=picture.shape, dtype=np.uint8)
+        for name, picture in given["images"].items()
+    }
+    for instruction in ("reach the green ball", "smash it!", ""):
+        given["instruction"] = instruction
+        features = demo.features(given)
+        assert features.shape == (1, demo.num_vl_tokens(instruction), 128)
+        np.testing.assert_allclose(features, other.features(given), atol=2e-4)
 
 
 def test_both_engines_agree_along_a_trajectory(demo: Policy) -> None:
@@ -97,10 +105,7 @@ def test_interventions_reach_both_engines(demo: Policy, name: str) -> None:
     change = INTERVENTIONS[name]
     other = Policy.load(engine="torch", num_threads=1)
     rng = np.random.default_rng(3)
-    images = {
-        camera.name: rng.integers(256, size=(64, 64, 3), dtype=np.uint8) for camera in demo.config.cameras
-    }
-    observation = {"images": images, "proprio": demo.config.state.mean, "instruction": "open the drawer"}
+    observation = seen(demo, fill=120)
     noise = demo.noise(rng)
     plain = demo.act(observation, noise=noise).actions
     changed = demo.act(observation, noise=noise, intervention=change).actions
@@ -108,14 +113,13 @@ def test_interventions_reach_both_engines(demo: Policy, name: str) -> None:
     np.testing.assert_allclose(changed, expected, atol=1e-4)
     assert np.abs(changed - plain).max() > 1e-3
     # The same by hand, from the parts that studies use.
-    context = demo.engine.encode(demo.features(observation))
-    normalised = demo.engine.sample(context, demo.state(observation), noise, change)[0]
-    np.testing.assert_array_equal(np.clip(demo.config.action.restore(normalised), -1, 1), changed)
+    context = demo.head.encode(demo.features(observation))
+    normalised = demo.head.sample(context, demo.state(observation), 0, noise=noise, intervention=change)
+    np.testing.assert_array_equal(demo.robot_actions(np.asarray(normalised))[0], changed)
 
 
 def test_an_intervention_that_does_not_fit_is_refused(demo: Policy) -> None:
-    images = {camera.name: np.zeros((64, 64, 3), np.uint8) for camera in demo.config.cameras}
-    observation = {"images": images, "proprio": np.zeros(4), "instruction": ""}
+    observation = seen(demo)
     noise = demo.noise(np.random.default_rng(0))
     for policy in (demo, Policy.load(engine="torch", num_threads=1)):
         with pytest.raises(InputError, match="block"):
@@ -140,7 +144,7 @@ def test_episodes_take_interventions_fixed_and_by_chunk(demo: Policy) -> None:
             return super().act(observation, noise=noise, intervention=intervention)
 
     def drive(intervention: Any) -> tuple[list[Any], list[np.ndarray]]:
-        policy = Remembering(demo.config, demo.backbone, demo.engine, demo.checkpoint)
+        policy = Remembering(demo.whole, demo.config, demo.checkpoint)
         policy.given = []
         hands: list[np.ndarray] = []
         with contextlib.closing(environment_for(policy, "button-press-topdown")) as environment:
@@ -181,23 +185,15 @@ def test_shipped_checkpoint_is_small_and_has_the_released_layout(demo: Policy) -
     tensors = load_file(DEMO_CHECKPOINT / "model.safetensors")
     assert {name.split(".")[0] for name in tensors} == {"backbone", "action_head"}
     assert (DEMO_CHECKPOINT / "model.safetensors").stat().st_size < 10e6
-    head = demo.config.head
-    assert (head["num_target_vision_tokens"], head["action_horizon"], head["num_inference_timesteps"]) == (
-        32,
-        16,
-        4,
-    )
-    assert head["use_vlln"] is True
-    assert head["vl_self_attention_cfg"]["num_layers"] >= 1
+    config = demo.head.config
+    assert (config.num_future_tokens, config.action_horizon, config.num_steps) == (32, 16, 4)
+    assert config.version == "n1.5"
+    assert config.use_vlln is True
+    assert config.vl_num_layers >= 1
 
 
 def test_actions_are_bounded_and_repeatable(demo: Policy) -> None:
-    images = {camera.name: np.full((64, 64, 3), 90, np.uint8) for camera in demo.config.cameras}
-    observation = {
-        "images": images,
-        "proprio": np.array([0, 0.6, 0.2, 1]),
-        "instruction": "open the drawer",
-    }
+    observation = seen(demo, fill=90)
     noise = demo.noise(np.random.default_rng(5))
     first, second = (demo.act(observation, noise=noise) for _ in range(2))
     assert first.actions.shape == (16, 4)
@@ -207,16 +203,15 @@ def test_actions_are_bounded_and_repeatable(demo: Policy) -> None:
 
 
 def test_observations_of_the_wrong_form_are_refused(demo: Policy) -> None:
-    images = {camera.name: np.zeros((64, 64, 3), np.uint8) for camera in demo.config.cameras}
-    good = {"images": images, "proprio": np.zeros(4), "instruction": ""}
+    good = seen(demo)
+    images = good["images"]
     noise = demo.noise(np.random.default_rng(0))
     with pytest.raises(ShapeError, match="none of camera left"):
         demo.act({**good, "images": {"top": images["top"]}}, noise=noise)
     with pytest.raises(ShapeError, match="proprio"):
         demo.act({**good, "proprio": np.zeros(3)}, noise=noise)
-    small = {name: picture[:32] for name, picture in images.items()}
-    with pytest.raises(ShapeError, match="images"):
-        demo.act({**good, "images": small}, noise=noise)
+    with pytest.raises((InputError, ShapeError), match="left"):
+        demo.act({**good, "images": {**images, "left": images["left"][..., :2]}}, noise=noise)
 
 
 def test_missing_files_are_named(copied: Path) -> None:
@@ -230,16 +225,23 @@ def test_missing_files_are_named(copied: Path) -> None:
         Policy.load(copied)
 
 
+@pytest.mark.parametrize("name", ["tokenizer.json", "experiment_cfg/metadata.json"])
+def test_every_file_is_needed(copied: Path, name: str) -> None:
+    (copied / name).unlink()
+    with pytest.raises(FileNotFoundError, match=Path(name).name):
+        Policy.load(copied)
+
+
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        (("backbone_cfg", "patch_size"), 12, "not a power of two"),
-        (("backbone_cfg", "width"), "wide", "expected integers for width"),
-        (("backbone_cfg", "width"), 64, "backbone width and backbone_embedding_dim differ: 64 and 128"),
-        (("policy_cfg", "cameras"), [], "cameras and num_cameras differ: 0 and 3"),
-        (("policy_cfg", "execute_steps"), 17, "execute_steps 17 is not in 1..16"),
-        (("policy_cfg", "statistics", "state"), {}, "'mean' is missing"),
-        (("policy_cfg",), 3, "config.json"),
+        (("backbone_cfg", "eagle_config", "text_config", "hidden_size"), 64, "embed_tokens"),
+        (("backbone_cfg", "eagle_config", "vision_config", "image_size"), 32, "image size is 32"),
+        (("simulation_cfg", "cameras"), [], "cameras: expected at least one"),
+        (("simulation_cfg", "cameras"), [{"name": "left"}], "'lookat' is missing"),
+        (("simulation_cfg", "execute_steps"), 17, "execute_steps: expected 1 to 16, got 17"),
+        (("simulation_cfg", "image_size"), 3, "image_size: expected at least 8, got 3"),
+        (("simulation_cfg",), 3, "config.json"),
     ],
 )
 def test_configs_that_do_not_fit_are_refused(
@@ -256,19 +258,16 @@ def test_text_that_is_no_json_is_refused(copied: Path) -> None:
         Policy.load(copied)
 
 
-def test_backbone_lists_all_tensors_that_do_not_fit(copied: Path) -> None:
+def test_all_tensors_that_do_not_fit_are_listed(copied: Path) -> None:
     path = copied / "model.safetensors"
     tensors = load_file(path)
-    del tensors["backbone.norm.bias"]
-    tensors["backbone.surplus"] = torch.zeros(1)
-    tensors["backbone.register"] = torch.zeros(2, 128)
+    del tensors["backbone.eagle_model.mlp1.0.bias"]
+    tensors["backbone.eagle_model.surplus"] = torch.zeros(1)
     save_file(tensors, path)
     with pytest.raises(CheckpointError) as caught:
         Policy.load(copied)
-    message = str(caught.value)
-    assert "norm.bias: missing" in message
-    assert "surplus: unknown" in message
-    assert "register: shape (2, 128), expected (1, 128)" in message
+    assert "mlp1.0.bias" in str(caught.value)
+    assert "surplus" in str(caught.value)
 
 
 def test_engine_and_threads_are_checked(demo: Policy) -> None:
@@ -280,25 +279,11 @@ def test_engine_and_threads_are_checked(demo: Policy) -> None:
         check_trained_on(demo, ["reach", "sweep"])
 
 
-def test_config_survives_a_round_trip(demo: Policy) -> None:
-    values = json.loads(json.dumps(demo.config.to_dict()))
-    assert PolicyConfig.from_dict(values) == demo.config
-
-
-def test_tokenizer_pads_cuts_and_knows_what_it_does_not_know() -> None:
-    vocabulary = build_vocabulary(["open the drawer", "Press the button!"])
-    assert vocabulary == ("<pad>", "<unknown>", "button", "drawer", "open", "press", "the")
-    tokenizer = Tokenizer(vocabulary, 4)
-    assert tokenizer("Open, the DRAWER.").tolist() == [4, 6, 3, 0]
-    assert tokenizer("smash the the the the button").tolist() == [1, 6, 6, 6]
-    assert tokenizer("").tolist() == [0, 0, 0, 0]
-
-
-def test_statistics_normalise_and_restore() -> None:
-    values = np.random.default_rng(0).normal(3.0, 2.0, size=(500, 2)).astype(np.float32)
-    values[:, 1] = 7.0  # a constant dimension must not divide by zero
-    found = Statistics.of(values)
-    normalised = found.normalize(values)
-    assert abs(normalised[:, 0].std() - 1.0) < 1e-3
-    np.testing.assert_allclose(normalised[:, 1], 0.0, atol=1e-3)
-    np.testing.assert_allclose(found.restore(normalised), values, atol=1e-5)
+def test_statistics_are_those_of_the_groups() -> None:
+    values = np.random.default_rng(0).normal(3.0, 2.0, size=(500, 4)).astype(np.float32)
+    found = statistics_of(values)
+    assert {name: len(group["mean"]) for name, group in found.items()} == {"hand": 3, "gripper": 1}
+    np.testing.assert_allclose(found["hand"]["min"], values[:, :3].min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found["gripper"]["max"], values[:, 3:].max(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found["hand"]["std"], values[:, :3].std(axis=0), atol=1e-5)
+    np.testing.assert_allclose(found["hand"]["q99"], np.quantile(values[:, :3], 0.99, axis=0), atol=1e-5)

@@ -17,12 +17,13 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
 
-from saccade import CheckpointError, InputError
+from saccade import InputError
+from saccade.backbone_inputs import BackboneInputs
 from saccade.cli import main
-from saccade.config import HeadConfig
+from saccade.processor import Processor
 from saccade.sim import demos, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
-from saccade.sim.dataset import chunks, describe, later_frames, load_samples, statistics
+from saccade.sim.dataset import chunks, describe, later_frames, load_samples, prepared
 from saccade.sim.learner import Learner, pool_tokens
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.tasks import DEMONSTRATION_SEEDS
@@ -35,7 +36,10 @@ TINY = TrainingSettings(
     width=16,
     num_layers=2,
     num_heads=2,
-    backbone_layers=1,
+    language_layers=1,
+    vision_width=16,
+    vision_layers=1,
+    vision_heads=2,
     num_future_tokens=3,
     patch_size=8,
 )
@@ -50,6 +54,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for task in TASKS:
         demos.record_task(task, 2, out, RECORDING, lambda: None)
     return out
+
+
+def processor_of(settings: TrainingSettings) -> Processor:
+    """The processor of the policy that a run trains."""
+    return train.policy_config(settings, RECORDING, TASKS).processor()
 
 
 def ignore(progress: train.Progress) -> None:
@@ -124,7 +133,7 @@ def test_held_out_samples_come_from_demonstrations_of_their_own(
     recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("saccade.sim.dataset.VALIDATION_EVERY", 2)
-    training, held_out = load_samples(recording, TASKS, 4)
+    training, held_out = load_samples(recording, TASKS, 4, processor_of(TINY))
     seeds = [demonstration.proprio[0] for _, demonstration in demos.episodes(recording, "reach")]
     assert len(seeds) == 2
     assert set(map(tuple, training.targets)).isdisjoint(map(tuple, held_out.targets))
@@ -161,7 +170,9 @@ def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Pa
     train.train(recording, tmp_path, TINY, ignore)
     assert {path.name for path in tmp_path.iterdir()} == {
         "config.json",
+        "experiment_cfg",
         "model.safetensors",
+        "tokenizer.json",
         "training.pt",
         "settings.json",
         "history.json",
@@ -185,19 +196,60 @@ def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Pa
     )
 
 
+def test_padding_changes_no_gradient(recording: Path) -> None:
+    """Prompts of different lengths in a batch train as they do alone, which is how they are run."""
+    run, batches = make_batches(recording, dataclasses.replace(TINY, batch_size=6), with_later=False)
+    run.learner.double()
+    batch = batches.draw(0)
+    lengths = batch.inputs.attention_mask.sum(axis=1)
+    assert len(set(lengths)) > 1
+    features = run.learner.backbone(batch.inputs).backbone_features
+    views = len(RECORDING.cameras)
+    for row, length in enumerate(lengths):
+        pixels = batch.inputs.pixel_values
+        assert isinstance(pixels, np.ndarray)
+        alone = BackboneInputs(
+            pixels[row * views : (row + 1) * views], batch.inputs.input_ids[row : row + 1, -length:]
+        )
+        expected = run.learner.backbone(alone).backbone_features[0]
+        torch.testing.assert_close(features[row, -length:], expected)
+
+
 def test_a_run_with_other_settings_is_refused(recording: Path, tmp_path: Path) -> None:
     train.train(recording, tmp_path, TINY, ignore)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = {path.name: path.read_bytes() for path in tmp_path.rglob("*.*")}
     other = TrainingSettings(**{**vars(TINY), "seed": 1, "batch_size": 3})
     with pytest.raises(InputError, match=r"other settings \(batch_size, seed\)"):
         train.train(recording, tmp_path, other, ignore)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path.name: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
-def test_settings_that_do_not_fit_the_pictures_are_refused(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="image_size 16 is not a multiple of patch_size 32"):
-        train.train(recording, tmp_path, TrainingSettings(patch_size=32), ignore)
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("size", [0, 7])
+def test_patches_that_cannot_be_halved_are_refused(size: int) -> None:
+    with pytest.raises(InputError, match=f"patch_size: given {size}, expected an even number"):
+        TrainingSettings(patch_size=size)
+
+
+@pytest.mark.parametrize(("size", "patch", "view"), [(68, 16, 64), (64, 16, 64), (64, 8, 64), (16, 32, 32)])
+def test_the_tower_sees_whole_patches(size: int, patch: int, view: int) -> None:
+    """Preprocessing crops to 95 % and resizes to the nearest size that patches divide."""
+    settings = dataclasses.replace(TINY, patch_size=patch)
+    config = train.policy_config(settings, dataclasses.replace(RECORDING, image_size=size), TASKS)
+    assert config.processor().image_size == view
+    assert config.processor().tokens_per_view == (view // patch) ** 2
+
+
+def test_frames_are_prepared_as_the_policy_prepares_them() -> None:
+    """At 68 pixels the crop is all that is done; against a slice of the frame."""
+    config = train.policy_config(TINY, dataclasses.replace(RECORDING, image_size=68), TASKS)
+    images = np.random.default_rng(0).integers(256, size=(2, 3, 68, 68, 3), dtype=np.uint8)
+    found = prepared(images, config.processor())
+    expected = images[:, :, 2:66, 2:66].transpose(0, 1, 4, 2, 3)
+    assert found.dtype == np.uint8
+    # Isaac-GR00T truncates after it has divided and multiplied by 255.
+    assert np.abs(found.astype(int) - expected.astype(int)).max() <= 1
+    processed = config.processor()(list(images[0]), "reach the green ball").pixel_values
+    np.testing.assert_array_equal((found[0].astype(np.float32) - 127.5) / 127.5, processed)
 
 
 def test_learning_rate_warms_up_and_falls_to_zero() -> None:
@@ -233,12 +285,19 @@ def make_batches(
     recording: Path, settings: TrainingSettings, *, with_later: bool = True
 ) -> tuple[train.Run, train.Batches]:
     """A run before its first step, and what it draws from."""
-    samples, _ = load_samples(recording, TASKS, settings.horizon)
-    found = statistics(samples)
-    config = train.policy_config(settings, RECORDING, TASKS, found)
+    config = train.policy_config(settings, RECORDING, TASKS)
+    samples, _ = load_samples(recording, TASKS, settings.horizon, config.processor())
+    config = train.with_statistics(config, samples)
     run = train.new_run(settings, config, describe(recording, TASKS))
+    targets = samples.targets.mean(axis=0), samples.targets.std(axis=0) + np.float32(1e-3)
     batches = train.Batches(
-        samples, config, found["targets"], settings.batch_size, settings.absent_share, with_later
+        samples,
+        config,
+        config.processor(),
+        targets,
+        settings.batch_size,
+        absent_share=settings.absent_share,
+        with_later=with_later,
     )
     return run, batches
 
@@ -260,21 +319,21 @@ def test_later_frames_are_the_next_ones_recorded_a_horizon_on() -> None:
 
 def test_samples_point_at_their_own_demonstrations_pictures(recording: Path) -> None:
     horizon = 16
-    samples, _ = load_samples(recording, TASKS, horizon)
+    processor = processor_of(TINY)
+    samples, _ = load_samples(recording, TASKS, horizon, processor)
     row, first = 0, 0
     for task in TASKS:
         for _, demonstration in demos.episodes(recording, task):
             valid = chunks(demonstration, horizon)[1].sum(axis=(1, 2))
+            images = prepared(demonstration.images, processor)
             for frame, step in enumerate(demonstration.frame_steps):
                 if valid[frame] < 4:
                     continue  # no sample, but its picture is kept: it may be what another one leads to
-                np.testing.assert_array_equal(samples.images[samples.now[row]], demonstration.images[frame])
+                np.testing.assert_array_equal(samples.images[samples.now[row]], images[frame])
                 after = [n for n, other in enumerate(demonstration.frame_steps) if other >= step + horizon]
                 expected = after[0] if after else len(demonstration.images) - 1
                 assert samples.later[row] == first + expected
-                np.testing.assert_array_equal(
-                    samples.images[samples.later[row]], demonstration.images[expected]
-                )
+                np.testing.assert_array_equal(samples.images[samples.later[row]], images[expected])
                 row += 1
             first += len(demonstration.images)
     assert row == len(samples)
@@ -284,10 +343,12 @@ def test_samples_point_at_their_own_demonstrations_pictures(recording: Path) -> 
 def test_who_is_told_to_stand_still_sees_the_same_later(recording: Path) -> None:
     _, batches = make_batches(recording, dataclasses.replace(ALIGNED, absent_share=1.0))
     batch = batches.draw(0)
-    assert torch.equal(batch["later_images"], batch["images"])
+    assert batch.later is not None
+    np.testing.assert_array_equal(batch.later.pixel_values, batch.inputs.pixel_values)
     _, batches = make_batches(recording, dataclasses.replace(ALIGNED, batch_size=8))
     batch = batches.draw(0)
-    assert not torch.equal(batch["later_images"], batch["images"])
+    assert batch.later is not None
+    assert not np.array_equal(batch.later.pixel_values, batch.inputs.pixel_values)
 
 
 def test_pooling_means_runs_of_neighbours() -> None:
@@ -314,12 +375,14 @@ def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Pa
     handle.remove()
     losses["alignment_loss"].backward()
 
-    other = Learner(run.config.backbone, HeadConfig.from_dict(run.config.head))
+    other = Learner(run.config.backbone_sizes, run.config.head_config)
     other.load_state_dict(run.average, strict=False)
     with torch.no_grad():
-        seen = other.backbone(batch["later_images"], batch["words"])
+        assert batch.later is not None
+        seen = other.backbone(batch.later)
+        image_tokens = seen.backbone_features[seen.image_mask].reshape(3, -1, TINY.width)
         projected = run.learner.projector(rows[0][:, 1:4])
-        targets = F.adaptive_avg_pool1d(seen.mT, 3).mT
+        targets = F.adaptive_avg_pool1d(image_tokens.mT, 3).mT
         cosines = (projected * targets).sum(-1) / (projected.norm(dim=-1) * targets.norm(dim=-1))
     assert cosines.shape == (3, 3)
     torch.testing.assert_close(losses["alignment_loss"].detach(), 1 - cosines.mean())
@@ -380,7 +443,7 @@ def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) ->
         assert torch.equal(tensor, other.learner.state_dict()[name]), name
 
     torch.manual_seed(settings.seed)
-    learner = Learner(run.config.backbone, HeadConfig.from_dict(run.config.head))
+    learner = Learner(run.config.backbone_sizes, run.config.head_config)
     optimizer = torch.optim.AdamW(
         [
             {"params": [p for p in learner.parameters() if p.ndim >= 2], "weight_decay": 0.01},
@@ -392,18 +455,25 @@ def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) ->
         found = train.train_step(run, batches)
         assert found.keys() == {"loss", "target_loss"}
         batch = batches.draw(settings.seed, step)
-        assert "later_images" not in batch
+        assert batch.later is None
         for group in optimizer.param_groups:
             group["lr"] = train.learning_rate(settings, step)
         seed = np.random.default_rng((settings.seed, step, 1)).integers(2**63)
         generator = torch.Generator().manual_seed(int(seed))
-        features = learner.backbone(batch["images"], batch["words"])
-        noise = torch.randn(batch["actions"].shape, generator=generator)
+        features = learner.backbone(batch.inputs).backbone_features
+        noise = torch.randn(batch.actions.shape, generator=generator)
         time = learner.action_head.sample_time(len(noise), generator)
         flow = learner.action_head.loss(
-            features, batch["state"], 0, batch["actions"], noise=noise, time=time, action_mask=batch["mask"]
+            features,
+            batch.state,
+            0,
+            batch.actions,
+            noise=noise,
+            time=time,
+            action_mask=batch.mask,
+            drop_vl=~torch.from_numpy(batch.inputs.attention_mask),
         )
-        positions = F.mse_loss(learner.target_head(features[:, -1]), batch["targets"])
+        positions = F.mse_loss(learner.target_head(features[:, -1]), batch.targets)
         optimizer.zero_grad()
         (flow + settings.target_weight * positions).backward()
         torch.nn.utils.clip_grad_norm_(learner.parameters(), 1.0)

@@ -127,7 +127,7 @@ def tokenizer(*, published_ids: bool, words: Sequence[str] = ()) -> dict[str, An
         first = FIRST_ADDED
     else:
         for token in (*known, *parts):
-            vocabulary[token] = len(vocabulary)
+            vocabulary.setdefault(token, len(vocabulary))  # a word may be a single character
         first = len(vocabulary)
     ids = {token: first + index for index, token in enumerate(ADDED)}
     added = [

@@ -37,7 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "demonstrations per task (default: 100; 300 of reach, 200 of each of the harder tasks)",
     )
     arguments.add_integer(
-        parser, "--image-size", minimum=8, default=DEFAULT_IMAGE_SIZE, help="pixels along each side of an image"
+        parser,
+        "--image-size",
+        minimum=8,
+        default=DEFAULT_IMAGE_SIZE,
+        help="pixels along each side of an image",
     )
     arguments.add_integer(
         parser, "--frame-stride", default=3, help="control steps between recorded observations"

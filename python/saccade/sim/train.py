@@ -122,6 +122,13 @@ def policy_config(
     )
 
 
+def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
+    """The config with the statistics of states and of valid actions."""
+    valid = samples.mask[..., 0] > 0
+    recorded = {"state": samples.state, "action": samples.actions[valid]}
+    return replace(config, statistics={kind: statistics_of(values) for kind, values in recorded.items()})
+
+
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
     """A run before its first step; for `demonstrations` see `dataset.describe`."""
     torch.manual_seed(settings.seed)
@@ -267,12 +274,17 @@ def export(run: Run, out: Path) -> None:
     run.config.write(out)
 
 
+def described(config: PolicyConfig) -> Any:
+    """Config and statistics as they are read from JSON."""
+    return json.loads(json.dumps([config.to_dict(), config.metadata()]))
+
+
 def save(run: Run, out: Path) -> None:
     """Writes all files of the run."""
     out.mkdir(parents=True, exist_ok=True)
     state = {
         "settings": asdict(run.settings),
-        "config": [run.config.to_dict(), run.config.metadata()],
+        "config": described(run.config),
         "step": run.step,
         "history": run.history,
         "learner": run.learner.state_dict(),
@@ -301,7 +313,7 @@ def resume(run: Run, path: Path) -> None:
             name for name, value in asdict(run.settings).items() if state["settings"].get(name) != value
         ]
         raise InputError(f"{path}: the run was started with other settings ({', '.join(changed)})")
-    if state["config"] != [run.config.to_dict(), run.config.metadata()]:
+    if state["config"] != described(run.config):
         raise InputError(f"{path}: the run was started with other demonstrations")
     run.step, run.history = state["step"], state["history"]
     run.learner.load_state_dict(state["learner"])
@@ -317,7 +329,7 @@ def start_from(run: Run, policy: Path) -> None:
         InputError: the policy has other sizes, tasks or statistics.
     """
     found = [json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE)]
-    if found != [run.config.to_dict(), run.config.metadata()]:
+    if found != described(run.config):
         raise InputError(f"{policy}: was trained with other sizes or other demonstrations")
     tensors = load_file(policy / TENSOR_FILE)
     run.learner.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, strict=False)
@@ -353,11 +365,7 @@ def train(
     config = policy_config(settings, recording, tasks)
     processor = config.processor()
     training, validation = load_samples(demonstrations, tasks, settings.horizon, processor)
-    valid = training.mask[..., 0] > 0
-    recorded = {"state": training.state, "action": training.actions[valid]}
-    config = replace(
-        config, statistics={kind: statistics_of(values) for kind, values in recorded.items()}
-    )
+    config = with_statistics(config, training)
     if start is not None:
         settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
     run = new_run(settings, config, describe(demonstrations, tasks))

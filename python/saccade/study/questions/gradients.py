@@ -252,7 +252,7 @@ def check_demonstrations(directory: Path, source: Simulator) -> None:
         raise InputError(f"--demos: {directory} has none of {', '.join(missing)}")
     recording = demos.read_settings(directory, list(source.tasks))
     config = source.policy.config
-    given, expected = (recording.image_size, recording.cameras), (config.backbone.image_size, config.cameras)
+    given, expected = (recording.image_size, recording.cameras), (config.image_size, config.cameras)
     if given != expected:
         raise InputError(
             f"--demos: {directory} was recorded with another image size or other cameras than the policy's"
