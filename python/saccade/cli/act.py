@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -72,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
     """Loads, looks, acts and prints."""
     require("act")
     import saccade
+    from saccade.frames import instruction_of, observation, read_state
 
     pictures = named_pictures(args.image)
     state = None if args.state is None else read_state(args.state)
@@ -145,70 +145,6 @@ def named_pictures(given: list[str]) -> dict[str, Path]:
             raise UsageError(f"--image: expected CAMERA=FILE, each camera once, got {' '.join(given)}")
         found[name] = Path(file)
     return found
-
-
-def read_state(path: Path) -> Any:
-    """The state in a JSON file: numbers by key, or one list.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        UsageError: It contains something else.
-    """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: cannot be read as JSON: {error}") from None
-    rows = list(values.values()) if isinstance(values, dict) else [values]
-    if not rows or not all(is_numbers(row) for row in rows):
-        raise UsageError(f"{path}: expected lists of numbers by key, or one list of numbers")
-    return values
-
-
-def is_numbers(row: Any) -> bool:
-    """Whether a value of JSON is a list of numbers."""
-    return isinstance(row, list) and all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) for value in row
-    )
-
-
-def observation(
-    policy: Policy, pictures: Mapping[str, Path], instruction: str | None, state: Any
-) -> dict[str, Any]:
-    """An observation in Isaac-GR00T's nested form, with a batch of one.
-
-    Raises:
-        FileNotFoundError, UsageError: A picture cannot be read, or a list of the state is too short or long.
-    """
-    from saccade.cli._pictures import read_picture
-
-    given = policy.example_observation()
-    if pictures:
-        cameras = policy.requirements.cameras
-        only = cameras[0].name if cameras is not None and len(cameras) == 1 else next(iter(given["video"]))
-        horizon = policy.requirements.video_horizon or 1
-        given["video"] = {
-            name or only: np.repeat(read_picture(path)[None, None], horizon, axis=1)
-            for name, path in pictures.items()
-        }
-    if isinstance(state, list):
-        width = policy.requirements.state_width
-        if len(state) != width:
-            keys = ", ".join(f"{key} ({size})" for key, size in policy.requirements.state)
-            raise UsageError(f"--state: expected {width} numbers ({keys}), got {len(state)}")
-        state = {key: state[where] for key, where in policy.normalizer.state_slices.items()}
-    if state is not None:
-        history = policy.requirements.state_history
-        given["state"] = {
-            key: np.tile(np.asarray(values, np.float32), (1, history, 1)) for key, values in state.items()
-        }
-    if instruction is not None:
-        given["language"] = {key: [[instruction]] for key in given["language"]}
-    return given
-
-
-def instruction_of(given: Mapping[str, Any]) -> str:
-    """The instruction of an observation of `observation`."""
-    return str(next(iter(given["language"].values()))[0][0])
 
 
 def chunk(policy: Policy, actions: Mapping[str, Float32Array]) -> Section:
