@@ -59,7 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     seen.add_argument("--instruction", metavar="TEXT", help="what to do")
     seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
-    seen.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
     arguments.add_policy_options(parser)
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_num_steps(parser)
@@ -79,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     with _output.progress_bar("loading", transient=True):
         policy = saccade.Policy.load(
             args.checkpoint,
-            embodiment=embodiment(args.embodiment),
+            embodiment=args.embodiment,
             preprocessing=args.preprocessing,
             tokenizer=args.tokenizer,
             precision=arguments.precisions(args),
@@ -122,11 +121,6 @@ class Clock:
         now = time.perf_counter()
         self.milliseconds[part] = 1e3 * (now - self._last)
         self._last = now
-
-
-def embodiment(given: str | None) -> str | int | None:
-    """A tag, or an id if it is a number."""
-    return int(given) if given is not None and given.isdecimal() else given
 
 
 def named_pictures(given: list[str]) -> dict[str, Path]:
