@@ -32,7 +32,7 @@ from saccade.maps import occlusion, record
 from saccade.maps.drawing import ranges
 from saccade.maps.layout import Camera, parse_layout
 from saccade.maps.notes import NO_FUTURE, NO_IMAGES
-from saccade.maps.occlusion import BlankedPixels, DroppedPositions, cell_for, measure, places_of
+from saccade.maps.occlusion import BlankedFrames, DroppedPositions, cell_for, measure, places_of
 from saccade.maps.sheet import DOTS_PER_INCH, WIDTH, Sheet, write_sheet
 from saccade.maps.summary import Overlap, entropy, overlap, shuffle, summarize
 from saccade.maps.view import LayoutOptions, View, from_file, from_simulator
@@ -220,8 +220,10 @@ def policy() -> Policy:
 
 
 @pytest.fixture(scope="module")
-def head() -> saccade.ActionHead:
-    return saccade.ActionHead.load(DEMO_CHECKPOINT, num_threads=1)
+def head(policy: Policy) -> saccade.ActionHead:
+    found = policy.whole.head
+    assert isinstance(found, saccade.ActionHead)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -254,16 +256,18 @@ def test_blanking_a_picture_of_one_colour_changes_nothing(
     grey = np.full_like(pushed.images["top"], 90)
     observation = {
         "images": {**pushed.images, "top": grey},
-        "proprio": policy.config.state.restore(pushed.observation.state[0]),
+        "proprio": np.asarray(policy.whole.normalizer.unstate(pushed.observation.state)).ravel(),
         "instruction": pushed.source["instruction"],
     }
-    occluder = BlankedPixels(policy, observation, pushed.observation)
+    nested = policy.observation(observation)
+    occluder = BlankedFrames(policy.whole, nested, policy.whole.encode(nested), pushed.observation)
     found = measure(head, pushed.layout, occluder, lambda count: np.zeros((count, 16, 4), np.float32), cell=2)
     assert not found.change["top"].any()
     assert found.change["left"].max() > 0.01
-    # One of them by hand: the lower right quarter of the left picture.
+    # One of them by hand: the lower right quarter of what the tower sees of the left picture, rows and
+    # columns 2 to 65 of its 68.
     blanked = pushed.images["left"].copy()
-    blanked[32:, 32:] = np.rint(blanked.mean(axis=(0, 1)))
+    blanked[34:66, 34:66] = np.rint(blanked.mean(axis=(0, 1)))
     chunks = [
         head(
             policy.features({**observation, "images": images}),
@@ -580,6 +584,7 @@ def test_the_command_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[st
         "seed": 1,
         "control_steps": 8,
         "instruction": "move the hand to the green ball",
+        "views": ["left", "right", "top"],
     }
     assert found["checkpoint"]["sha256"] == Policy.load().checkpoint_sha256()
     assert found["selection"]["blocks"] == [1, 2]

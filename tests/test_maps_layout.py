@@ -13,11 +13,9 @@ from saccade.maps.layout import (
     Token,
     from_image_mask,
     from_input_ids,
-    of_policy,
     parse_grid,
     parse_layout,
 )
-from saccade.sim.backbone import BackboneConfig
 
 IMG, IMG_CONTEXT, END_IMG, END_OF_TEXT, IM_START = 151670, 151669, 151671, 151643, 151644
 
@@ -169,22 +167,6 @@ def test_positions_are_described_once() -> None:
         Layout(2, (Camera("left", 0, 1, 2),), (Token(1, "text", "x"),))
     with pytest.raises(ShapeError, match="positions 1 to 4, expected 0 to 2"):
         Layout(3, (Camera("left", 1, 2, 2),), ())
-
-
-def test_a_policy_of_the_simulator() -> None:
-    config = BackboneConfig(image_size=32, patch_size=16, num_cameras=2, text_length=4)
-    layout = of_policy(config, ["left", "top"], ["<pad>", "<unknown>", "push", "the"], "Push the cube")
-    assert layout.num_tokens == config.num_tokens
-    assert layout.cameras == (Camera("left", 0, 2, 2), Camera("top", 4, 2, 2))
-    assert [(token.kind, token.name) for token in layout.tokens] == [
-        ("text", "push"),
-        ("text", "the"),
-        ("text", "cube <unknown>"),
-        ("pad", "<pad>"),
-        ("special", "register"),
-    ]
-    longer = of_policy(config, ["left", "top"], ["push"], "push push push push push push")
-    assert [token.kind for token in longer.tokens] == ["text"] * 4 + ["special"]
 
 
 @pytest.mark.parametrize(("text", "grid"), [("16x16", (16, 16)), ("3x4", (3, 4)), ("64", (8, 8))])

@@ -144,16 +144,16 @@ def run(args: argparse.Namespace) -> int:
 def look(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
     from saccade._files import checkpoint_identity
-    from saccade.head import ActionHead
 
     checkpoint = args.checkpoint
     if checkpoint is None:
         from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
-    if args.frames is not None:
+    if args.features is not None:
+        head, view = take_features(args, checkpoint)
+    elif args.frames is not None:
         head, view = take_frames(args, checkpoint)
     else:
-        head = ActionHead.load(checkpoint, config=args.config, num_threads=args.num_threads)
-        view = take(args, checkpoint, head.config)
+        head, view = take_simulator(args, checkpoint)
     return maps_of(args, checkpoint_identity(checkpoint), head, view)
 
 
@@ -215,36 +215,46 @@ def probabilities(config: HeadConfig, view: View, blocks: int, steps: int) -> in
     return blocks * steps * config.num_heads * rows * view.layout.num_tokens
 
 
-def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> View:
-    """The observation that the arguments ask for."""
-    from saccade.errors import CheckpointError
+def take_features(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:
+    """The head of any checkpoint, and the row of a file that the arguments ask for."""
+    from saccade.head import ActionHead
     from saccade.maps import layout, view
 
-    if args.features is not None:
-        options = view.LayoutOptions(
-            text=args.layout,
-            grid=None if args.grid is None else layout.parse_grid(args.grid),
-            image_token_index=layout.IMAGE_TOKEN_INDEX
-            if args.image_token_index is None
-            else args.image_token_index,
-        )
-        return view.from_file(args.features, config, row=args.row or 0, options=options, seed=args.seed)
+    head = ActionHead.load(checkpoint, config=args.config, num_threads=args.num_threads)
+    options = view.LayoutOptions(
+        text=args.layout,
+        grid=None if args.grid is None else layout.parse_grid(args.grid),
+        image_token_index=layout.IMAGE_TOKEN_INDEX
+        if args.image_token_index is None
+        else args.image_token_index,
+    )
+    found = view.from_file(args.features, head.config, row=args.row or 0, options=options, seed=args.seed)
+    return head, found
+
+
+def take_simulator(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:
+    """The head of a policy of the simulator, and what it sees in the episode that the arguments ask for."""
+    from saccade.errors import CheckpointError
+    from saccade.maps.view import from_simulator
     from saccade.sim import graphics
     from saccade.sim.policy import Policy, check_trained_on
+    from saccade.whole import parts_of
 
     try:
         policy = Policy.load(checkpoint, num_threads=args.num_threads)
     except (CheckpointError, FileNotFoundError) as error:
-        raise UsageError(f"{error}; for another checkpoint: --features FILE") from None
+        raise UsageError(f"{error}; for another checkpoint: --frames DIR or --features FILE") from None
     known = policy.config.tasks
     task = args.task or ("push" if "push" in known else known[0])
     check_trained_on(policy, [task])
     graphics.check()
-    return view.from_simulator(policy, task, args.seed, args.after or 0)
+    return parts_of(policy.whole).head, from_simulator(policy, task, args.seed, args.after or 0)
 
 
 def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:
     """The head of a whole checkpoint, and the moment of a directory that the arguments ask for."""
+    import numpy as np
+
     from saccade.frames import read_frames
     from saccade.maps.view import from_policy
     from saccade.policy import Policy
@@ -265,11 +275,12 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     if row >= len(moments):
         raise UsageError(f"--row: given {row}, {args.frames} has moments 0 to {len(moments) - 1}")
     moment = moments[row]
+    shape = (1, policy.head.config.action_horizon, policy.head.config.encoder_action_dim)
     robot = policy.normalizer.embodiment or f"embodiment {policy.embodiment_id}"
     view = from_policy(
         policy,
         moment.observation,
-        seed=args.seed,
+        noise=np.random.default_rng(args.seed).standard_normal(shape, dtype=np.float32),
         title=f'{moment.name}: "{moment.instruction}", {robot}',
         source={
             "kind": "frames",
@@ -278,6 +289,7 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
             "embodiment_id": policy.embodiment_id,
             "precision": args.precision or "float32",
             "preprocessing": parts.processor.preprocessing,
+            "noise": f"seed {args.seed}",
         },
     )
     return parts.head, view

@@ -25,7 +25,7 @@ an uninterrupted run. The defaults are those of the bundled policy; `make demo-p
 
 examples:
   saccade train --demos out/demos --out out/policy
-  saccade train --demos out/more --start-from out/policy --training-steps 1200 --learning-rate 3e-4 --out out/next
+  saccade train --demos out/more --start-from out/policy --learning-rate 3e-4 --out out/next
   saccade train --demos out/demos --out out/n0 --num-future-tokens 0
   saccade train --demos out/demos --out out/aligned --alignment-weight 0.2
   saccade train --demos out/demos --out out/quick --training-steps 2000 --num-threads 2

@@ -12,8 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade.errors import InputError, ShapeError
-from saccade.sim.backbone import BackboneConfig
-from saccade.sim.instructions import PAD, UNKNOWN, words
 
 #: Kinds of tokens that are not image patches, in the order in which they are listed.
 OTHER_KINDS = ("text", "special", "pad")
@@ -348,22 +346,6 @@ def kind_of(position: int, text: str) -> Token:
 def is_special(text: str) -> bool:
     """Whether the text of a token is that of a special token, such as ``"</img>"``."""
     return re.fullmatch(r"<[^<>\s]+>", text) is not None
-
-
-def of_policy(
-    config: BackboneConfig, cameras: Sequence[str], vocabulary: Sequence[str], instruction: str
-) -> Layout:
-    """The layout of a policy of `saccade.sim`: pictures, then words, then the register."""
-    side = config.image_size // config.patch_size
-    patches = config.tokens_per_camera
-    placed = [Camera(name, index * patches, side, side) for index, name in enumerate(cameras)]
-    said = words(instruction)[: config.text_length]
-    named = [word if word in vocabulary else f"{word} {UNKNOWN}" for word in said]
-    start = len(cameras) * patches
-    tokens = [Token(start + index, "text", name) for index, name in enumerate(named)]
-    tokens += [Token(start + index, "pad", PAD) for index in range(len(said), config.text_length)]
-    tokens.append(Token(start + config.text_length, "special", "register"))
-    return Layout(config.num_tokens, tuple(placed), tuple(tokens))
 
 
 def readable(name: str) -> str:

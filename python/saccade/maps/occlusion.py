@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,10 +20,6 @@ from saccade.maps.layout import Camera, Layout
 from saccade.observation import Observation
 from saccade.policy import Policy
 from saccade.policy_context import PolicyContext
-
-if TYPE_CHECKING:
-    from saccade.sim.policy import Policy as SimulatorPolicy
-
 
 MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the head
 NOISES = 8  # draws that `other_noise` is computed from
@@ -68,42 +64,6 @@ class Occlusion:
         """For JSON."""
         change = {name: values.tolist() for name, values in self.change.items()}
         return {**vars(self), "change": change}
-
-
-class BlankedPixels:
-    """Removes patches from the picture: their pixels get the mean colour of the picture.
-
-    Args:
-        policy: policy with the backbone.
-        seen: observation of the simulator.
-        observation: the same as the head takes it; its state and noise are used for all chunks.
-    """
-
-    method = "the patch's pixels are replaced by the picture's mean colour, before the backbone"
-    batch = 16
-
-    def __init__(self, policy: SimulatorPolicy, seen: Mapping[str, Any], observation: Observation) -> None:
-        self._policy = policy
-        self._seen = seen
-        self._observation = observation
-
-    def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
-        """See `Occluder`."""
-        features = np.concatenate([self._policy.features(self._without(place)) for place in places])
-        repeated = self._observation.repeated(len(places))
-        return replace(repeated, backbone_features=features).sample(head)
-
-    def _without(self, place: Place | None) -> Mapping[str, Any]:
-        if place is None:
-            return self._seen
-        picture: UInt8Array = self._seen["images"][place.camera.name].copy()
-        size = picture.shape[0] // place.camera.rows
-        blanked = (
-            slice(place.rows.start * size, place.rows.stop * size),
-            slice(place.columns.start * size, place.columns.stop * size),
-        )
-        picture[blanked] = np.rint(picture.mean(axis=(0, 1))).astype(np.uint8)
-        return {**self._seen, "images": {**self._seen["images"], place.camera.name: picture}}
 
 
 class BlankedFrames:

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade._arrays import UInt8Array
+from saccade._arrays import Float32Array, UInt8Array
 from saccade.config import HeadConfig
 from saccade.dialects import read
 from saccade.errors import InputError, ShapeError
 from saccade.maps import layout as layouts
 from saccade.maps.grid import layout_of
 from saccade.maps.layout import Layout
-from saccade.maps.occlusion import BlankedFrames, BlankedPixels, DroppedPositions, Occluder
+from saccade.maps.occlusion import BlankedFrames, DroppedPositions, Occluder
 from saccade.observation import Observation, as_mask, from_arrays, read_arrays
-from saccade.policy import Policy as WholePolicy
-from saccade.sim.policy import EMBODIMENT_ID, Policy
+from saccade.policy import Policy
+from saccade.sim.policy import Policy as SimulatorPolicy
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class LayoutOptions:
     image_token_index: int = layouts.IMAGE_TOKEN_INDEX
 
 
-def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> View:
+def from_simulator(policy: SimulatorPolicy, task: str, seed: int, control_steps: int) -> View:
     """What the policy sees after a number of control steps of a rollout, with the noise of that rollout.
 
     Raises:
@@ -88,11 +88,10 @@ def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> 
                         f"{steps} steps"
                     )
     instruction = observation["instruction"]
-    cameras = [camera.name for camera in policy.config.cameras]
-    given = Observation(
-        policy.features(observation), policy.state(observation), np.array([EMBODIMENT_ID]), noise
-    )
-    return View(
+    return from_policy(
+        policy.whole,
+        policy.observation(observation),
+        noise=noise,
         title=f'{task}, seed {seed}, after {control_steps} control steps: "{instruction}"',
         source={
             "kind": "simulator",
@@ -101,24 +100,20 @@ def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> 
             "control_steps": control_steps,
             "instruction": instruction,
         },
-        observation=given,
-        layout=layouts.of_policy(policy.config.backbone, cameras, policy.config.vocabulary, instruction),
-        images={name: observation["images"][name] for name in cameras},
-        occluder=BlankedPixels(policy, observation, given),
     )
 
 
 def from_policy(
-    policy: WholePolicy, seen: Mapping[str, Any], *, seed: int, title: str, source: Mapping[str, Any]
+    policy: Policy, seen: Mapping[str, Any], *, noise: Float32Array, title: str, source: Mapping[str, Any]
 ) -> View:
     """What a whole policy sees, and what it makes of it.
 
     Args:
         policy: A policy of :meth:`saccade.Policy.load`.
         seen: An observation in Isaac-GR00T's nested form, with a batch of one.
-        seed: Seed of the noise.
+        noise: The noise that its chunk starts from, `(1, action_horizon, encoder_action_dim)`.
         title: What the observation is, on one line.
-        source: Where it comes from, for JSON; the seed of the noise and the views are added.
+        source: Where it comes from, for JSON; the views are added.
 
     Raises:
         InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.encode`.
@@ -131,12 +126,13 @@ def from_policy(
         np.asarray(features[0].backbone_features),
         np.asarray(policy.normalizer.state(reading.state)),
         np.array([policy.embodiment_id]),
+        noise,
         image_mask=np.asarray(features[0].image_mask),
-    ).with_noise(np.random.default_rng(seed), policy.head.config)
+    )
     frames = reading.frames[0]
     return View(
         title=title,
-        source={**source, "views": list(frames), "noise": f"seed {seed}"},
+        source={**source, "views": list(frames)},
         observation=given,
         layout=layout_of(policy, frames, inputs, features[0].views),
         images=dict(frames),
