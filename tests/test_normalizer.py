@@ -25,7 +25,6 @@ from safetensors.numpy import save_file
 import saccade
 from saccade import Normalizer
 from saccade.sim.policy import DEMO_CHECKPOINT
-from saccade.sim.settings import PolicyConfig
 
 Array = NDArray[np.float32]
 
@@ -461,26 +460,23 @@ def test_a_lerobot_checkpoint_with_isaacs_groups_is_read_like_isaacs(tmp_path: P
     assert np.array_equal(as_array(lerobot.actions(draw(3, 4, 8))), as_array(isaac.actions(draw(3, 4, 8))))
 
 
-# --- saccade's own, and mappings ---
+# --- mappings ---
 
 
-def test_the_demo_policys_statistics_give_the_simulations_bits() -> None:
-    normalizer, config = (
-        Normalizer.load(DEMO_CHECKPOINT),
-        PolicyConfig.from_file(DEMO_CHECKPOINT / "config.json"),
-    )
-    state, chunk = draw(3, 4), draw(3, 16, 4)
-    assert np.array_equal(as_array(normalizer.state(state)), config.state.normalize(state))
-    assert np.array_equal(as_array(normalizer.actions(chunk)), config.action.restore(chunk))
-    assert normalizer.embodiment_id == 0
+def test_an_id_may_be_given_for_a_robot_without_one() -> None:
+    """The demo's robot is none of the released code's: the id selects the head's embodiment."""
+    assert Normalizer.load(DEMO_CHECKPOINT, 0).embodiment == "metaworld_sawyer"
+    assert saccade.Policy.load(DEMO_CHECKPOINT, embodiment=0, num_threads=1).embodiment_id == 0
+    with pytest.raises(saccade.InputError, match=r"embodiment_id|embodiment"):
+        saccade.Policy.load(DEMO_CHECKPOINT, embodiment=3)
+    with pytest.raises(saccade.InputError, match="expected one of those in"):
+        Normalizer.load(DEMO_CHECKPOINT, "gr1")
 
 
 def test_mappings_may_be_lerobots_or_plain() -> None:
     plain = Normalizer.load({"state": row(3, 0), "action": row(2, 1)}, 7)
     theirs = Normalizer.load({"observation.state": row(3, 0), "action": row(2, 1)}, "gr1")
     assert (plain.embodiment, plain.embodiment_id) == (None, 7)
-    with pytest.raises(saccade.InputError, match=r"embodiment: expected None .*, got 3"):
-        Normalizer.load(DEMO_CHECKPOINT, 3)
     assert (theirs.embodiment, theirs.embodiment_id) == ("gr1", 24)
     assert np.array_equal(as_array(plain.state(draw(2, 3))), as_array(theirs.state(draw(2, 3))))
 

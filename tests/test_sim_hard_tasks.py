@@ -18,11 +18,9 @@ import saccade.sim  # noqa: F401  (registers the environments)
 from saccade import InputError
 from saccade.cli import main
 from saccade.sim import demos, graphics
-from saccade.sim.backbone import BackboneConfig
 from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
 from saccade.sim.environment import TaskEnvironment
 from saccade.sim.experts import Expert
-from saccade.sim.instructions import words
 from saccade.sim.scenarios import TOUCH, Ball, BallScenario, Fork, StereoReach, TwoGoals
 from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS, check_evaluation_seeds
 
@@ -92,12 +90,11 @@ def test_the_shipped_tasks_keep_their_numbers() -> None:
     assert set(demos.DEFAULT_COUNTS) == set(TASKS)
 
 
-def test_instructions_are_five_and_fit() -> None:
+def test_instructions_are_five() -> None:
     said = [text for task in TASKS.values() for text in task.instructions]
     assert len(set(said)) == len(said)
     for task in STUDY_TASKS:
         assert len(task.instructions) == 5
-        assert all(len(words(text)) <= BackboneConfig().text_length for text in task.instructions)
 
 
 @pytest.mark.parametrize("task", NAMES)

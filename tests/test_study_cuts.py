@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ def test_chunks_of_an_arm_are_those_of_the_reference() -> None:
         with torch.no_grad():
             vl_embs = head.encode(given.backbone_features)
             actions = head.sample(vl_embs, given.state, 0, noise=given.noise)[0].numpy()  # type: ignore[arg-type]
-        return np.clip(policy.config.action.restore(actions), -1.0, 1.0)
+        return policy.robot_actions(actions)
 
     np.testing.assert_allclose(change, np.abs(chunk(without) - chunk(reference)), atol=1e-5)
 
@@ -149,7 +150,8 @@ def without_future_tokens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shipped policy with N = 0, as `saccade train --num-future-tokens 0` writes one."""
     from safetensors.numpy import save_file
 
-    directory = tmp_path_factory.mktemp("n0")
+    directory = tmp_path_factory.mktemp("n0") / "policy"
+    shutil.copytree(DEMO_CHECKPOINT, directory)
     config = json.loads((DEMO_CHECKPOINT / "config.json").read_text())
     config["action_head_cfg"]["num_target_vision_tokens"] = 0
     (directory / "config.json").write_text(json.dumps(config))

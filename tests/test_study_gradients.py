@@ -182,7 +182,7 @@ def test_sensitivity_of_the_loss_is_autograd_s(case: tuple[ActionHead, Tensor, T
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two demonstrations as the shipped policy would see them."""
     out = tmp_path_factory.mktemp("demos")
-    settings = demos.RecordingSettings(image_size=64, frame_stride=12, cameras=DEFAULT_CAMERAS)
+    settings = demos.RecordingSettings(frame_stride=12, cameras=DEFAULT_CAMERAS)
     demos.record_task(TASK, 2, out, settings, lambda: None)
     return out
 
@@ -222,7 +222,7 @@ def test_the_study_end_to_end(recording: Path, tmp_path: Path, capsys: pytest.Ca
 
 def test_a_policy_without_future_tokens(recording: Path, tmp_path: Path) -> None:
     settings = TrainingSettings(
-        steps=1, batch_size=1, width=8, num_layers=2, num_heads=1, backbone_layers=1, num_future_tokens=0
+        steps=1, batch_size=1, width=8, num_layers=2, num_heads=1, language_layers=1, num_future_tokens=0
     )
     train.train(recording, tmp_path / "policy", settings, lambda progress: None)
     arguments = [

@@ -140,9 +140,12 @@ def test_frames_are_the_rows_of_the_reference(tmp_path: Path) -> None:
         with torch.no_grad():
             vl_embs = head.encode(look.backbone_features)
             trace = head.trace(vl_embs, look.state, 0, noise=look.noise, record=("hidden",), steps=[step])
+        assert look.image_mask is not None
+        images = look.image_mask[0]
+        assert images.sum() == 3 * 16
         expected = {
-            VL: vl_embs[0].flatten(),
-            ("features", -1, "mean"): look.backbone_features[0].mean(axis=0),
+            VL: vl_embs[0][torch.from_numpy(images)].flatten(),
+            ("features", -1, "mean"): look.backbone_features[0, images].mean(axis=0),
         }
         for block in range(head.config.num_layers):
             rows = trace.hidden[step, block][0]

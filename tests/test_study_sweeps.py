@@ -33,7 +33,7 @@ from saccade.study.table import read_provenance, read_table
 
 TASK = "button-press-topdown"
 TINY = TrainingSettings(
-    steps=2, batch_size=2, width=8, num_layers=2, num_heads=1, backbone_layers=1, patch_size=8
+    steps=2, batch_size=2, width=8, num_layers=2, num_heads=1, language_layers=1, patch_size=8
 )
 
 

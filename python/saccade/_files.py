@@ -67,8 +67,15 @@ def sha256_of(*paths: Path) -> str:
 
 
 def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
-    """`name` and `sha256` of a checkpoint; the hash covers `config.json`, if any, and the tensors."""
+    """`name` and `sha256` of a checkpoint.
+
+    The hash covers the tensors and what decides how they are used: config, tokenizer and statistics, where
+    there are such files.
+    """
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
-    config = [directory / "config.json"] if (directory / "config.json").is_file() else []
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
-    return {"name": checkpoint.resolve().name, "sha256": sha256_of(*config, *tensors)}
+    beside = [directory / name for name in ("config.json", "tokenizer.json", "experiment_cfg/metadata.json")]
+    return {
+        "name": checkpoint.resolve().name,
+        "sha256": sha256_of(*filter(Path.is_file, beside), *tensors),
+    }

@@ -127,14 +127,9 @@ def _lerobot_tags(values: Mapping[str, Any]) -> list[str | None]:
     return [None] if values.get("steps") else []
 
 
-def _own_tags(values: Mapping[str, Any]) -> list[str | None]:
-    return [None] if "policy_cfg" in values else []
-
-
 #: Files with statistics, in the order in which `Normalizer.load` tries them, and how their robots are listed.
 TAGS: dict[str, Callable[[Mapping[str, Any]], list[str | None]]] = {
     "policy_preprocessor.json": _lerobot_tags,
     "processor_config.json": _processor_tags,
     "experiment_cfg/metadata.json": _metadata_tags,
-    "config.json": _own_tags,
 }

@@ -37,8 +37,8 @@ COMMANDS: dict[str, str] = {
 }
 
 _PICTURES = ("matplotlib", "PIL")
-_TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn")
-_SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging", "threadpoolctl")
+_TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn", "threadpoolctl")
+_SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
 # The optional packages that each command needs, checked once its arguments have been: a message then names
 # all that are missing. Commands without an entry need NumPy only. See `saccade._extras` for the extras.
 NEEDS: dict[str, tuple[str, ...]] = {

@@ -2,7 +2,7 @@
 
 `reading` finds the statistics of a checkpoint and chooses their layout. Each layout has a file of its own:
 `isaac_metadata` (Isaac-GR00T N1 and N1.5), `isaac_processor` (Isaac-GR00T N1.6 and N1.7), `lerobot` and
-`flat` (saccade's own, or a mapping). `groups` has the arithmetic.
+`flat` (a mapping). `groups` has the arithmetic.
 """
 
 from saccade.robots.files import read_json

@@ -48,6 +48,9 @@ class Options:
     def choose(self, tags: Sequence[str], ids: Mapping[str, int], where: str) -> str:
         """The tag of the requested embodiment.
 
+        An id may be given for the only robot there is, if it has none: a fine-tune may name a robot that the
+        released code does not know. The id then selects the head's embodiment.
+
         Raises:
             InputError: It is not there, or several are and none is requested.
         """
@@ -58,7 +61,9 @@ class Options:
         elif isinstance(wanted, str):
             found = [tag for tag in tags if tag == wanted]
         else:
-            found = [tag for tag in tags if ids.get(tag) == integer("embodiment", wanted, least=0)]
+            asked = integer("embodiment", wanted, least=0)
+            alone = len(tags) == 1
+            found = [tag for tag in tags if ids.get(tag, asked if alone else None) == asked]
         if len(found) != 1:
             raise InputError(f"embodiment: expected one of those in {where} ({listed}), got {wanted!r}")
         return found[0]

@@ -1,4 +1,4 @@
-"""Statistics of the whole state and the whole action: saccade's own policies, and plain mappings."""
+"""Statistics of the whole state and the whole action, in plain mappings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from saccade.robots.isaac_metadata import EMBODIMENTS
 
 
 def flat_robot(
-    values: Any, options: Options, where: str, dims: Dims, embodiment_id: int | None = None
+    values: Any, options: Options, where: str, dims: Dims
 ) -> Robot:
     """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well.
 
@@ -30,11 +30,10 @@ def flat_robot(
         groups.append(builder.group(kind, found, "min_max" if has_bounds else "mean_std"))
     state, action = builder.check(groups)
     # The statistics do not name a robot, so the request does.
-    tag, asked = None, options.embodiment
-    if embodiment_id is None and asked is not None:
-        if isinstance(asked, str):
-            tag, embodiment_id = asked, EMBODIMENTS.get(asked)
-        else:
-            embodiment_id = integer("embodiment", asked, least=0)
+    tag, embodiment_id, asked = None, None, options.embodiment
+    if isinstance(asked, str):
+        tag, embodiment_id = asked, EMBODIMENTS.get(asked)
+    elif asked is not None:
+        embodiment_id = integer("embodiment", asked, least=0)
     options.check_only(tag, embodiment_id, where)
     return finished(where, options, tag, embodiment_id, (state,), (action,), dims)

@@ -59,7 +59,6 @@ class Normalizer(Robot):
         - Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``. The checkpoint does not contain the keys
           of the data config, their order and their modes. The default is all keys in the order of the file,
           min-max for continuous keys and binary for others.
-        - saccade: ``policy_cfg`` in ``config.json``.
         - A mapping or a JSON file: the contents of any of these files, or ``{"state": {"min": ..., "max":
           ...}, "action": ...}``, or the same with ``"mean"`` and ``"std"``.
 

@@ -63,26 +63,17 @@ def _metadata(folder: Path, values: Mapping[str, Any], options: Options) -> Robo
     return _from_values(values, options, where, _dims(config))
 
 
-def _own(folder: Path, values: Mapping[str, Any], options: Options) -> Robot | None:
-    """saccade's own policies, which have their statistics in the config."""
-    return _from_values(values, options, str(folder / "config.json")) if "policy_cfg" in values else None
-
-
 #: Files of a checkpoint that have statistics, in the order in which they are tried. A new layout is one more
 #: line.
 FILES: dict[str, Callable[[Path, Mapping[str, Any], Options], Robot | None]] = {
     "policy_preprocessor.json": lerobot_robot,
     "processor_config.json": _processor,
     "experiment_cfg/metadata.json": _metadata,
-    "config.json": _own,
 }
 
 
 def _from_values(values: Mapping[str, Any], options: Options, where: str, dims: Dims = (None, None)) -> Robot:
     """The robot of a mapping, or of the contents of a JSON file."""
-    if isinstance(values.get("policy_cfg"), Mapping):
-        statistics = values["policy_cfg"].get("statistics")
-        return flat_robot(statistics, options, where, _dims(values), embodiment_id=0)
     entries = [entry for entry in values.values() if isinstance(entry, Mapping)]
     if entries and all("statistics" in entry and "modalities" in entry for entry in entries):
         return metadata_robot(values, options, where, dims)

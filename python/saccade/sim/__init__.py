@@ -6,14 +6,14 @@ Importing this package registers a gymnasium environment for each task of `sacca
     >>> env = gymnasium.make("saccade/drawer-open-v0")
     >>> observation, info = env.reset(seed=5)
     >>> observation["images"]["left"].shape, observation["proprio"].shape, observation["instruction"]
-    ((64, 64, 3), (4,), 'open the drawer')
+    ((68, 68, 3), (4,), 'open the drawer')
     >>> env.close()
 
 Modules: `tasks` (instructions, seeds), `scenarios` (layouts, success, experts' actions), `cameras`,
 `environment` (observations and actions), `graphics` and `rendering` (OpenGL), `experts` and `demos`
-(demonstrations), `backbone` and `policy` (inference in NumPy), `dataset`, `learner`, `training_settings` and
-`train` (training in torch), `rollout`, `report` and `video` (closed loop). Needs the extra `sim`. Opens no
-window.
+(demonstrations), `settings` (the files of a policy), `policy` and `torch_engine` (a whole policy in the
+simulator), `dataset`, `learner`, `training_settings` and `train` (training in torch), `rollout`, `report` and
+`video` (closed loop). Needs the extra `sim`. Opens no window.
 """
 
 from saccade.sim import graphics
@@ -26,7 +26,7 @@ def register_environments() -> None:
     """Registers `saccade/<task>-v0` with gymnasium, if it is installed."""
     try:
         import gymnasium
-    except ModuleNotFoundError:  # `policy` and `backbone` need NumPy only
+    except ModuleNotFoundError:  # `policy` needs NumPy only
         return
     entry_point = "saccade.sim.environment:TaskEnvironment"
     for name in TASKS:

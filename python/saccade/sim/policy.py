@@ -14,7 +14,7 @@ import numpy as np
 
 import saccade
 from saccade._arrays import Float32Array
-from saccade._files import sha256_of
+from saccade._files import checkpoint_identity
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.intervention import Intervention
 from saccade.policy_head import Head
@@ -246,8 +246,8 @@ class Policy:
         }
 
     def checkpoint_sha256(self) -> str:
-        """SHA-256 of all files of the policy, in the order of `FILES`."""
-        return checkpoint_sha256(self.checkpoint)
+        """SHA-256 of the policy's files, see `checkpoint_identity`."""
+        return checkpoint_identity(self.checkpoint)["sha256"]
 
 
 def num_vl_tokens(processor: Processor, config: SimulationConfig, instruction: str | None = None) -> int:
@@ -258,11 +258,6 @@ def num_vl_tokens(processor: Processor, config: SimulationConfig, instruction: s
     if instruction is not None:
         texts = [instruction]
     return max(processor(frames, text).input_ids.shape[1] for text in texts)
-
-
-def checkpoint_sha256(directory: Path) -> str:
-    """SHA-256 of all files of a policy, in the order of `FILES`."""
-    return sha256_of(*(directory / name for name in FILES))
 
 
 def check_trained_on(policy: Policy, tasks: list[str]) -> None:

@@ -21,7 +21,7 @@ from saccade.sim.cameras import Camera
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
 TOKENIZER_FILE, METADATA_FILE = "tokenizer.json", "experiment_cfg/metadata.json"
-#: Every file of a policy, in the order in which they are hashed.
+#: Every file of a policy.
 FILES = (CONFIG_FILE, TENSOR_FILE, TOKENIZER_FILE, METADATA_FILE)
 
 EMBODIMENT = "metaworld_sawyer"

@@ -199,10 +199,14 @@ class Fast(Study):
         return [{"part": part, "task": task, "seed": seed, "mode": name, **measured}]
 
     def mass(self) -> list[float]:
-        """The share of the cross-attention of each vision-language position."""
+        """The share of the cross-attention of each position of T_vl, over observations that have it."""
         head = self.source.head()
         shares = [cross_mass(head, one.encode(head), one) for one in calibration_observations(self.source)]
-        return [float(share) for share in np.mean(shares, axis=0)]
+        longest = max(map(len, shares))
+        return [
+            float(np.mean([share[position] for share in shares if position < len(share)]))
+            for position in range(longest)
+        ]
 
     def step_times(self, num_steps: int) -> list[float]:
         """The best step times, without the first and the last."""

@@ -128,11 +128,17 @@ class Calibration:
         """The times of `num_steps` steps."""
         return next(grid for grid in self.times if len(grid) == num_steps + 1)
 
-    def least(self, percent: int, removed: BoolArray | None) -> BoolArray:
-        """Which positions are removed, `(1, T_vl)`: `percent` of those not `removed` yet, rounded down."""
-        gone = np.zeros((1, len(self.mass)), bool) if removed is None else removed.copy()
+    def least(self, percent: int, removed: BoolArray) -> BoolArray:
+        """Which positions are removed: `percent` of those not `removed` yet, rounded down, `(1, T_vl)` each.
+
+        Positions that no calibrated observation had, those of longer instructions, go last.
+        """
+        gone = removed.copy()
+        mass = np.full(gone.shape[1], np.inf)
+        known = self.mass[: len(mass)]
+        mass[: len(known)] = known
         there = np.flatnonzero(~gone[0])
-        order = there[np.argsort(np.asarray(self.mass)[there], kind="stable")]
+        order = there[np.argsort(mass[there], kind="stable")]
         gone[0, order[: len(there) * percent // 100]] = True
         return gone
 
@@ -145,8 +151,9 @@ class Calibration:
 def encode(head: ActionHead, mode: Mode, calibration: Calibration, observation: Observation) -> Context:
     """A single observation as the mode encodes it."""
     if mode.drop:
-        removed = calibration.least(mode.drop, observation.drop_vl)
-        observation = dataclasses.replace(observation, drop_vl=removed)
+        there = observation.drop_vl
+        removed = np.zeros((1, observation.num_vl_tokens), np.bool_) if there is None else there
+        observation = dataclasses.replace(observation, drop_vl=calibration.least(mode.drop, removed))
     return observation.encode(head)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from saccade._files import checkpoint_identity
 from saccade.errors import InputError
 
 SETTINGS_FILE = "settings.json"
@@ -43,10 +44,8 @@ class Run:
 
     @property
     def checkpoint_sha256(self) -> str:
-        """Hash of all files of the policy."""
-        from saccade.sim.policy import checkpoint_sha256
-
-        return checkpoint_sha256(self.directory)
+        """Hash of the policy's files, equal to `Policy.checkpoint_sha256`."""
+        return checkpoint_identity(self.directory)["sha256"]
 
     @property
     def finished(self) -> bool:
