@@ -18,7 +18,7 @@ import saccade.sim  # noqa: F401  (registers the environments)
 from saccade import InputError
 from saccade.cli import main
 from saccade.sim import demos, graphics
-from saccade.sim.cameras import DEFAULT_CAMERAS, Camera
+from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, Camera
 from saccade.sim.environment import TaskEnvironment
 from saccade.sim.experts import Expert
 from saccade.sim.scenarios import TOUCH, Ball, BallScenario, Fork, StereoReach, TwoGoals
@@ -156,7 +156,7 @@ def test_proprioception_and_words_do_not_depend_on_the_layout(task: str) -> None
 
 @pytest.mark.parametrize("task", NAMES)
 def test_every_ball_is_drawn_where_it_is(task: str) -> None:
-    size = 64
+    size = DEFAULT_IMAGE_SIZE
     with make(task) as environment:
         for seed in range(8):
             images = environment.reset(seed=seed)[0]["images"]
