@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,11 @@ from saccade.maps.grid import layout_of
 from saccade.maps.layout import Layout
 from saccade.maps.occlusion import BlankedFrames, BlankedPixels, DroppedPositions, Occluder
 from saccade.observation import Observation, as_mask, from_arrays, read_arrays
-from saccade.policy import Policy as WholePolicy
-from saccade.sim.policy import EMBODIMENT_ID, Policy
+from saccade.policy import Policy
+from saccade.whole import as_head_takes_it
+
+if TYPE_CHECKING:
+    from saccade.sim.policy import Policy as SimulatorPolicy
 
 
 @dataclass(frozen=True)
@@ -60,12 +63,13 @@ class LayoutOptions:
     image_token_index: int = layouts.IMAGE_TOKEN_INDEX
 
 
-def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> View:
+def from_simulator(policy: SimulatorPolicy, task: str, seed: int, control_steps: int) -> View:
     """What the policy sees after a number of control steps of a rollout, with the noise of that rollout.
 
     Raises:
         InputError: the episode ends before that.
     """
+    from saccade.sim.policy import EMBODIMENT_ID
     from saccade.sim.rollout import environment_for
     from saccade.sim.tasks import TASKS
 
@@ -109,7 +113,7 @@ def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> 
 
 
 def from_policy(
-    policy: WholePolicy, seen: Mapping[str, Any], *, seed: int, title: str, source: Mapping[str, Any]
+    policy: Policy, seen: Mapping[str, Any], *, seed: int, title: str, source: Mapping[str, Any]
 ) -> View:
     """What a whole policy sees, and what it makes of it.
 
@@ -123,17 +127,12 @@ def from_policy(
     Raises:
         InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.encode`.
     """
-    reading = read(seen, policy.requirements)
     (inputs,) = policy.inputs(seen)
     features = policy.features([inputs])
     encoded = policy.context(features)
-    given = Observation(
-        np.asarray(features[0].backbone_features),
-        np.asarray(policy.normalizer.state(reading.state)),
-        np.array([policy.embodiment_id]),
-        image_mask=np.asarray(features[0].image_mask),
-    ).with_noise(np.random.default_rng(seed), policy.head.config)
-    frames = reading.frames[0]
+    given = as_head_takes_it(policy, seen, features[0])
+    given = given.with_noise(np.random.default_rng(seed), policy.head.config)
+    frames = read(seen, policy.requirements).frames[0]
     return View(
         title=title,
         source={**source, "views": list(frames), "noise": f"seed {seed}"},

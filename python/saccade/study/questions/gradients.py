@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade._arguments import add_integer, add_rollout_arguments
+from saccade._arguments import add_frames, add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS
 from saccade.observation import MASKS, Observation
@@ -27,7 +27,7 @@ from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
 from saccade.study.paths import PATHS
 from saccade.study.questions.gradients_section import section
-from saccade.study.recording import Recording
+from saccade.study.recording import Recorded
 from saccade.study.section import Section
 from saccade.study.source import Source
 from saccade.study.study import Study
@@ -76,6 +76,7 @@ class Gradients(Study):
         """See `Study`."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=10)
+        add_frames(parser)
         add_integer(
             parser,
             "--num-observations",
@@ -194,7 +195,7 @@ class Gradients(Study):
         """The generator of the random projections of a cell."""
         import torch
 
-        given = (self.source.seed, seed) if isinstance(self.source, Recording) else (seed, *map(ord, task))
+        given = (self.source.seed, seed) if isinstance(self.source, Recorded) else (seed, *map(ord, task))
         return torch.Generator().manual_seed(int(np.random.default_rng(given).integers(2**31)))
 
     def of_loss(self, task: str, seed: int) -> Rows:

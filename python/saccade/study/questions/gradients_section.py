@@ -10,7 +10,7 @@ from saccade.study.changes import recorded
 from saccade.study.paths import DETOUR, DIRECT, PATHS, READ
 from saccade.study.section import Figure, Grid, Prose, Section, number
 from saccade.study.statistics import Estimate, bootstrap
-from saccade.study.table import Provenance, clusters_of, from_file
+from saccade.study.table import Provenance, clusters_of, is_recorded
 
 LABELS = {"actions": "change of the chunk (norm)", "loss": "change of the loss"}
 
@@ -22,7 +22,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     paths = table[table["path"].notna()] if "path" in table else table.iloc[:0]
     prose = Prose(
         "gradients",
-        recorded=recorded(table, table, provenance) if from_file(provenance) else None,
+        recorded=recorded(table, table, provenance) if is_recorded(provenance) else None,
         checkpoint=settings["checkpoint"],
         episodes=episodes.get("actions", 0),
         looks=settings.get("looks"),
