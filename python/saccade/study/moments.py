@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from saccade._files import checkpoint_identity
+from saccade.backbone_config import BackboneConfig
 from saccade.backbone_inputs import BackboneInputs
 from saccade.dialects import read
 from saccade.errors import InputError
@@ -111,6 +112,7 @@ class Looked:
         observation, other_observation: The same as the head takes them; None without others.
         inputs: What the backbone was given for each of `moments`.
         layouts: What is at each position of each of `moments`.
+        backbone_config: Config of the backbone.
     """
 
     head: ActionHead
@@ -122,6 +124,7 @@ class Looked:
     other_observation: Observation | None
     inputs: Sequence[BackboneInputs]
     layouts: Sequence[Layout]
+    backbone_config: BackboneConfig
 
 
 @functools.lru_cache(maxsize=1)
@@ -164,6 +167,7 @@ def look(source: Moments) -> Looked:
         other_observation=joined(compared, others) if others else None,
         inputs=given,
         layouts=layouts,
+        backbone_config=parts.backbone.config,
     )
 
 
