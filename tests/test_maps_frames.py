@@ -98,7 +98,7 @@ def test_texts_of_no_tokens() -> None:
         with pytest.raises(saccade.InputError, match=f"of the tokenizer's .* got {wrong}"):
             processor.texts([wrong])
     with pytest.raises(saccade.ShapeError, match=r"expected \(tokens,\)"):
-        processor.texts([[1]])  # type: ignore[list-item]
+        processor.texts([[1]])
 
 
 def grey(frames: NDArray[np.uint8], rows: slice, columns: slice) -> NDArray[np.uint8]:
@@ -175,7 +175,12 @@ def test_occlusion_is_the_policy_on_changed_frames() -> None:
 
     done: list[int] = []
     found = measure(
-        head, view.layout, view.occluder, lambda count: np.zeros((count, 1, 1)), cell=4, on_done=done.append
+        head,
+        view.layout,
+        view.occluder,
+        lambda count: np.zeros((count, 1, 1), np.float32),
+        cell=4,
+        on_done=done.append,
     )
     assert done == [2]
     # The processor keeps 38 of 40 rows from 1 on and 45 of 48 columns from 2 on, and a cell is all of them.
@@ -190,7 +195,7 @@ def test_a_map_covers_the_part_of_the_picture_that_tokens_see() -> None:
     picture, heat = np.zeros((4, 8, 3), np.uint8), np.ones((2, 2), np.float32)
     show(axes, (10.0, 12.0, 1.0, 0.0), picture, heat, 1.0, HEAT, (0.25, 0.5, 0.75, 1.5))
     drawn = axes.get_images()[-1]
-    assert drawn.get_extent() == [10.5, 11.5, 1.5, 0.5]
+    assert tuple(drawn.get_extent()) == (10.5, 11.5, 1.5, 0.5)
     assert drawn.get_clip_box() is not axes.bbox  # cut off at the picture
 
 
