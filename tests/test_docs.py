@@ -31,7 +31,10 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 #: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
-NEED_CHECKPOINTS = ("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md")
+NEED_CHECKPOINTS = (
+    *("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md"),
+    "frames.md",
+)
 MODULES = sorted(
     info.name
     for info in pkgutil.walk_packages(saccade.__path__, "saccade.")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frames_cases import write_moment
 from numpy.typing import NDArray
 from PIL import Image
 from policy_cases import policy
@@ -26,21 +27,12 @@ def isaac() -> Policy:
     return policy("isaac")
 
 
-def write(folder: Path, seed: int = 0, names: tuple[str, ...] = ("front.png", "wrist.png")) -> Path:
-    """A picture for each name."""
-    folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(seed)
-    for name in names:
-        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)).save(folder / name)
-    return folder
-
-
 def pixels(path: Path) -> NDArray[np.uint8]:
     return np.asarray(Image.open(path).convert("RGB"))
 
 
 def test_a_directory_of_pictures_is_one_moment(isaac: Policy, tmp_path: Path) -> None:
-    folder = write(tmp_path / "table")
+    folder = write_moment(tmp_path / "table")
     (folder / "notes.txt").write_text("not a picture")
     (folder / ".front.jpg").write_text("hidden")
     (folder / "state.json").write_text(json.dumps(STATE))
@@ -55,7 +47,7 @@ def test_a_directory_of_pictures_is_one_moment(isaac: Policy, tmp_path: Path) ->
 
 
 def test_what_is_not_given_is_that_of_the_example(isaac: Policy, tmp_path: Path) -> None:
-    (moment,) = read_frames(write(tmp_path), isaac)
+    (moment,) = read_frames(write_moment(tmp_path), isaac)
     example = isaac.example_observation()
     assert moment.observation["language"] == example["language"]
     for key, values in example["state"].items():
@@ -64,7 +56,7 @@ def test_what_is_not_given_is_that_of_the_example(isaac: Policy, tmp_path: Path)
 
 def test_folders_are_moments_in_the_order_of_their_numbers(isaac: Policy, tmp_path: Path) -> None:
     for number in (1, 2, 10):
-        write(tmp_path / f"step{number}", number)
+        write_moment(tmp_path / f"step{number}", number)
     (tmp_path / "step2" / "state.json").write_text(json.dumps([0.0] * 7))
     (tmp_path / "other.json").write_text(json.dumps(STATE))
     found = read_frames(tmp_path, isaac, state=tmp_path / "other.json")
@@ -79,7 +71,7 @@ def test_folders_are_moments_in_the_order_of_their_numbers(isaac: Policy, tmp_pa
 
 def test_folders_of_folders_are_episodes(isaac: Policy, tmp_path: Path) -> None:
     for name in ("pour/1", "pour/2", "wipe/1"):
-        write(tmp_path / name)
+        write_moment(tmp_path / name)
     found = read_frames(tmp_path, isaac)
     assert [(moment.name, moment.episode) for moment in found] == [
         ("pour/1", "pour"),
@@ -90,14 +82,14 @@ def test_folders_of_folders_are_episodes(isaac: Policy, tmp_path: Path) -> None:
 
 def test_without_known_cameras_every_picture_is_a_view(tmp_path: Path) -> None:
     any_camera = policy("nvidia", CameraSources())
-    folder = write(tmp_path, names=("left.jpg", "above.png"))
+    folder = write_moment(tmp_path, names=("left.jpg", "above.png"))
     (moment,) = read_frames(folder, any_camera)
     assert list(moment.observation["video"]) == ["above", "left"]
 
 
 def test_a_picture_stands_for_all_frames_of_its_camera(tmp_path: Path) -> None:
     both = policy("n16", CameraSources(video_horizon=2))
-    (moment,) = read_frames(write(tmp_path, names=("front.png",)), both)
+    (moment,) = read_frames(write_moment(tmp_path, names=["front.png"]), both)
     frames = moment.observation["video"]["front"]
     assert frames.shape == (1, 2, HEIGHT, WIDTH, 3)
     assert np.array_equal(frames[0, 0], frames[0, 1])
@@ -108,32 +100,32 @@ def broken(folder: Path, kind: str) -> dict[str, Any]:
     if kind == "empty":
         folder.mkdir()
     elif kind == "empty moment":
-        write(folder / "1")
+        write_moment(folder / "1")
         (folder / "2").mkdir()
     elif kind == "too deep":
-        write(folder / "a" / "b" / "c")
+        write_moment(folder / "a" / "b" / "c")
     elif kind == "missing":
-        write(folder / "1")
-        write(folder / "2", names=("front.png",))
+        write_moment(folder / "1")
+        write_moment(folder / "2", names=["front.png"])
     elif kind == "unknown":
-        write(folder, names=("front.png", "wrist.png", "depth.png"))
+        write_moment(folder, names=("front.png", "wrist.png", "depth.png"))
     elif kind == "twice":
-        write(folder, names=("front.png", "front.jpg", "wrist.png"))
+        write_moment(folder, names=("front.png", "front.jpg", "wrist.png"))
     elif kind == "both":
-        write(write(folder) / "1")
+        write_moment(write_moment(folder) / "1")
     elif kind == "size":
-        write(folder)
+        write_moment(folder)
         Image.fromarray(np.zeros((3, 2, 3), np.uint8)).save(folder / "front.png")
     elif kind == "text":
-        (write(folder) / "front.png").write_text("no picture")
+        (write_moment(folder) / "front.png").write_text("no picture")
     elif kind == "state":
-        (write(folder) / "state.json").write_text("[1.0]")
+        (write_moment(folder) / "state.json").write_text("[1.0]")
     elif kind == "part":
-        (write(folder) / "state.json").write_text('{"arm": [0, 0, 0, 0, 0]}')
+        (write_moment(folder) / "state.json").write_text('{"arm": [0, 0, 0, 0, 0]}')
     elif kind == "huge":
-        (write(folder) / "state.json").write_text(f'{{"arm": [{10**400}]}}')
+        (write_moment(folder) / "state.json").write_text(f'{{"arm": [{10**400}]}}')
     elif kind == "no state":
-        write(folder)
+        write_moment(folder)
         return {"state": folder / "missing.json"}
     return {}
 
@@ -173,4 +165,4 @@ def test_paths_that_are_not_there(isaac: Policy, tmp_path: Path) -> None:
 
 def test_an_instruction_must_be_text(isaac: Policy, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected valid Unicode"):
-        read_frames(write(tmp_path), isaac, instruction="\ud800")
+        read_frames(write_moment(tmp_path), isaac, instruction="\ud800")

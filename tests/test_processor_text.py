@@ -10,6 +10,7 @@ from collections.abc import Callable
 import hypothesis
 import numpy as np
 import pytest
+import tokenizers
 from hypothesis import strategies as st
 from processor_cases import BLACK, TOKENIZER
 
@@ -75,3 +76,11 @@ def test_quotes_and_escapes(text: str) -> None:
     found, expected = as_a_list(text)
     assert found == expected
     assert np.asarray(found).size
+
+
+@pytest.mark.parametrize("processor", [N15, N17])
+def test_texts_are_those_of_the_package(processor: saccade.Processor) -> None:
+    package = tokenizers.Tokenizer.from_file(str(TOKENIZER))
+    ids = list(package.get_vocab(with_added_tokens=True).values())
+    expected = [package.decode([one], skip_special_tokens=False) for one in ids]
+    assert processor.texts(ids) == expected

@@ -126,7 +126,7 @@ def test_released_weights_in_one_file(tmp_path: Path, capsys: pytest.CaptureFixt
     arguments = ("--config", str(tmp_path / "c.json"), "--arms", "future-unread")
     assert study("cuts", given.path, given.path, tmp_path / "out", *arguments) == 0
     printed = capsys.readouterr().out
-    assert "The file does not say which episode" in printed
+    assert "It is not known which episode" in printed
     assert "another noise" not in printed
     table = read_table(tmp_path / "out" / "cuts.csv").set_index(["arm", "seed"])
     without = ActionHead.load(given.path, config=given.config, dtype=torch.float64)
@@ -144,7 +144,7 @@ def test_patching_pairs_and_numbers(tmp_path: Path) -> None:
     # The next one, going round, of another episode with the same embodiment; 0 and 4 are of one episode.
     donors = table.groupby("seed")["donor_seed"].first()
     assert donors[[1, 2, 3]].tolist() == [2, 1, 1]
-    assert table[table["seed"].isin([0, 4])]["note"].str.startswith("the file has no donor").all()
+    assert table[table["seed"].isin([0, 4])]["note"].str.startswith("there is no donor").all()
     # Everything the donor's run had after every step's last patched block, by the reference.
     arrays, head = np.load(file), ActionHead.load(checkpoint, dtype=torch.float64)
     noise = arrays["noise"][1:2]

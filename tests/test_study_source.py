@@ -23,7 +23,7 @@ from saccade.study.arms import METRICS, Arm, Metric
 from saccade.study.cell import Cell
 from saccade.study.questions.cuts import ARMS, Cuts
 from saccade.study.questions.resized import arms_of, merge
-from saccade.study.recording import TASK, Recording
+from saccade.study.recording import Recording
 from saccade.study.run import run
 from saccade.study.study import STUDIES, Study, load_study
 from saccade.study.table import read_provenance
@@ -113,7 +113,7 @@ def test_a_changed_arm_is_measured_again(tmp_path: Path) -> None:
     measured(2.0)
     assert done == []
     other = measured(3.0)
-    assert done == [f"{TASK} {row} future-doubled" for row in range(5)]
+    assert done == [f"{Recording.task} {row} future-doubled" for row in range(5)]
     assert not np.allclose(once["chunk_change"], other["chunk_change"])
 
 

@@ -267,7 +267,10 @@ def embodiment(word: str) -> str | int:
 
 
 #: The flags that `add_frames` declares besides `--frames`.
-WITH_FRAMES = ("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer")
+WITH_FRAMES = (
+    *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
+    *("other_frames", "other_instruction"),  # of `saccade study patching`
+)
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:

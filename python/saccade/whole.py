@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from saccade.backbone import Backbone
+from saccade.backbone_features import BackboneFeatures
+from saccade.dialects import read
 from saccade.errors import InputError
 from saccade.head import ActionHead
+from saccade.observation import Observation
 from saccade.policy import Policy
 from saccade.processor import Processor
 
@@ -30,3 +37,21 @@ def parts_of(policy: Policy) -> Parts:
     if backbone is None or processor is None or not isinstance(head, ActionHead):
         raise InputError(f"policy: expected one that saccade.Policy.load loaded, got {policy!r}")
     return Parts(head, backbone, processor)
+
+
+def as_head_takes_it(policy: Policy, seen: Mapping[str, Any], features: BackboneFeatures) -> Observation:
+    """One observation of a whole policy as its head takes it, without noise.
+
+    Args:
+        policy: The policy.
+        seen: The observation, in a form of :meth:`saccade.Policy.encode`.
+        features: What the backbone made of it, a batch of one.
+    """
+    state = read(seen, policy.requirements).state
+    reads_mask = policy.head.config.mask_mode == "alternate"
+    return Observation(
+        np.asarray(features.backbone_features),
+        np.asarray(policy.normalizer.state(state)),
+        np.array([policy.embodiment_id]),
+        image_mask=np.asarray(features.image_mask) if reads_mask else None,
+    )

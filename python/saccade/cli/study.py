@@ -92,7 +92,8 @@ def run(args: argparse.Namespace) -> int:
     if args.study == "report":
         require("study report")
         return run_report(args)
-    require("study" if getattr(args, "features", None) is None else "study --features")
+    recorded = [getattr(args, name, None) for name in ("features", "frames")]
+    require("study" if recorded == [None, None] else "study --features")
     return measure(args)
 
 
@@ -102,7 +103,8 @@ def measure(args: argparse.Namespace) -> int:
     from saccade.study.run import run as run_study
 
     check_workers(args.backend, args.jobs)
-    study = load_study(args.study).from_arguments(args)
+    with _output.progress_bar("loading", transient=True):
+        study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
     with _output.progress_bar(args.study) as update:
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,10 @@ from saccade.maps.layout import Layout
 from saccade.maps.occlusion import BlankedFrames, DroppedPositions, Occluder
 from saccade.observation import Observation, as_mask, from_arrays, read_arrays
 from saccade.policy import Policy
-from saccade.sim.policy import Policy as SimulatorPolicy
+from saccade.whole import as_head_takes_it
+
+if TYPE_CHECKING:
+    from saccade.sim.policy import Policy as SimulatorPolicy
 
 
 @dataclass(frozen=True)
@@ -118,18 +121,11 @@ def from_policy(
     Raises:
         InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.encode`.
     """
-    reading = read(seen, policy.requirements)
     (inputs,) = policy.inputs(seen)
     features = policy.features([inputs])
     encoded = policy.context(features)
-    given = Observation(
-        np.asarray(features[0].backbone_features),
-        np.asarray(policy.normalizer.state(reading.state)),
-        np.array([policy.embodiment_id]),
-        noise,
-        image_mask=np.asarray(features[0].image_mask),
-    )
-    frames = reading.frames[0]
+    given = replace(as_head_takes_it(policy, seen, features[0]), noise=noise)
+    frames = read(seen, policy.requirements).frames[0]
     return View(
         title=title,
         source={**source, "views": list(frames)},

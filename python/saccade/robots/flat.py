@@ -13,9 +13,7 @@ from saccade.robots.groups import Robot
 from saccade.robots.isaac_metadata import EMBODIMENTS
 
 
-def flat_robot(
-    values: Any, options: Options, where: str, dims: Dims
-) -> Robot:
+def flat_robot(values: Any, options: Options, where: str, dims: Dims) -> Robot:
     """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well.
 
     Raises:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from saccade._arguments import check_tasks
+from saccade._arguments import check_frames, check_tasks
 from saccade.errors import InputError
+from saccade.study.moments import Moments
 from saccade.study.recording import Recording
 from saccade.study.source import Source
 
@@ -18,14 +19,19 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
     """Creates the source from parsed arguments.
 
     Args:
-        args: as `saccade._arguments.add_rollout_arguments` declares them.
-        refused: options of the study that cannot be used with a file of features.
+        args: as `saccade._arguments.add_rollout_arguments` declares them, and for studies that take
+            pictures `add_frames`.
+        refused: options of the study that cannot be used with recorded observations.
 
     Raises:
         InputError: an argument is wrong, or cannot be combined with another one.
         FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
         GraphicsError: the simulator is needed and cannot draw here.
     """
+    if "frames" in args:
+        check_frames(args, "features", "config", "tasks", "episodes", *refused)
+        if args.frames is not None:
+            return moments_of(args)
     if args.features is not None:
         return recording_of(args, *refused)
     if args.config is not None:
@@ -60,14 +66,8 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
         raise InputError(
             f"{flags}: not with --features, whose observations are measured as they are, without a simulator"
         )
-    if args.seed < 0:
-        raise InputError(f"--seed: given {args.seed}, expected at least 0")
-    if args.checkpoint is None:
-        from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
-    else:
-        checkpoint = args.checkpoint
     found = Recording(
-        checkpoint=str(checkpoint),
+        checkpoint=checkpoint_of(args),
         file=str(args.features),
         config_file=None if args.config is None else str(args.config),
         seed=args.seed,
@@ -77,3 +77,32 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
     found.head()
     _ = found.all
     return found
+
+
+def moments_of(args: argparse.Namespace) -> Moments:
+    """Creates a source of pictures from parsed arguments, and looks at them; errors as `source_of`."""
+    found = Moments(
+        checkpoint=checkpoint_of(args),
+        frames=str(args.frames),
+        instruction=args.instruction,
+        state=None if args.state is None else str(args.state),
+        other_frames=None if getattr(args, "other_frames", None) is None else str(args.other_frames),
+        other_instruction=getattr(args, "other_instruction", None),
+        embodiment=args.embodiment,
+        precision=args.precision or "float32",
+        preprocessing=args.preprocessing,
+        tokenizer=None if args.tokenizer is None else str(args.tokenizer),
+        seed=args.seed,
+        num_threads=None if args.jobs == 1 else 1,
+    )
+    _ = found.all
+    return found
+
+
+def checkpoint_of(args: argparse.Namespace) -> str:
+    """The checkpoint that was given, or the bundled one."""
+    if args.checkpoint is None:
+        from saccade.sim.policy import DEMO_CHECKPOINT
+
+        return str(DEMO_CHECKPOINT)
+    return str(args.checkpoint)

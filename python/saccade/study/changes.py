@@ -112,9 +112,12 @@ def recorded(table: pd.DataFrame, measured: pd.DataFrame, provenance: Provenance
         measured: The rows that intervals are computed from.
     """
     settings = provenance.settings
-    known = settings["features"]["episodes"] is not None
+    has_pictures = "frames" in settings
+    given = settings["frames" if has_pictures else "features"]
+    known = given["episodes"] is not None
     return {
-        "features": settings["features"],
+        "has_pictures": has_pictures,
+        "given": given,
         "checkpoint": settings["checkpoint"],
         "observations": table["seed"].nunique(),
         "episodes": table["episode"].nunique() if known else None,

@@ -56,22 +56,44 @@ def path_derivatives(
     Returns:
         Each path of `PATHS` and their sum `ALL_PATHS`, `(projections, T_vl, context_dim)`.
     """
-    count = len(cotangents)
 
     def derivative(stopped: Sequence[tuple[str, str]]) -> Tensor:
-        leaf = vl_embs.detach().repeat(count, 1, 1).requires_grad_()
-        actions = head.sample(
-            leaf,
-            state.expand(count, *state.shape[1:]),
-            noise=noise.expand(count, -1, -1),
-            stop_gradient=stopped,
-            **conditions(count, embodiment_id, masks),
-        )
-        # Rows of a batch do not interact: each copy of the tokens gets the derivative of its own projection.
-        return torch.autograd.grad((actions * cotangents).sum(), leaf)[0]
+        return vl_derivative(head, vl_embs, state, noise, cotangents, embodiment_id, masks, stopped)
 
     whole, direct, read = derivative(()), derivative(LEAVING_FUTURE), derivative(READ_BY_OTHERS)
     return {DIRECT: direct, READ: read, DETOUR: whole - direct - read, ALL_PATHS: whole}
+
+
+def vl_derivative(
+    head: ActionHead,
+    vl_embs: Tensor,
+    state: Tensor,
+    noise: Tensor,
+    cotangents: Tensor,
+    embodiment_id: int = 0,
+    masks: Mapping[str, Tensor] = NO_MASKS,
+    stopped: Sequence[tuple[str, str]] = (),
+) -> Tensor:
+    """Derivatives of projections of the actions by the vision-language tokens.
+
+    Args:
+        head, vl_embs, state, noise, cotangents, embodiment_id, masks: As in `path_derivatives`.
+        stopped: Pairs (reader, source) through which no derivative passes.
+
+    Returns:
+        `(projections, T_vl, context_dim)`.
+    """
+    count = len(cotangents)
+    leaf = vl_embs.detach().repeat(count, 1, 1).requires_grad_()
+    actions = head.sample(
+        leaf,
+        state.expand(count, *state.shape[1:]),
+        noise=noise.expand(count, -1, -1),
+        stop_gradient=stopped,
+        **conditions(count, embodiment_id, masks),
+    )
+    # Rows of a batch do not interact: each copy of the tokens gets the derivative of its own projection.
+    return torch.autograd.grad((actions * cotangents).sum(), leaf)[0]
 
 
 @dataclass(frozen=True)

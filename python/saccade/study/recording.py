@@ -1,8 +1,9 @@
-"""A recording as a source: a file of backbone features for any checkpoint, without a simulator."""
+"""Recorded observations as a source, without a simulator: what any have in common, and a file of features."""
 
 from __future__ import annotations
 
 import functools
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,71 +19,40 @@ from saccade.intervention import Intervention
 from saccade.observation import Observation
 from saccade.study.source import Source, episode_rng
 
-TASK = "features"  # in the tables, in place of the simulator's task
-NOISES = 4  # drawn for each observation if the file has none
+NOISES = 4  # drawn for each observation that has none
 
 
-@dataclass(frozen=True)
-class Recording(Source):
-    """A checkpoint and a file of features for it. There is no closed loop, so success is unknown.
+class Recorded(Source):
+    """Observations that are there before a study begins. There is no closed loop, so success is unknown.
 
     Attributes:
-        checkpoint: A checkpoint that `ActionHead.load` reads.
-        file: File of features, see `saccade.observation.read_arrays`.
-        config_file: Path of the head's config. Default: that of the checkpoint.
-        seed: Seed of random tokens, and of the noise if the file contains none.
-        num_threads: Number of threads of the head. Default: that of the engine.
+        task: What stands in the tables in place of the simulator's task.
+        seed: Seed of random tokens, and of the noise of observations that have none.
     """
 
-    checkpoint: str
-    file: str
-    config_file: str | None = None
-    seed: int = 0
-    num_threads: int | None = None
     closed_loop: ClassVar[bool] = False
+    task: ClassVar[str]
+    seed: int
 
-    def describe(self) -> dict[str, Any]:
-        """See `Source`."""
-        found = self.all
-        checkpoint = checkpoint_identity(Path(self.checkpoint))
-        if self.config_file is not None:
-            checkpoint["config_sha256"] = sha256_of(Path(self.config_file))
-        return {
-            "checkpoint": {
-                **checkpoint,
-                "num_future_tokens": self.config.num_future_tokens,
-                "num_layers": self.config.num_layers,
-                "num_steps": self.config.num_steps,
-                "num_vl_tokens": found.num_vl_tokens,
-            },
-            "features": {
-                "name": Path(self.file).name,
-                "sha256": sha256_of(Path(self.file)),
-                "observations": len(found),
-                "episodes": None if found.episode is None else int(found.episode.max()) + 1,
-                "noise": f"{NOISES} draws an observation" if found.noise is None else "of the file",
-            },
-            "seed": self.seed,
-        }
+    @property
+    @abstractmethod
+    def all(self) -> Observation:
+        """All observations, checked."""
+
+    @property
+    def others(self) -> Observation | None:
+        """For each of `all` an observation to compare it with, or None if there are none."""
+        return None
 
     @property
     def units(self) -> list[tuple[str, int]]:
-        """Every row of the file."""
-        return [(TASK, row) for row in range(len(self.all))]
+        """Every observation by its number."""
+        return [(self.task, row) for row in range(len(self.all))]
 
     @property
     def config(self) -> HeadConfig:
         """See `Source`."""
         return self.head().config
-
-    def head(self, precision: str = "float32") -> ActionHead:
-        """See `Source`."""
-        return head_of(self.checkpoint, self.config_file, precision, self.num_threads)
-
-    @property
-    def all(self) -> Observation:
-        """All observations of the file, checked; raises as `saccade.observation.read`."""
-        return read(self.file, self.config)
 
     def observed(self, task: str, seed: int) -> Observation:
         """See `Source`."""
@@ -90,11 +60,11 @@ class Recording(Source):
         return self.all.row(seed).with_noise(rng, self.config, NOISES)
 
     def episode_of(self, row: int) -> int:
-        """The episode of a row of the file, or the row itself if unknown."""
+        """The episode of an observation, or its number if unknown."""
         return int(self.all.clusters[row])
 
     def rng(self, task: str, seed: int) -> np.random.Generator:
-        """See `Source`; the same for all rows of an episode."""
+        """See `Source`; the same for all observations of an episode."""
         return episode_rng(f"{task} {self.seed}", self.episode_of(seed))
 
     def encode(self, observation: Observation) -> Any:
@@ -119,6 +89,72 @@ class Recording(Source):
     def labels(self, task: str, seed: int) -> dict[str, Any]:
         """See `Source`."""
         return {"episode": self.episode_of(seed)}
+
+    def describe_head(self, checkpoint: dict[str, str]) -> dict[str, Any]:
+        """What `describe` says of the checkpoint.
+
+        Args:
+            checkpoint: Its name and hash.
+        """
+        return {
+            **checkpoint,
+            "num_future_tokens": self.config.num_future_tokens,
+            "num_layers": self.config.num_layers,
+            "num_steps": self.config.num_steps,
+            "num_vl_tokens": self.all.num_vl_tokens,
+        }
+
+
+def num_episodes(observation: Observation) -> int | None:
+    """The number of episodes, or None if unknown."""
+    return None if observation.episode is None else int(observation.episode.max()) + 1
+
+
+@dataclass(frozen=True)
+class Recording(Recorded):
+    """A checkpoint and a file of features for it.
+
+    Attributes:
+        checkpoint: A checkpoint that `ActionHead.load` reads.
+        file: File of features, see `saccade.observation.read_arrays`.
+        config_file: Path of the head's config. Default: that of the checkpoint.
+        seed: Seed of random tokens, and of the noise if the file contains none.
+        num_threads: Number of threads of the head. Default: that of the engine.
+    """
+
+    checkpoint: str
+    file: str
+    config_file: str | None = None
+    seed: int = 0
+    num_threads: int | None = None
+    task: ClassVar[str] = "features"
+
+    def describe(self) -> dict[str, Any]:
+        """See `Source`."""
+        found = self.all
+        checkpoint = checkpoint_identity(Path(self.checkpoint))
+        if self.config_file is not None:
+            checkpoint["config_sha256"] = sha256_of(Path(self.config_file))
+        return {
+            "checkpoint": self.describe_head(checkpoint),
+            "features": {
+                "name": Path(self.file).name,
+                "sha256": sha256_of(Path(self.file)),
+                "observations": len(found),
+                "episodes": num_episodes(found),
+                "noise": f"{NOISES} draws an observation" if found.noise is None else "of the file",
+            },
+            "seed": self.seed,
+        }
+
+    def head(self, precision: str = "float32") -> ActionHead:
+        """See `Source`."""
+        return head_of(self.checkpoint, self.config_file, precision, self.num_threads)
+
+    @property
+    def all(self) -> Observation:
+        """All observations of the file, checked; raises as `saccade.observation.read`."""
+        return read(self.file, self.config)
 
 
 @functools.lru_cache(maxsize=3)

@@ -136,6 +136,6 @@ def clusters_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
     return list(zip(table["task"], table["episode" if "episode" in table else "seed"], strict=True))
 
 
-def from_file(provenance: Provenance) -> bool:
-    """Whether a table was measured on a file of features."""
-    return "features" in provenance.settings
+def is_recorded(provenance: Provenance) -> bool:
+    """Whether a table was measured on recorded observations: a file of features, or pictures."""
+    return "features" in provenance.settings or "frames" in provenance.settings

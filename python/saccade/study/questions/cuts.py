@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade._arguments import add_list, add_rollout_arguments, check_known
+from saccade._arguments import add_frames, add_list, add_rollout_arguments, check_known
 from saccade._arrays import Float32Array
 from saccade.intervention import ROW_GROUPS, Intervention
 from saccade.study.arguments import source_of
@@ -18,12 +18,13 @@ from saccade.study.arms import Arm, ArmStudy
 from saccade.study.changes import change_section
 from saccade.study.questions.cuts_section import BASELINE, SHUFFLED, section
 from saccade.study.section import Prose, Section
-from saccade.study.table import Provenance, from_file
+from saccade.study.table import Provenance, is_recorded
 
 EPILOG = """\
 Every arm runs the same episodes: the same layouts, instructions and noise. Success is compared in pairs with
 the arm "none", which is always run. The change of the chunk is measured on the observations of "none". With
---features it is measured on the observations of a file, for any checkpoint; success is then unknown.
+--frames it is measured on pictures, for any whole checkpoint, and with --features on a file of features, for
+any checkpoint; success is then unknown.
 
 arms:
 {arms}
@@ -31,6 +32,7 @@ arms:
 examples:
   saccade study cuts --episodes 15 --out out/study
   saccade study cuts --arms future-unread future-blind --tasks push --jobs 2 --out out/study
+  saccade study cuts --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "take the pear" --out out/own
   saccade study cuts --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
@@ -161,6 +163,7 @@ class Cuts(ArmStudy):
             arms="\n".join(f"  {arm.name:{width}}  {arm.label}" for arm in ARMS.values())
         )
         add_rollout_arguments(parser, episodes=15)
+        add_frames(parser)
         add_list(parser, "--arms", help="arms (default: all)")
         parser.add_argument(
             "--engine", choices=("rust", "torch"), help="what computes the action head (default: rust)"
@@ -181,7 +184,7 @@ class Cuts(ArmStudy):
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
-        if not from_file(provenance):
+        if not is_recorded(provenance):
             return section(arms_in(table), table, provenance)
         arms = arms_in(table)
         labels = {name: arm.label for name, arm in arms.items()}

@@ -26,7 +26,7 @@ from saccade.study.questions.fast_results import (
 )
 from saccade.study.section import Figure, Grid, Prose, Section, number, points, rate
 from saccade.study.statistics import Estimate, PairedDifference, scaled
-from saccade.study.table import Provenance, from_file, truths
+from saccade.study.table import Provenance, is_recorded, truths
 
 
 def section(table: pd.DataFrame, provenance: Provenance) -> Section:
@@ -42,7 +42,7 @@ def values(table: pd.DataFrame, provenance: Provenance, results: Mapping[str, Mo
     chunks, episodes, times = (part(table, name) for name in ("chunks", "episodes", "time"))
     calibrated = part(table, "calibrate")
     of_baseline = chunks[chunks["mode"] == BASELINE]
-    recorded = from_file(provenance)
+    recorded = is_recorded(provenance)
     separated = {} if recorded else separations(table)
     judged = [one for one in results.values() if one.judged and not recorded]
     screened = [one for name, one in results.items() if recorded and name != BASELINE and one.change]

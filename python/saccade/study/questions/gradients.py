@@ -18,16 +18,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade._arguments import add_integer, add_rollout_arguments
+from saccade._arguments import add_frames, add_integer, add_rollout_arguments
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS
 from saccade.observation import MASKS, Observation
 from saccade.study.arguments import source_of
 from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
-from saccade.study.paths import PATHS
+from saccade.study.moments import Moments, look
+from saccade.study.paths import ALL_PATHS, PATHS
 from saccade.study.questions.gradients_section import section
-from saccade.study.recording import Recording
+from saccade.study.recording import Recorded
 from saccade.study.section import Section
 from saccade.study.source import Source
 from saccade.study.study import Study
@@ -36,7 +37,7 @@ from saccade.study.table import Provenance
 if TYPE_CHECKING:
     import torch
 
-    from saccade.reference import ActionHead
+    from saccade.reference import ActionHead, Backbone
     from saccade.study.derivatives import Sensitivity, Shares
     from saccade.study.simulator import Simulator
 
@@ -45,11 +46,13 @@ NUM_OBSERVATIONS = 3
 EPILOG = """\
 Runs the policy in closed loop and takes derivatives of its chunks in torch: by the rows before and after
 every block, and by the vision-language tokens, split by the paths along which they arise. With --demos also
-the derivative of the training loss by the rows.
+the derivative of the training loss by the rows. With --frames also the derivative by the words and the image
+tokens that the backbone is given, and by the pixels of the views.
 
 examples:
   saccade study gradients --out out/study
   saccade study gradients --checkpoint out/policy --demos out/demos --tasks push --out out/study
+  saccade study gradients --checkpoint GR00T-N1.5-3B/ --frames table/ --projections 4 --out out/own
   saccade study gradients --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
@@ -76,6 +79,7 @@ class Gradients(Study):
         """See `Study`."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=10)
+        add_frames(parser)
         add_integer(
             parser,
             "--num-observations",
@@ -152,17 +156,44 @@ class Gradients(Study):
         sensitivities, paths = [], []
         for place in spaced(len(observed), self.num_observations):
             observation = observed.row(place).with_draw(0)
-            sensitivity, parts = self.of_observation(head, observation, generator)
+            sensitivity, parts, by_vl = self.of_observation(head, observation, generator)
             sensitivities.append(sensitivity)
             if parts is not None:
                 paths.append(derivatives.shares(parts))
         rows = sensitivity_rows(sensitivities, derivatives.row_groups(head))
-        return rows + (path_rows(paths) if paths else [{"note": NO_TOKENS}])
+        rows += path_rows(paths) if paths else [{"note": NO_TOKENS}]
+        if isinstance(self.source, Moments):
+            assert by_vl is not None
+            rows += self.of_inputs(self.source, seed, by_vl)
+        return rows
+
+    def of_inputs(self, source: Moments, row: int, by_vl: torch.Tensor) -> Rows:
+        """Derivatives by the tokens of the prompt and by the pixels of a moment.
+
+        Args:
+            source: The source.
+            row: Which moment.
+            by_vl: Derivatives by the vision-language tokens, `(projections, T_vl, context_dim)`.
+        """
+        import torch
+
+        from saccade.study import input_derivatives as derivatives
+
+        looked = look(source)
+        inputs, layout, config = looked.inputs[row], looked.layouts[row], looked.backbone_config
+        count = layout.num_tokens  # what is behind it is padding
+        features = torch.from_numpy(source.all.row(row).backbone_features)[:, :count]
+        by_features = derivatives.feature_derivatives(reference_of(source), features, by_vl[:, :count])
+        found = derivatives.input_derivatives(backbone_of(source), inputs, by_features)
+        by_view = derivatives.by_image_token(found, inputs, config, layout)
+        return derivatives.part_rows(found, layout, by_view)
 
     def of_observation(
         self, head: ActionHead, observation: Observation, generator: torch.Generator
-    ) -> tuple[Sensitivity, Mapping[str, torch.Tensor] | None]:
-        """Sensitivities and derivatives along paths; None without future tokens."""
+    ) -> tuple[Sensitivity, Mapping[str, torch.Tensor] | None, torch.Tensor | None]:
+        """Sensitivities; derivatives along paths, None without future tokens; and those along all paths,
+        None where nothing needs them.
+        """
         import torch
 
         from saccade.study import derivatives
@@ -185,16 +216,19 @@ class Gradients(Study):
             sensitivities.append(derivatives.action_sensitivity(*given))
             if head.config.num_future_tokens:
                 paths.append(derivatives.path_derivatives(*given))
+            elif isinstance(self.source, Moments):
+                paths.append({ALL_PATHS: derivatives.vl_derivative(*given)})
         sensitivity = sensitivities[0] if self.source.closed_loop else derivatives.pooled(sensitivities)
         if not paths:
-            return sensitivity, None
-        return sensitivity, {name: torch.cat([one[name] for one in paths]) for name in paths[0]}
+            return sensitivity, None, None
+        parts = {name: torch.cat([one[name] for one in paths]) for name in paths[0]}
+        return sensitivity, parts if head.config.num_future_tokens else None, parts[ALL_PATHS]
 
     def generator(self, task: str, seed: int) -> torch.Generator:
         """The generator of the random projections of a cell."""
         import torch
 
-        given = (self.source.seed, seed) if isinstance(self.source, Recording) else (seed, *map(ord, task))
+        given = (self.source.seed, seed) if isinstance(self.source, Recorded) else (seed, *map(ord, task))
         return torch.Generator().manual_seed(int(np.random.default_rng(given).integers(2**31)))
 
     def of_loss(self, task: str, seed: int) -> Rows:
@@ -257,6 +291,16 @@ def check_demonstrations(directory: Path, source: Simulator) -> None:
         raise InputError(
             f"--demos: {directory} was recorded with another image size or other cameras than the policy's"
         )
+
+
+@functools.lru_cache(maxsize=1)
+def backbone_of(source: Source) -> Backbone:
+    """The backbone in torch, without gradients for its weights."""
+    from saccade.reference import Backbone
+
+    backbone = Backbone.load(source.checkpoint)
+    backbone.requires_grad_(False)
+    return backbone
 
 
 @functools.lru_cache(maxsize=1)

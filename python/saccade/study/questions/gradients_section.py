@@ -10,7 +10,7 @@ from saccade.study.changes import recorded
 from saccade.study.paths import DETOUR, DIRECT, PATHS, READ
 from saccade.study.section import Figure, Grid, Prose, Section, number
 from saccade.study.statistics import Estimate, bootstrap
-from saccade.study.table import Provenance, clusters_of, from_file
+from saccade.study.table import Provenance, clusters_of, is_recorded
 
 LABELS = {"actions": "change of the chunk (norm)", "loss": "change of the loss"}
 
@@ -22,13 +22,14 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     paths = table[table["path"].notna()] if "path" in table else table.iloc[:0]
     prose = Prose(
         "gradients",
-        recorded=recorded(table, table, provenance) if from_file(provenance) else None,
+        recorded=recorded(table, table, provenance) if is_recorded(provenance) else None,
         checkpoint=settings["checkpoint"],
         episodes=episodes.get("actions", 0),
         looks=settings.get("looks"),
         projections=settings["projections"],
         demonstrations=episodes.get("loss", 0),
         paths=path_estimates(paths) if len(paths) else None,
+        inputs=input_shares(table),
     )
     pictures = [
         Figure(
@@ -41,12 +42,13 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     ]
     if "token" in table:
         pictures.append(Figure("tokens", prose.line("caption_tokens"), token_picture(table)))
+    grids = [input_grid(prose, table)] if "input" in table else []
     if not len(paths):
-        return prose.section(pictures)
+        return prose.section(pictures, grids)
     share = [mean_of(shares_of(paths, path), "share") for path in PATHS]
     picture = figures.estimates(PATHS, share, "share of the derivative", reference=0)
     pictures.insert(0, Figure("paths", prose.line("caption_paths"), picture))
-    return prose.section(pictures, [path_grid(prose, paths), cosine_grid(prose, paths)])
+    return prose.section(pictures, [path_grid(prose, paths), cosine_grid(prose, paths), *grids])
 
 
 def path_estimates(paths: pd.DataFrame) -> dict[str, Estimate]:
@@ -102,6 +104,35 @@ def token_picture(table: pd.DataFrame) -> Picture:
 def shares_of(paths: pd.DataFrame, path: str) -> pd.DataFrame:
     """The rows with the length and share of a path."""
     return paths[(paths["path"] == path) & paths["share"].notna()]
+
+
+def parts_of(table: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
+    """The rows of each part of the backbone's inputs, by kind of input and part; none without pictures."""
+    if "input" not in table:
+        return {}
+    whole = table[table["input"].notna() & table["row"].isna()]
+    return {
+        (str(kind), str(part)): rows for (kind, part), rows in whole.groupby(["input", "part"], sort=False)
+    }
+
+
+def input_shares(table: pd.DataFrame) -> dict[str, dict[str, Estimate]]:
+    """The share of each part, by kind of input: `tokens` and `pixels`."""
+    found: dict[str, dict[str, Estimate]] = {}
+    for (kind, part), rows in parts_of(table).items():
+        found.setdefault(kind, {})[part] = mean_of(rows, "share")
+    return found
+
+
+def input_grid(prose: Prose, table: pd.DataFrame) -> Grid:
+    """Norms and shares of the parts of the backbone's inputs."""
+    rows = []
+    for (kind, part), found in parts_of(table).items():
+        relative = number(mean_of(found, "relative"), digits=3) if kind == "tokens" else ""
+        norm = number(mean_of(found, "norm"), digits=3)
+        rows.append([kind, part, norm, relative, number(mean_of(found, "share"), digits=2)])
+    columns = ("by", "part", "norm", "norm times length", "share")
+    return Grid(prose.line("caption_inputs"), columns, rows)
 
 
 def path_grid(prose: Prose, paths: pd.DataFrame) -> Grid:

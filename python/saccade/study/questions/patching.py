@@ -5,21 +5,32 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from saccade._arguments import add_list, add_rollout_arguments, check_known, indices
+from saccade._arguments import add_frames, add_list, add_rollout_arguments, check_known, indices
 from saccade.head import ActionHead
 from saccade.intervention import ROW_GROUPS, Intervention, Tokens
 from saccade.observation import Observation
 from saccade.study.arguments import source_of
 from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
-from saccade.study.questions.patching_section import ABOUT, ALL, FROM_FILE, GROUPS, KINDS, section
-from saccade.study.recording import Recording
+from saccade.study.moments import Moments
+from saccade.study.questions.patching_section import (
+    ABOUT,
+    ALL,
+    FROM_FILE,
+    GROUPS,
+    KINDS,
+    WITH_FRAMES,
+    WITH_INSTRUCTION,
+    section,
+)
+from saccade.study.recording import Recorded
 from saccade.study.section import Section
 from saccade.study.source import Source
 from saccade.study.study import Study
@@ -37,9 +48,16 @@ chunk to the donor's: 0 is no effect, 1 is the donor's chunk.
 kinds of donors:
 {kinds}
 
+With --frames or --features, the donor of an observation is one of another episode. With --frames it may also
+be the same pictures with another instruction (--other-instruction), or the pictures of another directory
+(--other-frames). Only rows of the head are patched: donor and receiver have equally many, whatever their
+numbers of vision-language tokens are.
+
 examples:
   saccade study patching --episodes 15 --out out/study
   saccade study patching --kinds layout --blocks 1 --steps 0 --tasks push --out out/study
+  saccade study patching --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "take the pear" \\
+    --other-instruction "take the apple" --out out/own
   saccade study patching --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
@@ -52,8 +70,8 @@ class Patching(Study):
         source: The receivers: the first observation of each episode, or each row of a file.
         blocks: Are patched one by one, and all of them at once.
         steps: Euler steps in which they are patched.
-        kinds: Kinds of donors, names from `KINDS`; a file has only the kind `FROM_FILE`. In the simulator,
-            donors have the seeds that follow those of the receivers.
+        kinds: Kinds of donors, names from `KINDS`; of recorded observations the one of `kind_of`. In the
+            simulator, donors have the seeds that follow those of the receivers.
     """
 
     source: Source
@@ -70,7 +88,15 @@ class Patching(Study):
             kinds="\n".join(f"  {name:{width}}  {about}" for name, about in KINDS.items())
         )
         add_rollout_arguments(parser, episodes=15)
-        add_list(parser, "--kinds", help="kinds of donors (default: all)")
+        add_frames(parser)
+        parser.add_argument("--other-instruction", metavar="TEXT", help="with --frames: donors are told this")
+        parser.add_argument(
+            "--other-frames",
+            type=Path,
+            metavar="DIR",
+            help="with --frames: donors see these pictures",
+        )
+        add_list(parser, "--kinds", help="kinds of donors in the simulator (default: all)")
         add_list(
             parser, "--blocks", item=int, metavar="N", help="blocks, one by one and together (default: all)"
         )
@@ -91,7 +117,7 @@ class Patching(Study):
             source,
             indices("--blocks", args.blocks, source.config.num_layers),
             indices("--steps", args.steps, source.config.num_steps),
-            kinds if source.closed_loop else (FROM_FILE,),
+            kinds if source.closed_loop else (kind_of(source),),
         )
 
     def settings(self) -> Mapping[str, Any]:
@@ -136,9 +162,16 @@ class Pair:
     labels: Mapping[str, Any]
 
 
+def kind_of(source: Source) -> str:
+    """The kind of donors of recorded observations."""
+    if isinstance(source, Moments) and source.others is not None:
+        return WITH_INSTRUCTION if source.other_frames is None else WITH_FRAMES
+    return FROM_FILE
+
+
 def pair_of(source: Source, kind: str, task: str, seed: int, donor_seed: int | None) -> Pair | str:
     """Donor and receiver, or why there is no donor."""
-    if isinstance(source, Recording):
+    if isinstance(source, Recorded):
         return recorded_pair(source, kind, task, seed)
     from saccade.study.simulator import Simulator  # imports MuJoCo
 
@@ -165,18 +198,19 @@ def simulated_pair(source: Simulator, kind: str, task: str, seed: int, donor_see
     return Pair(donor, receiver, {"donor_task": donor_task, "donor_seed": donor_seed})
 
 
-def recorded_pair(source: Recording, kind: str, task: str, row: int) -> Pair | str:
-    """A row of a file, and the next row (cyclically) of another episode with the same embodiment."""
-    found = source.all
+def recorded_pair(source: Recorded, kind: str, task: str, row: int) -> Pair | str:
+    """An observation and its other one; or the next (cyclically) of another episode, same embodiment."""
+    found, receiver = source.all, source.observed(task, row).with_draw(0)
+    if source.others is not None:
+        return Pair(source.others.row(row), receiver, {"donor_task": task, "donor_seed": row})
     others = (np.arange(1, len(found)) + row) % len(found)
     fitting = (found.clusters[others] != found.clusters[row]) & (
         found.embodiment_id[others] == found.embodiment_id[row]
     )
     if not fitting.any():
-        return f"the file has no donor for it ({ABOUT[kind]})"
+        return f"there is no donor for it ({ABOUT[kind]})"
     number = int(others[fitting][0])
-    donor, receiver = found.row(number), source.observed(task, row).with_draw(0)
-    return Pair(donor, receiver, {"donor_task": task, "donor_seed": number})
+    return Pair(found.row(number), receiver, {"donor_task": task, "donor_seed": number})
 
 
 def patched(

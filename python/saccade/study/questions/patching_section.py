@@ -14,7 +14,7 @@ from saccade.study import figures
 from saccade.study.changes import recorded
 from saccade.study.section import Figure, Grid, Prose, Section, number
 from saccade.study.statistics import Estimate, bootstrap_ratio
-from saccade.study.table import Provenance, clusters_of, from_file
+from saccade.study.table import Provenance, clusters_of, is_recorded
 
 ALL = "all"  # every block at once
 CONTROL = "all rows"
@@ -28,7 +28,13 @@ KINDS = {
     "task": "another task: other objects, another instruction",
 }
 FROM_FILE = "observation"
-ABOUT = {**KINDS, FROM_FILE: "an observation of another episode of the file, same embodiment"}
+WITH_INSTRUCTION, WITH_FRAMES = "instruction", "frames"
+ABOUT = {
+    **KINDS,
+    FROM_FILE: "an observation of another episode, same embodiment",
+    WITH_INSTRUCTION: "the same pictures and state, with the other instruction",
+    WITH_FRAMES: "the moment in the same place of the other directory, with its state",
+}
 GROUPS: dict[str, tuple[str, ...]] = {
     "future": ("future",),
     "state": ("state",),
@@ -47,7 +53,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         for (kind, group, block), rows in measured.groupby(["kind", "group", "block"]):
             found[str(kind), str(group), str(block)] = (*shares(rows), len(rows))
     kinds = [kind for kind in ABOUT if kind in set(table["kind"])]
-    on_file = from_file(provenance)
+    on_file = is_recorded(provenance)
     prose = Prose(
         "patching",
         recorded=recorded(table, measured, provenance) if on_file else None,

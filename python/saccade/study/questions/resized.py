@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 import saccade._saccade as _saccade
-from saccade._arguments import add_list, add_rollout_arguments
+from saccade._arguments import add_frames, add_list, add_rollout_arguments
 from saccade._arrays import Float32Array
 from saccade.errors import InputError
 from saccade.intervention import Intervention
@@ -25,7 +25,7 @@ from saccade.study.cell import Cell
 from saccade.study.changes import change_section
 from saccade.study.questions.resized_section import BASELINE, TWICE, TWICE_EQUAL, arm_order, section
 from saccade.study.section import Prose, Section
-from saccade.study.table import Provenance, from_file
+from saccade.study.table import Provenance, is_recorded
 
 EPILOG = """\
 Arms, for each number K of --num-future-tokens: K of the tokens, drawn at random for every episode; the same
@@ -35,6 +35,7 @@ every token twice, with twice the mass, and with the same mass (which must chang
 examples:
   saccade study n-runtime --out out/study
   saccade study n-runtime --checkpoint out/policy --num-future-tokens 1 4 16 --episodes 20 --out out/study
+  saccade study n-runtime --checkpoint GR00T-N1.5-3B/ --frames table/ --out out/own
   saccade study n-runtime --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
@@ -56,6 +57,7 @@ class Resized(ArmStudy):
         """See `Study`."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=15)
+        add_frames(parser)
         add_list(
             parser,
             "--num-future-tokens",
@@ -80,7 +82,7 @@ class Resized(ArmStudy):
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
-        if not from_file(provenance):
+        if not is_recorded(provenance):
             return section(table, provenance)
         labels = {arm: arm for arm in sorted(dict.fromkeys(table["arm"]), key=arm_order)}
         return change_section(cls, Prose("resized", arms=list(labels)), labels, table, provenance)

@@ -13,7 +13,9 @@ use tokenizers::pre_tokenizers::PreTokenizerWrapper;
 use tokenizers::pre_tokenizers::byte_level::ByteLevel;
 use tokenizers::pre_tokenizers::sequence::Sequence;
 use tokenizers::pre_tokenizers::split::{Split, SplitPattern};
-use tokenizers::{AddedToken, Decoder, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl};
+use tokenizers::{
+    AddedToken, Decoder, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl,
+};
 
 use crate::error::{Error, Result};
 use find::FilesText;
@@ -153,7 +155,10 @@ impl Tokenizer {
             return Some(token);
         }
         // Without others to join it with, a token is one string, and decoding bytes has no errors.
-        ByteLevel::default().decode_chain(vec![token]).ok().map(|text| text.concat())
+        ByteLevel::default()
+            .decode_chain(vec![token])
+            .ok()
+            .map(|text| text.concat())
     }
 
     /// The id of a special token, found by its string.

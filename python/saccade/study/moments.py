@@ -1,0 +1,220 @@
+"""Pictures as a source: a whole checkpoint, and directories of what its robot saw, without a simulator."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from saccade._files import checkpoint_identity
+from saccade.backbone_config import BackboneConfig
+from saccade.backbone_inputs import BackboneInputs
+from saccade.dialects import read
+from saccade.errors import InputError
+from saccade.frames import Moment, read_frames
+from saccade.head import ActionHead
+from saccade.maps.grid import layout_of
+from saccade.maps.layout import Layout
+from saccade.observation import Observation
+from saccade.policy import Policy
+from saccade.study.recording import NOISES, Recorded, num_episodes
+from saccade.whole import as_head_takes_it, parts_of
+
+Preprocessing = Literal["lerobot", "isaac"]
+
+
+@dataclass(frozen=True)
+class Moments(Recorded):
+    """A whole checkpoint, and pictures of moments for it.
+
+    The backbone looks at all moments once in a process, and is then let go. The head computes in float32.
+
+    Attributes:
+        checkpoint: A checkpoint that `saccade.Policy.load` reads.
+        frames: Directory of the pictures, see `saccade.frames.read_frames`.
+        instruction, state: As `read_frames` takes them.
+        other_frames, other_instruction: Of the moments to compare with. Where one is None, it is that of the
+            moments themselves; with both None there are none.
+        embodiment, preprocessing, tokenizer: As `saccade.Policy.load` takes them.
+        precision: How the backbone computes.
+        seed: Seed of random tokens and of the noise.
+        num_threads: Number of threads. Default: that of the engine.
+    """
+
+    checkpoint: str
+    frames: str
+    instruction: str | None = None
+    state: str | None = None
+    other_frames: str | None = None
+    other_instruction: str | None = None
+    embodiment: str | int | None = None
+    precision: str = "float32"
+    preprocessing: Preprocessing | None = None
+    tokenizer: str | None = None
+    seed: int = 0
+    num_threads: int | None = None
+    task: ClassVar[str] = "frames"
+
+    def describe(self) -> dict[str, Any]:
+        """See `Source`."""
+        looked = look(self)
+        other = described(self.other_frames or self.frames, looked.others) if looked.others else None
+        return {
+            "checkpoint": self.describe_head(looked.identity),
+            "frames": {
+                **described(self.frames, looked.moments),
+                "episodes": num_episodes(looked.observation),
+                "noise": f"{NOISES} draws an observation",
+                "precision": self.precision,
+                "preprocessing": looked.preprocessing,
+                "embodiment_id": int(looked.observation.embodiment_id[0]),
+                "other": other,
+            },
+            "seed": self.seed,
+        }
+
+    def head(self, precision: str = "float32") -> ActionHead:
+        """See `Source`."""
+        if precision != "float32":
+            raise InputError(f"precision: expected float32 for a head on pictures, got {precision}")
+        return look(self).head
+
+    @property
+    def all(self) -> Observation:
+        """See `Recorded`; raises as `read_frames` and `saccade.Policy.load`."""
+        return look(self).observation
+
+    @property
+    def others(self) -> Observation | None:
+        """For each moment the one in the same place of the other directory, or with the other instruction."""
+        return look(self).other_observation
+
+    def labels(self, task: str, seed: int) -> dict[str, Any]:
+        """See `Source`; with the name of the moment."""
+        return {**super().labels(task, seed), "moment": look(self).moments[seed].name}
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What a policy made of the moments of a source.
+
+    Attributes:
+        head: The head of the policy.
+        identity: Name and hash of the checkpoint.
+        preprocessing: How frames and words were prepared.
+        moments, others: The moments, and those to compare them with.
+        observation, other_observation: The same as the head takes them; None without others.
+        inputs: What the backbone was given for each of `moments`.
+        layouts: What is at each position of each of `moments`.
+        backbone_config: Config of the backbone.
+    """
+
+    head: ActionHead
+    identity: dict[str, str]
+    preprocessing: str
+    moments: Sequence[Moment]
+    others: Sequence[Moment]
+    observation: Observation
+    other_observation: Observation | None
+    inputs: Sequence[BackboneInputs]
+    layouts: Sequence[Layout]
+    backbone_config: BackboneConfig
+
+
+@functools.lru_cache(maxsize=1)
+def look(source: Moments) -> Looked:
+    """Loads the policy and looks at all moments; cached for the next cell."""
+    policy = Policy.load(
+        source.checkpoint,
+        embodiment=source.embodiment,
+        preprocessing=source.preprocessing,
+        tokenizer=source.tokenizer,
+        precision={"backbone": source.precision, "head": "float32"},
+        num_threads=source.num_threads,
+    )
+    parts = parts_of(policy)
+    moments = moments_of(source, policy, source.frames, source.instruction)
+    others: list[Moment] = []
+    if (source.other_frames, source.other_instruction) != (None, None):
+        told = source.instruction if source.other_instruction is None else source.other_instruction
+        found = moments_of(source, policy, source.other_frames or source.frames, told)
+        others = [found[place % len(found)] for place in range(len(moments))]
+    seen, compared, given, layouts = [], [], [], []
+    for place, moment in enumerate(moments):
+        (inputs,) = policy.inputs(moment.observation)
+        context = policy.context(policy.features([inputs]))
+        seen.append(as_head_takes_it(policy, moment.observation, context.features[0]))
+        given.append(inputs)
+        frames = read(moment.observation, policy.requirements).frames[0]
+        layouts.append(layout_of(policy, frames, inputs, context.features[0].views))
+        if others:  # views with the same frames are not computed again
+            other = others[place].observation
+            (features,) = policy.features(policy.inputs(other), previous=context)
+            compared.append(as_head_takes_it(policy, other, features))
+    return Looked(
+        head=parts.head,
+        identity=checkpoint_identity(Path(source.checkpoint)),
+        preprocessing=parts.processor.preprocessing,
+        moments=moments,
+        others=others,
+        observation=joined(seen, moments),
+        other_observation=joined(compared, others) if others else None,
+        inputs=given,
+        layouts=layouts,
+        backbone_config=parts.backbone.config,
+    )
+
+
+def moments_of(source: Moments, policy: Policy, directory: str, instruction: str | None) -> list[Moment]:
+    """The moments of a directory, with the state of the source."""
+    state = None if source.state is None else Path(source.state)
+    return read_frames(Path(directory), policy, instruction=instruction, state=state)
+
+
+def joined(observations: Sequence[Observation], moments: Sequence[Moment]) -> Observation:
+    """Observations of one row each as one, the shorter ones padded and their padding dropped.
+
+    The head drops padding exactly: each has the bits that it has alone.
+    """
+    lengths = np.array([one.num_vl_tokens for one in observations])
+    longest = int(lengths.max())
+    masks = [longer(one.image_mask, longest) for one in observations if one.image_mask is not None]
+    dropped = np.arange(longest) >= lengths[:, None]
+    episodes = [moment.episode for moment in moments]
+    return Observation(
+        np.concatenate([longer(one.backbone_features, longest) for one in observations]),
+        np.concatenate([one.state for one in observations]),
+        np.concatenate([one.embodiment_id for one in observations]),
+        image_mask=np.concatenate(masks) if masks else None,
+        drop_vl=dropped if dropped.any() else None,
+        episode=None if None in episodes else np.unique(np.array(episodes), return_inverse=True)[1],
+    )
+
+
+def longer(array: np.ndarray[Any, Any], length: int) -> np.ndarray[Any, Any]:
+    """``(1, T, ...)`` padded with zeros to ``(1, length, ...)``."""
+    return np.pad(array, [(0, 0), (0, length - array.shape[1]), *[(0, 0)] * (array.ndim - 2)])
+
+
+def described(directory: str, moments: Sequence[Moment]) -> dict[str, Any]:
+    """What identifies moments, as JSON values; the hash covers names, pixels, states and instruction."""
+    digest = hashlib.sha256()
+    for moment in moments:
+        given = moment.observation
+        values = {key: np.asarray(state).tolist() for key, state in given["state"].items()}
+        digest.update(json.dumps([moment.name, moment.instruction, values]).encode())
+        for name, frames in given["video"].items():
+            digest.update(f"{name} {frames.shape}".encode())
+            digest.update(frames.tobytes())
+    return {
+        "name": Path(directory).resolve().name,
+        "sha256": digest.hexdigest(),
+        "observations": len(moments),
+        "instruction": moments[0].instruction,
+    }
