@@ -38,7 +38,9 @@ def loaded(layout: str) -> Policy:
 @functools.cache
 def view_of(layout: str) -> View:
     policy = loaded(layout)
-    return from_policy(policy, policy.example_observation(), seed=3, title="", source={"kind": "test"})
+    return from_policy(
+        policy, policy.example_observation(), rng=np.random.default_rng(3), title="", source={}
+    )
 
 
 def region(layout: str, height: int, width: int) -> tuple[float, ...]:
@@ -213,7 +215,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     policy = loaded("isaac")
     pictures = {name: np.asarray(Image.open(folder / "2" / f"{name}.png"))[None, None] for name in CAMERAS}
     seen = policy.example_observation() | {"video": pictures, "language": {"task": [["open the drawer"]]}}
-    view = from_policy(policy, seen, seed=0, title="", source={})
+    view = from_policy(policy, seen, rng=np.random.default_rng(0), title="", source={})
     trace = view.observation.trace(parts_of(policy).head, record=("attention",), blocks=[0], steps=[0])
     maps = np.asarray(trace.attention[0, 0])[0].mean(axis=0)[trace.rows["future"]]
     summary = next(one for one in found["summaries"] if one["group"] == "future" and one["head"] == "mean")

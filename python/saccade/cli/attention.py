@@ -275,12 +275,11 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     if row >= len(moments):
         raise UsageError(f"--row: given {row}, {args.frames} has moments 0 to {len(moments) - 1}")
     moment = moments[row]
-    shape = (1, policy.head.config.action_horizon, policy.head.config.encoder_action_dim)
     robot = policy.normalizer.embodiment or f"embodiment {policy.embodiment_id}"
     view = from_policy(
         policy,
         moment.observation,
-        noise=np.random.default_rng(args.seed).standard_normal(shape, dtype=np.float32),
+        rng=np.random.default_rng(args.seed),
         title=f'{moment.name}: "{moment.instruction}", {robot}',
         source={
             "kind": "frames",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from saccade._arrays import Float32Array, UInt8Array
+from saccade._arrays import UInt8Array
 from saccade.config import HeadConfig
 from saccade.dialects import read
 from saccade.errors import InputError, ShapeError
@@ -78,10 +78,9 @@ def from_simulator(policy: SimulatorPolicy, task: str, seed: int, control_steps:
         steps = 0
         while True:
             observation = environment.observe()
-            noise = policy.noise(rng)
             if steps == control_steps:
                 break
-            chunk = policy.act(observation, noise=noise)
+            chunk = policy.act(observation, noise=policy.noise(rng))
             for action in chunk.actions[: min(policy.config.execute_steps, control_steps - steps)]:
                 success = environment.advance(action).success
                 steps += 1
@@ -94,7 +93,7 @@ def from_simulator(policy: SimulatorPolicy, task: str, seed: int, control_steps:
     return from_policy(
         policy.whole,
         policy.observation(observation),
-        noise=noise,
+        rng=rng,
         title=f'{task}, seed {seed}, after {control_steps} control steps: "{instruction}"',
         source={
             "kind": "simulator",
@@ -107,14 +106,19 @@ def from_simulator(policy: SimulatorPolicy, task: str, seed: int, control_steps:
 
 
 def from_policy(
-    policy: Policy, seen: Mapping[str, Any], *, noise: Float32Array, title: str, source: Mapping[str, Any]
+    policy: Policy,
+    seen: Mapping[str, Any],
+    *,
+    rng: np.random.Generator,
+    title: str,
+    source: Mapping[str, Any],
 ) -> View:
     """What a whole policy sees, and what it makes of it.
 
     Args:
         policy: A policy of :meth:`saccade.Policy.load`.
         seen: An observation in Isaac-GR00T's nested form, with a batch of one.
-        noise: The noise that its chunk starts from, `(1, action_horizon, encoder_action_dim)`.
+        rng: Generator of the noise.
         title: What the observation is, on one line.
         source: Where it comes from, for JSON; the views are added.
 
@@ -124,7 +128,7 @@ def from_policy(
     (inputs,) = policy.inputs(seen)
     features = policy.features([inputs])
     encoded = policy.context(features)
-    given = replace(as_head_takes_it(policy, seen, features[0]), noise=noise)
+    given = as_head_takes_it(policy, seen, features[0]).with_noise(rng, policy.head.config)
     frames = read(seen, policy.requirements).frames[0]
     return View(
         title=title,

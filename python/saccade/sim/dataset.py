@@ -95,8 +95,8 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
         `(frames, cameras, 3, image_size, image_size)`.
     """
     views = [processor.frame(image) for image in images.reshape(-1, *images.shape[2:])]
-    pixels = np.rint(np.stack(views) * PIXEL_CENTRE + PIXEL_CENTRE).astype(np.uint8)
-    return pixels.reshape(*images.shape[:2], *pixels.shape[1:])
+    pixels = np.rint(np.stack(views) * PIXEL_CENTRE + PIXEL_CENTRE)
+    return pixels.astype(np.uint8).reshape(*images.shape[:2], *pixels.shape[1:])
 
 
 def load_samples(

@@ -190,7 +190,8 @@ class Policy:
 
     def robot_actions(self, chunk: Float32Array) -> Float32Array:
         """Actions of the head `(..., horizon, action_dim)` as the robot takes them, in [-1, 1]."""
-        return np.clip(np.asarray(self.whole.normalizer.actions(chunk)), -1.0, 1.0)
+        actions: Float32Array = np.clip(np.asarray(self.whole.normalizer.actions(chunk)), -1.0, 1.0)
+        return actions
 
     def act(
         self, seen: Mapping[str, Any], *, noise: Float32Array, intervention: Interventions = None
@@ -241,7 +242,7 @@ class Policy:
         return {
             "name": "rust",
             "saccade": saccade.__version__,
-            "isa": saccade.show_config()["isa"],
+            "isa": saccade.show_config("dicts")["isa"],
             "num_threads": self.head.num_threads,
         }
 
@@ -257,7 +258,7 @@ def num_vl_tokens(processor: Processor, config: SimulationConfig, instruction: s
     texts = [text for name in config.tasks for text in find_task(name).instructions]
     if instruction is not None:
         texts = [instruction]
-    return max(processor(frames, text).input_ids.shape[1] for text in texts)
+    return max(int(processor(frames, text).input_ids.shape[1]) for text in texts)
 
 
 def check_trained_on(policy: Policy, tasks: list[str]) -> None:
