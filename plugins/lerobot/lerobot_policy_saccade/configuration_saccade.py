@@ -24,7 +24,8 @@ class SaccadeConfig(PreTrainedConfig):
         precision: How the backbone computes, and the head: float32, bfloat16 or int8.
         head_precision: How the head computes. Default: as the backbone.
         num_threads: Number of threads. Default: as :meth:`saccade.Policy.load`.
-        preprocessing: ``lerobot`` or ``isaac``: how frames and words are prepared. Default: by the checkpoint.
+        preprocessing: ``lerobot`` or ``isaac``: how frames and words are prepared. Default: as the
+            checkpoint's training program did.
         tokenizer: A ``tokenizer.json`` or its directory. Default: as :meth:`saccade.Policy.load`.
         cameras: The names of the cameras in the order of the prompt. Default: those of the checkpoint.
         rename_map: Keys of the environment's observations, and the keys that the checkpoint knows. For

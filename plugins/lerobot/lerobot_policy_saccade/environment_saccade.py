@@ -35,7 +35,7 @@ class SaccadeEnv(EnvConfig):
         from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM
 
         size = self.image_size or DEFAULT_IMAGE_SIZE
-        shapes = {
+        shapes: dict[str, tuple[FeatureType, tuple[int, ...], str]] = {
             "action": (FeatureType.ACTION, (ACTION_DIM,), ACTION),
             "agent_pos": (FeatureType.STATE, (PROPRIO_DIM,), OBS_STATE),
         }
@@ -45,7 +45,9 @@ class SaccadeEnv(EnvConfig):
                 (size, size, 3),
                 f"{OBS_IMAGES}.{camera.name}",
             )
-        self.features = {name: PolicyFeature(type=kind, shape=shape) for name, (kind, shape, _) in shapes.items()}
+        self.features = {
+            name: PolicyFeature(type=kind, shape=shape) for name, (kind, shape, _) in shapes.items()
+        }
         self.features_map = {name: key for name, (_, _, key) in shapes.items()}
 
     @property

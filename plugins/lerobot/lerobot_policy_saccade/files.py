@@ -7,12 +7,13 @@ from typing import Any
 
 from huggingface_hub import snapshot_download
 from huggingface_hub.errors import HfHubHTTPError
+
 from saccade.hub import PUBLISHED, resolve
 
 #: The folder of the checkpoint. It has a `config.json` of its own, as lerobot's policies do.
 CHECKPOINT = "checkpoint"
 
-#: What saccade reads of a checkpoint. Others, such as the state of an optimizer, are neither fetched nor copied.
+#: What saccade reads of a checkpoint. Other files, such as an optimizer's state, are not fetched or copied.
 FILES = ("*.json", "*.safetensors", "*.txt")
 
 
@@ -46,7 +47,7 @@ def folder_of(name: str | Path, *, revision: str | None, **hub_options: Any) -> 
         raise FileNotFoundError(f"pretrained_name_or_path: {name} is not on the Hub: {error}") from error
 
 
-def copy_checkpoint(source: Path, folder: Path) -> None:
+def copy_checkpoint(source: str, folder: Path) -> None:
     """Copies a checkpoint into the folder of a policy. What was there before is replaced at the end only.
 
     Args:

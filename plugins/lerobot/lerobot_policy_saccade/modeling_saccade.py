@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, Self
 
-import saccade
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+import saccade
 from lerobot_policy_saccade.configuration_saccade import NO_TRAINING, SaccadeConfig
 from lerobot_policy_saccade.files import CHECKPOINT, copy_checkpoint, folder_of
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
@@ -56,11 +56,14 @@ class SaccadePolicy(PreTrainedPolicy):
     def __init__(self, config: SaccadeConfig, *, dataset_stats: Any = None, dataset_meta: Any = None) -> None:
         super().__init__(config)
         if config.checkpoint is None:
-            raise ValueError("checkpoint: expected --policy.checkpoint=CHECKPOINT, or --policy.path, got none")
+            raise saccade.InputError(
+                "checkpoint: expected a directory or an id (--policy.checkpoint), got none"
+            )
+        self._checkpoint = config.checkpoint
         self.policy = saccade.Policy.load(
             config.checkpoint,
             embodiment=_embodiment(config.embodiment),
-            preprocessing=config.preprocessing,  # type: ignore[arg-type]  # checked there
+            preprocessing=config.preprocessing,
             tokenizer=config.tokenizer,
             precision={"backbone": config.precision, "head": config.head_precision or config.precision},
             num_threads=config.num_threads,
@@ -149,7 +152,7 @@ class SaccadePolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         """Writes what ``--policy.path`` needs: options, processors, and a copy of the checkpoint."""
-        copy_checkpoint(Path(self.config.checkpoint), save_directory)
+        copy_checkpoint(self._checkpoint, save_directory)
         replace(self.config, checkpoint=None)._save_pretrained(save_directory)
         for processor in make_saccade_pre_post_processors(self.config):
             processor.save_pretrained(save_directory)

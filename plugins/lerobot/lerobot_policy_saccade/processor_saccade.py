@@ -1,4 +1,4 @@
-"""lerobot's processors of a policy. They rename and batch only: the rest is the checkpoint's and saccade's."""
+"""lerobot's processors of a policy. They only rename and batch: saccade normalises by the checkpoint."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The tasks as lerobot's programs expect environments: `pixels`, `agent_pos`, and the instruction as an attribute.
+"""The tasks as lerobot expects environments: `pixels`, `agent_pos`, and the instruction as an attribute.
 
 Importing this module registers `saccade/<task>-lerobot-v0` for each task:
 
@@ -27,9 +27,7 @@ from saccade.sim.tasks import TASKS
 Actions = npt.NDArray[np.float32]
 
 
-class LeRobotObservation(
-    gymnasium.Wrapper[dict[str, Any], Actions, SimulatedObservation, Actions],
-):
+class LeRobotObservation(gymnasium.Wrapper[dict[str, Any], Actions, SimulatedObservation, Actions]):
     """An environment of `saccade.sim` with lerobot's names.
 
     Observations are `{"pixels": {camera: (H, W, 3) uint8}, "agent_pos": (4,) float32}`; infos also contain
