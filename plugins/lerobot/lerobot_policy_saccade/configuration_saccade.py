@@ -39,6 +39,7 @@ class SaccadeConfig(PreTrainedConfig):
         ValueError: ``device`` is not the CPU, or ``n_action_steps`` is less than 1.
     """
 
+    device: str | None = "cpu"
     checkpoint: str | None = None
     embodiment: str | None = None
     precision: str = "float32"
@@ -57,7 +58,7 @@ class SaccadeConfig(PreTrainedConfig):
             raise ValueError(f"device: expected 'cpu', got {self.device!r}; saccade computes on the CPU")
         if self.n_action_steps is not None and self.n_action_steps < 1:
             raise ValueError(f"n_action_steps: expected at least 1, got {self.n_action_steps}")
-        self.device = "cpu"  # otherwise lerobot would choose a GPU if there is one
+        self.device = "cpu"
         super().__post_init__()
 
     @property

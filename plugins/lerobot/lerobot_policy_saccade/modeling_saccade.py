@@ -56,14 +56,12 @@ class SaccadePolicy(PreTrainedPolicy):
     def __init__(self, config: SaccadeConfig, *, dataset_stats: Any = None, dataset_meta: Any = None) -> None:
         super().__init__(config)
         if config.checkpoint is None:
-            raise saccade.InputError(
-                "checkpoint: expected a directory or an id (--policy.checkpoint), got none"
-            )
+            raise saccade.InputError("checkpoint: expected a path or an id, got none (--policy.checkpoint)")
         self._checkpoint = config.checkpoint
         self.policy = saccade.Policy.load(
             config.checkpoint,
             embodiment=_embodiment(config.embodiment),
-            preprocessing=config.preprocessing,
+            preprocessing=config.preprocessing,  # type: ignore[arg-type]  # it is checked there
             tokenizer=config.tokenizer,
             precision={"backbone": config.precision, "head": config.head_precision or config.precision},
             num_threads=config.num_threads,
@@ -211,7 +209,9 @@ class SaccadePolicy(PreTrainedPolicy):
         config = replace(config, **options)
         if config.checkpoint is None:
             config.checkpoint = str(saved if saved.is_dir() else folder)
-        return cls(config).eval()
+        policy = cls(config)
+        policy.eval()
+        return policy
 
 
 def _embodiment(given: str | None) -> str | int | None:
