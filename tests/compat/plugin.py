@@ -225,7 +225,7 @@ def test_saved_and_loaded(
 def test_a_full_disk_keeps_what_was_saved(policy: SaccadePolicy, tmp_path: Path) -> None:
     policy.save_pretrained(tmp_path)
     held = {path: path.stat().st_mtime_ns for path in (tmp_path / "checkpoint").rglob("*")}
-    with mock.patch.object(files.shutil, "copyfile", side_effect=OSError(28, "full")), pytest.raises(OSError):
+    with mock.patch("shutil.copyfile", side_effect=OSError(28, "full")), pytest.raises(OSError):
         policy.save_pretrained(tmp_path)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "checkpoint").rglob("*")} == held
     assert not list(tmp_path.glob(".*"))
@@ -264,7 +264,7 @@ def test_published_repositories(
 
 
 def test_every_option_reaches_the_hub(checkpoint: Path) -> None:
-    given = {
+    given: dict[str, Any] = {
         "force_download": True,
         "resume_download": None,
         "proxies": {"https": "proxy"},
