@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -44,29 +45,34 @@ def test_the_state_stays_in_its_bounds() -> None:
     for direction in (1.0, -1.0):
         for _ in range(40):
             env.advance(np.full(4, direction))
-        assert env.observe()["proprio"] in env.observation_space["proprio"]
+        assert env.observe() in env.observation_space
     env.close()
+
+
+def same_but_for_names(observation: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert set(observation) == {"pixels", "agent_pos"}
+    assert set(observation["pixels"]) == set(expected["images"])
+    for name, picture in expected["images"].items():
+        np.testing.assert_array_equal(observation["pixels"][name], picture)
+    np.testing.assert_array_equal(observation["agent_pos"], expected["proprio"])
 
 
 def test_a_wrapper_offers_lerobots_names() -> None:
     env = gymnasium.make("saccade/push-lerobot-v0", image_size=SMALL, render_mode="rgb_array")
     assert isinstance(env, LeRobotObservation)  # lerobot 0.5 looks at the outermost wrapper only
     plain = TaskEnvironment("push", image_size=SMALL)
-    pairs = [(env.reset(seed=5), plain.reset(seed=5)), (env.step(np.ones(4)), plain.step(np.ones(4)))]
-    for answer, expected in pairs:
-        assert answer[0] in env.observation_space
-        assert set(answer[0]) == {"pixels", "agent_pos"}
-        for name, picture in expected[0]["images"].items():
-            np.testing.assert_array_equal(answer[0]["pixels"][name], picture)
-        np.testing.assert_array_equal(answer[0]["agent_pos"], expected[0]["proprio"])
-        assert answer[1:-1] == expected[1:-1]
-        assert answer[-1] == {**expected[-1], "is_success": False}
-    names = ("task", "task_description", "_max_episode_steps")
-    assert [env.get_wrapper_attr(name) for name in names] == [
-        "push",
-        plain.instruction,
-        TASKS["push"].max_steps,
-    ]
+    observation, info = env.reset(seed=5)
+    expected, plain_info = plain.reset(seed=5)
+    same_but_for_names(observation, expected)
+    assert info == {**plain_info, "is_success": False}
+    observation, *outcome, info = env.step(np.ones(4, np.float32))
+    expected, *plain_outcome, plain_info = plain.step(np.ones(4))
+    assert observation in env.observation_space
+    same_but_for_names(observation, expected)
+    assert outcome == plain_outcome
+    assert info == {**plain_info, "is_success": False}
+    told = [env.get_wrapper_attr(name) for name in ("task", "task_description", "_max_episode_steps")]
+    assert told == ["push", plain.instruction, TASKS["push"].max_steps]
     rendered = env.render()
     assert isinstance(rendered, np.ndarray)
     assert rendered.dtype == np.uint8
