@@ -74,8 +74,8 @@ def policy(checkpoint: Path) -> SaccadePolicy:
 @pytest.fixture
 def batch() -> dict[str, Any]:
     """Three observations as lerobot's processors give them."""
-    frames = np.random.default_rng(0).integers(0, 256, (len(VIEWS), 3, 3, 64, 64), np.uint8)
-    assert frames.shape[-1] == DEFAULT_IMAGE_SIZE
+    shape = (len(VIEWS), 3, 3, DEFAULT_IMAGE_SIZE, DEFAULT_IMAGE_SIZE)
+    frames = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     images = {
         f"observation.images.{name}": torch.from_numpy(seen).float() / 255
         for name, seen in zip(VIEWS, frames, strict=True)
