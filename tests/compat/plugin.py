@@ -322,6 +322,8 @@ def test_the_environment_is_that_of_the_task() -> None:
     assert config.gym_kwargs == {"render_mode": "rgb_array", "image_size": 16}
     assert config.features["pixels/top"].shape == (16, 16, 3)
     assert lerobot_policy_saccade.SaccadeEnv(task="reach").gym_id == "saccade/reach-lerobot-v0"
+    with pytest.raises(saccade.InputError, match="no-such-task"):
+        SaccadeEnv(task="no-such-task")
 
 
 def evaluate(out: Path, *arguments: str) -> dict[str, Any]:

@@ -94,6 +94,10 @@ environment these tests passed too:
   inside, float64, changed code under the same names, other draws from the generator.
 - Calls from several threads, at 1 and 2 threads, give the same bits.
 
+In lerobot 0.5.1 and 0.6.1 those of the plugin `lerobot_policy_saccade` passed too. `lerobot-eval`, started as
+users start it, runs episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their rewards
+are those of `saccade.Policy.act` in a loop.
+
 ## What is not in the table
 
 - **lerobot 0.4.0 to 0.4.3, 0.5.0, 0.6.0**: the files of their heads equal those of the releases above (in

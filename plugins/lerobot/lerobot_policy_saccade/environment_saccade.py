@@ -8,6 +8,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from saccade._extras import require
+
 
 @EnvConfig.register_subclass("saccade")
 @dataclass
@@ -21,6 +23,7 @@ class SaccadeEnv(EnvConfig):
 
     Raises:
         saccade.MissingExtraError: The extra ``sim`` is not installed.
+        saccade.InputError: There is no such task.
     """
 
     task: str = "reach"
@@ -32,8 +35,10 @@ class SaccadeEnv(EnvConfig):
     def __post_init__(self) -> None:
         # Not at the top: it chooses how MuJoCo draws, which concerns only those who use these tasks.
         from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE
-        from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM
+        from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 
+        require("mujoco", "metaworld")
+        find_task(self.task)
         size = self.image_size or DEFAULT_IMAGE_SIZE
         shapes: dict[str, tuple[FeatureType, tuple[int, ...], str]] = {
             "action": (FeatureType.ACTION, (ACTION_DIM,), ACTION),
