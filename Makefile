@@ -35,10 +35,10 @@ help:
 	@echo "make bench-peers  compare with other engines that run the same head; report in out/peers"
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
 	@echo "make fuzz         fuzz headers, indexes, configs, resizing, tokenizers and processors, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
-	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
+	@echo "make test-compat  test accelerate() and the plugin on lerobot releases; writes docs/compatibility.md"
 	@echo "make test-clients test saccade serve with Isaac-GR00T's clients: CLIENTS_ARGS=\"--clone PATH\" of its repository"
 	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
-	@echo "make wheel        build manylinux wheels of the last commit in dist, for x86-64 and 64-bit ARM (WHEEL_TARGETS)"
+	@echo "make wheel        build manylinux wheels of the last commit in dist, for x86-64 and 64-bit ARM (WHEEL_TARGETS), and the lerobot plugin"
 	@echo "make test-wheel   test the wheels on CPythons, NumPys and emulated CPUs; writes docs/wheels.md"
 	@echo "make clean        remove the virtual environments and build outputs"
 
@@ -186,6 +186,8 @@ wheel:
 	$(if $(filter aarch64-%,$(WHEEL_TARGETS)),.ci/aarch64/run.sh setup)
 	rm -rf dist
 	for target in $(WHEEL_TARGETS); do $(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist --target $$target $(WHEEL_ARGS) || exit 1; done
+	SOURCE_DATE_EPOCH=$$(git show --no-patch --format=%ct) $(WHEEL_VENV)/bin/python -m pip wheel --disable-pip-version-check --quiet \
+		--no-deps --no-build-isolation --wheel-dir dist plugins/lerobot
 
 test-wheel: wheel
 	@$(PYTHON) .ci/needs.py opengl qemu

@@ -4,7 +4,8 @@
 
 `make test-compat` runs all releases. Environments are `.venv-compat-lerobot-*` next to the Makefile. They are
 recreated when their list of packages changes. All packages are installed without their dependencies, because
-the lists in this folder are complete. torch is large, so two environments use the torch of another one.
+the lists in this folder are complete. torch is large, so two environments use the torch of another one. Where
+lerobot has plugins, that of plugins/lerobot is installed too.
 """
 
 from __future__ import annotations
@@ -22,6 +23,10 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--quiet")
+
+#: The package of plugins/lerobot, and its tests.
+PLUGIN = ROOT / "plugins" / "lerobot"
+PLUGIN_TESTS = "plugin.py"
 
 
 @dataclass(frozen=True)
@@ -48,8 +53,8 @@ class Release:
 #: In the order in which the environments build on each other; "" is the environment that runs this program.
 RELEASES = (
     Release("0.4.4", "", ("policies.py", "normalizers.py")),
-    Release("0.6.1", None, ("policies.py", "normalizers.py", "n17_parity.py")),
-    Release("0.5.1", "0.6.1", ("policies.py", "normalizers.py")),
+    Release("0.6.1", None, ("policies.py", "normalizers.py", "n17_parity.py", PLUGIN_TESTS)),
+    Release("0.5.1", "0.6.1", ("policies.py", "normalizers.py", PLUGIN_TESTS)),
 )
 
 INTRODUCTION = """\
@@ -88,6 +93,10 @@ environment these tests passed too:
 - These are refused: training mode, hooks, gradients, a replaced `get_action` or `forward`, `torch.compile`
   inside, float64, changed code under the same names, other draws from the generator.
 - Calls from several threads, at 1 and 2 threads, give the same bits.
+
+In lerobot 0.5.1 and 0.6.1 those of the plugin `lerobot_policy_saccade` passed too. `lerobot-eval`, started as
+users start it, runs episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their rewards
+are those of `saccade.Policy.act` in a loop.
 
 ## What is not in the table
 
@@ -140,6 +149,9 @@ def set_up(release: Release, python312: str | None) -> None:
         (site_packages(release.folder / "bin" / "python") / "below.pth").write_text(f"{below}\n")
     install = [*PIP, "--no-deps", "--requirement", str(release.packages)]
     subprocess.run([str(release.folder / "bin" / "python"), *install], check=True)
+    if PLUGIN_TESTS in release.tests:
+        editable = [*PIP, "--no-deps", "--no-build-isolation", "--editable", str(PLUGIN)]
+        subprocess.run([str(release.folder / "bin" / "python"), *editable], check=True)
     stamp.write_text(release.packages.read_text())
 
 

@@ -21,6 +21,9 @@ SimulatedObservation = dict[str, Any]
 
 VIDEO_SIZE = 360
 SIMULATION_HZ = 80  # control steps in a second of simulated time
+#: Bounds of the proprioception, to which Meta-World clips it: the hand in metres, the gripper's opening.
+PROPRIO_LOW = np.array([-0.525, 0.348, -0.0525, 0.0], np.float32)
+PROPRIO_HIGH = np.array([0.525, 1.025, 0.7, 1.0], np.float32)
 
 
 class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32]]):
@@ -211,7 +214,7 @@ def observation_space(cameras: Sequence[Camera], image_size: int) -> spaces.Dict
     return spaces.Dict(
         {
             "images": spaces.Dict({camera.name: spaces.Box(0, 255, shape, np.uint8) for camera in cameras}),
-            "proprio": spaces.Box(-np.inf, np.inf, (PROPRIO_DIM,), np.float32),
+            "proprio": spaces.Box(PROPRIO_LOW, PROPRIO_HIGH, dtype=np.float32),
             "instruction": spaces.Text(max_length=200, charset=spaces.text.alphanumeric | frozenset(" ,.'-")),
         }
     )

@@ -1,0 +1,219 @@
+"""A whole GR00T checkpoint as one of lerobot's policies: tensors in, actions out, computed by saccade."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn, Self
+
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+import saccade
+from lerobot_policy_saccade.configuration_saccade import NO_TRAINING, SaccadeConfig
+from lerobot_policy_saccade.files import CHECKPOINT, copy_checkpoint, folder_of
+from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
+
+OBSERVATION, TASK = "observation.", "task"
+
+#: Seeds are drawn below this number.
+SEEDS = 2**63 - 1
+
+
+class SaccadePolicy(PreTrainedPolicy):
+    """A :class:`saccade.Policy` in lerobot's form.
+
+    It takes lerobot's observations as they are, without normalisation: the checkpoint has its own statistics,
+    and knows how frames and words are prepared. Actions are in the robot's units. It has no torch parameters.
+
+    Args:
+        config: The options.
+        dataset_stats, dataset_meta: Unused; lerobot passes them.
+
+    Attributes:
+        policy: The :class:`saccade.Policy`.
+
+    Raises:
+        ValueError: No checkpoint is given, an option is out of range, or the environment's actions have
+            another width.
+        FileNotFoundError, saccade.CheckpointError: As :meth:`saccade.Policy.load`.
+
+    Example:
+        >>> import torch
+        >>> def first_action(checkpoint: str, frames: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        ...     policy = SaccadePolicy(SaccadeConfig(checkpoint=checkpoint, embodiment="new_embodiment"))
+        ...     policy.reset()
+        ...     batch = {"observation.images.front": frames, "observation.state": state, "task": ["lift"]}
+        ...     return policy.select_action(batch)
+    """
+
+    config_class = SaccadeConfig
+    name = "saccade"
+
+    def __init__(self, config: SaccadeConfig, *, dataset_stats: Any = None, dataset_meta: Any = None) -> None:
+        super().__init__(config)
+        if config.checkpoint is None:
+            raise saccade.InputError("checkpoint: expected a path or an id, got none (--policy.checkpoint)")
+        self._checkpoint = config.checkpoint
+        self.policy = saccade.Policy.load(
+            config.checkpoint,
+            embodiment=_embodiment(config.embodiment),
+            preprocessing=config.preprocessing,  # type: ignore[arg-type]  # it is checked there
+            tokenizer=config.tokenizer,
+            precision={"backbone": config.precision, "head": config.head_precision or config.precision},
+            num_threads=config.num_threads,
+            cameras=config.cameras,
+        )
+        normalizer = self.policy.normalizer
+        width = config.action_feature.shape[-1] if config.action_feature else normalizer.action_width
+        if width != normalizer.action_width:
+            keys = ", ".join(f"{group.key} ({group.size})" for group in normalizer.action_groups)
+            raise saccade.InputError(
+                f"{ACTION}: expected an environment of {normalizer.action_width} numbers, {keys}, got {width}"
+            )
+        horizon = normalizer.action_horizon or self.policy.head.config.action_horizon
+        self._steps = config.n_action_steps or horizon
+        if self._steps > horizon:
+            raise saccade.InputError(
+                f"n_action_steps: expected at most {horizon}, the length of a chunk, got {self._steps}"
+            )
+        self._actions: deque[Tensor] = deque()
+        self._chunks = 0
+
+    def reset(self) -> None:
+        """Forgets what is left of the last chunk. lerobot calls it before every episode."""
+        self._actions.clear()
+        self._chunks = 0
+
+    def select_action(self, batch: Mapping[str, Any], noise: Tensor | None = None) -> Tensor:
+        """The next action: of the last chunk, or of a new one when that is used up.
+
+        Args:
+            batch, noise: As in :meth:`predict_action_chunk`.
+
+        Returns:
+            float32 ``(B, D)``, in the robot's units.
+
+        Raises:
+            saccade.InputError, saccade.ShapeError, saccade.DtypeError: As :meth:`predict_action_chunk`.
+        """
+        if not self._actions:
+            chunk = self.predict_action_chunk(batch, noise=noise)
+            self._actions.extend(chunk[:, : self._steps].unbind(1))
+        return self._actions.popleft()
+
+    def predict_action_chunk(self, batch: Mapping[str, Any], noise: Tensor | None = None) -> Tensor:
+        """A chunk of actions for each observation.
+
+        Args:
+            batch: ``observation.images.<name>`` ``(B, 3, H, W)``, uint8 or float from 0 to 1;
+                ``observation.state`` ``(B, D)``; ``task``, a string for each row. Other keys are ignored.
+            noise: float32 ``(B, T, D)`` of the head. Default: drawn; see ``seed`` of the options.
+
+        Returns:
+            float32 ``(B, T, D)``, in the robot's units.
+
+        Raises:
+            saccade.InputError, saccade.ShapeError, saccade.DtypeError: The observation does not fit the
+                robot; the message lists what the robot needs.
+        """
+        options: dict[str, Any] = {"num_steps": self.config.num_steps}
+        if noise is not None:
+            options["noise"] = noise
+        elif self.config.seed is not None:
+            options["seed"] = self.config.seed + self._chunks
+        else:
+            options["seed"] = int(torch.randint(SEEDS, ()))
+        chunk: Tensor = self.policy.act(self._observation(batch), **options)
+        self._chunks += 1
+        return chunk
+
+    def _observation(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """What saccade reads of a batch, on the CPU, with the checkpoint's keys."""
+        renamed = self.config.rename_map
+        return {
+            renamed.get(key, key): value.cpu() if isinstance(value, Tensor) else value
+            for key, value in batch.items()
+            if key == TASK or key.startswith(OBSERVATION)
+        }
+
+    def forward(self, batch: Mapping[str, Any]) -> NoReturn:
+        """Raises a NotImplementedError: there is no training loss."""
+        raise NotImplementedError(NO_TRAINING)
+
+    def get_optim_params(self) -> NoReturn:
+        """Raises a NotImplementedError: there are no parameters to train."""
+        raise NotImplementedError(NO_TRAINING)
+
+    def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
+        """Writes what ``--policy.path`` needs: options, processors, and a copy of the checkpoint."""
+        copy_checkpoint(self._checkpoint, save_directory)
+        replace(self.config, checkpoint=None)._save_pretrained(save_directory)
+        for processor in make_saccade_pre_post_processors(self.config):
+            processor.save_pretrained(save_directory)
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: SaccadeConfig | None = None,
+        force_download: bool = False,
+        resume_download: bool | None = None,
+        proxies: dict[str, str] | None = None,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+        revision: str | None = None,
+        strict: bool = False,
+        dataset_stats: Any = None,
+        dataset_meta: Any = None,
+        **options: Any,
+    ) -> Self:
+        """Loads a directory or a published repository.
+
+        Args:
+            pretrained_name_or_path: What ``save_pretrained`` wrote, or any whole GR00T checkpoint.
+            config: The options. Default: those that were saved, or the defaults.
+            force_download, resume_download, proxies, token, cache_dir, local_files_only, revision: As in
+                ``huggingface_hub.snapshot_download``. Unused for a directory.
+            strict: Unused: tensors that are missing are always an error.
+            dataset_stats, dataset_meta: Unused; lerobot passes them.
+            **options: Options that replace those of ``config``, such as ``embodiment`` and ``precision``.
+
+        Raises:
+            FileNotFoundError: There is neither the directory nor the repository.
+            ValueError, saccade.CheckpointError: As the class.
+
+        Example:
+            >>> def load(**hub: bool | str) -> SaccadePolicy:
+            ...     name = "nvidia/GR00T-N1.5-3B"
+            ...     return SaccadePolicy.from_pretrained(name, embodiment="gr1", precision="int8", **hub)
+        """
+        folder = folder_of(
+            pretrained_name_or_path,
+            revision=revision,
+            cache_dir=cache_dir,
+            force_download=force_download,
+            resume_download=resume_download,
+            proxies=proxies,
+            token=token,
+            local_files_only=local_files_only,
+        )
+        saved = folder / CHECKPOINT
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(folder) if saved.is_dir() else SaccadeConfig()
+        config = replace(config, **options)
+        if config.checkpoint is None:
+            config.checkpoint = str(saved if saved.is_dir() else folder)
+        policy = cls(config)
+        policy.eval()
+        return policy
+
+
+def _embodiment(given: str | None) -> str | int | None:
+    """A tag, or an id if it is a number."""
+    return int(given) if given is not None and given.isdecimal() else given
