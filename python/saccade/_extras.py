@@ -28,9 +28,9 @@ EXTRAS: dict[str, dict[str, str]] = {
         "threadpoolctl": "threadpoolctl",
         "jinja2": "jinja2",
         "scipy": "scipy",
+        "joblib": "joblib",
     },
     "study": {
-        "joblib": "joblib",
         "markdown_it": "markdown-it-py",
         "pandas": "pandas",
         "sklearn": "scikit-learn",

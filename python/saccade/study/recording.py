@@ -66,6 +66,11 @@ class Recording(Source):
         }
 
     @property
+    def files(self) -> tuple[str, ...]:
+        """See `Source`."""
+        return (*super().files, self.file)
+
+    @property
     def units(self) -> list[tuple[str, int]]:
         """Every row of the file."""
         return [(TASK, row) for row in range(len(self.all))]
