@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,7 @@ def test_bad_input(arguments: dict[str, Any], message: str) -> None:
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The cache of a machine, empty."""
-    monkeypatch.setattr(files.tempfile, "tempdir", str(tmp_path / "machine"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "machine"))
     (tmp_path / "machine").mkdir()
     return files.cache_directory()
 
@@ -79,7 +80,12 @@ def test_a_directory_arrives_as_it_was(tmp_path: Path, cache: Path, monkeypatch:
         (source / name).write_bytes(content)
     (source / ".hidden").write_text("stays")
     sent: list[UInt8Array] = []
-    shipment = files.pack(source, lambda piece: sent.append(piece) or len(sent) - 1)  # type: ignore[func-returns-value]
+
+    def put(piece: UInt8Array) -> int:
+        sent.append(piece)
+        return len(sent) - 1
+
+    shipment = files.pack(source, put)
     assert [len(piece) for piece in sent] == [2, 5, 5, 3]
     placed = files.place(shipment, sent.__getitem__)
     assert placed.name == "policy"
