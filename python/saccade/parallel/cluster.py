@@ -6,6 +6,7 @@ import contextlib
 import functools
 import logging
 import os
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from saccade import _extras
 from saccade.errors import InputError, SaccadeError
 from saccade.parallel.files import Shipment, pack, place, relocated
 from saccade.parallel.workers import RETRIES, Lost, Piece, Result, Workers
+
+SECONDS_TO_CONNECT = 10.0
 
 
 class ClusterError(SaccadeError):
@@ -116,6 +119,7 @@ def connected(address: str | None) -> Iterator[ModuleType]:
         yield ray
         return
     try:
+        check_reachable(address)
         # What processes print would run through the progress bar.
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
@@ -125,6 +129,13 @@ def connected(address: str | None) -> Iterator[ModuleType]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def check_reachable(address: str | None) -> None:
+    """Raises `OSError` if nothing listens at `HOST:PORT`, of which Ray would say so after minutes."""
+    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), SECONDS_TO_CONNECT).close()
 
 
 def check_cluster(ray: ModuleType, workers: Workers) -> None:
