@@ -12,6 +12,8 @@ PEERS_ARGS ?=
 COMPAT_ARGS ?=
 CLIENTS_ARGS ?=
 FUZZ_SECONDS ?= 1800
+RAY_VENV ?= .venv-ray
+RAY_ARGS ?=
 WHEEL_VENV ?= .venv-wheel
 WHEEL_ARGS ?=
 WHEEL_TARGETS ?= x86_64-unknown-linux-gnu aarch64-unknown-linux-gnu
@@ -25,7 +27,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients test-aarch64 test-aarch64-all fuzz setup-rollout setup-test clean
+.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients test-ray test-aarch64 test-aarch64-all fuzz setup-rollout setup-test clean
 
 help:
 	@echo "make rollout      run the bundled policy in simulation; table and videos in $(ROLLOUT_OUT)"
@@ -37,6 +39,7 @@ help:
 	@echo "make fuzz         fuzz headers, indexes, configs, resizing, tokenizers and processors, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() and the plugin on lerobot releases; writes docs/compatibility.md"
 	@echo "make test-clients test saccade serve with Isaac-GR00T's clients: CLIENTS_ARGS=\"--clone PATH\" of its repository"
+	@echo "make test-ray     test rollout, study and demos on a Ray cluster of two nodes on this machine"
 	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
 	@echo "make wheel        build manylinux wheels of the last commit in dist, for x86-64 and 64-bit ARM (WHEEL_TARGETS), and the lerobot plugin"
 	@echo "make test-wheel   test the wheels on CPythons, NumPys and emulated CPUs; writes docs/wheels.md"
@@ -173,6 +176,22 @@ test-compat: setup-test
 # Nothing is fetched: the clients are read from a clone of Isaac-GR00T.
 test-clients: setup-test
 	$(BIN)/python tests/compat/groot.py $(CLIENTS_ARGS)
+
+# Processes and a node are killed meanwhile. Ray is in no other environment, since it does not support every Python.
+test-ray:
+	@$(PYTHON) .ci/needs.py python rust opengl
+	@$(MAKE) -s $(RAY_VENV)/.ray
+	SACCADE_RAY=1 OMP_NUM_THREADS=1 $(RAY_VENV)/bin/python -m pytest tests/test_ray.py $(RAY_ARGS)
+
+RAY_PIP := MATURIN_PEP517_ARGS=--locked $(RAY_VENV)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
+
+$(RAY_VENV)/.ray: pyproject.toml constraints.txt $(RUST_SOURCES)
+	@test "$$($(RAY_VENV)/bin/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(RAY_VENV))" || $(PYTHON) -m venv --clear $(RAY_VENV)
+	@echo "setup: saccade with the extra ray (torch is large; takes minutes the first time)"
+	@$(RAY_PIP) maturin pytest hypothesis
+	@$(RAY_PIP) --no-build-isolation --editable ".[ray]"
+	@touch $@
+
 # On one emulated CPU, and on those that differ in what they have. docs/aarch64.md says more.
 test-aarch64:
 	.ci/aarch64/run.sh test
@@ -200,5 +219,5 @@ $(WHEEL_VENV)/.tools: .ci/wheels/requirements.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS_VENV) $(WHEEL_VENV) .venv-compat-* target out dist
+	rm -rf $(VENV) $(PEERS_VENV) $(RAY_VENV) $(WHEEL_VENV) .venv-compat-* target out dist
 	find python -name '*.so' -delete

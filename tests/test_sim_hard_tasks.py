@@ -413,7 +413,7 @@ def test_demos_without_names_are_those_of_the_demo(
 ) -> None:
     recorded: dict[str, int] = {}
     monkeypatch.setattr(graphics, "check", lambda: None)
-    monkeypatch.setattr(demos, "record_task", lambda task, count, *_: recorded.update({task: count}))
+    monkeypatch.setattr(demos, "record_tasks", lambda counts, *_: recorded.update(counts))
     assert main(["demos", "--out", str(tmp_path)]) == 0
     assert recorded == dict(zip(SHIPPED, (300, 100, 100, 100, 100), strict=True))
     recorded.clear()

@@ -15,11 +15,13 @@ import pandas as pd
 import pytest
 
 from saccade.errors import InputError
+from saccade.parallel import Workers
 from saccade.study import table as tables
 from saccade.study.cell import Cell, Rows, digest
-from saccade.study.run import BACKENDS, StudyError, run_cells
+from saccade.study.run import StudyError, run_cells
 from saccade.study.study import STUDIES, load_study
 
+TWO = Workers(jobs=2)
 SETTINGS = {"checkpoint": "abc", "width": 0.1}
 
 
@@ -137,16 +139,19 @@ def test_a_failing_cell_is_named_after_the_others_are_done(tmp_path: Path) -> No
 def test_two_processes_give_the_same_table(tmp_path: Path) -> None:
     work = Square(tmp_path / "log")
     one = run_cells("demo", cells(*range(6)), work, tmp_path / "one", settings=SETTINGS)
-    two = run_cells("demo", cells(*range(6)), work, tmp_path / "two", settings=SETTINGS, jobs=2)
+    two = run_cells("demo", cells(*range(6)), work, tmp_path / "two", settings=SETTINGS, workers=TWO)
     pd.testing.assert_frame_equal(one, two)
     assert (tmp_path / "one" / "demo.csv").read_bytes() == (tmp_path / "two" / "demo.csv").read_bytes()
 
 
-def test_a_worker_that_dies_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match="a worker process died"):
-        run_cells(
-            "demo", cells(1, 2), Square(tmp_path / "log", dies=(1, 2)), tmp_path, settings=SETTINGS, jobs=2
-        )
+def test_a_cell_whose_process_dies_is_named_and_the_others_are_done(tmp_path: Path) -> None:
+    work = Square(tmp_path / "log", dies=(2,))
+    with pytest.raises(
+        StudyError, match=r"1 of 4 cells failed: square 2: a worker process died in each of 4"
+    ):
+        run_cells("demo", cells(1, 2, 3, 4), work, tmp_path, settings=SETTINGS, workers=TWO)
+    assert tables.read_table(tmp_path / "demo.csv")["number"].tolist() == [1, 3, 4]
+    assert work.worked.count(2) == 4
 
 
 def test_cell_files_that_are_none_are_done_anew(tmp_path: Path) -> None:
@@ -184,19 +189,9 @@ def test_a_cell_with_other_settings_takes_the_place_of_its_predecessor(tmp_path:
     assert table["number"].tolist() == [1, 2]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"backend": "dask"}, "backend: unknown name 'dask', expected one of loky, ray"),
-        ({"jobs": 0}, "jobs: given 0"),
-        ({"cells": cells(1, 1)}, "duplicate keys"),
-    ],
-)
-def test_bad_input(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
-    given = {"cells": cells(1), "backend": "loky", "jobs": 1, **arguments}
-    with pytest.raises(InputError, match=message):
-        run_cells("demo", given.pop("cells"), Square(tmp_path / "log"), tmp_path, settings=SETTINGS, **given)  # type: ignore[arg-type]
-    assert BACKENDS == ("loky", "ray")
+def test_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="duplicate keys"):
+        run_cells("demo", cells(1, 1), Square(tmp_path / "log"), tmp_path, settings=SETTINGS)
 
 
 def test_a_table_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -232,19 +227,3 @@ def test_studies_are_found_by_name() -> None:
     with pytest.raises(InputError, match=f"unknown name 'cut', expected one of {', '.join(STUDIES)}"):
         load_study("cut")
     assert load_study("cuts").name == "cuts"
-
-
-def test_ray_gives_the_same_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ray = pytest.importorskip("ray", reason="the extra ray is not installed")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # its workers import this file for `Square`
-    work = Square(tmp_path / "log")
-    one = run_cells("demo", cells(*range(9)), work, tmp_path / "one", settings=SETTINGS)
-    try:
-        two = run_cells(
-            "demo", cells(*range(9)), work, tmp_path / "two", settings=SETTINGS, backend="ray", jobs=2
-        )
-    finally:
-        ray.shutdown()
-    pd.testing.assert_frame_equal(one, two)
-    with pytest.raises(InputError, match="jobs: given -1"):
-        run_cells("demo", cells(1), work, tmp_path / "two", settings=SETTINGS, backend="ray", jobs=-1)

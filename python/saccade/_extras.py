@@ -27,9 +27,9 @@ EXTRAS: dict[str, dict[str, str]] = {
         "matplotlib": "matplotlib",
         "jinja2": "jinja2",
         "scipy": "scipy",
+        "joblib": "joblib",
     },
     "study": {
-        "joblib": "joblib",
         "markdown_it": "markdown-it-py",
         "pandas": "pandas",
         "sklearn": "scikit-learn",

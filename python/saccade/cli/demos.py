@@ -7,6 +7,8 @@ import argparse
 from saccade import _arguments as arguments
 from saccade._files import writable_directory
 from saccade.cli import EXIT_OK, _output, require
+from saccade.parallel.arguments import add_arguments as add_worker_arguments
+from saccade.parallel.arguments import workers_of
 
 HELP = "record demonstrations of the tasks with scripted experts"
 
@@ -14,13 +16,14 @@ EPILOG = """\
 Tasks of the demo: reach, push, drawer-open, button-press-topdown, window-open. Harder tasks, for studies:
 two-goals, stereo-reach, two-stage, fork.
 
-Writes DIR/TASK/SEED.npz. If the command is interrupted, run it again: it continues where it stopped. Two
-processes may record different tasks into the same directory.
+Writes DIR/TASK/SEED.npz. If the command is interrupted, run it again: it continues where it stopped. The
+files are the same with any number of processes and machines.
 
 examples:
   saccade demos --out out/demos                               the data of the bundled policy
   saccade demos --out out/demos --tasks reach --episodes 50
-  saccade demos --out out/study --tasks two-goals,stereo-reach,two-stage
+  saccade demos --out out/study --tasks two-goals,stereo-reach,two-stage --jobs -1
+  saccade demos --out out/demos --backend ray --address auto
 """
 
 
@@ -46,31 +49,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_integer(
         parser, "--frame-stride", default=3, help="control steps between recorded observations"
     )
+    add_worker_arguments(parser, "demonstrations")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Checks the arguments, then records task by task."""
+    """Checks the arguments, then records."""
     from saccade.sim.tasks import DEMO_TASKS
 
     arguments.check_tasks(args.tasks or ())
+    workers = workers_of(args)
     require("demos")
     from saccade.sim import graphics
-    from saccade.sim.demos import DEFAULT_COUNTS, RecordingSettings, record_task
+    from saccade.sim.demos import DEFAULT_COUNTS, RecordingSettings, record_tasks
 
     graphics.check()
     settings = RecordingSettings(image_size=args.image_size, frame_stride=args.frame_stride)
     tasks = args.tasks or [task.name for task in DEMO_TASKS]
     counts = {task: args.episodes or DEFAULT_COUNTS[task] for task in tasks}
     writable_directory(args.out)
-    for task, count in counts.items():
-        done = 0
-        with _output.progress_bar(task, count) as update:
+    done = 0
+    with _output.progress_bar("demos", sum(counts.values())) as update:
 
-            def on_episode() -> None:
-                nonlocal done
-                done += 1
-                update(done)
+        def on_episode(task: str) -> None:
+            nonlocal done
+            done += 1
+            update(done, description=task)
 
-            record_task(task, count, args.out, settings, on_episode)
+        record_tasks(counts, args.out, settings, on_episode, workers)
     print(f"{sum(counts.values())} demonstrations in {args.out}")
     return EXIT_OK

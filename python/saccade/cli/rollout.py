@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade import _arguments as arguments
-from saccade._files import writable_directory, write_json
+from saccade._files import writable_directory, write_atomically, write_json
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
+from saccade.errors import SaccadeError
+from saccade.parallel import Lost, Workers, each
+from saccade.parallel.arguments import add_arguments as add_worker_arguments
+from saccade.parallel.arguments import workers_of
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from saccade._arrays import UInt8Array
-    from saccade.sim.environment import TaskEnvironment
+    from saccade.sim.episodes import Episodes, Rolled
     from saccade.sim.policy import Policy
     from saccade.sim.report import Summary
-    from saccade.sim.rollout import Episode
 
 HELP = "run a policy on the simulated robot and report how often it succeeds"
+
+COLUMNS = 50  # of the contact sheet: with more seeds, only the first ones are shown
 
 EPILOG = """\
 Tasks of the demo, which the bundled policy knows: reach, push, drawer-open, button-press-topdown,
@@ -31,14 +34,18 @@ window-open. Harder tasks, for policies of your own: two-goals, stereo-reach, tw
 The same seed gives the same layout, wording and noise with either engine. Seeds from 1000000 on are reserved
 for training and refused.
 
-DIR receives results.json (after every episode), contact-sheet.png and, with --video, videos/TASK-SEED.mp4.
-After Ctrl-C the episodes that are done are kept.
+DIR receives results.json (after every episode), contact-sheet.png (of the first 50 seeds) and, with --video,
+videos/TASK-SEED.mp4.
+After Ctrl-C the episodes that are done are kept. With several processes the episodes are the same; an episode
+whose process or machine died is run again.
 
 examples:
   saccade rollout --video
   saccade rollout --tasks reach,push --episodes 20 --out out/twenty
   saccade rollout --checkpoint out/policy --engine torch --num-threads 1 --json
   saccade rollout --tasks reach --instruction-from push     the wrong instruction: it should fail
+  saccade rollout --episodes 100 --jobs -1                  a process for each core
+  saccade rollout --episodes 1000 --backend ray --address auto
 """
 
 
@@ -55,7 +62,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_tasks(parser)
     arguments.add_episodes(parser, 4)
     arguments.add_seed(parser, "seed of the first episode; the next ones count up")
-    arguments.add_num_threads(parser)
+    arguments.add_num_threads(
+        parser, "threads of the action head (default: the physical cores; with several processes 1)"
+    )
+    add_worker_arguments(parser, "episodes")
     arguments.add_out(parser, "out/rollout")
     parser.add_argument("--video", action="store_true", help="write an MP4 of every episode")
     parser.add_argument(
@@ -68,58 +78,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class Session:
     """One run of the command: its arguments and the episodes so far."""
 
-    policy: Policy
+    episodes: Episodes
     tasks: list[str]
     seeds: range
-    instruction_from: str | None
+    workers: Workers
     out: Path
-    video: bool
-    episodes: list[Episode] = field(default_factory=list)
-    pictures: list[tuple[Episode, UInt8Array]] = field(default_factory=list)
+    done: list[Rolled] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+
+    @property
+    def policy(self) -> Policy:
+        """The policy, with which this process describes what it runs."""
+        return self.episodes.policy
 
     def record(self) -> dict[str, Any]:
         """The content of the result file."""
         from saccade.sim.report import result_record
 
-        return result_record(
-            self.episodes,
+        record = result_record(
+            [rolled.episode for rolled in self.done],
             self.policy,
             seeds=self.seeds,
             tasks=self.tasks,
-            instruction_from=self.instruction_from,
+            instruction_from=self.episodes.instruction_from,
         )
+        return record | {"processes": {"backend": self.workers.backend, "jobs": self.workers.jobs}}
 
-    def run(self, on_episode: Callable[[Episode], None]) -> None:
-        """Runs all episodes and writes the result file after each of them."""
-        from saccade.sim.rollout import environment_for
+    def run(self, on_episode: Callable[[Rolled], None]) -> None:
+        """Runs all episodes and writes the result file after each of them, in the order of one process."""
+        from saccade.sim.episodes import Rolled
 
-        for task in self.tasks:
-            with contextlib.closing(
-                environment_for(self.policy, task, render_mode="rgb_array")
-            ) as environment:
-                for seed in self.seeds:
-                    episode = self.run_one(environment, seed)
-                    picture = environment.render()
-                    assert picture is not None
-                    self.episodes.append(episode)
-                    self.pictures.append((episode, picture))
-                    write_json(self.out / "results.json", self.record())
-                    on_episode(episode)
-
-    def run_one(self, environment: TaskEnvironment, seed: int) -> Episode:
-        """Runs one episode, and writes its video if requested."""
-        from saccade.sim.rollout import run_episode
-        from saccade.sim.video import VideoWriter
-
-        if not self.video:
-            return run_episode(environment, self.policy, seed, instruction_from=self.instruction_from)
-        name = f"videos/{environment.task.name}-{seed}.mp4"
-        with VideoWriter(self.out / name) as video:
-            episode = run_episode(
-                environment, self.policy, seed, instruction_from=self.instruction_from, on_step=video.add
-            )
-        episode.video = name
-        return episode
+        pieces = [(task, seed) for task in self.tasks for seed in self.seeds]
+        order = {piece: position for position, piece in enumerate(pieces)}
+        for (task, seed), rolled in each(self.episodes, pieces, self.workers, [self.episodes.checkpoint]):
+            if isinstance(rolled, Lost):
+                self.lost.append(f"{task} {seed}: {rolled.reason}")
+                continue
+            if rolled.video is not None and rolled.episode.video is not None:
+                with write_atomically(self.out / rolled.episode.video) as temporary:
+                    temporary.write_bytes(rolled.video)
+            picture = rolled.picture if seed in self.seeds[:COLUMNS] else None
+            self.done.append(Rolled(rolled.episode, picture))
+            self.done.sort(key=lambda one: order[one.episode.task, one.episode.seed])
+            write_json(self.out / "results.json", self.record())
+            on_episode(rolled)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -130,49 +132,61 @@ def run(args: argparse.Namespace) -> int:
     arguments.check_tasks(args.tasks or ())
     if args.instruction_from is not None:
         arguments.check_known("--instruction-from", [args.instruction_from], arguments.known_tasks())
+    workers = workers_of(args, args.num_threads)
     require("rollout")
-    session = prepare(args, seeds)
+    session = prepare(args, seeds, workers)
+    from saccade.sim import opened
     from saccade.sim.report import write_contact_sheet
 
     writable_directory(session.out)
-    if session.video:
+    if args.video:
         writable_directory(session.out / "videos")
     interrupted = False
     try:
         roll_out(session)
     except KeyboardInterrupt:
         interrupted = True
+    finally:
+        opened.close()
     write_json(session.out / "results.json", session.record())
-    if session.pictures:
-        write_contact_sheet(session.pictures, session.out / "contact-sheet.png")
+    pictures = [(rolled.episode, rolled.picture) for rolled in session.done if rolled.picture is not None]
+    if pictures:
+        write_contact_sheet(pictures, session.out / "contact-sheet.png")
     if args.json:
         _output.print_json(session.record(), indent=2)
     else:
         show(session)
+    if session.lost:
+        total = len(session.tasks) * len(session.seeds)
+        raise SaccadeError(
+            f"{len(session.lost)} of {total} episodes are missing: {'; '.join(session.lost[:3])}"
+        )
     return EXIT_INTERRUPTED if interrupted else EXIT_OK
 
 
-def prepare(args: argparse.Namespace, seeds: range) -> Session:
+def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session:
     """Loads the policy; nothing is written yet."""
     from saccade.sim import graphics
-    from saccade.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
+    from saccade.sim.episodes import Episodes
+    from saccade.sim.policy import DEMO_CHECKPOINT, check_trained_on
 
     graphics.check()
-    policy = Policy.load(args.checkpoint or DEMO_CHECKPOINT, engine=args.engine, num_threads=args.num_threads)
-    tasks = list(args.tasks or policy.config.tasks)
-    check_trained_on(policy, tasks)
-    policy.warmup()
-    return Session(policy, tasks, seeds, args.instruction_from, args.out, args.video)
+    num_threads = args.num_threads if workers.alone else workers.num_threads
+    checkpoint = str(args.checkpoint or DEMO_CHECKPOINT)
+    episodes = Episodes(checkpoint, args.engine, num_threads, args.instruction_from, args.video)
+    tasks = list(args.tasks or episodes.policy.config.tasks)
+    check_trained_on(episodes.policy, tasks)
+    return Session(episodes, tasks, seeds, workers, args.out)
 
 
 def roll_out(session: Session) -> None:
     """Runs the episodes with a progress bar."""
     with _output.progress_bar("rollout", len(session.seeds) * len(session.tasks)) as update:
 
-        def on_episode(episode: Episode) -> None:
-            done = len(session.episodes)
-            succeeded = sum(episode.success for episode in session.episodes)
-            update(done, description=f"{episode.task}: {succeeded} of {done} succeeded")
+        def on_episode(rolled: Rolled) -> None:
+            done = len(session.done)
+            succeeded = sum(one.episode.success for one in session.done)
+            update(done, description=f"{rolled.episode.task}: {succeeded} of {done} succeeded")
 
         session.run(on_episode)
 
@@ -182,20 +196,21 @@ def show(session: Session) -> None:
     from saccade.sim.report import summarize, summarize_tasks
 
     console = _output.console()
-    if not session.episodes:
+    episodes = [rolled.episode for rolled in session.done]
+    if not episodes:
         print("no episode was completed")
         return
     engine = session.policy.describe()
     described = ", ".join(f"{key} {value}" for key, value in engine.items() if key != "name")
     table = make_table(f"{engine['name']} engine ({described})")
-    for summary in summarize_tasks(session.episodes):
+    for summary in summarize_tasks(episodes):
         table.add_row(*cells(summary))
     table.add_section()
-    table.add_row(*cells(summarize("all", session.episodes)), style="bold")
+    table.add_row(*cells(summarize("all", episodes)), style="bold")
     console.print(table)
     print(f"results        {session.out / 'results.json'}")
     print(f"contact sheet  {session.out / 'contact-sheet.png'}")
-    if session.video:
+    if session.episodes.video:
         print(f"videos         {session.out / 'videos'}")
 
 

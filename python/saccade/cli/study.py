@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from saccade import _arguments as arguments
 from saccade._files import writable_directory
 from saccade.cli import EXIT_OK, Parser, _output, require
+from saccade.parallel.arguments import add_arguments as add_worker_arguments
+from saccade.parallel.arguments import workers_of
 from saccade.study.study import STUDIES, load_study
 
 if TYPE_CHECKING:
@@ -71,19 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares what every study takes."""
     arguments.add_out(parser, "out/study", "directory of the tables")
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=1,
-        metavar="N",
-        help="cells computed at the same time; with loky -1 for all cores (default: 1)",
-    )
-    parser.add_argument(
-        "--backend",
-        default="loky",
-        metavar="loky|ray",
-        help="processes on this machine, or on a Ray cluster (default: loky)",
-    )
+    add_worker_arguments(parser, "cells")
     arguments.add_json(parser, "print table and provenance as JSON")
 
 
@@ -99,10 +89,10 @@ def run(args: argparse.Namespace) -> int:
 
 def measure(args: argparse.Namespace) -> int:
     """Checks the arguments, works through the cells with a progress bar, and prints the conclusions."""
-    from saccade.study.run import Finished, check_workers
+    from saccade.study.run import Finished
     from saccade.study.run import run as run_study
 
-    check_workers(args.backend, args.jobs)
+    workers = workers_of(args)
     with _output.progress_bar("loading", transient=True):
         study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
@@ -111,7 +101,7 @@ def measure(args: argparse.Namespace) -> int:
         def on_done(finished: Finished, done: int, total: int) -> None:
             update(done, total, finished.cell.name)
 
-        run_study(study, out, backend=args.backend, jobs=args.jobs, on_done=on_done)
+        run_study(study, out, workers=workers, on_done=on_done)
     show(args.study, out, args.json)
     return EXIT_OK
 

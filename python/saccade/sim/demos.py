@@ -2,14 +2,16 @@
 
 A recording is a directory with `<task>/<seed>.npz` and `<task>/recording.json`, which has the settings. Files
 are written under a temporary name and renamed, so that an interrupted recording can be continued. An episode
-depends only on its task, its seed and the settings, so that several processes can record different tasks.
+depends only on its task, its seed and the settings, so that several processes record the same files as one.
 """
 
 from __future__ import annotations
 
+import functools
+import io
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._files import write_atomically, write_json
-from saccade.errors import InputError
+from saccade.errors import InputError, SaccadeError
+from saccade.parallel import ALONE, Lost, Workers, each
+from saccade.sim import opened
 from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, Camera
 from saccade.sim.experts import Expert, NoiseBursts
 from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
@@ -126,46 +130,145 @@ def record_episode(
     )
 
 
-def record_task(
-    task: str, count: int, out: Path, settings: RecordingSettings, on_episode: Callable[[], None]
+@dataclass(frozen=True)
+class Recorder:
+    """Records one episode; what a process runs.
+
+    Attributes:
+        settings: As of the whole recording.
+    """
+
+    settings: RecordingSettings
+
+    def __call__(self, piece: tuple[str, int]) -> bytes | None:
+        """The file of the episode of a task and a seed; None if the expert did not succeed."""
+        from saccade.sim.environment import TaskEnvironment  # not at the top: reading needs no simulator
+
+        task, seed = piece
+        settings = self.settings
+        environment = opened.opened(
+            (task, settings),
+            lambda: TaskEnvironment(task, image_size=settings.image_size, cameras=settings.cameras),
+        )
+        demonstration = record_episode(environment, seed, settings)
+        if demonstration is None:
+            return None
+        file = io.BytesIO()
+        np.savez_compressed(file, **vars(demonstration))
+        return file.getvalue()
+
+
+@dataclass
+class Seeds:
+    """The seeds of one task: the first ones at which the expert succeeds.
+
+    Attributes:
+        task: Its name.
+        count: Number of episodes that are wanted.
+        directory: Where they are written.
+        done: Number of episodes that are there.
+        outcomes: Whether the expert succeeded, by the seeds that were tried, in their order; None while it
+            is not known.
+    """
+
+    task: str
+    count: int
+    directory: Path
+    done: int = 0
+    outcomes: dict[int, bool | None] = field(default_factory=dict)
+    _left: Iterator[int] = field(default_factory=lambda: iter(DEMONSTRATION_SEEDS))
+
+    def next_seeds(self, on_episode: Callable[[], None]) -> list[int]:
+        """Seeds that one process would certainly try next: as many as episodes are missing.
+
+        Args:
+            on_episode: called for each episode that an earlier run recorded.
+        """
+        found: list[int] = []
+        for seed in self._left if self.done < self.count else ():
+            if self.path(seed).exists():
+                self.done += 1
+                on_episode()
+            else:
+                found.append(seed)
+            if self.done + len(found) == self.count:
+                break
+        self.outcomes.update(dict.fromkeys(found))
+        return found
+
+    def path(self, seed: int) -> Path:
+        """The file of an episode."""
+        return self.directory / f"{seed}.npz"
+
+    def check(self) -> None:
+        """Raises `InputError` if the expert fails too often, judged in the order of the seeds."""
+        succeeded = 0
+        for tried, outcome in enumerate(self.outcomes.values(), start=1):
+            if outcome is None:
+                return
+            succeeded += outcome
+            if not outcome and tried >= 20 and succeeded < (1 - MAX_MISSES) * tried:
+                raise InputError(f"{self.task}: the expert failed in {tried - succeeded} of {tried} episodes")
+
+
+def record_tasks(
+    counts: Mapping[str, int],
+    out: Path,
+    settings: RecordingSettings,
+    on_episode: Callable[[str], None],
+    workers: Workers = ALONE,
 ) -> None:
-    """Records `count` episodes of a task, less those that are recorded already.
+    """Records episodes of tasks, less those that are recorded already, in one process or in several.
 
     Args:
-        task: its name.
-        count: number of episodes: those with the first seeds at which the expert succeeds.
+        counts: number of episodes by the name of the task: those with the first seeds at which the expert
+            succeeds.
         out: directory of the whole recording.
         settings: must be the same as those of earlier episodes in `out`.
-        on_episode: called after each episode, recorded now or earlier.
+        on_episode: called with the task after each episode, recorded now or earlier.
+        workers: the processes. Files and episodes are the same with any of them.
 
     Raises:
         InputError: `out` was recorded with other settings, or the expert fails too often.
         GraphicsError: OpenGL cannot be loaded.
+        SaccadeError: processes died again and again; the other episodes are recorded.
     """
-    from saccade.sim.environment import TaskEnvironment  # not at the top: reading needs no simulator
-
-    directory = out / task
-    directory.mkdir(parents=True, exist_ok=True)
-    claim_directory(directory / "recording.json", settings)
-    environment = TaskEnvironment(task, image_size=settings.image_size, cameras=settings.cameras)
+    tasks = {task: Seeds(task, count, out / task) for task, count in counts.items()}
+    for task in tasks.values():
+        task.directory.mkdir(parents=True, exist_ok=True)
+        claim_directory(task.directory / "recording.json", settings)
+    lost = []
     try:
-        done = tried = 0
-        for seed in DEMONSTRATION_SEEDS:
-            if done == count:
-                return
-            path = directory / f"{seed}.npz"
-            if not path.exists():
-                demonstration = record_episode(environment, seed, settings)
-                tried += 1
-                if demonstration is None:
-                    if tried >= 20 and done < (1 - MAX_MISSES) * tried:
-                        raise InputError(f"{task}: the expert failed in {tried - done} of {tried} episodes")
+        # Failures of the experts are known only after a round; the next one makes up for them.
+        while pieces := [
+            (name, seed)
+            for name, task in tasks.items()
+            for seed in task.next_seeds(functools.partial(on_episode, name))
+        ]:
+            for (name, seed), file in each(Recorder(settings), pieces, workers):
+                task = tasks[name]
+                if isinstance(file, Lost):
+                    lost.append(f"{name} {seed}: {file.reason}")
                     continue
-                save(demonstration, path)
-            done += 1
-            on_episode()
+                task.outcomes[seed] = file is not None
+                if file is None:
+                    task.check()
+                    continue
+                with write_atomically(task.path(seed)) as temporary:
+                    temporary.write_bytes(file)
+                task.done += 1
+                on_episode(name)
+            if lost:
+                raise SaccadeError(f"{len(lost)} episodes are missing: {'; '.join(lost[:3])}")
     finally:
-        environment.close()
+        opened.close()
+
+
+def record_task(
+    task: str, count: int, out: Path, settings: RecordingSettings, on_episode: Callable[[], None]
+) -> None:
+    """Records `count` episodes of one task in this process; see `record_tasks`."""
+    record_tasks({task: count}, out, settings, lambda task: on_episode())
 
 
 def claim_directory(path: Path, settings: RecordingSettings) -> None:
@@ -178,12 +281,6 @@ def claim_directory(path: Path, settings: RecordingSettings) -> None:
         write_json(path, settings.to_dict())
     elif json.loads(path.read_text()) != json.loads(json.dumps(settings.to_dict())):
         raise InputError(f"{path.parent}: was recorded with other settings; use another directory")
-
-
-def save(demonstration: Demonstration, path: Path) -> None:
-    """Writes one episode, compressed."""
-    with write_atomically(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **vars(demonstration))
 
 
 def load(path: Path) -> Demonstration:

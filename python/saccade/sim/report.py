@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
+import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import saccade
@@ -107,11 +108,16 @@ def result_record(
     }
 
 
+def tile(picture: UInt8Array) -> UInt8Array:
+    """A picture `(H, W, 3)` as the contact sheet shows it, `(TILE, TILE, 3)`."""
+    return np.asarray(Image.fromarray(picture).resize((TILE, TILE), Image.Resampling.BOX))
+
+
 def write_contact_sheet(pictures: Sequence[tuple[Episode, UInt8Array]], path: Path) -> None:
     """Writes the last picture of every episode, a row per task, framed green for success and red for failure.
 
     Args:
-        pictures: episodes, at least one, with pictures `(H, W, 3)`.
+        pictures: episodes, at least one, with what `tile` returned.
         path: path of the PNG.
     """
     tasks = list(dict.fromkeys(episode.task for episode, _ in pictures))
@@ -124,10 +130,7 @@ def write_contact_sheet(pictures: Sequence[tuple[Episode, UInt8Array]], path: Pa
     for row, task in enumerate(tasks):
         for column, (episode, picture) in enumerate(rows[task]):
             left, top = column * TILE, row * row_height
-            sheet.paste(
-                Image.fromarray(picture).resize((TILE, TILE), Image.Resampling.BOX),
-                (left, top + LABEL_HEIGHT),
-            )
+            sheet.paste(Image.fromarray(picture), (left, top + LABEL_HEIGHT))
             colour = GREEN if episode.success else RED
             box = (left + 1, top + LABEL_HEIGHT, left + TILE - 2, top + row_height - 2)
             draw.rectangle(box, outline=colour, width=3)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from saccade._arguments import check_frames, check_tasks
 from saccade.errors import InputError
+from saccade.parallel.arguments import workers_of
 from saccade.study.moments import Moments
 from saccade.study.recording import Recording
 from saccade.study.source import Source
@@ -72,7 +73,7 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
         config_file=None if args.config is None else str(args.config),
         seed=args.seed,
         # The bits do not depend on it. One process may use all cores; several share them.
-        num_threads=None if args.jobs == 1 else 1,
+        num_threads=None if workers_of(args).alone else 1,
     )
     found.head()
     _ = found.all

@@ -61,6 +61,12 @@ class Moments(Recorded):
     num_threads: int | None = None
     task: ClassVar[str] = "frames"
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """See `Source`."""
+        read = (self.frames, self.other_frames, self.state, self.tokenizer)
+        return (*super().files, *(path for path in read if path is not None and Path(path).exists()))
+
     def describe(self) -> dict[str, Any]:
         """See `Source`."""
         looked = look(self)

@@ -129,6 +129,11 @@ class Recording(Recorded):
     num_threads: int | None = None
     task: ClassVar[str] = "features"
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """See `Source`."""
+        return (*super().files, self.file)
+
     def describe(self) -> dict[str, Any]:
         """See `Source`."""
         found = self.all

@@ -1,4 +1,4 @@
-"""Running a study: its cells are stored as soon as they are done, spread over processes, and resumable."""
+"""Running a study: its cells are stored as soon as they are done, run in processes, and are resumable."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ import functools
 import json
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import joblib
 import pandas as pd
 
 import saccade
 from saccade._files import sha256_of, writable_directory, write_json
 from saccade.environment import cpu_name
 from saccade.errors import InputError, SaccadeError
+from saccade.parallel import ALONE, Lost, Workers, each
 from saccade.study.cell import Cell, Rows, digest, plain, sortable
 from saccade.study.study import Study
 from saccade.study.table import (
@@ -33,8 +32,6 @@ from saccade.study.table import (
     write_table,
 )
 
-BACKENDS = ("loky", "ray")
-ROUND = 4  # cells per worker in a round, after which results are stored (Ray only)
 RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld", "scikit-learn")
 
 
@@ -60,14 +57,12 @@ def silent(finished: Finished, done: int, total: int) -> None:
     """An `OnDone` that does nothing."""
 
 
-def run(
-    study: Study, out: Path, *, backend: str = "loky", jobs: int = 1, on_done: OnDone = silent
-) -> pd.DataFrame:
+def run(study: Study, out: Path, *, workers: Workers = ALONE, on_done: OnDone = silent) -> pd.DataFrame:
     """Computes all stages of a study, and its table.
 
     Args:
         study: what is measured.
-        out, backend, jobs, on_done: as in `run_cells`.
+        out, workers, on_done: as in `run_cells`.
 
     Returns:
         The table.
@@ -75,7 +70,7 @@ def run(
     Raises:
         InputError, StudyError: as `run_cells`.
     """
-    stage: Study | None = study.begin(out)
+    stage: Study | None = study.begin(out.absolute())  # other processes may be in another directory
     while stage is not None:
         table = run_cells(
             stage.name,
@@ -83,8 +78,8 @@ def run(
             stage.measure,
             out,
             settings=stage.settings(),
-            backend=backend,
-            jobs=jobs,
+            workers=workers,
+            files=stage.files,
             on_done=on_done,
             expected=stage.num_cells,
         )
@@ -99,8 +94,8 @@ def run_cells(
     out: Path,
     *,
     settings: Mapping[str, Any],
-    backend: str = "loky",
-    jobs: int = 1,
+    workers: Workers = ALONE,
+    files: Sequence[str | Path] = (),
     on_done: OnDone = silent,
     expected: int = 0,
 ) -> pd.DataFrame:
@@ -119,8 +114,8 @@ def run_cells(
         out: directory of the tables.
         settings: JSON values that all rows depend on: hashes of checkpoints, engine, and so on; not what
             only determines which cells there are.
-        backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
-        jobs: number of processes; with loky -1 for one per core.
+        workers: the processes that cells run in. A cell whose process or machine died is computed again.
+        files: files and directories that `work` reads, as `saccade.parallel.each` takes them.
         on_done: called after each cell.
         expected: number of cells of all stages; the table is complete when that many are done.
 
@@ -128,19 +123,18 @@ def run_cells(
         The table, as `saccade.study.table.read_table` returns it.
 
     Raises:
-        InputError: an unknown backend, `jobs` out of range, keys that are not distinct, or `out`
-            contains this study with other settings.
-        StudyError: cells failed, and the first ones are named with their errors; or a worker process died.
-            Finished cells remain stored.
+        InputError: keys that are not distinct, or `out` contains this study with other settings.
+        StudyError: cells failed, and the first ones are named with their errors. Finished cells remain
+            stored.
     """
-    check_workers(backend, jobs)
     if len({cell.key for cell in cells}) != len(cells):
         raise InputError(f"cells: {study} has duplicate keys")
     store = Store(study, out, settings, cells, expected)
     todo = [cell for cell in cells if cell.digest not in store.finished]
     store.write()
     marks = {"settings_sha256": digest(settings), "saccade": saccade.__version__}
-    for finished in spread(Guarded(work, marks), todo, backend, jobs):
+    for cell, result in each(Guarded(work, marks), todo, workers, files):
+        finished = Finished(cell, [], 0.0, result.reason) if isinstance(result, Lost) else result
         store.add(finished)
         on_done(finished, len(cells) - len(todo) + store.added, max(len(cells), expected))
     if store.failed:
@@ -150,14 +144,6 @@ def run_cells(
             f"{study}: {len(store.failed)} of {len(cells)} cells failed: {'; '.join(lines)}{more}"
         )
     return read_table(table_path(out, study))
-
-
-def check_workers(backend: str, jobs: int) -> None:
-    """Raises `InputError` for an unknown backend or a number of jobs out of range."""
-    if backend not in BACKENDS:
-        raise InputError(f"backend: unknown name {backend!r}, expected one of {', '.join(BACKENDS)}")
-    if jobs < 1 and (backend, jobs) != ("loky", -1):
-        raise InputError(f"jobs: given {jobs}, expected at least 1, or with loky -1 for all cores")
 
 
 class Store:
@@ -279,39 +265,6 @@ class Guarded:
             return Finished(cell, [], spent, f"{type(error).__name__}: {error}")
         marks = {**self.marks, "cpu": cpu_name()}
         return Finished(cell, [{**row, **marks} for row in rows], time.perf_counter() - start)
-
-
-def spread(
-    work: Callable[[Cell], Finished], cells: Sequence[Cell], backend: str, jobs: int
-) -> Iterable[Finished]:
-    """Computes cells in processes, in any order; with one job in this process.
-
-    Raises:
-        StudyError: a worker process died.
-    """
-    todo = [joblib.delayed(work)(cell) for cell in cells]
-    if backend == "ray":
-        from ray.exceptions import RayError
-        from ray.util.joblib import register_ray
-
-        register_ray()
-        # joblib returns Ray's results only when all are there, so cells are given in rounds.
-        size = ROUND * jobs
-        rounds = [todo[start : start + size] for start in range(0, len(todo), size)]
-        for several in rounds:
-            try:
-                yield from joblib.Parallel(n_jobs=jobs, backend=backend, batch_size=1)(several)
-            except RayError as error:
-                reason = str(error).strip().splitlines()[-1]
-                raise StudyError(f"ray failed: {reason}; finished cells are stored") from None
-        return
-    parallel = joblib.Parallel(n_jobs=jobs, backend=backend, return_as="generator_unordered", batch_size=1)
-    try:
-        yield from parallel(todo)
-    except BrokenProcessPool:
-        raise StudyError(
-            "a worker process died, perhaps out of memory; finished cells are stored, run again to continue"
-        ) from None
 
 
 @functools.cache

@@ -37,6 +37,11 @@ class Source(ABC):
         return None
 
     @property
+    def files(self) -> tuple[str, ...]:
+        """The files and directories that are read, as the fields of the source name them."""
+        return tuple(path for path in (self.checkpoint, self.config_file) if path is not None)
+
+    @property
     def num_threads(self) -> int | None:
         """Threads that compute the head. Default: 1, because cells are spread over processes."""
         return 1

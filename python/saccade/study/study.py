@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from saccade.errors import InputError
 from saccade.study.cell import Cell, Rows
+from saccade.study.source import Source
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,6 +99,15 @@ class Study(ABC):
         Returns:
             Rows of the table: text, numbers, booleans or None by column.
         """
+
+    @property
+    def files(self) -> tuple[str | Path, ...]:
+        """The files and directories that `measure` reads, as the study's fields name them.
+
+        They are brought to other machines. Default: those of the field `source`, if there is one.
+        """
+        source = getattr(self, "source", None)
+        return source.files if isinstance(source, Source) else ()
 
     @classmethod
     @abstractmethod

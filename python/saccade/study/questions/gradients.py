@@ -139,6 +139,11 @@ class Gradients(Study):
             cells += [Cell(("loss", task, seed), recording) for seed in recorded[: len(simulator.seeds)]]
         return cells
 
+    @property
+    def files(self) -> tuple[str | Path, ...]:
+        """See `Study`."""
+        return (*super().files, *(() if self.demonstrations is None else (self.demonstrations,)))
+
     def measure(self, cell: Cell) -> Rows:
         """The rows of a cell: a kind, a task and a seed, or the row of a file."""
         kind, task, seed = str(cell.key[0]), str(cell.key[1]), int(cell.key[2])

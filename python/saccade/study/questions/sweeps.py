@@ -332,6 +332,14 @@ class Sweep(Study):
             rows = cost([self.read(name) for name in cell.settings["policies"]])
         return [{"kind": kind, **row} for row in rows]
 
+    @property
+    def files(self) -> tuple[str | Path, ...]:
+        """See `Study`: finished runs, and demonstrations. Runs that are trained stay in the output
+        directory, which other machines must share.
+        """
+        finished = (path for name, path in self.runs.items() if name not in self.planned)
+        return (*finished, *{plan.demonstrations for plan in self.planned.values()})
+
     def read(self, name: str) -> Run:
         """A run by name."""
         return read_run(self.runs[name], self.varied.names)

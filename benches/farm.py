@@ -1,0 +1,204 @@
+"""Farms: chunks a second and episodes an hour by processes, threads and batch, and the memory they take.
+
+    python -m benches.farm                             at most 10 minutes; writes out/farm/results.json
+    python -m benches.farm --minutes 60 --seconds 20   longer
+    python -m benches.farm --policies demo             without the full-size policy
+    python -m benches.farm report                      print the tables of existing measurements
+    python -m benches.farm report --write              write them to docs/farms.md and keep the measurements
+    python -m benches.farm --small --seconds 0.1       a quick trial of the program itself
+
+A setting is a number of processes, the threads of each, and the observations that each computes together. For
+`chunks`, processes act on random frames without pause. For `episodes`, they run the simulator, with as many
+robots each as the batch has observations. The policies are the bundled one and a random one of N1.5's
+published size, which is written to --work if it is not there (4.8 GB). saccade and torch, which is
+`saccade.reference`, take the same observations. A setting that does not fit into memory or time is left out,
+and the tables say so.
+
+With `fork`, one process loads the policy and the others are forked from it; with `spawn`, each loads its own.
+Memory is the sum of the proportional shares (PSS) of all processes, from /proc. Run it on an idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benches import farm_report
+from benches.farm_processes import Setting, measure
+from benches.peers import machine
+from benches.peers.results import rounded
+from saccade.checkpoints import random_checkpoint
+
+SECTIONS = ("chunks", "episodes")
+POLICIES = ("demo", "full")
+ENGINES = ("saccade", "torch")
+
+#: Bytes for each one in the checkpoint, which is bfloat16 at full size; loading included.
+FACTORS = {"float32": 2.2, "bfloat16": 1.15, "int8": 0.75}
+#: Share of the free memory that is used at most.
+FREE = 0.85
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit status."""
+    args = parse(arguments)
+    path: Path = args.work / "results.json"
+    if args.command == "report":
+        return farm_report.command(path, write=args.write)
+    checkpoints = {name: checkpoint(name, args) for name in args.policies}
+    results: dict[str, Any] = {"machine": machine.describe(), "rows": [], "left_out": []}
+    results["bytes"] = {name: weight(folder) for name, folder in checkpoints.items()}
+    args.work.mkdir(parents=True, exist_ok=True)
+    end = time.monotonic() + 60 * args.minutes
+    for setting in settings(args):
+        reason = why_not(setting, results["bytes"][setting.policy], end)
+        if reason is None:
+            note(f"{setting.name} ...")
+            measured = measure(setting, checkpoints[setting.policy], args.seconds)
+            reason = measured.get("failed")
+            if reason is None:
+                results["rows"].append(asdict(setting) | measured)
+        if reason is not None:
+            results["left_out"].append({"setting": asdict(setting), "reason": reason})
+            note(f"{setting.name}: left out, {reason}")
+        path.write_text(json.dumps(rounded(results), indent=1) + "\n")
+    print(farm_report.document(results))
+    note(f"wrote {path}")
+    return 0
+
+
+def settings(args: argparse.Namespace) -> Iterator[Setting]:
+    """What is measured, in the order of its importance: time may end before."""
+    cores = args.cores
+    shapes = [(processes, cores // processes) for processes in divisors(cores)]  # all use all cores
+    most = max(shapes)
+    for policy, section in (("demo", "chunks"), ("demo", "episodes"), ("full", "chunks")):
+        if policy not in args.policies or section not in args.sections:
+            continue
+        full = policy == "full"
+        batches = args.full_batches if full else args.batches
+        precision = args.precision if full else "float32"
+        common: dict[str, Any] = {"section": section, "policy": policy, "precision": precision}
+        if not full:
+            least = args.episodes if section == "episodes" else 0
+            yield Setting(**common, processes=1, threads=1, batch=1, least_episodes=least)
+        for processes, threads in reversed(shapes):
+            for batch in batches:
+                yield Setting(**common, processes=processes, threads=threads, batch=batch)
+        if most[0] > 1 and section == "chunks":
+            yield Setting(**common, processes=most[0], threads=most[1], batch=1, sharing="spawn")
+        if "torch" in args.engines:
+            torch = {**common, "precision": "float32", "engine": "torch", "sharing": "spawn"}
+            for processes, threads in reversed(shapes):
+                for batch in batches[: 1 if section == "episodes" or full else None]:
+                    yield Setting(**torch, processes=processes, threads=threads, batch=batch)
+
+
+def divisors(cores: int) -> list[int]:
+    """Numbers of processes that share the cores evenly.
+
+    Example:
+        >>> divisors(12)
+        [1, 2, 3, 4, 6, 12]
+    """
+    return [number for number in range(1, cores + 1) if cores % number == 0]
+
+
+def why_not(setting: Setting, size: int, end: float) -> str | None:
+    """Why a setting is not measured: no time or no memory; None if it is.
+
+    Args:
+        setting: the setting.
+        size: bytes of the checkpoint.
+        end: when the time ends, by the monotonic clock.
+    """
+    if time.monotonic() > end:
+        return "no time left"
+    copies = setting.processes if setting.sharing == "spawn" else 1
+    needed = copies * size * FACTORS[setting.precision]
+    free = available_memory()
+    if needed > FREE * free:
+        return f"needs about {needed / 1e9:.0f} GB, {free / 1e9:.0f} GB are free"
+    return None
+
+
+def available_memory() -> int:
+    """Bytes that programs can still have."""
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    raise RuntimeError("no MemAvailable in /proc/meminfo")
+
+
+def checkpoint(name: str, args: argparse.Namespace) -> Path:
+    """The directory of a policy; a random one is written if it is not there."""
+    if name == "demo":
+        if args.demo is not None:
+            return Path(args.demo)
+        from saccade.sim.policy import DEMO_CHECKPOINT
+
+        return DEMO_CHECKPOINT
+    folder: Path = args.checkpoint or args.work / ("n15-small" if args.small else "n15")
+    if not (folder / "config.json").is_file():
+        random_checkpoint.write(
+            folder,
+            backbone=random_checkpoint.small_backbone("n1.5") if args.small else None,
+            head=random_checkpoint.small_head("n1.5") if args.small else None,
+        )
+    return folder
+
+
+def weight(folder: Path) -> int:
+    """Bytes of a checkpoint's tensors."""
+    return sum(path.stat().st_size for path in folder.glob("*.safetensors"))
+
+
+def note(text: str) -> None:
+    """Progress, on standard error."""
+    print(f"farm: {text}", file=sys.stderr, flush=True)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The arguments."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benches.farm",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("command", nargs="?", choices=("measure", "report"), default="measure")
+    add("--write", action="store_true", help="report: write docs/farms.md and benches/farm.json")
+    add("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
+    add("--policies", nargs="+", choices=POLICIES, default=POLICIES)
+    add("--engines", nargs="+", choices=ENGINES, default=ENGINES, help="saccade is always measured")
+    add("--batches", type=int, nargs="+", default=[1, 4, 16], metavar="N", help="default: 1 4 16")
+    add("--full-batches", type=int, nargs="+", default=[1, 4], metavar="N", help="default: 1 4")
+    add(
+        "--precision", choices=FACTORS, default="bfloat16", help="of the full-size policy (default: bfloat16)"
+    )
+    add("--episodes", type=int, default=20, metavar="N", help="whose length is measured (default: 20)")
+    add("--cores", type=int, default=len(os.sched_getaffinity(0)), metavar="N", help="default: all")
+    add("--seconds", type=float, default=8.0, metavar="X", help="of each setting, at least (default: 8)")
+    add("--minutes", type=float, default=10.0, metavar="X", help="no setting begins later (default: 10)")
+    add("--demo", type=Path, metavar="DIR", help="another policy of the simulator")
+    add("--checkpoint", type=Path, metavar="DIR", help="another full-size policy, of one robot")
+    add("--work", type=Path, default=Path("out/farm"), metavar="DIR", help="default: out/farm")
+    add("--small", action="store_true", help="a small policy in place of the full-size one, for a trial")
+    args = parser.parse_args(arguments)
+    if min(*args.batches, *args.full_batches, args.cores, args.episodes) < 1 or args.seconds <= 0:
+        parser.error(
+            "--batches, --full-batches, --cores and --episodes must be at least 1, --seconds above 0"
+        )
+    return args
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    sys.exit(main())

@@ -1,0 +1,9 @@
+"""Independent pieces of work in several processes, of this machine or of a Ray cluster.
+
+`saccade rollout`, `demos` and `study` share it. `workers` says where pieces run and is the way in; `local`
+and `cluster` are the two kinds of processes; `files` brings checkpoints to other machines.
+"""
+
+from saccade.parallel.workers import ALONE, Lost, Workers, each
+
+__all__ = ["ALONE", "Lost", "Workers", "each"]

@@ -1,0 +1,94 @@
+"""Episodes as independent pieces of work, for `saccade rollout` in one process or in many."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from saccade._arrays import UInt8Array
+from saccade.sim import rollout
+from saccade.sim.environment import TaskEnvironment
+from saccade.sim.opened import opened
+from saccade.sim.policy import Policy
+from saccade.sim.report import tile
+from saccade.sim.rollout import Episode, environment_for
+from saccade.sim.video import VideoWriter
+
+
+@dataclass(frozen=True)
+class Rolled:
+    """One episode, and what was drawn.
+
+    Attributes:
+        episode: The outcome.
+        picture: The last picture of the simulation, as a contact sheet shows it.
+        video: Bytes of the MP4, if one was wanted.
+    """
+
+    episode: Episode
+    picture: UInt8Array | None
+    video: bytes | None = None
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Runs episodes of a policy. It is pickled; each process loads the policy once.
+
+    Attributes:
+        checkpoint: Directory of the policy.
+        engine: What computes the head, `"rust"` or `"torch"`.
+        num_threads: Threads of the head; None for its default.
+        instruction_from: A task whose instruction the policy gets instead.
+        video: Whether a video is made of each episode.
+    """
+
+    checkpoint: str
+    engine: str = "rust"
+    num_threads: int | None = None
+    instruction_from: str | None = None
+    video: bool = False
+
+    @property
+    def policy(self) -> Policy:
+        """The policy. The first call in a process loads it; raises as `Policy.load`."""
+        return policy_of(self.checkpoint, self.engine, self.num_threads)
+
+    def __call__(self, piece: tuple[str, int]) -> Rolled:
+        """Runs the episode of a task and a seed."""
+        task, seed = piece
+        policy = self.policy
+        environment = opened(
+            (self.checkpoint, task), lambda: environment_for(policy, task, render_mode="rgb_array")
+        )
+        episode, video = (
+            self._filmed(environment, seed) if self.video else (self._run(environment, seed), None)
+        )
+        picture = environment.render()
+        assert picture is not None
+        return Rolled(episode, tile(picture), video)
+
+    def _run(self, environment: TaskEnvironment, seed: int, **options: Any) -> Episode:
+        """The episode; options as `run_episode`."""
+        return rollout.run_episode(
+            environment, self.policy, seed, instruction_from=self.instruction_from, **options
+        )
+
+    def _filmed(self, environment: TaskEnvironment, seed: int) -> tuple[Episode, bytes]:
+        """The episode and its video."""
+        with tempfile.TemporaryDirectory(prefix="saccade-video-") as folder:
+            path = Path(folder) / "episode.mp4"
+            with VideoWriter(path) as video:
+                episode = self._run(environment, seed, on_step=video.add)
+            episode.video = f"videos/{environment.task.name}-{seed}.mp4"
+            return episode, path.read_bytes()
+
+
+@functools.lru_cache(maxsize=1)
+def policy_of(checkpoint: str, engine: str, num_threads: int | None) -> Policy:
+    """The policy in a directory, warmed up. The last one is kept for the next episode."""
+    policy = Policy.load(checkpoint, engine=engine, num_threads=num_threads)
+    policy.warmup()
+    return policy
