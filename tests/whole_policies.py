@@ -36,7 +36,7 @@ GRID = (1, 4, 6)
 TEXT = {
     "hidden_size": WIDTH,
     "intermediate_size": 96,
-    "num_hidden_layers": 3,
+    "num_hidden_layers": 4,
     "num_attention_heads": 4,
     "num_key_value_heads": 2,
     "head_dim": 24,
@@ -109,6 +109,7 @@ def build(released: ModuleType, kind: str, *, attention: str = "sdpa") -> Any:
 
 def build_n15(released: ModuleType, attention: str) -> Any:
     module = eagle_module()
+    sys.modules.setdefault(module.__name__, module)  # transformers 5 looks a model's module up
     config = module.Eagle25VLConfig(
         vision_config=VISION_N15,
         text_config={**TEXT, "architectures": ["Qwen3ForCausalLM"]},
@@ -151,7 +152,7 @@ def build_n17(released: ModuleType, attention: str) -> Any:
         tie_word_embeddings=True,
     )
     config._attn_implementation = attention
-    whole = released.GR00TN17Config(**{**small_config("n1.7"), "select_layer": 2})
+    whole = released.GR00TN17Config(**{**small_config("n1.7"), "select_layer": 3})
     with mock.patch.object(released, "_cosmos_reason2_qwen3_vl_config", lambda: config):
         return released.GR00TN17(whole, load_backbone_weights=False)
 
