@@ -194,7 +194,9 @@ def test_occlusion_equals_the_reference_without_these_positions(tiny: saccade.Ac
 @pytest.mark.parametrize("batch", [1, 3, 8, 100])
 def test_batches_of_any_size_agree(tiny: saccade.ActionHead, batch: int) -> None:
     done: list[int] = []
-    found = measure(tiny, TINY_LAYOUT, tiny_occluder(), no_noise, cell=1, batch=batch, on_done=done.append)
+    occluder: Any = tiny_occluder()
+    occluder.batch = batch
+    found = measure(tiny, TINY_LAYOUT, occluder, no_noise, cell=1, on_done=done.append)
     expected = measure(tiny, TINY_LAYOUT, tiny_occluder(), no_noise, cell=1)
     for name, change in expected.change.items():
         np.testing.assert_array_equal(found.change[name], change)

@@ -243,6 +243,14 @@ def add_policy_options(parser: Arguments) -> None:
         help="default: float32, which is exact",
     )
     parser.add_argument("--head-precision", choices=PRECISIONS, help="of the head (default: as --precision)")
+    add_preprocessing(parser)
+
+
+def add_preprocessing(parser: Arguments) -> None:
+    """Declares what a whole checkpoint may not say: the robot, preprocessing and tokenizer."""
+    parser.add_argument(
+        "--embodiment", type=embodiment, metavar="TAG", help="tag or id of the robot, if there are several"
+    )
     parser.add_argument(
         "--preprocessing",
         choices=("lerobot", "isaac"),
@@ -251,6 +259,55 @@ def add_policy_options(parser: Arguments) -> None:
     parser.add_argument(
         "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
     )
+
+
+def embodiment(word: str) -> str | int:
+    """A tag, or an id if it is a number."""
+    return int(word) if word.isdecimal() else word
+
+
+#: The flags that `add_frames` declares besides `--frames`.
+WITH_FRAMES = ("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer")
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Declares pictures and words for a whole checkpoint; see `check_frames`."""
+    seen = parser.add_argument_group("pictures and words for a whole checkpoint")
+    seen.add_argument(
+        "--frames",
+        type=Path,
+        metavar="DIR",
+        help="a picture for each camera, named after it (front.png), or a folder of them for each moment",
+    )
+    seen.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
+    seen.add_argument(
+        "--state",
+        type=Path,
+        metavar="FILE",
+        help="JSON: the robot's state in its own units, for moments without a state.json (default: the "
+        "middle of its range)",
+    )
+    seen.add_argument(
+        "--precision", choices=PRECISIONS, help="of the backbone (default: float32, as the head always)"
+    )
+    add_preprocessing(seen)
+
+
+def check_frames(args: argparse.Namespace, *refused: str) -> None:
+    """Checks the flags of `add_frames`.
+
+    Args:
+        args: Parsed arguments.
+        refused: Names of arguments that cannot be combined with `--frames`: they are None where not given.
+
+    Raises:
+        UsageError: One needs `--frames`, or cannot be combined with it.
+    """
+    wrong, rule = (WITH_FRAMES, "only with") if args.frames is None else (refused, "not with")
+    given = [name for name in wrong if getattr(args, name, None) is not None]
+    if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise UsageError(f"{flags}: {rule} --frames")
 
 
 def precisions(args: argparse.Namespace) -> dict[str, str]:

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
-from saccade._arrays import ArrayLike, Float32Array, frame, integer, text
+from saccade._arrays import ArrayLike, Float32Array, frame, int64, integer, text
 from saccade.backbone_inputs import BackboneInputs
-from saccade.errors import InputError
+from saccade.errors import InputError, ShapeError
 from saccade.hub import PUBLISHED, cache, cached, resolve
 
 #: The views of one observation: by camera name, or in the order of the prompt.
@@ -232,6 +232,27 @@ class Processor:
             array([389])
         """
         return self._processor.tokens(_text("text", text))
+
+    def texts(self, ids: ArrayLike | Sequence[int]) -> list[str]:
+        """The text of each of these tokens.
+
+        Args:
+            ids: ``(tokens,)`` integers.
+
+        Raises:
+            ShapeError: They are not a row.
+            InputError: They are not integers, or one is no token's.
+
+        Example:
+            >>> import saccade
+            >>> processor = saccade.Processor("n1.5", "tokenizer.json")
+            >>> processor.texts(processor.tokens("push the puck"))
+            ['push', ' the', ' p', 'uck']
+        """
+        given = int64("ids", ids)
+        if given.ndim != 1:
+            raise ShapeError(f"ids: expected (tokens,), got shape {given.shape}")
+        return self._processor.texts(given.tolist())
 
     def __repr__(self) -> str:
         size = (

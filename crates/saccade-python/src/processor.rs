@@ -163,6 +163,10 @@ impl Processor {
         to_numpy(py, ids, &shape)
     }
 
+    fn texts(&self, py: Python<'_>, ids: Vec<i64>) -> PyResult<Vec<String>> {
+        call(py, || self.0.texts(&ids))
+    }
+
     fn process<'py>(
         &self,
         py: Python<'py>,

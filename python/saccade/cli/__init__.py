@@ -48,6 +48,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
+    "attention --frames": ("rich", *_PICTURES, "jinja2", "scipy"),
     "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib"),
     "study --features": ("rich", *_PICTURES, *_TABLES, "joblib"),
     "study report": (*_PICTURES, *_TABLES),

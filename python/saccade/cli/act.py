@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -60,7 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     seen.add_argument("--instruction", metavar="TEXT", help="what to do")
     seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
-    seen.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
     arguments.add_policy_options(parser)
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_num_steps(parser)
@@ -72,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     """Loads, looks, acts and prints."""
     require("act")
     import saccade
+    from saccade.frames import instruction_of, observation, read_state
 
     pictures = named_pictures(args.image)
     state = None if args.state is None else read_state(args.state)
@@ -79,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     with _output.progress_bar("loading", transient=True):
         policy = saccade.Policy.load(
             args.checkpoint,
-            embodiment=embodiment(args.embodiment),
+            embodiment=args.embodiment,
             preprocessing=args.preprocessing,
             tokenizer=args.tokenizer,
             precision=arguments.precisions(args),
@@ -124,11 +123,6 @@ class Clock:
         self._last = now
 
 
-def embodiment(given: str | None) -> str | int | None:
-    """A tag, or an id if it is a number."""
-    return int(given) if given is not None and given.isdecimal() else given
-
-
 def named_pictures(given: list[str]) -> dict[str, Path]:
     """Files by camera; the name is empty if it was left out.
 
@@ -145,70 +139,6 @@ def named_pictures(given: list[str]) -> dict[str, Path]:
             raise UsageError(f"--image: expected CAMERA=FILE, each camera once, got {' '.join(given)}")
         found[name] = Path(file)
     return found
-
-
-def read_state(path: Path) -> Any:
-    """The state in a JSON file: numbers by key, or one list.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        UsageError: It contains something else.
-    """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: cannot be read as JSON: {error}") from None
-    rows = list(values.values()) if isinstance(values, dict) else [values]
-    if not rows or not all(is_numbers(row) for row in rows):
-        raise UsageError(f"{path}: expected lists of numbers by key, or one list of numbers")
-    return values
-
-
-def is_numbers(row: Any) -> bool:
-    """Whether a value of JSON is a list of numbers."""
-    return isinstance(row, list) and all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) for value in row
-    )
-
-
-def observation(
-    policy: Policy, pictures: Mapping[str, Path], instruction: str | None, state: Any
-) -> dict[str, Any]:
-    """An observation in Isaac-GR00T's nested form, with a batch of one.
-
-    Raises:
-        FileNotFoundError, UsageError: A picture cannot be read, or a list of the state is too short or long.
-    """
-    from saccade.cli._pictures import read_picture
-
-    given = policy.example_observation()
-    if pictures:
-        cameras = policy.requirements.cameras
-        only = cameras[0].name if cameras is not None and len(cameras) == 1 else next(iter(given["video"]))
-        horizon = policy.requirements.video_horizon or 1
-        given["video"] = {
-            name or only: np.repeat(read_picture(path)[None, None], horizon, axis=1)
-            for name, path in pictures.items()
-        }
-    if isinstance(state, list):
-        width = policy.requirements.state_width
-        if len(state) != width:
-            keys = ", ".join(f"{key} ({size})" for key, size in policy.requirements.state)
-            raise UsageError(f"--state: expected {width} numbers ({keys}), got {len(state)}")
-        state = {key: state[where] for key, where in policy.normalizer.state_slices.items()}
-    if state is not None:
-        history = policy.requirements.state_history
-        given["state"] = {
-            key: np.tile(np.asarray(values, np.float32), (1, history, 1)) for key, values in state.items()
-        }
-    if instruction is not None:
-        given["language"] = {key: [[instruction]] for key in given["language"]}
-    return given
-
-
-def instruction_of(given: Mapping[str, Any]) -> str:
-    """The instruction of an observation of `observation`."""
-    return str(next(iter(given["language"].values()))[0][0])
 
 
 def chunk(policy: Policy, actions: Mapping[str, Float32Array]) -> Section:

@@ -22,12 +22,18 @@ if TYPE_CHECKING:
 HELP = "show what the rows of the action head attend to"
 
 EPILOG = """\
-The observation comes from the simulator (--task, --seed, --after) or from a file of backbone features.
+The observation comes from the simulator (--task, --seed, --after), from pictures (--frames) or from a file of
+backbone features (--features).
 
-The file is .npz or .safetensors with backbone_features (batch, T_vl, context_dim), state (batch, state_dim)
-and embodiment_id, as ActionHead takes them. It may contain noise (batch, horizon, action_dim), input_ids,
-image_mask, attention_mask (batch, T_vl), images (batch, cameras, H, W, 3) uint8 and tokens (batch, T_vl)
-strings (in .safetensors a JSON list in the metadata).
+Pictures need a whole checkpoint, with backbone and tokenizer. DIR holds a picture for each camera, named
+after it (front.png), and state.json; or a folder of these for each moment, of which --row chooses one.
+Without state.json and --state the state is in the middle of the robot's range. `saccade inspect` lists the
+cameras.
+
+The file of features is .npz or .safetensors with backbone_features (batch, T_vl, context_dim), state (batch,
+state_dim) and embodiment_id, as ActionHead takes them. It may contain noise (batch, horizon, action_dim),
+input_ids, image_mask, attention_mask (batch, T_vl), images (batch, cameras, H, W, 3) uint8 and tokens (batch,
+T_vl) strings (in .safetensors a JSON list in the metadata).
 
 The positions of image tokens are given by --layout, else by input_ids, else by image_mask. A layout lists the
 parts in the order of their positions, KIND:SIZE or KIND:SIZE=NAME. KIND is image, text, special or pad. SIZE
@@ -42,6 +48,7 @@ A map shows what a row attends to, not what matters; the occlusion map shows wha
 examples:
   saccade attention --task push --seed 3
   saccade attention --checkpoint out/policy --task reach --after 24 --blocks 0,2 --steps 3
+  saccade attention --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "pick up the pear"
   saccade attention --checkpoint checkpoint/ --features step.npz --heads 0,5,12
   saccade attention --checkpoint checkpoint/ --features step.safetensors \\
     --layout "text:20,image:16x16,text:*" --json
@@ -60,18 +67,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_checkpoint(parser, "directory or .safetensors file (default: the bundled policy)")
     arguments.add_config(parser)
     arguments.add_seed(
-        parser, "seed of the task's layout, words and noise; of the noise if a file contains none"
+        parser,
+        "seed of the task's layout, words and noise; with pictures or a file without noise, of the noise",
+    )
+    arguments.add_integer(
+        parser, "--row", minimum=0, help="which moment or observation, of several (default: 0)"
     )
     simulator = parser.add_argument_group("an observation from the simulator")
     simulator.add_argument(
         "--task", metavar="NAME", help="task (default: push, or the policy's first task if it lacks push)"
     )
     arguments.add_integer(
-        simulator, "--after", minimum=0, default=0, help="control steps before the observation"
+        simulator, "--after", minimum=0, help="control steps before the observation (default: 0)"
     )
+    arguments.add_frames(parser)
     file = parser.add_argument_group("an observation from a file")
     arguments.add_features(file, "backbone features, .npz or .safetensors")
-    arguments.add_integer(file, "--row", minimum=0, default=0, help="which observation of the file")
     file.add_argument("--layout", metavar="PARTS", help="positions of the image tokens, see below")
     file.add_argument(
         "--grid",
@@ -111,7 +122,7 @@ def head(word: str) -> int | str:
 def run(args: argparse.Namespace) -> int:
     """Checks everything that can be wrong, then computes and writes the maps."""
     check(args)
-    require("attention")
+    require("attention" if args.frames is None else "attention --frames")
     from saccade.maps.page import write_page
     from saccade.maps.sheet import write_sheet
 
@@ -134,17 +145,27 @@ def look(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
     from saccade._files import checkpoint_identity
     from saccade.head import ActionHead
+
+    checkpoint = args.checkpoint
+    if checkpoint is None:
+        from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
+    if args.frames is not None:
+        head, view = take_frames(args, checkpoint)
+    else:
+        head = ActionHead.load(checkpoint, config=args.config, num_threads=args.num_threads)
+        view = take(args, checkpoint, head.config)
+    return maps_of(args, checkpoint_identity(checkpoint), head, view)
+
+
+def maps_of(args: argparse.Namespace, checkpoint: dict[str, str], head: ActionHead, view: View) -> Maps:
+    """Everything that is shown of an observation."""
     from saccade.maps import record
     from saccade.maps.occlusion import cell_for
-    from saccade.sim.policy import DEMO_CHECKPOINT
 
-    checkpoint = args.checkpoint or DEMO_CHECKPOINT
-    head = ActionHead.load(checkpoint, config=args.config, num_threads=args.num_threads)
     blocks = arguments.indices("--blocks", args.blocks, head.config.num_layers)
     steps = arguments.indices("--steps", args.steps, head.config.num_steps)
     named = args.heads not in (None, ("mean",))
     heads = arguments.indices("--heads", args.heads if named else None, head.config.num_heads)
-    view = take(args, checkpoint, head.config)
     few = probabilities(head.config, view, len(blocks), len(steps)) <= MAX_PROBABILITIES
     shown = heads if named or (args.heads is None and few) else ()
     selection = record.Selection(blocks, steps, heads, shown)
@@ -155,7 +176,7 @@ def look(args: argparse.Namespace) -> Maps:
         tokens = record.random_tokens(head.future_tokens, seed=0)
         redrawn = record.look_redrawn(head, view, selection, tokens)
     return record.Maps(
-        checkpoint=checkpoint_identity(checkpoint),
+        checkpoint=checkpoint,
         config=head.config,
         view=view,
         selection=selection,
@@ -174,16 +195,18 @@ def check(args: argparse.Namespace) -> None:
         raise UsageError("--heads: given mean and numbers, expected one or the other")
     if args.task is not None:
         arguments.check_known("--task", [args.task], arguments.known_tasks())
+    of_file = ("layout", "grid", "image_token_index")
+    arguments.check_frames(args, "features", "task", "after", "config", *of_file)
     if args.features is not None and (args.task is not None or args.after):
         raise UsageError("--features, --task: expected one observation, from a file or from the simulator")
-    if args.features is None:
+    if args.features is None and args.frames is None:
         from saccade.sim.tasks import check_evaluation_seeds
 
         check_evaluation_seeds(args.seed, 1)
-        given = {"--layout": args.layout, "--grid": args.grid, "--image-token-index": args.image_token_index}
-        wrong = [name for name, value in given.items() if value is not None] + ["--row"] * bool(args.row)
+        wrong = [name for name in (*of_file, "row") if getattr(args, name) is not None]
         if wrong:
-            raise UsageError(f"{', '.join(wrong)}: only with --features")
+            flags = ", ".join("--" + name.replace("_", "-") for name in wrong)
+            raise UsageError(f"{flags}: only with --features{' or --frames' * (wrong == ['row'])}")
 
 
 def probabilities(config: HeadConfig, view: View, blocks: int, steps: int) -> int:
@@ -205,7 +228,7 @@ def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> View
             if args.image_token_index is None
             else args.image_token_index,
         )
-        return view.from_file(args.features, config, row=args.row, options=options, seed=args.seed)
+        return view.from_file(args.features, config, row=args.row or 0, options=options, seed=args.seed)
     from saccade.sim import graphics
     from saccade.sim.policy import Policy, check_trained_on
 
@@ -217,7 +240,47 @@ def take(args: argparse.Namespace, checkpoint: Path, config: HeadConfig) -> View
     task = args.task or ("push" if "push" in known else known[0])
     check_trained_on(policy, [task])
     graphics.check()
-    return view.from_simulator(policy, task, args.seed, args.after)
+    return view.from_simulator(policy, task, args.seed, args.after or 0)
+
+
+def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:
+    """The head of a whole checkpoint, and the moment of a directory that the arguments ask for."""
+    from saccade.frames import read_frames
+    from saccade.maps.view import from_policy
+    from saccade.policy import Policy
+    from saccade.whole import parts_of
+
+    with _output.progress_bar("loading", transient=True):
+        policy = Policy.load(
+            checkpoint,
+            embodiment=args.embodiment,
+            preprocessing=args.preprocessing,
+            tokenizer=args.tokenizer,
+            precision={"backbone": args.precision or "float32", "head": "float32"},
+            num_threads=args.num_threads,
+        )
+    parts = parts_of(policy)
+    moments = read_frames(args.frames, policy, instruction=args.instruction, state=args.state)
+    row = args.row or 0
+    if row >= len(moments):
+        raise UsageError(f"--row: given {row}, {args.frames} has moments 0 to {len(moments) - 1}")
+    moment = moments[row]
+    robot = policy.normalizer.embodiment or f"embodiment {policy.embodiment_id}"
+    view = from_policy(
+        policy,
+        moment.observation,
+        seed=args.seed,
+        title=f'{moment.name}: "{moment.instruction}", {robot}',
+        source={
+            "kind": "frames",
+            "moment": moment.name,
+            "instruction": moment.instruction,
+            "embodiment_id": policy.embodiment_id,
+            "precision": args.precision or "float32",
+            "preprocessing": parts.processor.preprocessing,
+        },
+    )
+    return parts.head, view
 
 
 def occlude(head: ActionHead, view: View, cell: int) -> Occlusion:

@@ -39,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     limits = Limits()
     arguments.add_checkpoint_argument(parser)
-    parser.add_argument("--embodiment", metavar="TAG", help="tag or id of the robot, if there are several")
     arguments.add_policy_options(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
     served = parser.add_argument_group("server")
@@ -148,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
     policy = saccade.Policy.load(
         args.checkpoint,
-        embodiment=embodiment(args.embodiment),
+        embodiment=args.embodiment,
         preprocessing=args.preprocessing,
         tokenizer=args.tokenizer,
         precision=arguments.precisions(args),
@@ -175,11 +174,6 @@ def run(args: argparse.Namespace) -> int:
     finally:
         log.close()
     return EXIT_INTERRUPTED if stopped_by == "SIGINT" else EXIT_OK
-
-
-def embodiment(given: str | None) -> str | int | None:
-    """A tag, or an id if it is a number."""
-    return int(given) if given is not None and given.isdecimal() else given
 
 
 def make_log(form: str) -> Log:

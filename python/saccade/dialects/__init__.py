@@ -5,6 +5,7 @@
 forms. `isaac_nested`, `isaac_flat` and `lerobot` have one form each; `checks` has what they share.
 """
 
+from saccade.dialects.checks import view_places
 from saccade.dialects.dialects import DIALECTS, read, read_state
 from saccade.dialects.reading import Dialect, Reading, StateReading
 from saccade.dialects.requirements import Camera, Requirements
@@ -21,4 +22,5 @@ __all__ = [
     "camera_sources",
     "read",
     "read_state",
+    "view_places",
 ]

@@ -101,16 +101,30 @@ def check_batch(sizes: Mapping[str, int], needs: Requirements) -> int:
 
 def views(cameras: Sequence[Camera], frames: Mapping[str, UInt8Array]) -> tuple[dict[str, UInt8Array], ...]:
     """The views of each observation, from frames ``(batch, time, height, width, 3)`` by camera."""
-    first = frames[cameras[0].name]
-    batch, horizon = first.shape[:2]
+    ordered = {camera.name: frames[camera.name] for camera in cameras}
+    places = view_places(ordered)
     return tuple(
-        {
-            camera.name if horizon == 1 else f"{camera.name}[{time}]": frames[camera.name][row, time]
-            for time in range(horizon)
-            for camera in cameras
-        }
-        for row in range(batch)
+        {view: frames[name][row, time] for view, (name, time) in places.items()}
+        for row in range(len(frames[cameras[0].name]))
     )
+
+
+def view_places(frames: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
+    """The camera and the time of each view, by its name, in the order of the prompt: by time before camera.
+
+    Args:
+        frames: Frames ``(batch, time, height, width, 3)`` by camera.
+
+    Example:
+        >>> view_places({"front": np.zeros((1, 2, 8, 8, 3), np.uint8)})
+        {'front[0]': ('front', 0), 'front[1]': ('front', 1)}
+    """
+    horizon = next(iter(frames.values())).shape[1]
+    return {
+        name if horizon == 1 else f"{name}[{time}]": (name, time)
+        for time in range(horizon)
+        for name in frames
+    }
 
 
 def as_text(name: str, value: Any, needs: Requirements) -> str:

@@ -11,6 +11,7 @@ from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.patches import Rectangle
 
 from saccade._arrays import Float32Array, UInt8Array
+from saccade.maps.layout import WHOLE, Region
 
 CAMERA_COLOURS = ("#1b7837", "#5aae61", "#a6dba0", "#00696b", "#3ba5a7", "#9bd5d6")
 MATRIX_COLOURS = "inferno"
@@ -35,18 +36,38 @@ def show(
     heat: Float32Array | None,
     most: float,
     colours: Colormap,
+    region: Region = WHOLE,
 ) -> None:
-    """Draws the picture, in grey under a map. The map is not smoothed: patches keep their edges."""
+    """Draws the picture, in grey under a map. The map is not smoothed: patches keep their edges.
+
+    Args:
+        axes: Where.
+        extent: Left, right, bottom and top of the picture, with the top at 0.
+        picture: The picture, or None.
+        heat: The map, or None.
+        most: Value of the strongest colour.
+        colours: Colours of the map.
+        region: The part of the picture that the map covers. What lies beside the picture is not drawn.
+    """
+    left, right, bottom, _ = extent
+    frame = Rectangle((left, 0.0), right - left, bottom, fill=False, linewidth=0.5, clip_on=False)
     if picture is not None and heat is None:
         axes.imshow(picture, extent=extent)
     elif picture is not None:
         grey = picture.astype(np.float32).mean(axis=2) / 255.0
         axes.imshow(grey, extent=extent, cmap="gray", vmin=-0.4, vmax=1.0)
-    if heat is not None:
-        axes.imshow(heat, extent=extent, cmap=colours, vmin=0, vmax=most or 1.0, interpolation="nearest")
-    left, right, bottom, _ = extent
-    frame = Rectangle((left, 0.0), right - left, bottom, fill=False, linewidth=0.5, clip_on=False)
     axes.add_patch(frame)
+    if heat is not None:
+        covered = (
+            left + region[0] * (right - left),
+            left + region[2] * (right - left),
+            region[3] * bottom,
+            region[1] * bottom,
+        )
+        drawn = axes.imshow(
+            heat, extent=covered, cmap=colours, vmin=0, vmax=most or 1.0, interpolation="nearest"
+        )
+        drawn.set_clip_path(frame)
 
 
 def borders(axes: Axes, runs: Sequence[tuple[str, slice]], *, down: bool) -> None:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,10 @@ SPECIAL_NAMES = {
 }
 DEFAULT_GRID = (16, 16)  # patches of a picture in GR00T N1.5: 224 px, patch size 14
 
+#: Left, top, right and bottom of what the tokens of a picture see, as shares of its width and height.
+Region: TypeAlias = tuple[float, float, float, float]
+WHOLE: Region = (0.0, 0.0, 1.0, 1.0)
+
 GRAMMAR = "parts KIND:SIZE[=NAME] with commas, such as text:14,image:16x16=left,special:1,text:*"
 
 
@@ -43,12 +47,15 @@ class Camera:
         name: Name of the camera.
         start: Position of its first patch.
         rows, columns: Its grid.
+        region: The part of the picture that the grid covers. It reaches beyond the picture where a processor
+            adds bars to it.
     """
 
     name: str
     start: int
     rows: int
     columns: int
+    region: Region = WHOLE
 
     @property
     def positions(self) -> slice:
@@ -296,7 +303,7 @@ def from_image_mask(
     if names is None:
         special, names = np.zeros(length, dtype=np.bool_), [f"text {place}" for place in range(length)]
     else:
-        special = np.array([re.fullmatch(r"<[^<>\s]+>", name) is not None for name in names])
+        special = np.array([is_special(name) for name in names])
     return _from_mask(image, grid, "image_mask", padding=padding, special=special, names=names)
 
 
@@ -326,6 +333,21 @@ def _from_mask(
         kind = "pad" if padding[position] else "special" if special[position] else "text"
         tokens.append(Token(position, kind, readable(names[position])))
     return Layout(len(image), tuple(cameras), tuple(tokens))
+
+
+def kind_of(position: int, text: str) -> Token:
+    """A token that is no image patch, by its text: those in angle brackets are special.
+
+    Example:
+        >>> kind_of(3, " puck"), kind_of(4, "<|im_end|>").kind
+        (Token(position=3, kind='text', name='puck'), 'special')
+    """
+    return Token(position, "special" if is_special(text) else "text", readable(text))
+
+
+def is_special(text: str) -> bool:
+    """Whether the text of a token is that of a special token, such as ``"</img>"``."""
+    return re.fullmatch(r"<[^<>\s]+>", text) is not None
 
 
 def of_policy(

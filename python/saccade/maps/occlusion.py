@@ -13,16 +13,18 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from saccade._arrays import Float32Array, UInt8Array
+from saccade.dialects import view_places
 from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.maps.layout import Camera, Layout
 from saccade.observation import Observation
+from saccade.policy import Policy
+from saccade.policy_context import PolicyContext
 
 if TYPE_CHECKING:
-    from saccade.sim.policy import Policy
+    from saccade.sim.policy import Policy as SimulatorPolicy
 
 
-BATCH = 16  # one observation of N1.5 holds 32 MB of keys and values
 MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the head
 NOISES = 8  # draws that `other_noise` is computed from
 
@@ -40,6 +42,7 @@ class Occluder(Protocol):
     """Samples chunks with patches removed."""
 
     method: str  # one sentence: how
+    batch: int  # places at once
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
         """One chunk for each place, `(places, horizon, action_dim)`, normalised; None removes nothing."""
@@ -77,8 +80,9 @@ class BlankedPixels:
     """
 
     method = "the patch's pixels are replaced by the picture's mean colour, before the backbone"
+    batch = 16
 
-    def __init__(self, policy: Policy, seen: Mapping[str, Any], observation: Observation) -> None:
+    def __init__(self, policy: SimulatorPolicy, seen: Mapping[str, Any], observation: Observation) -> None:
         self._policy = policy
         self._seen = seen
         self._observation = observation
@@ -102,6 +106,64 @@ class BlankedPixels:
         return {**self._seen, "images": {**self._seen["images"], place.camera.name: picture}}
 
 
+class BlankedFrames:
+    """Removes patches from the frames of a whole policy: their pixels get the mean colour of the frame.
+
+    Args:
+        policy: Whole policy.
+        seen: Observation in Isaac-GR00T's nested form, with a batch of one.
+        encoded: What the policy encoded of it: other views are not computed again.
+        observation: The same as the head takes it; its state and noise are used for all chunks.
+    """
+
+    method = "the frame's pixels behind the patch are replaced by its mean colour, before the backbone"
+    batch = 4  # keys and values of N1.5's language model take 50 MB for each
+
+    def __init__(
+        self, policy: Policy, seen: Mapping[str, Any], encoded: PolicyContext, observation: Observation
+    ) -> None:
+        self._policy = policy
+        self._seen = seen
+        self._encoded = encoded
+        self._observation = observation
+
+    def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
+        """See `Occluder`."""
+        encoded = self._policy.encode([self._without(place) for place in places], previous=self._encoded)
+        return self._observation.repeated(len(places)).sample(head, encoded.context)
+
+    def _without(self, place: Place | None) -> Mapping[str, Any]:
+        if place is None:
+            return self._seen
+        video = self._seen["video"]
+        camera, time = view_places(video)[place.camera.name]
+        frames: UInt8Array = video[camera].copy()  # (1, time, height, width, 3)
+        frame = frames[0, time]
+        frame[behind(place, *frame.shape[:2])] = np.rint(frame.mean(axis=(0, 1))).astype(np.uint8)
+        return {**self._seen, "video": {**video, camera: frames}}
+
+
+def behind(place: Place, height: int, width: int) -> tuple[slice, slice]:
+    """The rows and columns of a frame of this size that a place sees; empty beside the frame.
+
+    Example:
+        >>> camera = Camera("front", 0, 4, 4, (0.25, -0.5, 0.75, 1.5))
+        >>> behind(Place(camera, slice(1, 2), slice(0, 4)), 8, 8)
+        (slice(0, 4, None), slice(2, 6, None))
+    """
+    left, top, right, bottom = place.camera.region
+
+    def part(cells: slice, count: int, start: float, stop: float, side: int) -> slice:
+        edges = [start + (stop - start) * cell / count for cell in (cells.start, cells.stop)]
+        first, last = (min(max(round(edge * side), 0), side) for edge in edges)
+        return slice(first, last)
+
+    return (
+        part(place.rows, place.camera.rows, top, bottom, height),
+        part(place.columns, place.camera.columns, left, right, width),
+    )
+
+
 class DroppedPositions:
     """Removes patches from T_vl: `drop_vl` removes their positions, as if they had not been there.
 
@@ -113,6 +175,7 @@ class DroppedPositions:
         "the patch's positions are dropped before the VL self-attention (drop_vl); what the backbone had "
         "already mixed into other positions stays"
     )
+    batch = 16  # one observation of N1.5 holds 32 MB of keys and values
 
     def __init__(self, observation: Observation) -> None:
         self._observation = observation
@@ -168,7 +231,6 @@ def measure(
     whole: Callable[[int], Float32Array],
     *,
     cell: int,
-    batch: int = BATCH,
     on_done: Callable[[int], None] = lambda done: None,
 ) -> Occlusion:
     """Removes every patch of every camera in turn.
@@ -180,10 +242,9 @@ def measure(
         whole: function from a number of draws to chunks of the whole observation, `(draws, horizon,
             action_dim)`.
         cell: patches along each side of what is removed at once.
-        batch: places at once.
         on_done: called with the number of places done.
     """
-    places = places_of(layout, cell)
+    places, batch = places_of(layout, cell), occluder.batch
     untouched = occluder(head, [None])[0]
     change = {camera.name: np.zeros((camera.rows, camera.columns), np.float32) for camera in layout.cameras}
     for start in range(0, len(places), batch):

@@ -416,7 +416,8 @@ class Sheet:
         for camera, width in zip(self.cameras, wide, strict=True):
             heat = None if heats is None else heats[camera.name]
             extent = (start, start + width, high, 0.0)
-            show(axes, extent, self.maps.view.images.get(camera.name), heat, most, colours)
+            picture = self.maps.view.images.get(camera.name)
+            show(axes, extent, picture, heat, most, colours, camera.region)
             if names:
                 self._text(left + start, self._top - 0.16, camera.name, fontsize=8.5)
             start += width + gap

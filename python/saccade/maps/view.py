@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,14 @@ import numpy.typing as npt
 
 from saccade._arrays import UInt8Array
 from saccade.config import HeadConfig
+from saccade.dialects import read
 from saccade.errors import InputError, ShapeError
 from saccade.maps import layout as layouts
+from saccade.maps.grid import layout_of
 from saccade.maps.layout import Layout
-from saccade.maps.occlusion import BlankedPixels, DroppedPositions, Occluder
+from saccade.maps.occlusion import BlankedFrames, BlankedPixels, DroppedPositions, Occluder
 from saccade.observation import Observation, as_mask, from_arrays, read_arrays
+from saccade.policy import Policy as WholePolicy
 from saccade.sim.policy import EMBODIMENT_ID, Policy
 
 
@@ -102,6 +105,42 @@ def from_simulator(policy: Policy, task: str, seed: int, control_steps: int) -> 
         layout=layouts.of_policy(policy.config.backbone, cameras, policy.config.vocabulary, instruction),
         images={name: observation["images"][name] for name in cameras},
         occluder=BlankedPixels(policy, observation, given),
+    )
+
+
+def from_policy(
+    policy: WholePolicy, seen: Mapping[str, Any], *, seed: int, title: str, source: Mapping[str, Any]
+) -> View:
+    """What a whole policy sees, and what it makes of it.
+
+    Args:
+        policy: A policy of :meth:`saccade.Policy.load`.
+        seen: An observation in Isaac-GR00T's nested form, with a batch of one.
+        seed: Seed of the noise.
+        title: What the observation is, on one line.
+        source: Where it comes from, for JSON; the seed of the noise and the views are added.
+
+    Raises:
+        InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.encode`.
+    """
+    reading = read(seen, policy.requirements)
+    (inputs,) = policy.inputs(seen)
+    features = policy.features([inputs])
+    encoded = policy.context(features)
+    given = Observation(
+        np.asarray(features[0].backbone_features),
+        np.asarray(policy.normalizer.state(reading.state)),
+        np.array([policy.embodiment_id]),
+        image_mask=np.asarray(features[0].image_mask),
+    ).with_noise(np.random.default_rng(seed), policy.head.config)
+    frames = reading.frames[0]
+    return View(
+        title=title,
+        source={**source, "views": list(frames), "noise": f"seed {seed}"},
+        observation=given,
+        layout=layout_of(policy, frames, inputs, features[0].views),
+        images=dict(frames),
+        occluder=BlankedFrames(policy, seen, encoded, given),
     )
 
 

@@ -139,6 +139,23 @@ impl Processor {
         self.tokenizer.encode(text)
     }
 
+    /// The text of each of these tokens.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for an id that is no token's.
+    pub fn texts(&self, ids: &[i64]) -> Result<Vec<String>> {
+        let text = |&id: &i64| {
+            let found = u32::try_from(id).ok().and_then(|id| self.tokenizer.text_of(id));
+            found.ok_or_else(|| {
+                Error::Input(format!(
+                    "ids: expected those of the tokenizer's {} tokens, got {id}",
+                    self.num_tokens()
+                ))
+            })
+        };
+        ids.iter().map(text).collect()
+    }
+
     /// The inputs of a batch of observations.
     ///
     /// # Errors

@@ -13,7 +13,7 @@ use tokenizers::pre_tokenizers::PreTokenizerWrapper;
 use tokenizers::pre_tokenizers::byte_level::ByteLevel;
 use tokenizers::pre_tokenizers::sequence::Sequence;
 use tokenizers::pre_tokenizers::split::{Split, SplitPattern};
-use tokenizers::{AddedToken, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl};
+use tokenizers::{AddedToken, Decoder, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl};
 
 use crate::error::{Error, Result};
 use find::FilesText;
@@ -143,6 +143,17 @@ impl Tokenizer {
         let encoding = self.inner.encode_fast(text, false);
         let encoding = encoding.map_err(|problem| Error::Input(format!("{name}: {problem}")))?;
         Ok(encoding.get_ids().to_vec())
+    }
+
+    /// The text of a token; none for an id that is no token's. Bytes that are no whole characters become U+FFFD.
+    #[must_use]
+    pub fn text_of(&self, id: u32) -> Option<String> {
+        let token = self.inner.id_to_token(id)?;
+        if self.inner.get_added_vocabulary().get_vocab().contains_key(&token) {
+            return Some(token);
+        }
+        // Without others to join it with, a token is one string, and decoding bytes has no errors.
+        ByteLevel::default().decode_chain(vec![token]).ok().map(|text| text.concat())
     }
 
     /// The id of a special token, found by its string.
