@@ -55,12 +55,12 @@ RELEASES = (
 INTRODUCTION = """\
 # What `accelerate` was tested with
 
-The tests use lerobot's own policy, model, backbone and head, small and with random weights. Where only the head
-is accelerated, the backbone is a stub. `make test-compat` creates an environment for each release, runs the
-tests in it and writes this page. Errors compare whole chunks with the original `get_action`
-for equal seeds: the root-mean-square difference divided by the root mean square of the actions, and of that
-the largest over the tests. In float32 the differences come from the order of sums and from torch's own sine
-tables. Where the original rounds to bfloat16, the difference is its rounding.
+The tests use lerobot's own policy, model, backbone and head, small and with random weights. Where only the
+head is accelerated, the backbone is a stub. `make test-compat` creates an environment for each release, runs
+the tests in it and writes this page. Errors compare whole chunks with the original `get_action` for equal
+seeds: the root-mean-square difference divided by the root mean square of the actions, and of that the largest
+over the tests. In float32 the differences come from the order of sums and from torch's own sine tables. Where
+the original rounds to bfloat16, the difference is its rounding.
 """
 
 ERRORS = {
@@ -95,9 +95,9 @@ environment these tests passed too:
 - These are refused: training mode, hooks, gradients, a replaced `get_action` or `forward`, `torch.compile`
   inside, float64, changed code under the same names, other draws from the generator.
 - Calls from several threads, at 1 and 2 threads, give the same bits.
-- With `backbone=True`: batches of 1 and 3 with one and two views and left padding; all of the above; in training,
-  and where a gradient is asked for, the original backbone runs; padding under another attention than torch's
-  `sdpa` is refused.
+- With `backbone=True`: batches of 1 and 3 with one and two views and left padding; all of the above. In
+  training, and where a gradient is asked for, the original backbone runs. Padding under another attention
+  than torch's `sdpa` is refused.
 
 ## What is not in the table
 
