@@ -50,7 +50,7 @@ class Difference:
     largest: dict[str, float]
     """By key of the action, in the robot's units."""
     of_range: dict[str, float]
-    """By key, relative to the range of each number: maximum minus minimum, the 99 % minus the 1 % quantile, or
+    """By key, relative to the range of each number: maximum minus minimum, 99 % minus 1 % quantile, or
     four standard deviations, whatever the statistics are. Numbers that are constant do not count."""
 
     @property
