@@ -115,7 +115,7 @@ def results() -> dict[str, Any]:
         ended = {"episodes": [0], "successes": [0], "lengths": [0]}
         return dataclasses.asdict(setting) | counts | ended | {"memory": memory} | more
 
-    whole = {"episodes": [20], "successes": [18], "lengths": [200]}
+    whole: dict[str, Any] = {"episodes": [20], "successes": [18], "lengths": [200]}
     return {
         "machine": {
             "cpu": "A CPU",

@@ -94,9 +94,8 @@ def model(config: dict[str, Any]) -> Any:
         return groot_n1_7.GR00TN17(groot_n1_7.GR00TN17Config(**config))
 
 
-@functools.cache
-def built() -> Any:
-    """A `GrootPolicy` with random weights."""
+def policy_around(model: Any) -> Any:
+    """A `GrootPolicy` that holds the model."""
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.groot.configuration_groot import GrootConfig
     from lerobot.policies.groot.modeling_groot import GrootPolicy
@@ -109,9 +108,15 @@ def built() -> Any:
     )
     with (
         contextlib.redirect_stdout(io.StringIO()),
-        mock.patch.object(GrootPolicy, "_create_groot_model", lambda self: model(small_config(KIND))),
+        mock.patch.object(GrootPolicy, "_create_groot_model", lambda self: model),
     ):
-        policy = GrootPolicy(config)
+        return GrootPolicy(config).eval()
+
+
+@functools.cache
+def built() -> Any:
+    """A `GrootPolicy` with random weights."""
+    policy = policy_around(model(small_config(KIND)))
     cases.fill(policy)
     return policy.eval()
 

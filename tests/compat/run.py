@@ -52,20 +52,20 @@ class Release:
 
 #: In the order in which the environments build on each other; "" is the environment that runs this program.
 RELEASES = (
-    Release("0.4.4", "", ("policies.py", "normalizers.py")),
-    Release("0.6.1", None, ("policies.py", "normalizers.py", "n17_parity.py", PLUGIN_TESTS)),
-    Release("0.5.1", "0.6.1", ("policies.py", "normalizers.py", PLUGIN_TESTS)),
+    Release("0.4.4", "", ("policies.py", "whole.py", "normalizers.py")),
+    Release("0.6.1", None, ("policies.py", "whole.py", "normalizers.py", "n17_parity.py", PLUGIN_TESTS)),
+    Release("0.5.1", "0.6.1", ("policies.py", "whole.py", "normalizers.py", PLUGIN_TESTS)),
 )
 
 INTRODUCTION = """\
 # What `accelerate` was tested with
 
-The tests use lerobot's own policy, model and head, small and with random weights. The backbone is a stub,
-because its constructor downloads assets from the Hub. `make test-compat` creates an environment for each
-release, runs the tests in it and writes this page. Errors compare whole chunks with the original `get_action`
-for equal seeds: the root-mean-square difference divided by the root mean square of the actions, and of that
-the largest over the tests. In float32 the differences come from the order of sums and from torch's own sine
-tables. Where the original rounds to bfloat16, the difference is its rounding.
+The tests use lerobot's own policy, model, backbone and head, small and with random weights. Where only the
+head is accelerated, the backbone is a stub. `make test-compat` creates an environment for each release, runs
+the tests in it and writes this page. Errors compare whole chunks with the original `get_action` for equal
+seeds: the root-mean-square difference divided by the root mean square of the actions, and of that the largest
+over the tests. In float32 the differences come from the order of sums and from torch's own sine tables. Where
+the original rounds to bfloat16, the difference is its rounding.
 """
 
 ERRORS = {
@@ -75,6 +75,13 @@ ERRORS = {
     "bfloat16, autocast": "bfloat16 weights, autocast",
     "precision bfloat16": 'float32 weights, `precision="bfloat16"`',
     "precision int8": 'float32 weights, `precision="int8"`',
+    "whole, float32": "whole policy, float32 weights",
+    "whole, float32, autocast": "whole policy, float32 weights, autocast",
+    "whole, bfloat16": "whole policy, bfloat16 weights",
+    "whole, bfloat16, autocast": "whole policy, bfloat16 weights, autocast",
+    "whole, float32, precision bfloat16": 'whole policy, float32 weights, `precision="bfloat16"`',
+    "whole, float32, autocast, precision bfloat16": 'whole policy, autocast, `precision="bfloat16"`',
+    "whole, precision int8": 'whole policy, float32 weights, `precision="int8"`',
     "real-time chunking": "real-time chunking through the policy",
     "chunking by options": "real-time chunking by the head's options",
     "published widths": "published widths, 6 blocks, 296 tokens",
@@ -93,6 +100,9 @@ environment these tests passed too:
 - These are refused: training mode, hooks, gradients, a replaced `get_action` or `forward`, `torch.compile`
   inside, float64, changed code under the same names, other draws from the generator.
 - Calls from several threads, at 1 and 2 threads, give the same bits.
+- With `backbone=True`: batches of 1 and 3 with one and two views and left padding; all of the above. In
+  training, and where a gradient is asked for, the original backbone runs. Padding under another attention
+  than torch's `sdpa` is refused.
 
 In lerobot 0.5.1 and 0.6.1 those of the plugin `lerobot_policy_saccade` passed too. `lerobot-eval`, started as
 users start it, runs episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their rewards
@@ -107,6 +117,7 @@ are those of `saccade.Policy.act` in a loop.
   above.
 - **Isaac-GR00T's classes** are in no package, so they are not run here. N1.5's head is lerobot's. N1.6's and
   N1.7's heads have the attributes, arguments and results of the test classes of the same structure.
+- **Flash attention**: lerobot's backbones can use it on GPUs only. It was not run.
 - **GPUs**: a head on a GPU is copied, computed on the CPU, and the results are copied back. This path has not
   been run.
 - **Trained weights**: random weights have errors of another size at reduced precision: see

@@ -49,6 +49,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
     "attention --frames": ("rich", *_PICTURES, "jinja2", "scipy"),
+    "inspect --precision-check": ("PIL",),
     "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib"),
     "study --features": ("rich", *_PICTURES, *_TABLES, "joblib"),
     "study report": (*_PICTURES, *_TABLES),

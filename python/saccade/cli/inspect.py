@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade import _arguments as arguments
-from saccade.cli import EXIT_OK, _output
+from saccade._arguments import UsageError
+from saccade.cli import EXIT_OK, _output, _precisions
 from saccade.cli._tables import Section, show
 
 if TYPE_CHECKING:
@@ -26,10 +27,15 @@ A tensor counts "as initialised" if it is distributed as the released constructo
 last table lists the evidence for and against "this checkpoint was trained from a random start"; docs/fork.md
 explains when that happens.
 
+With --precision-check it runs the whole checkpoint instead, at every precision on the same pictures from the
+same noise, compares features and actions with float32, and recommends the smallest precision whose actions
+differ by at most 1 % of their range. docs/precision.md says why.
+
 examples:
   saccade inspect GR00T-N1.5-3B/
   saccade inspect nvidia/GR00T-N1.5-3B --json          from the local Hugging Face cache
   saccade inspect my-fork/ --reference GR00T-N1.5-3B/  is it still the checkpoint that it started from?
+  saccade inspect my-policy/ --precision-check frames/ --instruction "open the drawer"
 """
 
 
@@ -48,10 +54,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-time", action="store_true", help="leave out the expected times and do not measure this CPU"
     )
     arguments.add_json(parser, "print JSON instead of tables")
+    seen = parser.add_argument_group("compare the precisions on pictures and words")
+    seen.add_argument(
+        "--precision-check",
+        type=Path,
+        metavar="DIR",
+        help="a picture for each camera, named after it (front.png), or a folder of them for each moment",
+    )
+    seen.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
+    seen.add_argument(
+        "--state",
+        type=Path,
+        metavar="FILE",
+        help="JSON: the robot's state in its own units, for moments without a state.json (default: the "
+        "middle of its range)",
+    )
+    arguments.add_preprocessing(seen)
+    arguments.add_integer(seen, "--seed", minimum=0, help="seed of the noise (default: 0)")
+    arguments.add_num_threads(seen, "threads (default: the physical cores)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Reads the checkpoint and prints what it contains."""
+    """Reads the checkpoint and prints what it contains, or compares its precisions."""
+    if args.precision_check is not None:
+        return _precisions.run(args)
+    given = [name for name in _precisions.ARGUMENTS if getattr(args, name) is not None]
+    if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise UsageError(f"{flags}: only with --precision-check")
     from saccade.checkpoints.inspection import inspect
 
     with _output.progress_bar("reading", in_bytes=True, transient=True) as update:

@@ -96,7 +96,7 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
     """
     views = [processor.frame(image) for image in images.reshape(-1, *images.shape[2:])]
     pixels = np.rint(np.stack(views) * PIXEL_CENTRE + PIXEL_CENTRE)
-    return pixels.astype(np.uint8).reshape(*images.shape[:2], *pixels.shape[1:])
+    return np.asarray(pixels.reshape(*images.shape[:2], *pixels.shape[1:]), dtype=np.uint8)
 
 
 def load_samples(

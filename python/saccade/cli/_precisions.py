@@ -1,0 +1,87 @@
+"""`saccade inspect --precision-check`: compares the precisions of a whole checkpoint on pictures."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from typing import TYPE_CHECKING
+
+from saccade._arguments import UsageError
+from saccade.cli import EXIT_OK, _output, require
+from saccade.cli._tables import Section, show
+
+if TYPE_CHECKING:
+    from saccade.precision_check import Difference, PrecisionCheck
+
+#: The arguments that need `--precision-check`; None where they are not given.
+ARGUMENTS = ("instruction", "state", "embodiment", "preprocessing", "tokenizer", "seed", "num_threads")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compares, prints and recommends."""
+    for name in ("config", "reference"):
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name}: not with --precision-check")
+    require("inspect --precision-check")
+    from saccade.precision_check import check_precisions
+
+    with _output.progress_bar("comparing", transient=True) as update:
+        found = check_precisions(
+            args.checkpoint,
+            args.precision_check,
+            instruction=args.instruction,
+            state=args.state,
+            embodiment=args.embodiment,
+            preprocessing=args.preprocessing,
+            tokenizer=args.tokenizer,
+            num_threads=args.num_threads,
+            seed=args.seed or 0,
+            progress=lambda done, total: update(done, total),
+        )
+    if args.json:
+        _output.print_json(dataclasses.asdict(found), indent=1)
+        return EXIT_OK
+    show([overview(found), by_key(found)])
+    print(
+        f"recommended: {found.recommended}, the smallest whose actions differ by at most "
+        f"{found.tolerance:.0%} of their range"
+    )
+    return EXIT_OK
+
+
+def overview(found: PrecisionCheck) -> Section:
+    """A row for each precision."""
+    rows = [
+        [
+            one.name,
+            f"{one.features:.1e}",
+            of_range(one.actions),
+            f"{one.nbytes / 1e6:,.1f}",
+            f"{one.milliseconds:,.1f}",
+        ]
+        for one in found.precisions
+    ]
+    rows.append(["float32, other noise", "-", of_range(found.other_noise), "-", "-"])
+    title = f"Difference from float32: {found.moments} moments, {found.samples} chunks of each, same noise"
+    columns = ["", ">error of features", ">largest of an action, of its range", ">MB", ">ms"]
+    return Section(title, columns, rows)
+
+
+def by_key(found: PrecisionCheck) -> Section:
+    """The largest differences in the robot's units, a row for each key of the action."""
+    differences = [*(one.actions for one in found.precisions[1:]), found.other_noise]
+    rows = [
+        [key, *(f"{one.largest[key]:.2e} ({one.of_range[key]:.2%})" for one in differences)]
+        for key in found.other_noise.largest
+    ]
+    names = [*(one.name for one in found.precisions[1:]), "float32, other noise"]
+    return Section(
+        "Largest difference of an action in the robot's units (of its range)",
+        ["", *(f">{name}" for name in names)],
+        rows,
+    )
+
+
+def of_range(found: Difference) -> str:
+    """The largest difference, relative to the range."""
+    return f"{found.worst:.2%}"
