@@ -15,8 +15,8 @@ Every contender runs in a separate process with the requested number of threads 
 works. In a round, each does every piece of work once, in an order that rotates. Before anything is timed, its
 result is compared with the reference in float32. What has a target comes first. Measurements are added to a
 JSON file, so an interrupted run resumes, and contenders that have all their rounds are not started again.
-At the end the file is copied to benches/peers/results/ under the name of the CPU's family. The whole policy is
-measured apart from the head, and has a file, a record and a page of its own.
+At the end the file is copied to benches/peers/results/ under the name of the CPU's family. The whole policy
+is measured apart from the head, and has a file, a record and a page of its own.
 
 Needs the environment that `make bench-peers` sets up. A contender whose package is missing is left out, with
 the reason in the report. The whole head in all contenders takes 12 GB of memory, the whole policy 19 GB;

@@ -150,9 +150,7 @@ def _policy(label: str, engine: str, gigabytes: float, process: str = "", **opti
 
 POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
     "narrow": {
-        "policy-saccade-bfloat16": _policy(
-            "saccade bfloat16", "saccade_policy", 4.5, precision="bfloat16"
-        ),
+        "policy-saccade-bfloat16": _policy("saccade bfloat16", "saccade_policy", 4.5, precision="bfloat16"),
         "policy-saccade-int8": _policy("saccade int8", "saccade_policy", 2.6, precision="int8"),
         "policy-lerobot-bfloat16-pure": _policy(
             "lerobot 0.4.4 bfloat16, no autocast",

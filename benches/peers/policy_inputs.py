@@ -85,7 +85,7 @@ def with_views(policy: saccade.Policy, views: int) -> saccade.Policy:
 def observation_of(policy: saccade.Policy) -> dict[str, Any]:
     """Random frames, a state in the middle of its range, and the usual instruction."""
     observation = policy.example_observation()
-    return {**observation, "language": dict.fromkeys(observation["language"], [[INSTRUCTION_TEXT]])}
+    return {**observation, "language": {key: [[INSTRUCTION_TEXT]] for key in observation["language"]}}
 
 
 def expected_of(case: Case, folder: Path) -> Arrays:

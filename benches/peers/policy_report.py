@@ -37,7 +37,8 @@ def command(results: Results, args: argparse.Namespace) -> int:
         return 0
     if not results.data["machine"]:
         raise SystemExit(
-            f'bench-peers: {args.results} has no measurements; run `make bench-peers PEERS_ARGS="--only policy"`'
+            f"bench-peers: {args.results} has no measurements; run "
+            '`make bench-peers PEERS_ARGS="--only policy"`'
         )
     write(results, args.results.parent)
     return 0
@@ -54,7 +55,7 @@ def page(measured: list[Results]) -> str:
     """docs/policy-speed.md: all machines, one after the other."""
     parts = [
         "# The whole policy, measured",
-        "From frames and words to a chunk of actions: N1.5 at its published size, with seeded random weights. "
+        "From frames and words to a chunk of actions: N1.5 at its published size with seeded random weights. "
         '`make bench-peers PEERS_ARGS="--only policy"` measures a machine and keeps the numbers in '
         "`benches/peers/results/policy/`, one file per CPU family; "
         "`python -m benches.peers report --only policy --write` writes this page from these files.",
@@ -99,7 +100,9 @@ def machine(results: Results) -> str:
 
 def goals(results: Results) -> str:
     """The table of targets, and whether each was reached."""
-    rows = [row for case in usual(results, "policy") for goal in GOALS for row in goal_row(results, case, goal)]
+    rows = [
+        row for case in usual(results, "policy") for goal in GOALS for row in goal_row(results, case, goal)
+    ]
     head = ["", "against", "threads", "target (exceeded at)", "times as fast (quartiles)", "reached"]
     return table(head, rows) if rows else "Nothing measured yet."
 
@@ -136,7 +139,7 @@ def section(results: Results, case: Case) -> list[str]:
             cells.append(f"{number(median)} ({number(low)} to {number(high)})")
             cells.append(speed_up(results, case, name, work))
         error, scale = results.error(case, name)
-        cells.append(f"{error / scale:.0e}" + ("" if results.is_correct(case, name) else ", **not correct**"))
+        cells.append(f"{error / scale:.1e}" + ("" if results.is_correct(case, name) else ", **not correct**"))
         rows.append(cells)
     head = ["ms"]
     for work in case.works:
@@ -153,9 +156,7 @@ def section(results: Results, case: Case) -> list[str]:
 
 def speed_up(results: Results, case: Case, name: str, work: str) -> str:
     """How many times as fast as lerobot's fastest correct bfloat16."""
-    peers = [
-        peer for peer in LEROBOT_BF16 if peer in results.names(case) and results.is_correct(case, peer)
-    ]
+    peers = [peer for peer in LEROBOT_BF16 if peer in results.names(case) and results.is_correct(case, peer)]
     if not peers:
         return ""
     peer = min(peers, key=lambda each: quartiles(results.seconds(case, each, work))[1])

@@ -44,7 +44,9 @@ def build(task: Task) -> Built:
     works: dict[str, Callable[[], Any]] = {work: partial(chunk, views) for work, views in named.items()}
     return Built(
         works,
-        lambda: np.stack([with_noise(given(task.arrays, views), works[work]) for work, views in named.items()]),
+        lambda: np.stack(
+            [with_noise(given(task.arrays, views), works[work]) for work, views in named.items()]
+        ),
         is_warm=True,
     )
 
