@@ -1,8 +1,8 @@
-"""The options of ``ActionHead``'s methods: their types, and the form that the engine takes."""
+"""The options of heads' and policies' methods: their types, and the form that the engine takes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -11,6 +11,9 @@ from saccade._arrays import ArrayLike, Float32Array, apart, does_not_fit, float3
 from saccade.chunking import Chunking
 from saccade.errors import InputError
 from saccade.intervention import Intervention, as_interventions
+
+#: The parts of a policy that have a precision.
+PARTS = ("backbone", "head")
 
 
 class _Sampling(TypedDict, total=False):
@@ -64,6 +67,21 @@ class LoadOptions(TypedDict, total=False):
 def optional_integer(name: str, value: int | None) -> int | None:
     """``value`` as an integer of at least 1. None stays None."""
     return None if value is None else integer(name, value)
+
+
+def precisions_of_parts(precision: str | Mapping[str, str]) -> dict[str, str]:
+    """The precision of each part of a policy. The parts check the names.
+
+    Raises:
+        InputError: It is a mapping of other parts.
+    """
+    if isinstance(precision, Mapping):
+        if set(precision) != set(PARTS):
+            raise InputError(
+                f"precision: expected a name, or names for {' and '.join(PARTS)}, got {dict(precision)!r}"
+            )
+        return dict(precision)
+    return dict.fromkeys(PARTS, precision)
 
 
 def noise_or_draw(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float32Array:

@@ -16,6 +16,7 @@ from saccade.dialects import Camera, CameraSources, camera_sources
 from saccade.errors import CheckpointError, InputError
 from saccade.head import ActionHead
 from saccade.hub import resolve
+from saccade.options import precisions_of_parts
 from saccade.policy_head import requested_id
 from saccade.processor import Preprocessing, Processor
 from saccade.robots import Normalizer
@@ -23,8 +24,6 @@ from saccade.robots import Normalizer
 #: What the names of a part's tensors begin with, in NVIDIA's and in lerobot's checkpoints.
 HEAD = ("action_head.", "_groot_model.action_head.")
 BACKBONE = ("backbone.", "_groot_model.backbone.")
-
-PARTS = ("backbone", "head")
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ def load(
 
     What is quick to load comes first, so that a mistake is found before gigabytes are read.
     """
-    precisions = _precisions(precision)
+    precisions = precisions_of_parts(precision)
     path = resolve(source)
     check_whole(path)
     config = HeadConfig(**open_published(path).config())
@@ -104,17 +103,6 @@ def check_whole(path: Path) -> None:
         f"{path}: expected a whole checkpoint, got a backbone without an action head (no tensor's name "
         f"begins with {' or '.join(HEAD)}): saccade.Backbone.load computes its features"
     )
-
-
-def _precisions(precision: str | Mapping[str, str]) -> dict[str, str]:
-    """The precision of each part. The parts check the names."""
-    if isinstance(precision, Mapping):
-        if set(precision) != set(PARTS):
-            raise InputError(
-                f"precision: expected a name, or names for {' and '.join(PARTS)}, got {dict(precision)!r}"
-            )
-        return dict(precision)
-    return dict.fromkeys(PARTS, precision)
 
 
 def _chosen(names: Sequence[str], found: CameraSources) -> tuple[Camera, ...]:

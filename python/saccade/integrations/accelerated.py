@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import copy
 import math
-import threading
-import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MethodType, TracebackType
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from saccade.backbone import Backbone
 from saccade.chunking import Chunking
 from saccade.config import HeadConfig
-from saccade.errors import DtypeError, InputError
+from saccade.errors import InputError
 from saccade.head import ActionHead
-from saccade.integrations import heads
-from saccade.integrations.weights import Watch, tensors_of
-from saccade.options import LoadOptions
+from saccade.integrations import backbones, heads
+from saccade.integrations.accelerated_backbone import AcceleratedBackbone
+from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, StandIn
+from saccade.integrations.weights import tensors_of
+from saccade.options import LoadOptions, precisions_of_parts
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
-
-#: Largest error in the check at load, relative to how far the original moves the noise. In exact arithmetic
-#: the tables of the released code cause a difference of 2e-4. The other precisions round to 8 bits. Another
-#: architecture differs by about 1.
-EXACT_TOLERANCE = 1e-2
-ROUNDED_TOLERANCE = 0.3
 
 #: Additional tolerance, relative to the noise, for rounding it at the start and after each of four steps. It
 #: matters for an untrained head, which hardly moves the noise.
@@ -45,40 +39,54 @@ CHUNKING_OPTIONS = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "
 def accelerate(
     policy: object,
     *,
-    precision: str = "float32",
+    backbone: bool = False,
+    precision: str | Mapping[str, str] = "float32",
     num_threads: int | None = None,
     embodiment_ids: Sequence[int] | None = None,
 ) -> Accelerated:
-    """Makes the action head of a torch policy compute in saccade, on the CPU.
+    """Makes the action head of a torch policy compute in saccade, on the CPU, and its backbone if asked to.
 
-    The `get_action` of this instance of the head is replaced. Arguments and results stay the same. The noise
-    is drawn from torch's generator as in the original, so equal seeds give equal actions up to rounding.
-    Nothing else in the policy changes, and :meth:`Accelerated.restore` puts the original back. As a check,
-    the original runs once on four random tokens, and the results must agree.
+    The `get_action` of this instance of the head is replaced, and the `forward` of this instance of the
+    backbone. Arguments and results stay the same. The noise is drawn from torch's generator as in the
+    original, so equal seeds give equal actions up to rounding. Nothing else in the policy changes, and
+    :meth:`Accelerated.restore` puts the originals back. As a check, the originals run once, the head on four
+    random tokens and the backbone on a random view, and the results must agree.
 
-    Heads are recognised by their structure: those of lerobot and Isaac-GR00T, N1.5 to N1.7, and forks that
-    :meth:`saccade.ActionHead.load` supports. The torch weights stay in memory. The copy in saccade takes
-    ``handle.head.nbytes`` more.
+    Parts are recognised by their structure: the heads of lerobot and Isaac-GR00T, N1.5 to N1.7, and forks
+    that :meth:`saccade.ActionHead.load` supports, and the backbones of N1.5 and N1.7. The torch weights stay
+    in memory. The copies in saccade take ``handle.head.nbytes`` and ``handle.backbone.nbytes`` more.
 
     Args:
         policy: `GrootPolicy` of lerobot, the policy or model of Isaac-GR00T, or the head itself.
-        precision: As in :meth:`saccade.ActionHead.load`. ``"float32"`` is exact up to rounding for weights of
-            any dtype.
+        backbone: Whether the backbone computes in saccade too.
+        precision: As in :meth:`saccade.ActionHead.load`: one name for both parts, or with `backbone` one for
+            each, as in ``{"backbone": "int8", "head": "bfloat16"}``. ``"float32"`` is exact up to rounding
+            for weights of any dtype.
         num_threads: As in :meth:`saccade.ActionHead.load`.
         embodiment_ids: The embodiments whose weights are copied. A call with another id is an error. Default:
             all.
 
     Raises:
-        InputError: `policy` does not contain exactly one head, or the head is in training mode, compiled,
-            quantised, hooked, replaced or accelerated already, or the original gives other actions.
+        InputError: `policy` does not contain exactly one head (and backbone), or a part is in training mode,
+            compiled, quantised, hooked, replaced or accelerated already, or the original gives other results.
         DtypeError: The call is made under the default device ``meta``.
-        CheckpointError: The weights are not those of a GR00T head. The message lists every problem.
+        CheckpointError: The weights are not those of a GR00T policy. The message lists every problem.
     """
+    precisions = precisions_of_parts(precision)
     module = heads.find(policy)
-    if isinstance(vars(module).get("get_action"), Accelerated):
-        raise InputError(f"policy: its {type(module).__name__} is accelerated already: restore() it first")
-    handle = Accelerated(module, precision, num_threads, embodiment_ids)
-    module.__dict__["get_action"] = handle
+    tower = backbones.find(policy) if backbone else None
+    if tower is None and not isinstance(precision, str):
+        raise InputError(f"precision: expected one name without backbone=True, got {dict(precision)!r}")
+    for part, method in ((module, "get_action"), (tower, "forward")):
+        if part is not None and isinstance(vars(part).get(method), StandIn):
+            raise InputError(f"policy: its {type(part).__name__} is accelerated already: restore() it first")
+    # The larger part first: what loading needs for a while then adds to less.
+    whole = None
+    if tower is not None:
+        autocast = bool(getattr(getattr(policy, "config", None), "use_bf16", False))
+        whole = AcceleratedBackbone(tower, precisions["backbone"], num_threads, autocast)
+    handle = Accelerated(module, precisions["head"], num_threads, embodiment_ids, whole)
+    handle.install()
     return handle
 
 
@@ -101,16 +109,20 @@ class Features(dict[str, Any]):
             raise AttributeError(name) from None
 
 
-class Accelerated:
-    """The replacement of a torch head's `get_action`, and a handle to it. Returned by :func:`accelerate`.
+class Accelerated(StandIn[ActionHead]):
+    """The replacement of a torch head's `get_action`, and a handle to it and to the accelerated backbone.
+    Returned by :func:`accelerate`.
 
-    Any number of threads may call it. The weights of the head may change: each call compares them, as far as
+    Any number of threads may call it. The weights may change: each call compares them, as far as
     :class:`saccade.integrations.weights.Watch` describes, and copies them again after a change, which takes
     as long as loading. A change that the comparison misses (of a few values through ``.data``) requires
-    :meth:`refresh`. Copies and pickles of the policy have the original `get_action`.
+    :meth:`refresh`. Copies and pickles of the policy have the original methods.
 
-    As a context manager it restores the original at the end.
+    As a context manager it restores the originals at the end.
     """
+
+    method = "get_action"
+    part = "the head"
 
     def __init__(
         self,
@@ -118,33 +130,14 @@ class Accelerated:
         precision: str,
         num_threads: int | None,
         embodiment_ids: Sequence[int] | None,
+        backbone: AcceleratedBackbone | None,
     ) -> None:
-        # Weak, since the module refers to this object: a cycle would keep gigabytes until the next
-        # collection.
-        self._weak_module = weakref.ref(module)
         self._options = LoadOptions(
             precision=precision, num_threads=num_threads, embodiment_ids=embodiment_ids
         )
         self._takes_options = heads.takes_options(module)
-        self._lock = threading.RLock()
-        self._restored = False
-        self._head: ActionHead | None = None
-        self._watch: Watch | None = None
-        self._load(module)
-
-    @property
-    def module(self) -> nn.Module:
-        """The torch head.
-
-        Raises:
-            InputError: The original was restored, or the policy no longer exists.
-        """
-        module = self._weak_module()
-        if module is None or self._restored:
-            raise InputError(
-                "the head is no longer accelerated: it was restored, or its policy no longer exists"
-            )
-        return module
+        self._backbone = backbone
+        super().__init__(module)
 
     @property
     def head(self) -> ActionHead:
@@ -156,33 +149,55 @@ class Accelerated:
         """
         return self._current(self.module)
 
+    @property
+    def backbone(self) -> Backbone:
+        """The backbone in saccade, with the current weights.
+
+        Raises:
+            InputError: As :attr:`head`, or the backbone was not accelerated.
+        """
+        if self._backbone is None:
+            raise InputError(
+                "the backbone is not accelerated: call accelerate(policy, backbone=True) for that"
+            )
+        return self._backbone.backbone
+
+    def install(self) -> None:
+        """Puts the replacements in the place of the originals."""
+        if self._backbone is not None:
+            self._backbone.install()
+        super().install()
+
     def refresh(self) -> None:
-        """Copies the weights again. Needed only after a change that the comparison misses.
+        """Copies all weights again. Needed only after a change that the comparison misses.
 
         Raises:
             InputError, CheckpointError: As :func:`accelerate`.
         """
-        with self._lock:
-            self._load(self.module)
+        super().refresh()
+        if self._backbone is not None:
+            self._backbone.refresh()
 
-    def restore(self) -> None:
-        """Puts the original `get_action` back and frees the weights in saccade. A second call does nothing.
+    def check_restorable(self) -> None:
+        """Checks that nothing else has replaced a method since.
 
         Raises:
-            InputError: `get_action` has been replaced by something else in the meantime.
+            InputError: Something has.
         """
-        module = self._weak_module()
-        if module is None or self._restored:
-            return
-        now = vars(module).get("get_action")
-        if now is not self:
-            raise InputError(
-                f"get_action was replaced since by {heads.describe(now)}: remove that first, then restore"
-            )
-        del module.__dict__["get_action"]
-        with self._lock:
-            self._restored = True
-            self._head = self._watch = None
+        super().check_restorable()
+        if self._backbone is not None:
+            self._backbone.check_restorable()
+
+    def restore(self) -> None:
+        """Puts the original methods back and frees the weights in saccade. A second call does nothing.
+
+        Raises:
+            InputError: A method has been replaced by something else in the meantime. Nothing is changed then.
+        """
+        self.check_restorable()
+        if self._backbone is not None:
+            self._backbone.restore()
+        super().restore()
 
     def __enter__(self) -> Accelerated:
         return self
@@ -241,39 +256,21 @@ class Accelerated:
             backbone_output["backbone_features"] = vl_embs
             return kinds.result(data=results)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> MethodType:
-        """A copy of the policy has the original `get_action`."""
-        return copy.deepcopy(self._original(), memo)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """So has a pickle: during unpickling, the name refers to the method of the class."""
-        return getattr, (self.module, "get_action")
-
     def __repr__(self) -> str:
-        module = self._weak_module()
-        if module is None or self._restored:
+        if self.is_restored:
             return "<saccade.integrations.Accelerated, restored>"
-        return f"<saccade.integrations.Accelerated {type(module).__name__} {self._options}>"
+        also = "" if self._backbone is None else f" and {self._backbone!r}"
+        return f"<saccade.integrations.Accelerated {type(self.module).__name__} {self._options}{also}>"
 
-    def _original(self) -> MethodType:
-        module = self.module
-        return MethodType(type(module).get_action, module)  # type: ignore[attr-defined]
+    def _check(self, module: nn.Module) -> None:
+        heads.check(module, self)
 
-    def _load(self, module: nn.Module) -> None:
-        """Copies the head's weights, and compares the result with the original."""
+    def _settings_of(self, module: nn.Module) -> object:
+        return heads.settings_of(module)
+
+    def _convert(self, module: nn.Module) -> ActionHead:
         import torch
 
-        if torch.get_default_device().type == "meta":
-            raise DtypeError(
-                "accelerate: expected a default device with memory, got meta; leave `with "
-                "torch.device('meta')`, or call torch.set_default_device('cpu')"
-            )
-        self._head = None  # so that there are never two copies in memory
-        heads.check(module, self)
-        # Before the weights are read, so that the next call detects changes during the reading.
-        self._watch = Watch(module)
-        self._settings = heads.settings_of(module)
-        self._parts = list(module.named_modules())[1:]  # without the module itself, see _weak_module
         self._kinds: dict[tuple[Any, ...], Kinds] = {}
         head = ActionHead.from_tensors(tensors_of(module), config=heads.config_of(module), **self._options)
         parameters = list(module.parameters())
@@ -282,20 +279,6 @@ class Accelerated:
         like = parameters[0].detach()
         with torch.no_grad(), torch.autocast(like.device.type, torch.bfloat16, enabled=mixed):
             self._kinds_of(module, head, like, like)
-        self._head = head
-
-    def _current(self, module: nn.Module) -> ActionHead:
-        """The head with the current weights."""
-        # In this order, so that a load in another thread can make a current head look stale, but not vice
-        # versa.
-        watch, head = self._watch, self._head
-        if head is None or watch is None or self._settings != heads.settings_of(module) or watch.changed():
-            with self._lock:
-                # Another thread may have loaded it in the meantime.
-                if self._head is None or self._head is head:
-                    self._load(self.module)
-                head = self._head
-        assert head is not None
         return head
 
     def _kinds_of(self, module: nn.Module, head: ActionHead, features: Tensor, state: Tensor) -> Kinds:

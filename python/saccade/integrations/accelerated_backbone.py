@@ -1,0 +1,192 @@
+"""Runs the `forward` of a torch backbone in saccade."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from saccade.backbone import Backbone
+from saccade.errors import InputError
+from saccade.integrations import backbones
+from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, StandIn
+from saccade.integrations.weights import tensors_of
+from saccade.options import LoadOptions
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """The dtype of the original's features, and the class of its result."""
+
+    features: torch.dtype
+    result: type[Any]
+
+
+class Inputs(dict[str, Any]):
+    """A dict with keys as attributes, as backbones expect of a BatchFeature. For the inputs of the check."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+
+class AcceleratedBackbone(StandIn[Backbone]):
+    """The replacement of a torch backbone's `forward`.
+
+    The original runs where saccade cannot take its place: in training mode, and where a gradient is asked
+    for.
+    """
+
+    method = "forward"
+    part = "the backbone"
+
+    def __init__(self, module: nn.Module, precision: str, num_threads: int | None, autocast: bool) -> None:
+        self._options = LoadOptions(precision=precision, num_threads=num_threads)
+        self._autocast = autocast  # whether the policy calls it under autocast to bfloat16
+        super().__init__(module)
+
+    @property
+    def backbone(self) -> Backbone:
+        """The backbone in saccade, with the current weights.
+
+        Raises:
+            InputError: As :attr:`module`, and as :func:`saccade.integrations.accelerate` if the weights have
+                changed.
+        """
+        return self._current(self.module)
+
+    def __call__(self, vl_input: Any) -> Any:
+        """The replacement of the backbone's `forward`.
+
+        Args:
+            vl_input: What the policy's processors prepare: `pixel_values`, `input_ids (batch, T)` and
+                `attention_mask (batch, T)`, in N1.5 with the prefix `eagle_`, in N1.7 also `image_grid_thw`.
+
+        Returns:
+            An instance of the original's class with `backbone_features (batch, T, feature_dim)` in the
+            original's dtype and on its device, and with the original's masks.
+
+        Raises:
+            InputError: The backbone has hooks inside, or there are inputs that saccade does not read. Also
+                as :meth:`saccade.Backbone.__call__`.
+        """
+        import torch
+
+        module = self.module
+        parts = list(module.named_modules())
+        if any(part.training for _, part in parts) or wants_gradient(module, vl_input):
+            return self._original()(vl_input)
+        if problems := backbones.in_use(parts[1:]):
+            raise InputError(f"{type(module).__name__}.forward: {'; '.join(problems)}")
+        with torch.no_grad():
+            backbone = self._current(module)
+            device = next(module.parameters()).device
+            kinds = self._kinds_of(module, backbone, device)
+            features = run(module, backbone, vl_input).to(device, kinds.features)
+            return kinds.result(data=backbones.results_of(module, vl_input, features))
+
+    def __repr__(self) -> str:
+        return f"{type(self.module).__name__} {self._options}"
+
+    def _check(self, module: nn.Module) -> None:
+        backbones.check(module, self)
+
+    def _settings_of(self, module: nn.Module) -> object:
+        return backbones.settings_of(module)
+
+    def _convert(self, module: nn.Module) -> Backbone:
+        import torch
+
+        self._kinds: dict[tuple[Any, ...], Kinds] = {}
+        backbone = Backbone.from_tensors(
+            tensors_of(module),
+            config=backbones.config_of(module),
+            precision=self._options["precision"],
+            num_threads=self._options["num_threads"],
+        )
+        parameters = list(module.parameters())
+        # With parameters of mixed dtypes, the original works under autocast only.
+        mixed = len({parameter.dtype for parameter in parameters}) > 1
+        device = parameters[0].device
+        with torch.no_grad(), autocast(device) if mixed or self._autocast else contextlib.nullcontext():
+            self._kinds_of(module, backbone, device)
+        return backbone
+
+    def _kinds_of(self, module: nn.Module, backbone: Backbone, device: torch.device) -> Kinds:
+        """The dtype of the original's features under the current autocast.
+
+        For a new combination the original runs on a random view, and saccade must agree.
+        """
+        import torch
+
+        to = torch.is_autocast_enabled(device.type) and torch.get_autocast_dtype(device.type)
+        key = (device.type, to)
+        if key not in self._kinds:
+            reduced = bool(to) or any(p.dtype != torch.float32 for p in module.parameters())
+            rounded = reduced or backbone.precision != "float32"
+            self._kinds[key] = agree(module, backbone, device, rounded)
+        return self._kinds[key]
+
+
+@contextlib.contextmanager
+def autocast(device: torch.device) -> Iterator[None]:
+    """Autocast to bfloat16, as lerobot's policies do."""
+    import torch
+
+    with torch.autocast(device.type, torch.bfloat16):
+        yield
+
+
+def wants_gradient(module: nn.Module, vl_input: Mapping[str, Any]) -> bool:
+    """Whether a result of the original would have a gradient."""
+    import torch
+
+    if not torch.is_grad_enabled():
+        return False
+    given = (value for value in vl_input.values() if isinstance(value, torch.Tensor))
+    return any(tensor.requires_grad for tensor in (*module.parameters(), *given))
+
+
+def run(module: nn.Module, backbone: Backbone, vl_input: Mapping[str, Any]) -> Tensor:
+    """The features in float32 on the CPU, from the inputs of the original."""
+    return backbone(backbones.inputs_of(module, vl_input)).backbone_features  # type: ignore[return-value]
+
+
+def agree(module: nn.Module, backbone: Backbone, device: torch.device, rounded: bool) -> Kinds:
+    """Compares the original and saccade on the same random view.
+
+    Args:
+        module: the original.
+        backbone: its copy in saccade.
+        device: where the original computes.
+        rounded: whether one of the two rounds to 8 bits.
+
+    Raises:
+        InputError: the features differ.
+    """
+    import torch
+
+    given = backbones.check_inputs(module, backbone.config, device)
+    result = type(module).forward(module, Inputs(given))
+    theirs = result["backbone_features"]
+    ours = run(module, backbone, given)
+    expected = theirs.float().cpu()
+    # By row, and then the mean: a few rows are thousands of times as large as the others.
+    error = float("inf")
+    if ours.shape == expected.shape:
+        sizes = torch.linalg.vector_norm(expected, dim=-1).clamp_min(torch.finfo(torch.float32).tiny)
+        error = float((torch.linalg.vector_norm(ours - expected, dim=-1) / sizes).mean())
+    allowed = ROUNDED_TOLERANCE if rounded else EXACT_TOLERANCE
+    if not error <= allowed:
+        raise InputError(
+            f"{type(module).__name__} cannot be accelerated: on a random view its features differ from those "
+            f"of saccade; expected a relative difference of at most {allowed:.1e}, got {error:.1e}"
+        )
+    return Kinds(theirs.dtype, type(result))

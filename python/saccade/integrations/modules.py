@@ -1,0 +1,159 @@
+"""Finds torch modules in a policy and checks them without running them: for heads and for backbones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from types import MethodType
+from typing import TYPE_CHECKING, Any
+
+from saccade.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import nn
+
+#: Attributes of other objects that contain the module, or another such object.
+HOLDERS = ("model", "policy", "_groot_model", "action_head")
+
+
+def held_by(policy: object) -> nn.Module:
+    """The torch module in `policy`: itself, or what an object contains.
+
+    Raises:
+        InputError: there is none, or it is compiled.
+    """
+    from torch import nn
+
+    held: Any = policy
+    for _ in range(len(HOLDERS)):
+        if isinstance(held, nn.Module):
+            break
+        held = next((getattr(held, name) for name in HOLDERS if hasattr(held, name)), None)
+    if not isinstance(held, nn.Module):
+        raise InputError(
+            f"policy: expected a torch module, or an object that contains one as {', '.join(HOLDERS)}; got "
+            f"{type(policy).__name__}"
+        )
+    if hasattr(held, "_orig_mod"):
+        raise InputError(
+            f"policy: {type(held).__name__} is compiled by torch.compile: accelerate the module that was "
+            "compiled"
+        )
+    return held
+
+
+def find(policy: object, is_wanted: Callable[[nn.Module], bool], wanted: str) -> nn.Module:
+    """The only module in `policy` that is wanted.
+
+    Args:
+        policy: the module itself, a module that contains it, or an object that contains such a module.
+        is_wanted: whether a module is one.
+        wanted: how a message names it.
+
+    Raises:
+        InputError: there is none, or more than one.
+    """
+    found: dict[str, nn.Module] = {
+        name or "itself": module for name, module in held_by(policy).named_modules() if is_wanted(module)
+    }
+    if len(found) != 1:
+        raise InputError(
+            f"policy: expected one {wanted} in {type(policy).__name__}; found {', '.join(found) or 'none'}"
+        )
+    return next(iter(found.values()))
+
+
+def is_own(module: nn.Module, method: str) -> bool:
+    """Whether the method is that of the class. Copies and transformers set it as an attribute."""
+    replaced = vars(module).get(method)
+    of_class = getattr(type(module), method)
+    return replaced is None or (
+        isinstance(replaced, MethodType) and replaced.__func__ is of_class and replaced.__self__ is module
+    )
+
+
+def in_code(module: nn.Module, noun: str) -> Iterator[str]:
+    """Problems in the code of a module's parts: compiled ones."""
+    import torch
+
+    for name, part in module.named_modules():
+        where = name or f"the {noun}"
+        if isinstance(part, torch.jit.ScriptModule):
+            yield f"{where} is compiled by torch.jit: accelerate the {noun} before compiling it"
+        elif hasattr(part, "_orig_mod"):
+            yield f"{where} is compiled by torch.compile: accelerate the module that was compiled"
+
+
+def in_parameters(module: nn.Module, noun: str) -> Iterator[str]:
+    """Problems in a module's weights."""
+    import torch
+
+    parameters = dict(module.named_parameters())
+    if not parameters:
+        yield "it has no parameters"
+        return
+    devices = {str(parameter.device) for parameter in parameters.values()}
+    if len(devices) > 1 or next(iter(devices)).partition(":")[0] not in ("cpu", "cuda"):
+        yield f"its parameters are on {', '.join(sorted(devices))}: expected all on the CPU, or on one GPU"
+    for name, parameter in parameters.items():
+        if type(parameter) is not torch.nn.Parameter:
+            yield (
+                f"{name} is of {type(parameter).__name__} (quantised? sharded?): accelerate the {noun} with "
+                "plain parameters and choose a precision"
+            )
+            break
+        if parameter.dtype not in (torch.float32, torch.bfloat16, torch.float16):
+            yield f"{name} is {parameter.dtype}, expected float32, bfloat16 or float16"
+            break
+
+
+def training(parts: list[tuple[str, nn.Module]], noun: str) -> Iterator[str]:
+    """That parts of a module, given by name, are in training mode."""
+    named = [name or f"the {noun}" for name, part in parts if part.training]
+    if named:
+        yield (
+            f"{shortened(named)}: in training mode, which has dropout; call eval(), or restore() the "
+            "original during training"
+        )
+
+
+def replaced_or_hooked(parts: list[tuple[str, nn.Module]], noun: str) -> Iterator[str]:
+    """Replaced methods and forward hooks of parts of a module, given by name."""
+    replaced = [name or f"the {noun}" for name, part in parts if not is_own(part, "forward")]
+    if replaced:
+        yield (
+            f"the forward of {shortened(replaced)} has been replaced: put back that of the class, or "
+            "restore() the original"
+        )
+    hooked = [name or f"the {noun}" for name, part in parts if is_hooked(part)]
+    if hooked:
+        yield f"{shortened(hooked)}: forward hooks would not run; remove them, or restore() the original"
+
+
+def is_hooked(module: nn.Module) -> bool:
+    """Whether a module has forward hooks, besides those with which transformers records hidden states."""
+    hooks = (*module._forward_hooks.values(), *module._forward_pre_hooks.values())
+    return any(getattr(hook, "__module__", None) != "transformers.utils.output_capturing" for hook in hooks)
+
+
+def plain(values: dict[str, Any], module: nn.Module) -> dict[str, Any]:
+    """Values of a module's config as JSON represents them.
+
+    Raises:
+        InputError: JSON cannot represent them.
+    """
+    try:
+        held: dict[str, Any] = json.loads(json.dumps(values, default=dict))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{type(module).__name__}: its config cannot be read: {error}") from None
+    return held
+
+
+def describe(function: object) -> str:
+    """The name of a function for a message."""
+    return getattr(function, "__qualname__", None) or type(function).__name__
+
+
+def shortened(names: list[str]) -> str:
+    """The first three names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

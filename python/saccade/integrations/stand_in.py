@@ -1,0 +1,166 @@
+"""A method of a torch module that saccade computes: what every replacement has in common."""
+
+from __future__ import annotations
+
+import copy
+import threading
+import weakref
+from abc import ABC, abstractmethod
+from types import MethodType
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from saccade.errors import DtypeError, InputError
+from saccade.integrations import modules
+from saccade.integrations.weights import Watch
+
+if TYPE_CHECKING:
+    from torch import nn
+
+#: What saccade has in place of the module: an action head or a backbone.
+Engine = TypeVar("Engine")
+
+#: Largest error in the check at load, relative to what the original computes. In exact arithmetic the tables
+#: of the released heads cause a difference of 2e-4. The other precisions round to 8 bits. Another
+#: architecture differs by about 1.
+EXACT_TOLERANCE = 1e-2
+ROUNDED_TOLERANCE = 0.3
+
+
+class StandIn(ABC, Generic[Engine]):
+    """Replaces one method of an instance of a torch module.
+
+    A subclass converts the weights, compares the result with the original, and is called in its place. Copies
+    and pickles of the module have the original method.
+    """
+
+    #: The method, and what the module is called in messages.
+    method: ClassVar[str]
+    part: ClassVar[str]
+
+    def __init__(self, module: nn.Module) -> None:
+        # Weak, since the module refers to this object: a cycle would keep gigabytes until the next
+        # collection.
+        self._weak_module = weakref.ref(module)
+        self._lock = threading.RLock()
+        self._restored = False
+        self._engine: Engine | None = None
+        self._watch: Watch | None = None
+        self._load(module)
+
+    @abstractmethod
+    def _check(self, module: nn.Module) -> None:
+        """Checks that nothing but weights and settings determines what the module computes."""
+
+    @abstractmethod
+    def _settings_of(self, module: nn.Module) -> object:
+        """What determines the result besides the weights; compared before each call."""
+
+    @abstractmethod
+    def _convert(self, module: nn.Module) -> Engine:
+        """A copy of the weights in saccade, compared with the original."""
+
+    @property
+    def module(self) -> nn.Module:
+        """The torch module.
+
+        Raises:
+            InputError: The original was restored, or the policy no longer exists.
+        """
+        module = self._weak_module()
+        if module is None or self._restored:
+            raise InputError(
+                f"{self.part} is no longer accelerated: it was restored, or its policy no longer exists"
+            )
+        return module
+
+    @property
+    def is_restored(self) -> bool:
+        """Whether the original is back, or the policy no longer exists."""
+        return self._restored or self._weak_module() is None
+
+    def refresh(self) -> None:
+        """Copies the weights again. Needed only after a change that the comparison misses.
+
+        Raises:
+            InputError, CheckpointError: As :func:`saccade.integrations.accelerate`.
+        """
+        with self._lock:
+            self._load(self.module)
+
+    def install(self) -> None:
+        """Puts this object in the place of the method."""
+        self.module.__dict__[self.method] = self
+
+    def check_restorable(self) -> None:
+        """Checks that nothing else has replaced the method since.
+
+        Raises:
+            InputError: Something has.
+        """
+        module = self._weak_module()
+        if module is None or self._restored:
+            return
+        now = vars(module).get(self.method)
+        if now is not self:
+            raise InputError(
+                f"{self.method} was replaced since by {modules.describe(now)}: remove that first, then "
+                "restore"
+            )
+
+    def restore(self) -> None:
+        """Puts the original method back and frees the weights in saccade. A second call does nothing.
+
+        Raises:
+            InputError: The method has been replaced by something else in the meantime.
+        """
+        self.check_restorable()
+        module = self._weak_module()
+        if module is None or self._restored:
+            return
+        del module.__dict__[self.method]
+        with self._lock:
+            self._restored = True
+            self._engine = self._watch = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> MethodType:
+        """A copy of the policy has the original method."""
+        return copy.deepcopy(self._original(), memo)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """So has a pickle: during unpickling, the name refers to the method of the class."""
+        return getattr, (self.module, self.method)
+
+    def _original(self) -> MethodType:
+        module = self.module
+        return MethodType(getattr(type(module), self.method), module)
+
+    def _load(self, module: nn.Module) -> None:
+        """Copies the weights, and compares the result with the original."""
+        import torch
+
+        if torch.get_default_device().type == "meta":
+            raise DtypeError(
+                "accelerate: expected a default device with memory, got meta; leave `with "
+                "torch.device('meta')`, or call torch.set_default_device('cpu')"
+            )
+        self._engine = None  # so that there are never two copies in memory
+        self._check(module)
+        # Before the weights are read, so that the next call detects changes during the reading.
+        self._watch = Watch(module)
+        self._settings = self._settings_of(module)
+        self._parts = list(module.named_modules())[1:]  # without the module itself, see _weak_module
+        self._engine = self._convert(module)
+
+    def _current(self, module: nn.Module) -> Engine:
+        """The copy in saccade with the current weights."""
+        # In this order, so that a load in another thread can make a current copy look stale, but not vice
+        # versa.
+        watch, engine = self._watch, self._engine
+        if engine is None or watch is None or self._settings != self._settings_of(module) or watch.changed():
+            with self._lock:
+                # Another thread may have loaded it in the meantime.
+                if self._engine is None or self._engine is engine:
+                    self._load(self.module)
+                engine = self._engine
+        assert engine is not None
+        return engine
