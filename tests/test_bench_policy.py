@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from test_bench_peers import run
 
 from benches.peers import __main__ as command
 from benches.peers import policy_inputs, policy_report
@@ -18,12 +18,14 @@ from benches.peers.contenders import CONTENDERS, POLICY_GROUPS
 from benches.peers.engines import Task
 from benches.peers.processes import difference, sharing
 from benches.peers.results import RECORDS, Results, records
-from saccade.integrations import accelerate
-from test_bench_peers import run
 
 CASE = Case("policy", 2)
 SMALL = Case("policy", 1, size="small")
-TAKES_BACKBONE = "backbone" in inspect.signature(accelerate).parameters
+PACKAGES = {
+    "lerobot_policy": ["lerobot"],
+    "open_vino": ["onnxscript", "openvino"],
+    "onnx_runtime": ["onnxscript", "onnxruntime"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +36,8 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", [name for group in POLICY_GROUPS.values() for name in group])
 def test_every_engine_computes_what_the_reference_does(name: str, work: Path) -> None:
     contender = CONTENDERS[name]
-    if contender.engine == "lerobot_policy":
-        pytest.importorskip("lerobot")
-    if "accelerated" in contender.options and not TAKES_BACKBONE:
-        pytest.skip("accelerate() takes no backbone")
+    for package in PACKAGES.get(contender.options.get("opened_by", contender.engine), ()):
+        pytest.importorskip(package, reason="in the environment of make bench-peers")
     arrays = policy_inputs.expected_of(SMALL, work)
     source = policy_inputs.checkpoint(SMALL, work)
     task = Task(SMALL, dict(contender.options), source, arrays, work)
@@ -123,7 +123,9 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     ]
     policy_report.write(results, tmp_path)
     page = (tmp_path / "policy-report.md").read_text()
-    assert "| saccade int8 | 750.0 (625.0 to 875.0) | 3.80 x | 1500 (1250 to 1750) | 3.80 x | 2.5e-02 |" in page
+    assert (
+        "| saccade int8 | 750.0 (625.0 to 875.0) | 3.80 x | 1500 (1250 to 1750) | 3.80 x | 2.5e-02 |" in page
+    )
     assert "- lerobot 0.4.4 float32 could not run: MemoryError: no" in page
     assert "Peaks of 2 threads: float32 100, bfloat16 200, int8 400 GMAC/s, 20 GB/s." in page
 

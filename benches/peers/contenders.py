@@ -190,6 +190,22 @@ POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
             "lerobot 0.4.4 float32", "lerobot_policy", 0.5, "lerobot-float32", arithmetic="float32"
         ),
     },
+    "graphs": {
+        "policy-openvino-bfloat16": _policy(
+            "OpenVINO bfloat16", "policy_graphs", 8.0, opened_by="open_vino", arithmetic="bfloat16"
+        ),
+        "policy-onnxruntime-int8": _policy(
+            "ONNX Runtime int8, dynamic", "policy_graphs", 6.0, opened_by="onnx_runtime", arithmetic="int8"
+        ),
+    },
+    "float32 graphs": {
+        "policy-openvino-float32": _policy(
+            "OpenVINO float32", "policy_graphs", 9.0, opened_by="open_vino", arithmetic="float32"
+        ),
+        "policy-onnxruntime-float32": _policy(
+            "ONNX Runtime float32", "policy_graphs", 9.0, opened_by="onnx_runtime", arithmetic="float32"
+        ),
+    },
 }
 """Those that run the whole policy, in the same way. What matters most comes first."""
 
