@@ -211,8 +211,8 @@ def busy_processes(count: int) -> Iterator[None]:
             process.terminate()
 
 
-def run(policy: saccade.Policy, args: argparse.Namespace, busy: int) -> None:
-    """One run of the loop, and its report."""
+def run(policy: saccade.Policy, args: argparse.Namespace, busy: int) -> str:
+    """One run of the loop, and its report; the row of the table."""
     robot = Robot(policy, args.instruction)
     with busy_processes(busy):
         thinker = Thinker(policy, robot, args.rate)
@@ -244,6 +244,16 @@ def run(policy: saccade.Policy, args: argparse.Namespace, busy: int) -> None:
         ("sampling: a chunk", thinker.sampling),
     ):
         print("\n".join(histogram(name, values)))
+    cells = [title, str(len(record.late)), str(record.missed), str(record.held), str(len(thinker.looking))]
+    cells += [quantiles(values) for values in (record.late, record.age, thinker.looking, thinker.sampling)]
+    return f"| {' | '.join(cells)} |"
+
+
+def quantiles(seconds: list[float]) -> str:
+    """Median, 99th percentile and maximum in milliseconds."""
+    if not seconds:
+        return ""
+    return " / ".join(f"{1e3 * np.quantile(seconds, part):.3g}" for part in (0.5, 0.99, 1))
 
 
 def load(args: argparse.Namespace, stack: ExitStack) -> saccade.Policy:
@@ -292,8 +302,11 @@ def main() -> None:
         except (saccade.SaccadeError, OSError) as error:
             parser.error(str(error))
         print(policy)
-        for busy in (0, os.cpu_count() or 1) if args.busy else (0,):
-            run(policy, args, busy)
+        rows = [run(policy, args, busy) for busy in ((0, os.cpu_count() or 1) if args.busy else (0,))]
+    print("\nms: median / p99 / max\n")
+    print("| | ticks | missed | without an action | chunks | jitter | age | looking | sampling |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    print("\n".join(rows))
 
 
 if __name__ == "__main__":

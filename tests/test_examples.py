@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 import runpy
 import subprocess
@@ -78,6 +79,9 @@ def test_the_control_loop_reports_every_tick_quiet_and_busy() -> None:
         assert held <= ticks
         assert chunks >= 1
     assert finished.stdout.count("age of the frames behind an action, ms: min") == 2
+    rows = [line.split(" | ") for line in finished.stdout.splitlines()[-2:]]
+    assert [row[0] for row in rows] == ["| quiet", f"| {os.cpu_count()} busy processes"]
+    assert [tuple(map(int, row[1:5])) for row in rows] == [tuple(map(int, counts)) for _, *counts in found]
     assert run("control_loop.py", "--small", "--cameras", "none").returncode == 2
 
 

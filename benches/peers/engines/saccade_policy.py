@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import saccade
 from benches.peers.engines import Built, Task
 from benches.peers.policy_inputs import VIEWS, given, observation_of, with_views
+from saccade._arrays import Float32Array
 from saccade.dialects import read_state
 
 
@@ -23,12 +23,14 @@ def build(task: Task) -> Built:
     seeing = {views: with_views(policy, views) for views in VIEWS}
     observations = {views: observation_of(one) for views, one in seeing.items()}
 
-    def normalised(views: int) -> NDArray[np.float32]:
+    def normalised(views: int) -> Float32Array:
         one, observation = seeing[views], observations[views]
         state = policy.normalizer.state(read_state(observation, one.requirements).state)
         context = one.encode(observation).context
         embodiment_id = given(task.arrays, views).embodiment_id
-        return np.asarray(policy.head.sample(context, state, embodiment_id, noise=noise))[0]
+        sampled = policy.head.sample(context, state, embodiment_id, noise=noise)
+        actions: Float32Array = np.asarray(sampled)[0]
+        return actions
 
     works: dict[str, Any] = {
         work: partial(seeing[views].act, observations[views], noise=noise)
