@@ -33,7 +33,7 @@ help:
 	@echo "make test         run all tests, Rust and Python"
 	@echo "make lint         run the other checks of .ci/run: formatting, clippy, ruff, mypy, stubs, rustdoc"
 	@echo "make format       format all Rust and Python files"
-	@echo "make bench-peers  compare with other engines that run the same head; report in out/peers"
+	@echo "make bench-peers  compare with other engines that run the same head, or PEERS_ARGS=\"--only policy\" the whole policy"
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
 	@echo "make fuzz         fuzz headers, indexes, configs, resizing, tokenizers and processors, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() on lerobot releases; writes docs/compatibility.md"
