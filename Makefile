@@ -9,6 +9,7 @@ ROLLOUT_ARGS ?= --episodes 3 --video
 PYTEST_ARGS ?=
 PEERS_VENV ?= .venv-peers
 PEERS_ARGS ?=
+VLA_SOURCE ?=
 COMPAT_ARGS ?=
 CLIENTS_ARGS ?=
 FUZZ_SECONDS ?= 1800
@@ -34,7 +35,7 @@ help:
 	@echo "make test         run all tests, Rust and Python"
 	@echo "make lint         run the other checks of .ci/run: formatting, clippy, ruff, mypy, stubs, rustdoc"
 	@echo "make format       format all Rust and Python files"
-	@echo "make bench-peers  compare with other engines that run the same head; report in out/peers"
+	@echo "make bench-peers  compare with other engines that run the same head, or PEERS_ARGS=\"--only policy\" the whole policy"
 	@echo "make sanitize     run the kernel tests under AddressSanitizer (nightly Rust) and valgrind"
 	@echo "make fuzz         fuzz headers, indexes, configs, resizing, tokenizers and processors, FUZZ_SECONDS each (nightly Rust, cargo-fuzz)"
 	@echo "make test-compat  test accelerate() and the plugin on lerobot releases; writes docs/compatibility.md"
@@ -75,7 +76,7 @@ lint: setup-test
 
 # Other engines, in a separate environment. PEERS_ARGS=--help lists the options.
 bench-peers: setup-peers
-	SACCADE_PEERS_GGML=$(PEERS_VENV)/ggml/build/bin $(PEERS_VENV)/bin/python -m benches.peers $(PEERS_ARGS)
+	SACCADE_PEERS_GGML=$(PEERS_VENV)/ggml/build/bin SACCADE_PEERS_VLA=$(PEERS_VENV)/vla $(PEERS_VENV)/bin/python -m benches.peers $(PEERS_ARGS)
 
 format: setup-test
 	cargo fmt --all
@@ -116,6 +117,7 @@ setup-peers:
 	@$(MAKE) -s $(PEERS_VENV)/.engines
 	@$(MAKE) -s $(PEERS_VENV)/.extension
 	@$(MAKE) -s $(PEERS_VENV)/.ggml
+	@test -z "$(VLA_SOURCE)" || $(MAKE) -s $(PEERS_VENV)/.vla
 
 # The environment of a copied or moved checkout points to the old place, so it is recreated.
 $(VENV)/.tools: constraints.txt
@@ -159,6 +161,12 @@ $(PEERS_VENV)/.extension: pyproject.toml $(RUST_SOURCES) $(PEERS_VENV)/.engines
 $(PEERS_VENV)/.ggml: benches/peers/constraints.txt $(PEERS_VENV)/.engines
 	@echo "setup: building ggml (takes minutes)"
 	@sh benches/peers/build_ggml.sh $(PEERS_VENV) || echo "ggml could not be built; the report will not include it"
+	@touch $@
+
+# vla.cpp from a clone of github.com/VinRobotics/vla.cpp, VLA_SOURCE. It is optional likewise.
+$(PEERS_VENV)/.vla: benches/peers/build_vla.sh $(PEERS_VENV)/.ggml
+	@echo "setup: building vla.cpp (takes minutes)"
+	@sh benches/peers/build_vla.sh $(PEERS_VENV) $(VLA_SOURCE) || { echo "vla.cpp could not be built"; exit 1; }
 	@touch $@
 
 # fuzz/README.md describes the targets and why they run without AddressSanitizer.

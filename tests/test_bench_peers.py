@@ -20,7 +20,7 @@ from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.engines import Task
 from benches.peers.floors import floor, limits
-from benches.peers.machine import family_name
+from benches.peers.machine import describe, family_name
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
 from benches.peers.throughput import throughput
@@ -249,6 +249,7 @@ def test_names_of_families() -> None:
         family_name("unknown family (GenuineIntel, family 6, model 1)") == "GenuineIntel, family 6, model 1"
     )
     assert family_name("aarch64") == "aarch64"
+    assert describe()["name"] == family_name(saccade.show_config("dicts")["family"])
 
 
 def test_forced_instruction_sets_are_those_that_the_machine_does_not_choose() -> None:

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import re
 import runpy
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
+
+import saccade
+from saccade.checkpoints import random_checkpoint
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 #: Runs the script with the rest of the arguments in an interpreter without torch.
@@ -50,6 +59,63 @@ def test_real_time_refuses_nonsense(arguments: list[str]) -> None:
     finished = run("real_time.py", *arguments)
     assert finished.returncode == 2
     assert "expected" in finished.stderr or "invalid choice" in finished.stderr
+
+
+def test_the_control_loop_reports_every_tick_quiet_and_busy() -> None:
+    finished = run(
+        "control_loop.py", "--small", "--seconds", "0.5", "--rate", "20", "--num-threads", "1", "--busy"
+    )
+    assert finished.returncode == 0, finished.stderr
+    found = re.findall(
+        r"(quiet|busy processes), \S+ priority: (\d+) ticks of 50 ms in 0.5 s, (\d+) missed, "
+        r"(\d+) without an action, (\d+) chunks",
+        finished.stdout,
+    )
+    assert [title for title, *_ in found] == ["quiet", "busy processes"]
+    for _, *counts in found:
+        ticks, missed, held, chunks = map(int, counts)
+        assert ticks >= 1
+        assert ticks + missed >= 10
+        assert held <= ticks
+        assert chunks >= 1
+    assert finished.stdout.count("age of the frames behind an action, ms: min") == 2
+    rows = [line.split(" | ") for line in finished.stdout.splitlines()[-2:]]
+    assert [row[0] for row in rows] == ["| quiet", f"| {os.cpu_count()} busy processes"]
+    assert [tuple(map(int, row[1:5])) for row in rows] == [tuple(map(int, counts)) for _, *counts in found]
+    assert run("control_loop.py", "--small", "--cameras", "none").returncode == 2
+
+
+def test_the_control_loop_holds_where_a_chunk_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    loop = importlib.import_module("control_loop")
+    plan = loop.Plan({"arm": np.arange(8.0).reshape(1, 4, 2)}, 0, time.perf_counter())
+    thinker, sent = SimpleNamespace(plan=plan, tick=-1), []
+    robot = SimpleNamespace(send=lambda action: sent.append((thinker.tick, *action["arm"])))
+    record = loop.control(thinker, robot, rate=100, seconds=0.12)
+    assert record.held >= 1
+    assert sent == [(tick, 2.0 * tick, 2.0 * tick + 1) for tick, *_ in sent]
+    assert len(sent) + record.held == len(record.late) == len(record.age)
+    assert len(record.late) + record.missed >= 12
+
+
+def test_the_control_loop_continues_the_last_chunk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    loop = importlib.import_module("control_loop")
+    small: dict[str, Any] = {
+        "backbone": random_checkpoint.small_backbone("n1.5"),
+        "head": random_checkpoint.small_head("n1.5"),
+    }
+    policy = saccade.Policy.load(random_checkpoint.write(tmp_path / "small", **small), num_threads=1)
+    thinker = loop.Thinker(policy, loop.Robot(policy, "open the drawer"), rate=10)
+    thinker.tick = 4  # the next action is that of tick 5
+    thinker._recent.append(0.25)
+    plan = thinker._think(thinker.plan)
+    assert (thinker.plan.tick, plan.tick, thinker.delay) == (0, 5, 3)
+    for part, values in plan.chunk.items():
+        np.testing.assert_allclose(values[0, :3], thinker.plan.chunk[part][0, 5:8], rtol=1e-4, atol=1e-5)
+        assert np.abs(values[0, 3:11] - thinker.plan.chunk[part][0, 8:]).max() > 1e-3
+    assert plan.action(5)["gripper"] == plan.chunk["gripper"][0, 0]
+    assert plan.action(21) is None
 
 
 @pytest.fixture

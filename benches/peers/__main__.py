@@ -6,18 +6,21 @@
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
     make bench-peers PEERS_ARGS="--only throughput --rounds 3 --minutes 120"
                        chunks per second of 1, 8 and 32 observations at once, on 1 thread to all cores
+    make bench-peers PEERS_ARGS="--only policy"            the whole policy, frames and words to a chunk
     python -m benches.peers report                         write the report of existing measurements
     python -m benches.peers report --write                 write docs/performance.md and its figures
+    python -m benches.peers report --only policy --write   write docs/policy-speed.md
 
 Every contender runs in a separate process with the requested number of threads and waits while another one
 works. In a round, each does every piece of work once, in an order that rotates. Before anything is timed, its
 result is compared with the reference in float32. What has a target comes first. Measurements are added to a
 JSON file, so an interrupted run resumes, and contenders that have all their rounds are not started again.
-At the end the file is copied to benches/peers/results/ under the name of the CPU's family.
+At the end the file is copied to benches/peers/results/ under the name of the CPU's family. The whole policy
+is measured apart from the head, and has a file, a record and a page of its own.
 
 Needs the environment that `make bench-peers` sets up. A contender whose package is missing is left out, with
-the reason in the report. The whole head in all contenders takes 12 GB of memory; `--memory` limits how much
-is used at a time.
+the reason in the report. The whole head in all contenders takes 12 GB of memory, the whole policy 19 GB;
+`--memory` limits how much is used at a time.
 """
 
 from __future__ import annotations
@@ -31,31 +34,35 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from benches.peers import machine, processes, report
+from benches.peers import machine, policy_report, processes, report
 from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
-from benches.peers.contenders import CONTENDERS, GROUPS, able
+from benches.peers.contenders import CONTENDERS, GROUPS, POLICY_GROUPS, able
 from benches.peers.goals import NEEDED
 from benches.peers.processes import Ready, note
 from benches.peers.results import RECORDS, Results
 from benches.peers.text import usual
 
-BUILDING = 40.0  # seconds to build the slowest batch, once its graphs are written
+BUILDING = {"policy": 150.0}
+"""Seconds to build the slowest batch of a piece, once its graphs are written; of others `BUILDING_PARTS`."""
+BUILDING_PARTS = 40.0
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The exit status."""
     args = parse(arguments)
     results = Results(args.results)
+    reporter: Any = policy_report if args.only == ["policy"] else report
     if args.command == "report":
-        return report.command(results, args)
+        return int(reporter.command(results, args))
     machine_now = machine.describe()
     args.contenders = able(args.contenders, machine_now)
     if results.begin(machine_now):
         note(f"{args.results} is from another machine or build; it is set aside and measured again")
     measure_all(results, args)
     if not args.prepare:
-        report.write(results, args.results.parent)
+        reporter.write(results, args.results.parent)
         keep(results, args.record)
     return 0
 
@@ -86,7 +93,7 @@ def measure_cases(
     """Measures the named contenders; whether the time was enough."""
     for case in cases:
         for batch in batches(results, case, args, names):
-            if time.monotonic() + BUILDING > end:
+            if time.monotonic() + BUILDING.get(case.piece, BUILDING_PARTS) > end:
                 note("the time limit is reached; the next run continues here")
                 return False
             processes.prepare(case, args.work)
@@ -95,8 +102,10 @@ def measure_cases(
 
 
 def keep(results: Results, folder: Path) -> None:
-    """Copies the measurements to the record of this CPU's family, if the whole head is among them."""
-    if usual(results, "head"):
+    """Copies the measurements to the record of this CPU's family, if the whole head or policy is among
+    them.
+    """
+    if usual(results, "head") or usual(results, "policy"):
         path = folder / f"{results.slug}.json"
         results.save(path)
         print(path)
@@ -117,7 +126,7 @@ def chosen_cases(args: argparse.Namespace) -> list[Case]:
 def batches(results: Results, case: Case, args: argparse.Namespace, names: Sequence[str]) -> list[list[str]]:
     """Batches of contenders with unfinished rounds that fit into memory, each with the first of its group."""
     found: list[list[str]] = []
-    for group in GROUPS.values():
+    for group in (POLICY_GROUPS if case.piece == "policy" else GROUPS).values():
         able = [name for name in group if case.piece in group[name].pieces and name in names]
         pending = [name for name in able if results.rounds(case, name) < args.rounds]
         if args.prepare:
@@ -138,8 +147,8 @@ def batches(results: Results, case: Case, args: argparse.Namespace, names: Seque
 
 
 def gigabytes(case: Case, name: str) -> float:
-    """Memory of a contender, roughly: the weights of the whole head, or of a fifth of it."""
-    return CONTENDERS[name].gigabytes * (1.0 if case.piece in WHOLE else 0.3)
+    """Memory of a contender, roughly: the weights of the whole policy or head, or of a fifth of it."""
+    return CONTENDERS[name].gigabytes * (1.0 if case.piece in (*WHOLE, "policy") else 0.3)
 
 
 def measure(results: Results, case: Case, names: list[str], args: argparse.Namespace, end: float) -> None:
@@ -186,7 +195,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         nargs="+",
         choices=WORKS,
         metavar="PIECE",
-        help=f"of {', '.join(WORKS)} (default: {', '.join(USUAL)}; with --full all)",
+        help=f"of {', '.join(WORKS)} (default: {', '.join(USUAL)}; with --full all but policy)",
     )
     parser.add_argument(
         "--contenders",
@@ -200,7 +209,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--threads",
         type=int,
         nargs="+",
-        help="counts (default 2; of throughput 1, 2, 4, ... all cores)",
+        help="counts (default 2; of throughput 1, 2, 4, ... all cores; of policy 2 and all cores)",
     )
     parser.add_argument("--rounds", type=int, default=5, help="repetitions of everything (default 5)")
     parser.add_argument(
@@ -215,12 +224,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--minutes", type=float, default=30, help="time limit; the next run continues (default 30)"
     )
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     parser.add_argument(
         "--memory",
         type=float,
-        default=min(12.0, 0.6 * memory),
-        help="GB that contenders may use (default 12, or 0.6 of the machine's)",
+        help="GB that contenders may use (default 12, of policy 19, or 0.6 or 0.8 of the machine's)",
     )
     parser.add_argument(
         "--prepare", action="store_true", help="write inputs and graphs, compare results, time nothing"
@@ -231,25 +238,38 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
     )
-    parser.add_argument("--results", type=Path, help="the JSON file (default: results.json in --work)")
+    parser.add_argument(
+        "--results", type=Path, help="the JSON file (default: results.json in --work; of policy policy.json)"
+    )
     parser.add_argument(
         "--record",
         type=Path,
-        default=RECORDS,
-        help="folder with a JSON file per CPU family (default benches/peers/results)",
+        help="folder with a JSON file per CPU family (default benches/peers/results; of policy policy in it)",
     )
-    parser.add_argument(
-        "--write", action="store_true", help="report: write docs/performance.md from --record"
-    )
+    parser.add_argument("--write", action="store_true", help="report: write the page in docs from --record")
     args = parser.parse_args(arguments)
-    args.results = args.results or args.work / "results.json"
-    args.only = args.only or list(WORKS if args.full else USUAL)
-    args.threads = args.threads or (machine.thread_counts() if args.only == ["throughput"] else [2])
+    args.only = args.only or ([work for work in WORKS if work != "policy"] if args.full else list(USUAL))
+    if "policy" in args.only and args.only != ["policy"]:
+        parser.error(f"--only: expected policy alone, got {' '.join(args.only)}")
+    is_policy = args.only == ["policy"]
+    args.results = args.results or args.work / ("policy.json" if is_policy else "results.json")
+    args.record = args.record or (RECORDS / "policy" if is_policy else RECORDS)
+    args.threads = args.threads or default_threads(args.only)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    args.memory = args.memory or (min(19.0, 0.8 * memory) if is_policy else min(12.0, 0.6 * memory))
     if args.contenders is None:
         args.contenders = [name for name, contender in CONTENDERS.items() if contender.usual]
     if args.rounds < 1 or min(args.threads) < 1:
         parser.error("--rounds and --threads must be at least 1")
     return args
+
+
+def default_threads(only: list[str]) -> list[int]:
+    """The thread counts of a run that names none."""
+    counts = machine.thread_counts()
+    if only == ["throughput"]:
+        return counts
+    return sorted({2, counts[-1]}) if only == ["policy"] else [2]
 
 
 if __name__ == "__main__":

@@ -30,9 +30,11 @@ WORKS: dict[str, tuple[str, ...]] = {
         *(f"encode, T_vl {value}" for value in COST["T_vl"]),
         *(f"sample, {name} {value}" for name, values in COST.items() for value in values),
     ),
+    "policy": ("1 view", "2 views"),
 }
 """The timed works of each piece. `held`: keys and values of the observation are cached; `both`: they are
-computed too. For the whole head, `both` is the sum of its two works in the same round.
+computed too. For the whole head, `both` is the sum of its two works in the same round. For the whole policy,
+which is measured apart, a work is a chunk from so many frames and an instruction.
 """
 
 USUAL = ("head", "blocks", "cross", "linear")
@@ -50,7 +52,7 @@ class Case:
     Attributes:
         piece: A key of `WORKS`: the linear layers alone (`LINEAR_SHAPES`), the attention of the eight cross
             blocks, four DiT blocks, the whole head, the whole head for several observations at once, the
-            whole head at the sizes of `COST`.
+            whole head at the sizes of `COST`, the whole policy (of the other sizes only `size` matters).
         threads: Threads that every engine is given.
         num_vl_tokens: T_vl.
         num_future_tokens: N.
@@ -84,6 +86,8 @@ class Case:
         return asdict(self)
 
     def __str__(self) -> str:
+        if self.piece == "policy":
+            return f"policy, {self.threads} threads"
         return (
             f"{self.piece} T_vl {self.num_vl_tokens} N {self.num_future_tokens} batch {self.batch} "
             f"samples {self.samples} steps {self.steps}, {self.threads} threads"
@@ -94,7 +98,7 @@ def default_cases(threads: list[int]) -> list[Case]:
     """Every piece at the released size, one view, N 32, one chunk; one observation, of throughput several."""
     cases = [Case(piece, count) for count in threads for piece in USUAL]
     cases += [Case("throughput", count, batch=batch) for batch in BATCHES for count in threads]
-    return [*cases, Case("cost", max(threads))]
+    return [*cases, Case("cost", max(threads)), *(Case("policy", count) for count in threads)]
 
 
 def full_cases(threads: list[int]) -> list[Case]:
@@ -102,7 +106,7 @@ def full_cases(threads: list[int]) -> list[Case]:
     cases = []
     for default in default_cases(threads):
         cases.append(default)
-        if default.piece in ("linear", "throughput", "cost"):
+        if default.piece in ("linear", "throughput", "cost", "policy"):
             continue
         for vl in (296, 822):
             # The cross-attention sees N only as more rows; four blocks have no samples of one observation.

@@ -20,6 +20,8 @@ class Contender:
         environment: Set in its process.
         usual: Whether it is part of a run that names nobody; the others are settings that were tried and
             that another setting of the same engine beats, or that take minutes to compile.
+        process: Contenders of the same process, if it is not empty, run in one and share the weights;
+            `gigabytes` is then what each adds.
     """
 
     label: str
@@ -29,6 +31,7 @@ class Contender:
     options: Mapping[str, Any]
     environment: Mapping[str, str] = field(default_factory=dict)
     usual: bool = True
+    process: str = ""
 
 
 ALL = ("linear", "cross", "blocks", "head")
@@ -140,8 +143,78 @@ GROUPS: Mapping[str, Mapping[str, Contender]] = {
 contenders of the targets come first, so that they share rounds.
 """
 
+
+def _policy(label: str, engine: str, gigabytes: float, process: str = "", **options: Any) -> Contender:
+    return Contender(label, engine, ("policy",), gigabytes, options, process=process)
+
+
+POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
+    "narrow": {
+        "policy-saccade-bfloat16": _policy("saccade bfloat16", "saccade_policy", 4.5, precision="bfloat16"),
+        "policy-saccade-int8": _policy("saccade int8", "saccade_policy", 2.6, precision="int8"),
+        "policy-lerobot-bfloat16-pure": _policy(
+            "lerobot 0.4.4 bfloat16, no autocast",
+            "lerobot_policy",
+            5.4,
+            "lerobot-bfloat16",
+            arithmetic="bfloat16",
+        ),
+        "policy-accelerate-bfloat16": _policy(
+            "lerobot 0.4.4 bfloat16, accelerate(policy, backbone=True)",
+            "lerobot_policy",
+            5.0,
+            "lerobot-bfloat16",
+            arithmetic="bfloat16",
+            accelerated="bfloat16",
+        ),
+        "policy-lerobot-bfloat16": _policy(
+            "lerobot 0.4.4 bfloat16 weights, autocast",
+            "lerobot_policy",
+            0.5,
+            "lerobot-bfloat16",
+            arithmetic="bfloat16",
+            autocast=True,
+        ),
+    },
+    "float32": {
+        "policy-saccade-float32": _policy("saccade float32", "saccade_policy", 5.5, precision="float32"),
+        "policy-lerobot-default": _policy(
+            "lerobot 0.4.4, its default: float32 weights, autocast to bfloat16",
+            "lerobot_policy",
+            12.0,
+            "lerobot-float32",
+            arithmetic="float32",
+            autocast=True,
+        ),
+        "policy-lerobot-float32": _policy(
+            "lerobot 0.4.4 float32", "lerobot_policy", 0.5, "lerobot-float32", arithmetic="float32"
+        ),
+    },
+    "graphs": {
+        "policy-openvino-bfloat16": _policy(
+            "OpenVINO bfloat16", "policy_graphs", 8.0, opened_by="open_vino", arithmetic="bfloat16"
+        ),
+        "policy-vla-bfloat16": _policy("vla.cpp bfloat16", "vla_cpp", 5.5),
+        "policy-onnxruntime-int8": _policy(
+            "ONNX Runtime int8, dynamic", "policy_graphs", 6.0, opened_by="onnx_runtime", arithmetic="int8"
+        ),
+    },
+    "float32 graphs": {
+        "policy-openvino-float32": _policy(
+            "OpenVINO float32", "policy_graphs", 9.0, opened_by="open_vino", arithmetic="float32"
+        ),
+        "policy-onnxruntime-float32": _policy(
+            "ONNX Runtime float32", "policy_graphs", 9.0, opened_by="onnx_runtime", arithmetic="float32"
+        ),
+    },
+}
+"""Those that run the whole policy, in the same way. What matters most comes first."""
+
 CONTENDERS: Mapping[str, Contender] = {
-    name: contender for group in GROUPS.values() for name, contender in group.items()
+    name: contender
+    for groups in (GROUPS, POLICY_GROUPS)
+    for group in groups.values()
+    for name, contender in group.items()
 }
 
 

@@ -142,14 +142,14 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     return arrays
 
 
-def times_of(head: Any, steps: int) -> Arrays:
+def times_of(head: Any, steps: int, embodiment: int = EMBODIMENT) -> Arrays:
     """What depends on the time alone: `time0`, `modulations0`, ..., as `pieces.times` gives it for a
     reference head.
     """
     from benches.peers.pieces import times
 
     arrays: Arrays = {}
-    for step, (time, modulations) in enumerate(times(head, EMBODIMENT, steps)):
+    for step, (time, modulations) in enumerate(times(head, embodiment, steps)):
         arrays |= {f"time{step}": time.detach().numpy(), f"modulations{step}": modulations.detach().numpy()}
     return arrays
 

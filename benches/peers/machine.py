@@ -32,7 +32,7 @@ def describe() -> dict[str, Any]:
     config = saccade.show_config("dicts")
     return {
         "cpu": cpuinfo.get("model name", platform.machine()),
-        "name": family_name(config["cpu"]),
+        "name": family_name(config["family"]),
         "family": f"family {cpuinfo.get('cpu family')}, model {cpuinfo.get('model')}",
         "flags": [flag for flag in FLAGS + AMX if flag in flags],
         "cores": len(os.sched_getaffinity(0)),

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benches.peers import inputs
+from benches.peers import inputs, policy_inputs
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Built, Task
@@ -48,28 +48,48 @@ class Ready:
     works: tuple[str, ...]
 
 
-def worker(pipe: Connection, name: str, case: Case, work_folder: Path) -> None:
-    """A contender's process: builds, then does what each message says and answers with seconds."""
+def worker(pipe: Connection, names: tuple[str, ...], case: Case, work_folder: Path) -> None:
+    """The process of one contender, or of several that share it: builds and says for each in turn whether it
+    is ready, then does what each message, a name and a work, says and answers with seconds.
+    """
+    shared: dict[str, Any] = {}
+    built: dict[str, Built] = {}
+    for name in names:
+        try:
+            built[name], ready = build(name, case, work_folder, shared)
+            pipe.send(ready)
+        except Exception as error:
+            pipe.send(RuntimeError(f"{type(error).__name__}: {error}"))
+    repeats: dict[str, dict[str, int]] = {name: {} for name in names}
     try:
-        contender = CONTENDERS[name]
-        graphs = graphs_folder(case, work_folder)
-        graphs.mkdir(parents=True, exist_ok=True)
+        while (asked := pipe.recv()) is not None:
+            name, work = asked
+            pipe.send(seconds_of(built[name], work, repeats[name]))
+    except Exception as error:
+        pipe.send(RuntimeError(f"{type(error).__name__}: {error}"))
+
+
+def build(name: str, case: Case, work_folder: Path, shared: dict[str, Any]) -> tuple[Built, Ready]:
+    """The works of a contender, each called once: the first call allocates and may compile."""
+    contender = CONTENDERS[name]
+    graphs = graphs_folder(case, work_folder)
+    graphs.mkdir(parents=True, exist_ok=True)
+    if case.piece == "policy":
+        arrays = policy_inputs.expected_of(case, work_folder)
+        source = policy_inputs.checkpoint(case, work_folder)
+    else:
         arrays = inputs.expected_of(case, work_folder)
         # Values are the same in both; who holds them in fewer bits has less to read.
         stored = "float32" if "float32" in contender.options.values() else "bfloat16"
         source = inputs.checkpoint(case, work_folder, stored)
-        task = Task(case, dict(contender.options), source, arrays, graphs)
-        engine = importlib.import_module(f"benches.peers.engines.{contender.engine}")
-        built: Built = engine.build(task)
-        error, scale = difference(built.result(), arrays["expected"])
+    task = Task(case, dict(contender.options), source, arrays, graphs, shared)
+    engine = importlib.import_module(f"benches.peers.engines.{contender.engine}")
+    built: Built = engine.build(task)
+    error, scale = difference(built.result(), arrays["expected"])
+    if not built.is_warm:
         for work in built.works.values():
-            work()  # the first call allocates and may compile; it is not timed
-        pipe.send(Ready(error, scale, built.notes, tuple(built.works)))
-        repeats: dict[str, int] = {}
-        while (asked := pipe.recv()) is not None:
-            pipe.send(seconds_of(built, asked, repeats))
-    except Exception as error:
-        pipe.send(RuntimeError(f"{type(error).__name__}: {error}"))
+            work()
+    return built, Ready(error, scale, built.notes, tuple(built.works))
 
 
 def difference(result: Any, expected: Any) -> tuple[float, float]:
@@ -102,6 +122,8 @@ def seconds_of(built: Built, work: str, repeats: dict[str, int]) -> float:
 def graphs_folder(case: Case, work_folder: Path) -> Path:
     """Folder of the graphs of a case, independent of its threads and steps."""
     parts = (case.size, case.piece, case.num_vl_tokens, case.num_future_tokens, case.batch, case.samples)
+    if case.piece == "policy":
+        return work_folder / "graphs" / f"{case.size}-policy"
     return work_folder / "graphs" / "-".join(map(str, parts))
 
 
@@ -116,6 +138,9 @@ def prepare(case: Case, work_folder: Path) -> None:
 
 def write_inputs(case: Case, work_folder: Path) -> None:
     """Runs in the process of `prepare`."""
+    if case.piece == "policy":
+        policy_inputs.expected_of(case, work_folder)
+        return
     inputs.expected_of(case, work_folder)
     inputs.checkpoint(case, work_folder, "bfloat16")
 
@@ -124,9 +149,9 @@ def write_inputs(case: Case, work_folder: Path) -> None:
 def contenders(
     names: list[str], case: Case, work_folder: Path
 ) -> Iterator[tuple[dict[str, Connection], dict[str, Ready | RuntimeError]]]:
-    """Processes that have built their works, and what each said, an error too.
+    """Processes that have built their works, and what each contender said, an error too.
 
-    They build at the same time. Only those that are ready have a pipe.
+    They build at the same time. Only those that are ready have a pipe, which contenders of one process share.
     """
     spawn = multiprocessing.get_context("spawn")
     pipes: dict[str, Connection] = {}
@@ -134,25 +159,26 @@ def contenders(
     processes: dict[str, SpawnProcess] = {}
     try:
         note(f"{case}: building {', '.join(names)}")
+        members = sharing(names)
         ours: dict[str, Connection] = {}
-        for name in names:
-            ours[name], theirs = spawn.Pipe()
-            process = spawn.Process(target=worker, args=(theirs, name, case, work_folder), daemon=True)
-            with environment_of(name, case, work_folder):
+        for first, together in members.items():
+            ours[first], theirs = spawn.Pipe()
+            process = spawn.Process(target=worker, args=(theirs, together, case, work_folder), daemon=True)
+            with environment_of(first, case, work_folder):
                 process.start()
             theirs.close()
-            processes[name] = process
-        for name, pipe in ours.items():
-            try:
-                answer = pipe.recv()
-            except EOFError:
-                processes[name].join()
-                answer = RuntimeError(f"the process ended with status {processes[name].exitcode}")
-            said[name] = answer
-            if isinstance(answer, Ready):
-                pipes[name] = pipe
-            else:
-                note(f"{name} failed: {answer}")
+            processes[first] = process
+        for first, together in members.items():
+            for name in together:
+                try:
+                    said[name] = ours[first].recv()
+                except EOFError:
+                    processes[first].join()
+                    said[name] = RuntimeError(f"the process ended with status {processes[first].exitcode}")
+                if isinstance(said[name], Ready):
+                    pipes[name] = ours[first]
+                else:
+                    note(f"{name} failed: {said[name]}")
         yield pipes, said
     finally:
         for pipe in pipes.values():
@@ -162,6 +188,14 @@ def contenders(
             process.join(timeout=10)
             process.kill()
             process.join()
+
+
+def sharing(names: list[str]) -> dict[str, tuple[str, ...]]:
+    """The contenders of each process, by the first of them."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(CONTENDERS[name].process or name, []).append(name)
+    return {together[0]: tuple(together) for together in found.values()}
 
 
 @contextlib.contextmanager
@@ -197,7 +231,7 @@ def round_of(
         for work in works:
             if work in said[name].works:
                 time.sleep(PAUSE)
-                pipes[name].send(work)
+                pipes[name].send((name, work))
                 answer = pipes[name].recv()
                 if isinstance(answer, Exception):
                     raise answer

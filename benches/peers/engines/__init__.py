@@ -23,6 +23,7 @@ class Task:
         source: A checkpoint of the piece's head.
         arrays: Inputs, and as `expected` the reference's result.
         graphs: A folder for exported graphs.
+        shared: What the contenders of one process share, such as weights. Empty for the first.
     """
 
     case: Case
@@ -30,6 +31,7 @@ class Task:
     source: Path
     arrays: dict[str, NDArray[Any]]
     graphs: Path
+    shared: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,11 @@ class Built:
         result: What is compared with the reference's.
         calls: How many layers one call of a work goes through, where the time of one is wanted.
         notes: Settings worth a line in the report.
+        is_warm: Whether `result` calls every work. They are then not called again before they are timed.
     """
 
     works: dict[str, Callable[[], Any]]
     result: Callable[[], NDArray[np.float32]]
     calls: dict[str, int] = field(default_factory=dict)
     notes: str = ""
+    is_warm: bool = False

@@ -31,8 +31,12 @@ class OnnxRuntime:
         path = self.folder / f"{name}.onnx"
         if not path.exists():
             export(module(), inputs, path)
+        return self.opened(path)
+
+    def opened(self, path: Path) -> graphs.Graph:
+        """A session of a model in a file, which is quantised first if the arithmetic is `int8`."""
         if self.arithmetic == "int8":
-            narrow = self.folder / f"{name}-int8.onnx"
+            narrow = path.with_name(f"{path.stem}-int8.onnx")
             if not narrow.exists():
                 quantize(path, narrow)
             path = narrow
@@ -53,10 +57,25 @@ class OnnxRuntime:
         return array
 
 
-def export(module: nn.Module, inputs: tuple[Tensor, ...], path: Path) -> None:
-    """Writes the module as ONNX with external weights, under a temporary name first."""
+def export(module: nn.Module, inputs: tuple[Tensor, ...], path: Path, dynamic_shapes: Any = None) -> None:
+    """Writes the module as ONNX with external weights, under a temporary name first.
+
+    Args:
+        module: takes the inputs.
+        inputs: examples.
+        path: of the file.
+        dynamic_shapes: the axes whose length varies, as for `torch.onnx.export`. Default: none.
+    """
     part = path.with_name(f"part-{path.name}")
-    torch.onnx.export(module.eval(), inputs, part, dynamo=True, external_data=True, verbose=False)
+    torch.onnx.export(
+        module.eval(),
+        inputs,
+        part,
+        dynamo=True,
+        external_data=True,
+        verbose=False,
+        dynamic_shapes=dynamic_shapes,
+    )
     part.rename(path)
 
 

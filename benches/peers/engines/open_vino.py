@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,10 @@ class OpenVino:
             openvino.save_model(model, part, compress_to_fp16=False)
             part.with_suffix(".bin").rename(path.with_suffix(".bin"))
             part.rename(path)
+        return self.opened(path)
+
+    def opened(self, path: Path) -> graphs.Graph:
+        """A model in a file, compiled for the CPU."""
         request = self.core.compile_model(path, "CPU", self.properties).create_infer_request()
 
         def call(*arrays: NDArray[np.float32]) -> tuple[Any, ...]:

@@ -1,0 +1,22 @@
+#!/bin/sh
+# Builds the library of vla.cpp from a clone, against the ggml that build_ggml.sh built: build_vla.sh ENVIRONMENT
+# CLONE. The library, its converter and Python's gguf are written to ENVIRONMENT/vla. Its server, which needs
+# ZeroMQ and protobuf, is not built.
+set -eu
+environment=$(cd "$1" && pwd)
+clone=$(cd "$2" && pwd)
+llama="$environment/ggml/source/vendor/llama.cpp"
+libraries="$environment/ggml/build/bin"
+rm -rf "$environment/vla" && mkdir -p "$environment/vla/objects"
+cd "$environment/vla"
+for source in model loader options vla_c_api modules/* models/*; do
+    for file in "$clone"/src/${source%.*}.cpp; do
+        [ -e "$file" ] || continue
+        # As CMake's release build of it; -march=native as in ggml.
+        c++ -std=c++17 -O3 -DNDEBUG -march=native -fPIC -I "$clone/src" -I "$clone/include" -I "$llama/vendor" \
+            -I "$llama/ggml/include" -c "$file" -o "objects/$(basename "$file").o"
+    done
+done
+c++ -shared -o libvla.so objects/*.o -L "$libraries" -lggml -lggml-base -lggml-cpu "-Wl,-rpath,$libraries"
+cp -r "$clone/scripts" scripts
+cp -r "$llama/gguf-py" gguf-py

@@ -1,0 +1,188 @@
+"""The N1.5 model of lerobot 0.4.4 with the weights of a checkpoint, without the rest of lerobot.
+
+lerobot asks the Hub for the sizes of its backbone, and needs FlashAttention, which only runs on a GPU. Here
+the sizes are those of the checkpoint, and the attention is torch's SDPA. All else is lerobot's code.
+"""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import importlib.util
+import io
+import json
+import sys
+from collections.abc import Callable
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+import torch
+from safetensors import safe_open
+from torch import Tensor, nn
+from transformers import Qwen3Config, Qwen3ForCausalLM, SiglipVisionConfig, SiglipVisionModel
+from transformers.modeling_utils import no_init_weights
+
+from benches.backbone.setup import sizes_of
+from benches.peers.policy_inputs import Given
+from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.reference import lerobot_head
+
+GROOT = "lerobot.policies.groot"
+
+
+def tensors_of(source: Path, dtype: torch.dtype) -> dict[str, Tensor]:
+    """All tensors of a checkpoint in `dtype`, by their names."""
+    tensors = {}
+    for path in sorted(source.glob("*.safetensors")):
+        with safe_open(path, framework="pt") as file:
+            for name in file.keys():  # noqa: SIM118 (the handle of safetensors is not a dict)
+                # Copied, because a mapped file has no huge pages.
+                tensors[name] = file.get_tensor(name).to(dtype, copy=True)
+    return tensors
+
+
+def build(source: Path, tensors: dict[str, Tensor], compute_dtype: torch.dtype) -> Any:
+    """A `GR00TN15` in evaluation mode.
+
+    Args:
+        source: a checkpoint of N1.5.
+        tensors: its weights, which become those of the model without a copy.
+        compute_dtype: that the model casts its inputs to.
+    """
+    config = json.loads((source / "config.json").read_text())
+    groot, eagle = modules()
+    # Nothing is initialised, since the weights replace all.
+    with (
+        contextlib.redirect_stdout(io.StringIO()),
+        mock.patch.object(groot, "ensure_eagle_cache_ready", lambda *_: None),
+        mock.patch.object(groot.AutoConfig, "from_pretrained", lambda *_, **__: None),
+        mock.patch.object(groot.AutoModel, "from_config", lambda *_, **__: vision_language(eagle, source)),
+        no_init_weights(),
+    ):
+        model: Any = groot.GR00TN15(
+            groot.GR00TN15Config(
+                backbone_cfg={
+                    key: value for key, value in config["backbone_cfg"].items() if key != "eagle_config"
+                },
+                action_head_cfg=config["action_head_cfg"],
+                action_horizon=config["action_horizon"],
+                action_dim=config["action_dim"],
+                compute_dtype=str(compute_dtype).removeprefix("torch."),
+            ),
+            local_model_path="",
+        )
+        # As its from_pretrained does; autocast keeps a cast weight only if it may be trained.
+        model.backbone.set_trainable_parameters(tune_visual=False, tune_llm=False)
+        model.action_head.set_trainable_parameters(tune_projector=True, tune_diffusion_model=True)
+    names = model.state_dict().keys()
+    language: Any = model.backbone.eagle_model.language_model
+    missing = model.load_state_dict(
+        {name: tensor for name, tensor in tensors.items() if name in names}, strict=False, assign=True
+    ).missing_keys
+    language.lm_head.weight = language.model.embed_tokens.weight  # tied
+    unread = [name for name in missing if "lm_head" not in name and ".vision_model.head." not in name]
+    if unread:
+        raise ValueError(f"{source}: these tensors of lerobot's model are missing: {', '.join(unread)}")
+    return model.eval()
+
+
+def vision_language(module: Any, source: Path) -> nn.Module:
+    """lerobot's Eagle model around transformers' SigLIP and Qwen3."""
+    sizes = sizes_of(source)
+    vision = {
+        "hidden_size": sizes.vision.width,
+        "intermediate_size": sizes.vision.mlp_width,
+        "num_hidden_layers": sizes.vision.num_layers,
+        "num_attention_heads": sizes.vision.num_heads,
+        "image_size": round(sizes.vision.num_positions**0.5) * sizes.vision.patch_size,
+        "patch_size": sizes.vision.patch_size,
+        "layer_norm_eps": sizes.vision.eps,
+        "model_type": "siglip_vision_model",
+    }
+    config = module.Eagle25VLConfig(
+        vision_config=vision,
+        text_config={**text_config(sizes), "architectures": ["Qwen3ForCausalLM"]},
+        select_layer=-1,
+        image_token_index=sizes.image_token,
+        use_pixel_shuffle=sizes.merge == 2,
+        mlp_connector_layers=sizes.connector_layers,
+        _attn_implementation="eager",
+    )
+    return module.Eagle25VLForConditionalGeneration(
+        config,
+        SiglipVisionModel(SiglipVisionConfig(**vision, attn_implementation="sdpa")),
+        Qwen3ForCausalLM(Qwen3Config(**text_config(sizes), attn_implementation="sdpa")),
+    )
+
+
+def text_config(sizes: BackboneSizes) -> dict[str, Any]:
+    """The sizes of Qwen3 as transformers names them."""
+    text = sizes.text
+    return {
+        "hidden_size": text.width,
+        "intermediate_size": text.mlp_width,
+        "num_hidden_layers": sizes.num_layers,
+        "num_attention_heads": text.num_heads,
+        "num_key_value_heads": text.num_key_heads,
+        "head_dim": text.head_dim,
+        "vocab_size": text.vocabulary,
+        "rms_norm_eps": text.eps,
+        "rope_theta": text.theta,
+        "tie_word_embeddings": True,
+    }
+
+
+def inputs_of(one: Given) -> dict[str, Tensor]:
+    """What lerobot's processor hands to the policy."""
+    ids = torch.from_numpy(one.ids)
+    return {
+        "eagle_pixel_values": torch.from_numpy(one.pixels),
+        "eagle_input_ids": ids,
+        "eagle_attention_mask": torch.ones_like(ids),
+        "eagle_image_sizes": torch.tensor([one.pixels.shape[2:]] * len(one.pixels)),
+        "state": torch.from_numpy(one.state).reshape(1, 1, -1),
+        "embodiment_id": torch.tensor([one.embodiment_id]),
+    }
+
+
+@functools.cache
+def modules() -> tuple[Any, Any]:
+    """lerobot's modules of the model and of its Eagle model, imported without lerobot's packages and with
+    stand-ins for what is not installed.
+    """
+    spec = importlib.util.find_spec("lerobot")
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError("lerobot is not installed")
+    constants: Any = ModuleType("lerobot.utils.constants")
+    constants.ACTION, constants.HF_LEROBOT_HOME = "action", Path()
+    peft: Any = ModuleType("peft")
+    peft.LoraConfig = peft.get_peft_model = None  # for fine-tuning
+    tree: Any = ModuleType("tree")
+    tree.map_structure = map_values
+    stubs = {stub.__name__: stub for stub in (constants, peft, tree)}
+    for stub in stubs.values():
+        stub.__spec__ = ModuleSpec(stub.__name__, None)  # diffusers asks for it
+    before = {name: sys.modules.get(name) for name in stubs}
+    with lerobot_head.empty_packages(Path(spec.submodule_search_locations[0])):
+        sys.modules.update(stubs)
+        try:
+            groot = importlib.import_module(f"{GROOT}.groot_n1")
+            return groot, importlib.import_module(f"{GROOT}.eagle2_hg_model.modeling_eagle2_5_vl")
+        finally:
+            for name, module in before.items():
+                if module is None:
+                    del sys.modules[name]
+                else:
+                    sys.modules[name] = module
+
+
+def map_values(function: Callable[[Any], Any], mapping: Any) -> Any:
+    """dm-tree's `map_structure` for a flat mapping."""
+    return type(mapping)({key: function(value) for key, value in mapping.items()})

@@ -1,0 +1,170 @@
+"""The report of the whole policy: Markdown of one machine, and docs/policy-speed.md of all."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from benches.peers.cases import Case
+from benches.peers.contenders import CONTENDERS
+from benches.peers.goals import Goal, reached
+from benches.peers.report import demoted, joined, said_of
+from benches.peers.results import Results, records
+from benches.peers.text import number, plural, table, usual
+from saccade.bench.timing import quartiles
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "policy-speed.md"
+NOTES = Path(__file__).with_name("policy_notes.md")
+
+LEROBOT_BF16 = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
+GOALS = tuple(
+    Goal(f"{what}, {work}", "policy", work, LEROBOT_BF16, ours, least, beyond)
+    for what, ours, least, beyond in (
+        ("frames + words to a chunk, int8", "policy-saccade-int8", 3.0, 4.5),
+        ("frames + words to a chunk, bfloat16", "policy-saccade-bfloat16", 1.7, 2.5),
+        ("accelerate(policy, backbone=True), bfloat16", "policy-accelerate-bfloat16", 1.6, 2.3),
+    )
+    for work in Case("policy", 1).works
+)
+
+
+def command(results: Results, args: argparse.Namespace) -> int:
+    """`python -m benches.peers report --only policy`."""
+    if args.write:
+        PAGE.write_text(page(records(args.record)))
+        print(PAGE)
+        return 0
+    if not results.data["machine"]:
+        raise SystemExit(
+            f"bench-peers: {args.results} has no measurements; run "
+            '`make bench-peers PEERS_ARGS="--only policy"`'
+        )
+    write(results, args.results.parent)
+    return 0
+
+
+def write(results: Results, folder: Path) -> None:
+    """Writes `policy-report.md` into the folder of the JSON file."""
+    path = folder / "policy-report.md"
+    path.write_text(joined([f"# The whole policy, {results.cpu}", *of_machine(results), notes()]))
+    print(path)
+
+
+def page(measured: list[Results]) -> str:
+    """docs/policy-speed.md: all machines, one after the other."""
+    parts = [
+        "# The whole policy, measured",
+        "From frames and words to a chunk of actions: N1.5 at its published size with seeded random weights. "
+        '`make bench-peers PEERS_ARGS="--only policy"` measures a machine and keeps the numbers in '
+        "`benches/peers/results/policy/`, one file per CPU family; "
+        "`python -m benches.peers report --only policy --write` writes this page from these files.",
+    ]
+    for results in measured:
+        parts += [f"## {results.cpu}", *(demoted(part) for part in of_machine(results))]
+    return joined([*parts, notes()])
+
+
+def notes() -> str:
+    """How it was measured."""
+    return NOTES.read_text().strip()
+
+
+def of_machine(results: Results) -> list[str]:
+    """What was measured on one machine."""
+    return [
+        machine(results),
+        "## Targets",
+        goals(results),
+        said_of(results),
+        *(part for case in usual(results, "policy") for part in section(results, case)),
+    ]
+
+
+def machine(results: Results) -> str:
+    """The machine in a few sentences, with its peaks."""
+    held = results.data["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in held["versions"].items() if version)
+    parts = [
+        f"{held['cpu']} ({held['family']}, {held['isa']}), {held['cores']} cores, {held['memory_gb']} GB, "
+        f"Linux {held['kernel']}; flags {', '.join(held['flags'])}. {versions}; commit {held['commit']}."
+    ]
+    for threads in sorted({entry["threads"] for entry in results.data["peaks"]}):
+        rates = {kind: results.peak(threads, held["isa"], kind) for kind in ("float32", "bfloat16", "int8")}
+        known = ", ".join(f"{kind} {rate / 1e9:.0f}" for kind, rate in rates.items() if rate)
+        bandwidth = results.bandwidth(threads)
+        read = "" if bandwidth is None else f", {bandwidth / 1e9:.0f} GB/s"
+        parts.append(f"Peaks of {plural(threads)}: {known} GMAC/s{read}.")
+    return " ".join(parts)
+
+
+def goals(results: Results) -> str:
+    """The table of targets, and whether each was reached."""
+    rows = [
+        row for case in usual(results, "policy") for goal in GOALS for row in goal_row(results, case, goal)
+    ]
+    head = ["", "against", "threads", "target (exceeded at)", "times as fast (quartiles)", "reached"]
+    return table(head, rows) if rows else "Nothing measured yet."
+
+
+def goal_row(results: Results, case: Case, goal: Goal) -> Iterator[list[str]]:
+    """A target against the fastest correct of its peers; nothing if it was not measured."""
+    measured = results.names(case)
+    peers = [name for name in goal.peers if name in measured and results.is_correct(case, name)]
+    if not peers or goal.ours not in measured:
+        return
+    peer = min(peers, key=lambda name: quartiles(results.seconds(case, name, goal.work))[1])
+    compared = results.ratio(case, peer, goal.ours, goal.work)
+    assert compared is not None
+    low, median, high = compared
+    correct = results.is_correct(case, goal.ours)
+    yield [
+        goal.what,
+        CONTENDERS[peer].label,
+        str(case.threads),
+        f"{goal.least} x ({goal.beyond} x)",
+        f"{in_turn(results, case, peer, goal.ours, goal.work)}{median:.2f} x ({low:.2f} to {high:.2f})",
+        reached(median, goal.least, goal.beyond) if correct else "**not correct**",
+    ]
+
+
+def section(results: Results, case: Case) -> list[str]:
+    """Times of every contender, and relative to lerobot's fastest bfloat16."""
+    names = sorted(results.names(case), key=list(CONTENDERS).index)
+    rows = []
+    for name in names:
+        cells = [CONTENDERS[name].label]
+        for work in case.works:
+            low, median, high = quartiles(results.seconds(case, name, work))
+            cells.append(f"{number(median)} ({number(low)} to {number(high)})")
+            cells.append(speed_up(results, case, name, work))
+        error, scale = results.error(case, name)
+        cells.append(f"{error / scale:.1e}" + ("" if results.is_correct(case, name) else ", **not correct**"))
+        rows.append(cells)
+    head = ["ms"]
+    for work in case.works:
+        head += [f"{work}: median (quartiles)", "against lerobot"]
+    failed = {
+        CONTENDERS[name].label: entry["failed"]
+        for record in results.records(case)
+        for name, entry in record["contenders"].items()
+        if "failed" in entry and results.rounds(case, name) == 1 << 30
+    }
+    said = [f"- {label} could not run: {reason}" for label, reason in failed.items()]
+    return [f"## {plural(case.threads).capitalize()}", table([*head, "error"], rows), "\n".join(said)]
+
+
+def speed_up(results: Results, case: Case, name: str, work: str) -> str:
+    """How many times as fast as lerobot's fastest correct bfloat16."""
+    peers = [peer for peer in LEROBOT_BF16 if peer in results.names(case) and results.is_correct(case, peer)]
+    if not peers:
+        return ""
+    peer = min(peers, key=lambda each: quartiles(results.seconds(case, each, work))[1])
+    compared = results.ratio(case, peer, name, work)
+    assert compared is not None
+    return f"{in_turn(results, case, peer, name, work)}{compared[1]:.2f} x"
+
+
+def in_turn(results: Results, case: Case, peer: str, name: str, work: str) -> str:
+    """The mark of a ratio of times that are not from the same rounds."""
+    return "" if results.ratios(case, peer, name, work) else "~"
