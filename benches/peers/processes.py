@@ -11,6 +11,7 @@ import contextlib
 import importlib
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -46,6 +47,14 @@ class Ready:
     scale: float
     notes: str
     works: tuple[str, ...]
+
+
+class KilledError(RuntimeError):
+    """A contender's process was killed from outside, for instance for want of memory."""
+
+
+KILLING = frozenset({signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
+"""Signals from outside; those that follow from what a process did, such as SIGSEGV, are its own failures."""
 
 
 def worker(pipe: Connection, name: str, case: Case, work_folder: Path) -> None:
@@ -137,7 +146,9 @@ def contenders(
         ours: dict[str, Connection] = {}
         for name in names:
             ours[name], theirs = spawn.Pipe()
-            process = spawn.Process(target=worker, args=(theirs, name, case, work_folder), daemon=True)
+            process = spawn.Process(
+                target=worker, name=name, args=(theirs, name, case, work_folder), daemon=True
+            )
             with environment_of(name, case, work_folder):
                 process.start()
             theirs.close()
@@ -147,7 +158,7 @@ def contenders(
                 answer = pipe.recv()
             except EOFError:
                 processes[name].join()
-                answer = RuntimeError(f"the process ended with status {processes[name].exitcode}")
+                answer = ended(processes[name].exitcode)
             said[name] = answer
             if isinstance(answer, Ready):
                 pipes[name] = pipe
@@ -162,6 +173,13 @@ def contenders(
             process.join(timeout=10)
             process.kill()
             process.join()
+
+
+def ended(status: int | None) -> RuntimeError:
+    """What is said of a process that ended with this exit status, without a word of its own."""
+    if status is not None and -status in KILLING:
+        return KilledError(f"the process was killed by signal {-status}; the next run tries again")
+    return RuntimeError(f"the process ended with status {status}")
 
 
 @contextlib.contextmanager
@@ -186,23 +204,32 @@ def environment_of(name: str, case: Case, work_folder: Path) -> Iterator[None]:
 
 
 def round_of(
-    pipes: Mapping[str, Connection], said: Mapping[str, Any], works: tuple[str, ...], index: int
+    pipes: dict[str, Connection], said: Mapping[str, Any], works: tuple[str, ...], index: int
 ) -> dict[str, dict[str, float]]:
-    """Seconds of every contender and work, once; contender number `index` begins."""
+    """Seconds of every contender and work, once; contender number `index` begins.
+
+    One whose process ends meanwhile has no seconds, and is taken out of `pipes`.
+    """
     names = list(pipes)
     turn = index % len(names)
     seconds: dict[str, dict[str, float]] = {}
     for name in names[turn:] + names[:turn]:
-        seconds[name] = {}
-        for work in works:
-            if work in said[name].works:
-                time.sleep(PAUSE)
-                pipes[name].send(work)
-                answer = pipes[name].recv()
-                if isinstance(answer, Exception):
-                    raise answer
-                seconds[name][work] = answer
+        try:
+            seconds[name] = {work: timed(pipes[name], work) for work in works if work in said[name].works}
+        except (EOFError, ConnectionError):
+            note(f"{name}: the process ended in this round; the next run continues here")
+            del pipes[name]
     return seconds
+
+
+def timed(pipe: Connection, work: str) -> float:
+    """Seconds of one work of a contender, after a pause."""
+    time.sleep(PAUSE)
+    pipe.send(work)
+    answer = pipe.recv()
+    if isinstance(answer, Exception):
+        raise answer
+    return float(answer)
 
 
 def note(message: str) -> None:
