@@ -377,6 +377,16 @@ def test_json_has_times_profile_and_model(
     ]
 
 
+def test_software_tiles_can_be_measured(
+    capsys: pytest.CaptureFixture[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SACCADE_ISA", "software_tiles")
+    sizes = ("--num-vl-tokens", "3", "--num-steps", "1", "--rounds", "1", "--num-threads", "1")
+    machine = printed(capsys, "--checkpoint", str(folder), *sizes)["machine"]
+    assert machine["isa"] == "software_tiles"
+    assert min(machine["macs_per_second"][precision] for precision in PRECISIONS) > 0
+
+
 def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -> None:
     """Its T_vl is what its backbone gives: three cameras of sixteen patches, eight words, a register."""
     assert main(["bench", "--precisions", "float32", "--rounds", "1", "--profile"]) == 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import multiprocessing
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,7 +17,7 @@ import pytest
 
 import saccade
 from benches.peers import __main__ as command
-from benches.peers import figures, goals, inputs, report, text
+from benches.peers import figures, goals, inputs, processes, report, text
 from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.engines import Task
@@ -190,6 +192,38 @@ def test_what_is_done_is_not_started_again(tmp_path: Path) -> None:
     assert batches(results, CASE, *names[:3], "--rounds", "2") == [["saccade-float32", "lerobot-float32"]]
     results.open(CASE)["contenders"]["torch-float32"] = {"failed": "it said no"}
     assert batches(results, CASE, *names, "--rounds", "1") == []
+
+
+def test_a_contender_that_was_killed_is_started_again(tmp_path: Path) -> None:
+    results = measured(tmp_path / "results.json")
+    killed, crashed = processes.ended(-signal.SIGKILL), processes.ended(-signal.SIGSEGV)
+    assert isinstance(killed, processes.KilledError)
+    assert not isinstance(crashed, processes.KilledError)
+    names = ["--contenders", "saccade-float32", "torch-float32"]
+    entries = results.open(CASE)["contenders"]
+    entries["torch-float32"] = {"killed": str(killed)}
+    assert batches(results, CASE, *names, "--rounds", "1") == [["saccade-float32", "torch-float32"]]
+    assert f"{CONTENDERS['torch-float32'].label}: the process was killed by signal 9" in report.document(
+        results
+    )
+    # As many rounds as it had before count.
+    entries["saccade-float32"] = {"killed": str(killed)}
+    assert batches(results, CASE, *names[:2], "--rounds", "2") == []
+    assert batches(results, CASE, *names[:2], "--rounds", "3") == [["saccade-float32"]]
+
+
+def test_a_contender_that_is_killed_in_a_round_leaves_the_others(tmp_path: Path) -> None:
+    case = Case("head", 1, 7, 5, steps=1, size="small")
+    processes.prepare(case, tmp_path)
+    names = ["saccade-float32", "saccade-int8"]
+    with processes.contenders(names, case, tmp_path) as (pipes, said):
+        assert sorted(pipes) == sorted(names), said
+        doomed = next(each for each in multiprocessing.active_children() if each.name == "saccade-int8")
+        doomed.kill()
+        doomed.join()
+        seconds = processes.round_of(pipes, said, case.works, 0)
+    assert list(seconds) == list(pipes) == ["saccade-float32"]
+    assert set(seconds["saccade-float32"]) == set(case.works)
 
 
 def test_the_report_of_known_numbers(tmp_path: Path) -> None:

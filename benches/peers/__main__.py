@@ -40,7 +40,7 @@ from benches.peers import machine, policy_report, processes, report
 from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
 from benches.peers.contenders import CONTENDERS, GROUPS, POLICY_GROUPS, able
 from benches.peers.goals import NEEDED
-from benches.peers.processes import Ready, note
+from benches.peers.processes import KilledError, Ready, note
 from benches.peers.results import RECORDS, Results
 from benches.peers.text import usual
 
@@ -164,11 +164,13 @@ def measure(results: Results, case: Case, names: list[str], args: argparse.Names
             record["contenders"][name] = (
                 {"error": answer.error, "scale": answer.scale, "notes": answer.notes, "seconds": {}}
                 if isinstance(answer, Ready)
-                else {"failed": str(answer)}
+                else {"killed" if isinstance(answer, KilledError) else "failed": str(answer)}
             )
         results.save()
-        rounds = max(args.rounds - min(results.rounds(case, name) for name in names), 0)
-        for index in range(rounds if pipes else 0):
+        rounds = args.rounds - min((results.rounds(case, name) for name in pipes), default=args.rounds)
+        for index in range(rounds):
+            if not pipes:
+                break
             if time.monotonic() > end:
                 note("the time limit is reached; the next run continues here")
                 break

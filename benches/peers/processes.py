@@ -11,6 +11,7 @@ import contextlib
 import importlib
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -46,6 +47,14 @@ class Ready:
     scale: float
     notes: str
     works: tuple[str, ...]
+
+
+class KilledError(RuntimeError):
+    """A contender's process was killed from outside, for instance for want of memory."""
+
+
+KILLING = frozenset({signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
+"""Signals from outside; those that follow from what a process did, such as SIGSEGV, are its own failures."""
 
 
 def worker(pipe: Connection, names: tuple[str, ...], case: Case, work_folder: Path) -> None:
@@ -174,7 +183,7 @@ def contenders(
                     said[name] = ours[first].recv()
                 except EOFError:
                     processes[first].join()
-                    said[name] = RuntimeError(f"the process ended with status {processes[first].exitcode}")
+                    said[name] = ended(processes[first].exitcode)
                 if isinstance(said[name], Ready):
                     pipes[name] = ours[first]
                 else:
@@ -196,6 +205,13 @@ def sharing(names: list[str]) -> dict[str, tuple[str, ...]]:
     for name in names:
         found.setdefault(CONTENDERS[name].process or name, []).append(name)
     return {together[0]: tuple(together) for together in found.values()}
+
+
+def ended(status: int | None) -> RuntimeError:
+    """What is said of a process that ended with this exit status, without a word of its own."""
+    if status is not None and -status in KILLING:
+        return KilledError(f"the process was killed by signal {-status}; the next run tries again")
+    return RuntimeError(f"the process ended with status {status}")
 
 
 @contextlib.contextmanager
@@ -220,23 +236,34 @@ def environment_of(name: str, case: Case, work_folder: Path) -> Iterator[None]:
 
 
 def round_of(
-    pipes: Mapping[str, Connection], said: Mapping[str, Any], works: tuple[str, ...], index: int
+    pipes: dict[str, Connection], said: Mapping[str, Any], works: tuple[str, ...], index: int
 ) -> dict[str, dict[str, float]]:
-    """Seconds of every contender and work, once; contender number `index` begins."""
+    """Seconds of every contender and work, once; contender number `index` begins.
+
+    One whose process ends meanwhile has no seconds, and is taken out of `pipes`.
+    """
     names = list(pipes)
     turn = index % len(names)
     seconds: dict[str, dict[str, float]] = {}
     for name in names[turn:] + names[:turn]:
-        seconds[name] = {}
-        for work in works:
-            if work in said[name].works:
-                time.sleep(PAUSE)
-                pipes[name].send((name, work))
-                answer = pipes[name].recv()
-                if isinstance(answer, Exception):
-                    raise answer
-                seconds[name][work] = answer
+        try:
+            seconds[name] = {
+                work: timed(pipes[name], name, work) for work in works if work in said[name].works
+            }
+        except (EOFError, ConnectionError):
+            note(f"{name}: the process ended in this round; the next run continues here")
+            del pipes[name]
     return seconds
+
+
+def timed(pipe: Connection, name: str, work: str) -> float:
+    """Seconds of one work of a contender, after a pause."""
+    time.sleep(PAUSE)
+    pipe.send((name, work))
+    answer = pipe.recv()
+    if isinstance(answer, Exception):
+        raise answer
+    return float(answer)
 
 
 def note(message: str) -> None:

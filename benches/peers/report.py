@@ -230,11 +230,13 @@ def section(results: Results, case: Case) -> str:
         cells.append(floor_share(results, case, name))
         cells.append(error_cell(results, case, name))
         rows.append(cells)
+    measured = results.names(case)
     failed = [
-        f"{CONTENDERS[name].label}: {entry['failed']}"
+        f"{CONTENDERS[name].label}: {entry[how]}"
         for record in results.records(case)
         for name, entry in record["contenders"].items()
-        if "failed" in entry and results.rounds(case, name) == 1 << 30
+        for how in ("failed", "killed")
+        if how in entry and name not in measured
     ]
     head = ["ms: median (quartiles)", *(titles[work] for work in case.reported)]
     head += ["times saccade's", "share of the floor", "max abs error"]

@@ -88,11 +88,13 @@ class Results:
                 yield record["contenders"][name]
 
     def rounds(self, case: Case, name: str) -> int:
-        """Number of finished rounds of a contender; one that failed counts as finished."""
+        """Number of finished rounds of a contender; one that failed counts as finished, one that was killed
+        does not.
+        """
         entries = list(self.entries(case, name))
         if entries and "failed" in entries[-1]:
             return 1 << 30
-        return sum(len(next(iter(entry["seconds"].values()), [])) for entry in entries)
+        return sum(len(next(iter(entry.get("seconds", {}).values()), [])) for entry in entries)
 
     def seconds(self, case: Case, name: str, work: str) -> list[float]:
         """All times of one work."""

@@ -9,7 +9,8 @@ use saccade::{Arithmetic, CpuReport, Error, Isa, Part, Profile};
 use crate::detached::call;
 use crate::error::raise;
 
-/// What this machine can do at most on `num_threads` threads; takes some tenths of a second for each instruction set.
+/// What this machine can do at most on `num_threads` threads; takes some tenths of a second for each instruction set
+/// that is available or selected.
 #[pyfunction]
 pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Bound<'_, PyDict>> {
     if num_threads == 0 {
@@ -17,8 +18,14 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
             "num_threads: expected at least 1, got 0".to_owned(),
         )));
     }
+    let mut isas = Isa::available();
+    let selected = Isa::from_env().map_err(|error| raise(error.into()))?;
+    // Software tiles can be selected, and are not among those that are available.
+    if !isas.contains(&selected) {
+        isas.push(selected);
+    }
     let rates = PyDict::new(py);
-    for isa in Isa::available() {
+    for isa in isas {
         let of_isa = PyDict::new(py);
         for (name, arithmetic) in [
             ("float32", Arithmetic::Float32),
