@@ -105,6 +105,25 @@ def test_recording_goes_on_where_it_stopped(recording: Path, tmp_path: Path) -> 
     assert not list(tmp_path.rglob(".*"))
 
 
+def test_what_was_recorded_earlier_counts_for_the_expert(tmp_path: Path) -> None:
+    """Only seeds at which the expert failed are tried again: they alone would look as if it always failed."""
+    first = DEMONSTRATION_SEEDS[0]
+    for seed in range(first, first + 60, 2):
+        (tmp_path / f"{seed}.npz").touch()
+    seeds = demos.Seeds("push", 60, tmp_path)
+    missing = seeds.next_seeds(lambda: None)
+    assert missing[:30] == list(range(first + 1, first + 60, 2))
+    assert (seeds.done, len(missing)) == (30, 30)
+    for seed in missing[:30]:
+        seeds.outcomes[seed] = False
+        seeds.check()
+    alone = demos.Seeds("push", 60, tmp_path / "empty")
+    for seed in alone.next_seeds(lambda: None)[:20]:
+        alone.outcomes[seed] = False
+    with pytest.raises(InputError, match="the expert failed in 20 of 20 episodes"):
+        alone.check()
+
+
 def test_recording_with_other_settings_is_refused(recording: Path) -> None:
     other = demos.RecordingSettings(image_size=24, cameras=RECORDING.cameras)
     with pytest.raises(InputError, match="other settings"):
@@ -274,7 +293,7 @@ def test_training_starts_from_a_policy(recording: Path, tmp_path: Path) -> None:
 
 
 def test_a_policy_of_other_sizes_cannot_be_started_from(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="other sizes or other demonstrations"):
+    with pytest.raises(InputError, match="other sizes, tasks or cameras"):
         train.train(recording, tmp_path / "out", TINY, ignore, start=DEMO_CHECKPOINT)
     with pytest.raises(FileNotFoundError):
         train.train(recording, tmp_path / "out", TINY, ignore, start=tmp_path / "nowhere")

@@ -167,8 +167,8 @@ class Seeds:
         count: Number of episodes that are wanted.
         directory: Where they are written.
         done: Number of episodes that are there.
-        outcomes: Whether the expert succeeded, by the seeds that were tried, in their order; None while it
-            is not known.
+        outcomes: Whether the expert succeeded, by the seeds that were tried now or by an earlier run, in
+            their order; None while it is not known.
     """
 
     task: str
@@ -188,12 +188,13 @@ class Seeds:
         for seed in self._left if self.done < self.count else ():
             if self.path(seed).exists():
                 self.done += 1
+                self.outcomes[seed] = True
                 on_episode()
             else:
                 found.append(seed)
+                self.outcomes[seed] = None
             if self.done + len(found) == self.count:
                 break
-        self.outcomes.update(dict.fromkeys(found))
         return found
 
     def path(self, seed: int) -> Path:

@@ -37,6 +37,7 @@ from saccade.sim.dataset import PIXEL_CENTRE, Samples, describe, load_samples, n
 from saccade.sim.learner import Batch, Learner
 from saccade.sim.settings import (
     CONFIG_FILE,
+    EMBODIMENT,
     METADATA_FILE,
     TENSOR_FILE,
     PolicyConfig,
@@ -321,16 +322,21 @@ def resume(run: Run, path: Path) -> None:
     run.average = state["average"]
 
 
-def start_from(run: Run, policy: Path) -> None:
-    """Starts from the weights of a policy.
+def config_of_start(config: PolicyConfig, policy: Path) -> PolicyConfig:
+    """The config with the statistics of the policy to start from: its weights know no others.
 
     Raises:
         FileNotFoundError: there is no policy.
-        InputError: the policy has other sizes, tasks or statistics.
+        InputError: the policy has other sizes, tasks or cameras.
     """
-    found = [json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE)]
-    if found != described(run.config):
-        raise InputError(f"{policy}: was trained with other sizes or other demonstrations")
+    found, statistics = (json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE))
+    if found != described(config)[0]:
+        raise InputError(f"{policy}: was trained with other sizes, tasks or cameras")
+    return replace(config, statistics=statistics[EMBODIMENT]["statistics"])
+
+
+def start_from(run: Run, policy: Path) -> None:
+    """Starts from the weights of a policy."""
     tensors = load_file(policy / TENSOR_FILE)
     run.learner.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, strict=False)
     run.average = {name: tensor.detach().clone() for name, tensor in run.learner.policy_tensors().items()}
@@ -365,7 +371,7 @@ def train(
     config = policy_config(settings, recording, tasks)
     processor = config.processor()
     training, validation = load_samples(demonstrations, tasks, settings.horizon, processor)
-    config = with_statistics(config, training)
+    config = with_statistics(config, training) if start is None else config_of_start(config, start)
     if start is not None:
         settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
     run = new_run(settings, config, describe(demonstrations, tasks))
