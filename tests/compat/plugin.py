@@ -16,6 +16,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -26,6 +27,8 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
+from lerobot.envs.factory import make_env
+from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -42,19 +45,18 @@ HORIZON, WIDTH = 16, 4
 TEXTS = ["reach the red ball", "push", "open the drawer slowly"]
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A random checkpoint of the simulated robot: its hand in place of the arm, and its cameras."""
-    folder = random_checkpoint.write(
-        tmp_path_factory.mktemp("whole") / "checkpoint",
+def random_policy(folder: Path, views: Sequence[str], size: int) -> Path:
+    """A random checkpoint of the simulated robot: its hand in place of the arm, and these cameras."""
+    random_checkpoint.write(
+        folder,
         backbone=random_checkpoint.small_backbone("n1.5"),
         head=random_checkpoint.small_head("n1.5"),
     )
     path = folder / "experiment_cfg" / "metadata.json"
     metadata = json.loads(path.read_text())
     robot = metadata["new_embodiment"]
-    view = {"resolution": [DEFAULT_IMAGE_SIZE, DEFAULT_IMAGE_SIZE], "channels": 3, "fps": 80.0}
-    robot["modalities"]["video"] = dict.fromkeys(VIEWS, view)
+    view = {"resolution": [size, size], "channels": 3, "fps": 80.0}
+    robot["modalities"]["video"] = dict.fromkeys(views, view)
     for kind in ("state", "action"):
         for part in (robot["statistics"], robot["modalities"]):
             part[kind] = {"hand": part[kind].pop("single_arm"), **part[kind]}
@@ -64,6 +66,11 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path.write_text(json.dumps(metadata))
     (folder / "optimizer.pt").write_bytes(b"large")
     return folder
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return random_policy(tmp_path_factory.mktemp("whole") / "checkpoint", VIEWS, DEFAULT_IMAGE_SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -324,6 +331,21 @@ def test_the_environment_is_that_of_the_task() -> None:
     assert lerobot_policy_saccade.SaccadeEnv(task="reach").gym_id == "saccade/reach-lerobot-v0"
     with pytest.raises(saccade.InputError, match="no-such-task"):
         SaccadeEnv(task="no-such-task")
+
+
+def test_an_environment_of_lerobot(tmp_path: Path) -> None:
+    config = EnvConfig.get_choice_class("metaworld")(task="reach-v3")
+    vector = make_env(config, n_envs=1)["reach-v3"][0]
+    try:
+        observation, _ = vector.reset(seed=[0])
+        size = observation["pixels"].shape[1]
+        # An environment with one camera does not name it.
+        folder = random_policy(tmp_path / "checkpoint", ["image"], size)
+        policy = make_policy(make_policy_config("saccade", checkpoint=str(folder)), env_cfg=config)
+        batch = preprocess_observation(observation) | {"task": list(vector.call("task_description"))}
+        vector.step(policy.select_action(batch).numpy())
+    finally:
+        vector.close()
 
 
 def evaluate(out: Path, *arguments: str) -> dict[str, Any]:
