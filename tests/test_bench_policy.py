@@ -15,7 +15,7 @@ from benches.peers import __main__ as command
 from benches.peers import policy_inputs, policy_report
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS, POLICY_GROUPS
-from benches.peers.engines import Task
+from benches.peers.engines import Task, vla_cpp
 from benches.peers.processes import difference, sharing
 from benches.peers.results import RECORDS, Results, records
 
@@ -38,6 +38,8 @@ def test_every_engine_computes_what_the_reference_does(name: str, work: Path) ->
     contender = CONTENDERS[name]
     for package in PACKAGES.get(contender.options.get("opened_by", contender.engine), ()):
         pytest.importorskip(package, reason="in the environment of make bench-peers")
+    if contender.engine == "vla_cpp":
+        pytest.skip("vla.cpp has only the published size")
     arrays = policy_inputs.expected_of(SMALL, work)
     source = policy_inputs.checkpoint(SMALL, work)
     task = Task(SMALL, dict(contender.options), source, arrays, work)
@@ -48,6 +50,14 @@ def test_every_engine_computes_what_the_reference_does(name: str, work: Path) ->
     assert tuple(built.works) == SMALL.works
     for call in built.works.values():
         call()
+
+
+def test_what_is_not_built_says_how(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SACCADE_PEERS_VLA", str(work / "nowhere"))
+    arrays = policy_inputs.expected_of(SMALL, work)
+    task = Task(SMALL, {}, policy_inputs.checkpoint(SMALL, work), arrays, work)
+    with pytest.raises(FileNotFoundError, match="make bench-peers VLA_SOURCE"):
+        vla_cpp.build(task)
 
 
 def test_one_view_and_two_are_different_questions(work: Path) -> None:

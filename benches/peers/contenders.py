@@ -192,7 +192,7 @@ POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
     },
     "graphs": {
         "policy-openvino-bfloat16": _policy(
-            "OpenVINO bfloat16", "policy_graphs", 8.0, opened_by="open_vino", arithmetic="bfloat16"
+            "OpenVINO bfloat16", "policy_graphs", 6.0, opened_by="open_vino", arithmetic="bfloat16"
         ),
         "policy-vla-bfloat16": _policy("vla.cpp bfloat16", "vla_cpp", 5.5),
         "policy-onnxruntime-int8": _policy(

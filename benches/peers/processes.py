@@ -1,4 +1,4 @@
-"""One process per contender, and rounds in which they take turns.
+"""One process per contender, or per group that shares weights, and rounds in which contenders take turns.
 
 Only one contender runs at a time, so idle threads of another do not disturb it, and no allocator is shared.
 In a round every contender does every work once, in an order that rotates, so that a drift of the clock
