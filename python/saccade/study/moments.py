@@ -23,6 +23,7 @@ from saccade.maps.grid import layout_of
 from saccade.maps.layout import Layout
 from saccade.observation import Observation
 from saccade.policy import Policy
+from saccade.policy_context import longer
 from saccade.study.recording import NOISES, Recorded, num_episodes
 from saccade.whole import as_head_takes_it, parts_of
 
@@ -195,11 +196,6 @@ def joined(observations: Sequence[Observation], moments: Sequence[Moment]) -> Ob
         drop_vl=dropped if dropped.any() else None,
         episode=None if None in episodes else np.unique(np.array(episodes), return_inverse=True)[1],
     )
-
-
-def longer(array: np.ndarray[Any, Any], length: int) -> np.ndarray[Any, Any]:
-    """``(1, T, ...)`` padded with zeros to ``(1, length, ...)``."""
-    return np.pad(array, [(0, 0), (0, length - array.shape[1]), *[(0, 0)] * (array.ndim - 2)])
 
 
 def described(directory: str, moments: Sequence[Moment]) -> dict[str, Any]:
