@@ -145,10 +145,12 @@ def look(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
     from saccade._files import checkpoint_identity
     from saccade.head import ActionHead
+    from saccade.hub import resolve
 
     checkpoint = args.checkpoint
     if checkpoint is None:
         from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
+    checkpoint = resolve(checkpoint)
     if args.frames is not None:
         head, view = take_frames(args, checkpoint)
     else:
