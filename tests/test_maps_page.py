@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
 import re
 import shutil
@@ -187,6 +188,30 @@ def test_a_map_is_painted_where_its_patches_are(page: Page) -> None:
     assert (
         blue[:size, size:, 2] - blue[:size, size:, 0]
     ).min() > 60  # the second patch was the one that counts
+
+
+@needs_browser
+def test_a_map_is_painted_on_the_part_that_tokens_see(driver: webdriver.Chrome, tmp_path: Path) -> None:
+    maps = mixed_maps()
+    left, top = maps.view.layout.cameras
+    # The right half of the picture, and as much beside it.
+    layout = dataclasses.replace(
+        maps.view.layout, cameras=(dataclasses.replace(left, region=(0.5, 0.0, 1.5, 1.0)), top)
+    )
+    view = dataclasses.replace(maps.view, layout=layout)
+    write_page(dataclasses.replace(maps, view=view), tmp_path / "page.html")
+    page = Page(driver, tmp_path / "page.html")
+    pixels = page.pixels("occlusion-0")
+    colour, size = pixels[..., 2] - pixels[..., 0], len(pixels) // 2
+    # The second of 2 x 2 patches counts, and lies beside the picture.
+    assert np.abs(colour).max() < 60
+    moved = dataclasses.replace(left, region=(-0.5, 0.0, 0.5, 1.0))
+    view = dataclasses.replace(view, layout=dataclasses.replace(layout, cameras=(moved, top)))
+    write_page(dataclasses.replace(maps, view=view), tmp_path / "page.html")
+    pixels = Page(driver, tmp_path / "page.html").pixels("occlusion-0")
+    colour = pixels[..., 2] - pixels[..., 0]
+    assert colour[:size, :size].min() > 60
+    assert np.abs(colour[:, size:]).max() < 20
 
 
 @needs_browser

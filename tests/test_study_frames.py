@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 import torch
 from frames_cases import write_moment, write_moments
+from test_hub import NAME, cached
 from whole_checkpoints import EMBODIMENT, whole
 
 from saccade import BackboneInputs, Policy
@@ -76,6 +77,18 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     assert found["moment"].unique().tolist() == ["pour/1", "pour/2", "wipe/1"]
     settings = read_provenance(tmp_path / "frames" / "cuts.json").settings["frames"]
     assert (settings["name"], settings["episodes"], settings["instruction"]) == ("table", 2, TOLD)
+
+
+def test_a_published_id(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    cached(tmp_path, whole("isaac"))
+    words = ["--checkpoint", NAME, "--frames", str(frames / "wipe"), "--out", str(tmp_path / "out")]
+    assert main(["study", "gradients", *words, "--projections", "1"]) == 0
+    assert main(["study", "cuts", *words, "--arms", "future-unread"]) == 0
+    words[-1] = str(tmp_path / "maps")
+    assert main(["attention", *words, "--blocks", "0", "--steps", "0", "--cell", "4"]) == 0
 
 
 def test_the_hash_covers_what_the_policy_sees(frames: Path, tmp_path: Path) -> None:

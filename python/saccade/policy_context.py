@@ -58,8 +58,8 @@ def encoded(head: Head, features: Sequence[BackboneFeatures]) -> PolicyContext:
     longest = max(lengths)
     dropped = np.arange(longest) >= np.array(lengths)[:, None]
     context = head.encode(
-        _joined([_longer(one.backbone_features, longest) for one in features]),
-        image_mask=_joined([_longer(one.image_mask, longest) for one in features]),
+        _joined([longer(one.backbone_features, longest) for one in features]),
+        image_mask=_joined([longer(one.image_mask, longest) for one in features]),
         drop_vl=dropped if dropped.any() else None,
     )
     return PolicyContext(context, tuple(features))
@@ -70,7 +70,7 @@ def _joined(arrays: list[Any]) -> Any:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _longer(array: Any, length: int) -> Any:
+def longer(array: Any, length: int) -> Any:
     """``(1, T, ...)`` zero-padded to ``(1, length, ...)``."""
     missing = length - array.shape[1]
     if missing == 0:

@@ -247,7 +247,7 @@ class Processor:
             >>> import saccade
             >>> processor = saccade.Processor("n1.5", "tokenizer.json")
             >>> processor.texts(processor.tokens("push the puck"))
-            ['push', ' the', ' p', 'uck']
+            ['push', ' the', ' ', 'pu', 'ck']
         """
         given = int64("ids", ids)
         if given.ndim != 1:

@@ -144,10 +144,12 @@ def run(args: argparse.Namespace) -> int:
 def look(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
     from saccade._files import checkpoint_identity
+    from saccade.hub import resolve
 
     checkpoint = args.checkpoint
     if checkpoint is None:
         from saccade.sim.policy import DEMO_CHECKPOINT as checkpoint
+    checkpoint = resolve(checkpoint)
     if args.features is not None:
         head, view = take_features(args, checkpoint)
     elif args.frames is not None:

@@ -87,7 +87,7 @@ class Layout:
     Example:
         >>> layout = parse_layout("text:2,image:2x2=left,special:1=</img>,pad:*", num_tokens=9)
         >>> layout.cameras
-        (Camera(name='left', start=2, rows=2, columns=2),)
+        (Camera(name='left', start=2, rows=2, columns=2, region=(0.0, 0.0, 1.0, 1.0)),)
         >>> {name: positions.tolist() for name, positions in layout.parts().items()}
         {'left': [2, 3, 4, 5], 'text': [0, 1], 'special': [6], 'pad': [7, 8]}
     """

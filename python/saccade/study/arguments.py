@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from saccade._arguments import check_frames, check_tasks
 from saccade.errors import InputError
+from saccade.hub import resolve
 from saccade.parallel.arguments import workers_of
 from saccade.study.moments import Moments
 from saccade.study.recording import Recording
@@ -83,7 +84,7 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
 def moments_of(args: argparse.Namespace) -> Moments:
     """Creates a source of pictures from parsed arguments, and looks at them; errors as `source_of`."""
     found = Moments(
-        checkpoint=checkpoint_of(args),
+        checkpoint=str(resolve(checkpoint_of(args))),
         frames=str(args.frames),
         instruction=args.instruction,
         state=None if args.state is None else str(args.state),

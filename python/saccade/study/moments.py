@@ -15,6 +15,7 @@ import numpy as np
 from saccade._files import checkpoint_identity
 from saccade.backbone_config import BackboneConfig
 from saccade.backbone_inputs import BackboneInputs
+from saccade.config import HeadConfig
 from saccade.dialects import read
 from saccade.errors import InputError
 from saccade.frames import Moment, read_frames
@@ -23,6 +24,7 @@ from saccade.maps.grid import layout_of
 from saccade.maps.layout import Layout
 from saccade.observation import Observation
 from saccade.policy import Policy
+from saccade.policy_context import longer
 from saccade.study.recording import NOISES, Recorded, num_episodes
 from saccade.whole import as_head_takes_it, parts_of
 
@@ -33,7 +35,8 @@ Preprocessing = Literal["lerobot", "isaac"]
 class Moments(Recorded):
     """A whole checkpoint, and pictures of moments for it.
 
-    The backbone looks at all moments once in a process, and is then let go. The head computes in float32.
+    The policy looks at all moments once in a process, and is then let go. Where a study needs the head, it is
+    loaded alone, in float32: what computes gradients in torch has the memory for itself.
 
     Attributes:
         checkpoint: A checkpoint that `saccade.Policy.load` reads.
@@ -89,7 +92,13 @@ class Moments(Recorded):
         """See `Source`."""
         if precision != "float32":
             raise InputError(f"precision: expected float32 for a head on pictures, got {precision}")
-        return look(self).head
+        (embodiment_id,) = set(self.all.embodiment_id.tolist())
+        return head_of(self.checkpoint, embodiment_id, self.num_threads)
+
+    @property
+    def config(self) -> HeadConfig:
+        """See `Source`."""
+        return look(self).config
 
     @property
     def all(self) -> Observation:
@@ -111,7 +120,7 @@ class Looked:
     """What a policy made of the moments of a source.
 
     Attributes:
-        head: The head of the policy.
+        config: Config of the head.
         identity: Name and hash of the checkpoint.
         preprocessing: How frames and words were prepared.
         moments, others: The moments, and those to compare them with.
@@ -121,7 +130,7 @@ class Looked:
         backbone_config: Config of the backbone.
     """
 
-    head: ActionHead
+    config: HeadConfig
     identity: dict[str, str]
     preprocessing: str
     moments: Sequence[Moment]
@@ -164,7 +173,7 @@ def look(source: Moments) -> Looked:
             (features,) = policy.features(policy.inputs(other), previous=context)
             compared.append(as_head_takes_it(policy, other, features))
     return Looked(
-        head=parts.head,
+        config=parts.head.config,
         identity=checkpoint_identity(Path(source.checkpoint)),
         preprocessing=parts.processor.preprocessing,
         moments=moments,
@@ -175,6 +184,12 @@ def look(source: Moments) -> Looked:
         layouts=layouts,
         backbone_config=parts.backbone.config,
     )
+
+
+@functools.lru_cache(maxsize=1)
+def head_of(checkpoint: str, embodiment_id: int, num_threads: int | None) -> ActionHead:
+    """The head with the layers of one embodiment."""
+    return ActionHead.load(checkpoint, embodiment_ids=[embodiment_id], num_threads=num_threads)
 
 
 def moments_of(source: Moments, policy: Policy, directory: str, instruction: str | None) -> list[Moment]:
@@ -201,11 +216,6 @@ def joined(observations: Sequence[Observation], moments: Sequence[Moment]) -> Ob
         drop_vl=dropped if dropped.any() else None,
         episode=None if None in episodes else np.unique(np.array(episodes), return_inverse=True)[1],
     )
-
-
-def longer(array: np.ndarray[Any, Any], length: int) -> np.ndarray[Any, Any]:
-    """``(1, T, ...)`` padded with zeros to ``(1, length, ...)``."""
-    return np.pad(array, [(0, 0), (0, length - array.shape[1]), *[(0, 0)] * (array.ndim - 2)])
 
 
 def described(directory: str, moments: Sequence[Moment]) -> dict[str, Any]:
