@@ -14,7 +14,7 @@ import whole_integration_cases as cases
 import whole_policies
 
 import saccade
-from saccade.integrations import accelerate
+from saccade.integrations import accelerate, modules
 
 torch.set_num_threads(1)  # small tensors gain nothing from more
 
@@ -80,6 +80,23 @@ def test_other_attention() -> None:
 
 def test_threads(whole: cases.Whole) -> None:
     cases.check_threads(whole)
+
+
+def test_the_original_in_another_thread_is_no_replacement(whole: cases.Whole) -> None:
+    """While it runs, transformers 4.57 has functions of its own in the place of the layers' `forward`."""
+    given = whole.observations()
+    layers = cases.language_model(whole.backbone).layers
+    seen: list[bool] = []
+
+    def look(*arguments: object) -> None:
+        seen.extend(("forward" in vars(layers[0]), modules.is_own(layers[0], "forward")))
+
+    hook = layers[1].register_forward_hook(look)
+    cases.call(whole, given)
+    hook.remove()
+    assert seen[:2] == [True, True]
+    layers[0].forward = lambda *arguments: None
+    assert not modules.is_own(layers[0], "forward")
 
 
 def test_projected_features(whole: cases.Whole) -> None:

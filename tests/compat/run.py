@@ -100,9 +100,10 @@ environment these tests passed too:
 - These are refused: training mode, hooks, gradients, a replaced `get_action` or `forward`, `torch.compile`
   inside, float64, changed code under the same names, other draws from the generator.
 - Calls from several threads, at 1 and 2 threads, give the same bits.
-- With `backbone=True`: batches of 1 and 3 with one and two views and left padding; all of the above. In
-  training, and where a gradient is asked for, the original backbone runs. Padding under another attention
-  than torch's `sdpa` is refused.
+- With `backbone=True`: batches of 1 and 3 with one and two views and left padding; `select_action`,
+  real-time chunking, `save_pretrained`, training in between, `restore`, copies, changed weights, refusals and
+  threads. In training, and where a gradient is asked for, the original backbone runs. Padding under another
+  attention than torch's `sdpa` is refused.
 
 In lerobot 0.5.1 and 0.6.1 those of the plugin `lerobot_policy_saccade` passed too. `lerobot-eval`, started as
 users start it, runs episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their rewards

@@ -106,6 +106,15 @@ def test_policy_steps_the_same(policy: Any) -> None:
     assert cases.error(ours, theirs) <= cases.EXACT
 
 
+@pytest.mark.skipif(KIND != "n1.7", reason="N1.5 has no real-time chunking")
+def test_policy_continues_a_chunk(policy: Any) -> None:
+    left = torch.randn(9, policies.ACTION_DIM, generator=torch.Generator().manual_seed(5))
+    theirs = predict(policy, 2, prev_chunk_left_over=left, inference_delay=3)
+    with accelerate(policy, backbone=True):
+        ours = predict(policy, 2, prev_chunk_left_over=left, inference_delay=3)
+    assert cases.error(ours, theirs) <= cases.EXACT
+
+
 def test_training_between_evaluations(policy: Any) -> None:
     """An optimizer's steps in lerobot's training mode, then `predict_action_chunk`, which turns it off."""
     handle = accelerate(policy, backbone=True)

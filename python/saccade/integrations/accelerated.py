@@ -15,7 +15,7 @@ from saccade.errors import InputError
 from saccade.head import ActionHead
 from saccade.integrations import backbones, heads
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
-from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, StandIn
+from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
 from saccade.integrations.weights import tensors_of
 from saccade.options import LoadOptions, precisions_of_parts
 
@@ -97,16 +97,6 @@ class Kinds:
     noise: torch.dtype
     actions: torch.dtype
     result: type[Any]
-
-
-class Features(dict[str, Any]):
-    """A dict with keys as attributes, as heads expect of a BatchFeature. For the inputs of the check."""
-
-    def __getattr__(self, name: str) -> Any:
-        try:
-            return self[name]
-        except KeyError:
-            raise AttributeError(name) from None
 
 
 class Accelerated(StandIn[ActionHead]):

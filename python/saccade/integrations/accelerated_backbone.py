@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from saccade.backbone import Backbone
 from saccade.errors import InputError
 from saccade.integrations import backbones
-from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, StandIn
+from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
 from saccade.integrations.weights import tensors_of
 from saccade.options import LoadOptions
 
@@ -25,16 +25,6 @@ class Kinds:
 
     features: torch.dtype
     result: type[Any]
-
-
-class Inputs(dict[str, Any]):
-    """A dict with keys as attributes, as backbones expect of a BatchFeature. For the inputs of the check."""
-
-    def __getattr__(self, name: str) -> Any:
-        try:
-            return self[name]
-        except KeyError:
-            raise AttributeError(name) from None
 
 
 class AcceleratedBackbone(StandIn[Backbone]):
@@ -93,7 +83,9 @@ class AcceleratedBackbone(StandIn[Backbone]):
             return kinds.result(data=backbones.results_of(module, vl_input, features))
 
     def __repr__(self) -> str:
-        return f"{type(self.module).__name__} {self._options}"
+        if self.is_restored:
+            return "<saccade.integrations.AcceleratedBackbone, restored>"
+        return f"<saccade.integrations.AcceleratedBackbone {type(self.module).__name__} {self._options}>"
 
     def _check(self, module: nn.Module) -> None:
         backbones.check(module, self)
@@ -174,7 +166,7 @@ def agree(module: nn.Module, backbone: Backbone, device: torch.device, rounded: 
     import torch
 
     given = backbones.check_inputs(module, backbone.config, device)
-    result = type(module).forward(module, Inputs(given))
+    result = type(module).forward(module, Features(given))
     theirs = result["backbone_features"]
     ours = run(module, backbone, given)
     expected = theirs.float().cpu()

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 #: Attributes of other objects that contain the module, or another such object.
 HOLDERS = ("model", "policy", "_groot_model", "action_head")
 
+#: Modules of transformers with functions that record hidden states.
+RECORDERS = ("transformers.utils.generic", "transformers.utils.output_capturing")
+
 
 def held_by(policy: object) -> nn.Module:
     """The torch module in `policy`: itself, or what an object contains.
@@ -67,9 +70,17 @@ def is_own(module: nn.Module, method: str) -> bool:
     """Whether the method is that of the class. Copies and transformers set it as an attribute."""
     replaced = vars(module).get(method)
     of_class = getattr(type(module), method)
-    return replaced is None or (
-        isinstance(replaced, MethodType) and replaced.__func__ is of_class and replaced.__self__ is module
-    )
+    is_bound = isinstance(replaced, MethodType) and replaced.__func__ is of_class
+    return replaced is None or records(replaced) or (is_bound and replaced.__self__ is module)
+
+
+def records(function: object) -> bool:
+    """Whether it is one of the functions with which transformers records hidden states.
+
+    Version 4.57 has them in the place of `forward` while a model runs, maybe in another thread. Version 5
+    leaves them as hooks.
+    """
+    return getattr(function, "__globals__", {}).get("__name__") in RECORDERS
 
 
 def in_code(module: nn.Module, noun: str) -> Iterator[str]:
@@ -133,7 +144,7 @@ def replaced_or_hooked(parts: list[tuple[str, nn.Module]], noun: str) -> Iterato
 def is_hooked(module: nn.Module) -> bool:
     """Whether a module has forward hooks, besides those with which transformers records hidden states."""
     hooks = (*module._forward_hooks.values(), *module._forward_pre_hooks.values())
-    return any(getattr(hook, "__module__", None) != "transformers.utils.output_capturing" for hook in hooks)
+    return not all(map(records, hooks))
 
 
 def plain(values: dict[str, Any], module: nn.Module) -> dict[str, Any]:

@@ -26,6 +26,16 @@ EXACT_TOLERANCE = 1e-2
 ROUNDED_TOLERANCE = 0.3
 
 
+class Features(dict[str, Any]):
+    """A dict with keys as attributes, as upstream expects of a BatchFeature. For the inputs of the check."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+
 class StandIn(ABC, Generic[Engine]):
     """Replaces one method of an instance of a torch module.
 
