@@ -50,10 +50,8 @@ def document(results: Results) -> str:
         for section, title in SECTIONS.items():
             rows = rows_of(results, policy, section)
             if rows:
-                parts += [
-                    f"### {POLICIES[policy]}: {title}".replace("### b", "### B"),
-                    *speeds(results, rows),
-                ]
+                name = POLICIES[policy]
+                parts += [f"### {name[0].upper()}{name[1:]}: {title}", *speeds(results, rows)]
     parts += memory(results)
     parts += left_out(results)
     return "\n\n".join(parts) + "\n"
@@ -120,10 +118,10 @@ def choices(results: Results) -> Iterator[str]:
     lines = []
     for policy in POLICIES:
         for section, title in SECTIONS.items():
-            ours = [row for row in rows_of(results, policy, section) if row["engine"] == "saccade"]
-            theirs = best(
-                results, [row for row in rows_of(results, policy, section) if row["engine"] == "torch"]
-            )
+            rows = rows_of(results, policy, section)
+            # Those with one copy of the weights: the others differ in memory, and in rate by chance.
+            ours = [row for row in rows if (row["engine"], row["sharing"]) == ("saccade", "fork")]
+            theirs = best(results, [row for row in rows if row["engine"] == "torch"])
             for use, fits in uses:
                 found = best(results, filter(fits, ours))
                 if found is None:

@@ -1,9 +1,10 @@
 """Independent pieces of work in several processes, of this machine or of a Ray cluster.
 
-`saccade rollout`, `demos` and `study` share it. `workers` says where pieces run and is the way in; `local`
-and `cluster` are the two kinds of processes; `files` brings checkpoints to other machines.
+`saccade rollout`, `demos` and `study` share it. `workers` says where pieces run, and `pieces` runs them;
+`local` and `cluster` are the two kinds of processes; `files` brings checkpoints to other machines.
 """
 
-from saccade.parallel.workers import ALONE, Lost, Workers, each
+from saccade.parallel.pieces import each
+from saccade.parallel.workers import ALONE, Lost, Workers
 
 __all__ = ["ALONE", "Lost", "Workers", "each"]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from saccade._arguments import Arguments
 from saccade.parallel.workers import Workers
 
 
-def add_arguments(parser: Arguments, pieces: str) -> None:
+def add_arguments(parser: argparse.ArgumentParser, pieces: str) -> None:
     """Declares where a command runs.
 
     Args:
