@@ -12,6 +12,7 @@ import pytest
 import torch
 import whole_integration_cases as cases
 import whole_policies
+from integration_cases import EXACT
 
 import saccade
 from saccade.integrations import accelerate, modules
@@ -116,14 +117,14 @@ def test_a_setting_that_changes_is_read(whole: cases.Whole) -> None:
         given["eagle_input_ids"][given["eagle_input_ids"] == whole_policies.IMAGE_TOKEN] = 9
         ours = cases.call(whole, given)
         assert handle.backbone is not before
-    cases.assert_same(ours, cases.call(whole, given), cases.EXACT)
+    cases.assert_same(ours, cases.call(whole, given), EXACT)
 
 
 def test_inference_mode(whole: cases.Whole) -> None:
     given = whole.observations()
     theirs = cases.call(whole, given)
     with torch.inference_mode(), accelerate(whole.model, backbone=True):
-        cases.assert_same(cases.call(whole, given), theirs, cases.EXACT)
+        cases.assert_same(cases.call(whole, given), theirs, EXACT)
 
 
 def test_a_policy_that_goes_takes_its_weights_along(whole: cases.Whole) -> None:

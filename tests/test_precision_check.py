@@ -60,9 +60,9 @@ def test_the_numbers_are_those_of_the_policy(layout: str, frames: Path) -> None:
     errors, largest = [], dict.fromkeys(one.actions.largest, 0.0)
     for index, moment in enumerate(moments):
         apart = {}
-        for key, one in (("theirs", reference), ("ours", policy)):
-            context = one.encode(moment.observation)
-            chunks = [one.sample(context, moment.observation, seed=3 + index, num_samples=NUM_SAMPLES)]
+        for key, loaded in (("theirs", reference), ("ours", policy)):
+            context = loaded.encode(moment.observation)
+            chunks = [loaded.sample(context, moment.observation, seed=3 + index, num_samples=NUM_SAMPLES)]
             apart[key] = (np.asarray(context.features[0].backbone_features[0]), chunks[0])
         theirs, ours = apart["theirs"], apart["ours"]
         errors += [np.linalg.norm(b - a) / np.linalg.norm(a) for a, b in zip(theirs[0], ours[0], strict=True)]
