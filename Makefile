@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
+DEMO_OUT ?= out/demo-policy
 
 PYTEST_ARGS ?=
 PEERS_VENV ?= .venv-peers
@@ -28,7 +29,7 @@ RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
-.PHONY: help bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients test-ray test-aarch64 test-aarch64-all fuzz setup-rollout setup-test clean
+.PHONY: help demo-policy pictures bench-peers setup-peers rollout test test-rust test-python lint format sanitize wheel test-wheel test-compat test-clients test-ray test-aarch64 test-aarch64-all fuzz setup-rollout setup-test clean
 
 help:
 	@echo "make rollout      run the bundled policy in simulation; table and videos in $(ROLLOUT_OUT)"
@@ -44,6 +45,8 @@ help:
 	@echo "make test-aarch64 run the Rust tests and some of Python's on an emulated 64-bit ARM CPU (Debian x86-64)"
 	@echo "make wheel        build manylinux wheels of the last commit in dist, for x86-64 and 64-bit ARM (WHEEL_TARGETS), and the lerobot plugin"
 	@echo "make test-wheel   test the wheels on CPythons, NumPys and emulated CPUs; writes docs/wheels.md"
+	@echo "make demo-policy  record demonstrations and train the bundled policy anew, in $(DEMO_OUT)"
+	@echo "make pictures     draw the pictures of the README anew"
 	@echo "make clean        remove the virtual environments and build outputs"
 
 rollout: setup-rollout
@@ -73,6 +76,30 @@ lint: setup-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/stubtest saccade._saccade
+
+# The bundled policy anew: about an hour and a half of one core. Each part resumes where it was stopped. The second
+# training has more demonstrations of the tasks that the first one did worst.
+demo-policy: setup-test
+	@$(MAKE) $(DEMO_OUT)/first.done
+	$(BIN)/saccade demos --out $(DEMO_OUT)/demos --tasks push --episodes 300
+	$(BIN)/saccade demos --out $(DEMO_OUT)/demos --tasks window-open --episodes 200
+	$(BIN)/saccade train --demos $(DEMO_OUT)/demos --start-from $(DEMO_OUT)/first --training-steps 4000 \
+		--learning-rate 3e-4 --seed 1 --out $(DEMO_OUT)/policy
+	$(BIN)/saccade rollout --checkpoint $(DEMO_OUT)/policy --episodes 20 --seed 1000 --out $(DEMO_OUT)/check
+
+# A stamp, because the demonstrations that follow would make the finished training look like another one.
+$(DEMO_OUT)/first.done:
+	$(BIN)/saccade demos --out $(DEMO_OUT)/demos
+	$(BIN)/saccade train --demos $(DEMO_OUT)/demos --out $(DEMO_OUT)/first
+	@touch $@
+
+# The pictures of README and docs/attention.md, from the bundled policy.
+pictures: setup-rollout
+	$(BIN)/saccade rollout --episodes 1 --seed 2 --video --out $(DEMO_OUT)/gif
+	$(BIN)/python docs/make_pictures.py gif $(patsubst %,$(DEMO_OUT)/gif/videos/%-2.mp4,reach push drawer-open button-press-topdown window-open)
+	$(BIN)/saccade attention --task push --seed 3 --out $(DEMO_OUT)/look
+	$(BIN)/python docs/make_pictures.py map $(DEMO_OUT)/look/sheet.png
+	cp $(DEMO_OUT)/look/sheet.png docs/images/attention.png
 
 # Other engines, in a separate environment. PEERS_ARGS=--help lists the options.
 bench-peers: setup-peers
