@@ -388,11 +388,11 @@ def test_software_tiles_can_be_measured(
 
 
 def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -> None:
-    """Its T_vl is what its backbone gives: three cameras of sixteen patches, eight words, a register."""
+    """Its T_vl is that of a prompt with its three cameras, 23 tokens each."""
     assert main(["bench", "--precisions", "float32", "--rounds", "1", "--profile"]) == 0
     text = capsys.readouterr().out
     assert "the bundled policy" in text
-    assert "T_vl 57, N 32, 4 steps, 1 samples, future_refresh 1" in text
+    assert "T_vl 93, N 32, 4 steps, 1 samples, future_refresh 1" in text
     assert "float32 sample, by part" in text
     assert "feed_forward_out" in text
 

@@ -204,7 +204,9 @@ sys.exit(main(sys.argv[1:]))
 def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path) -> None:
     arguments = {
         "act": ["checkpoint"],
+        "attention --frames": ["frames"],
         "demos": ["--out", "out"],
+        "inspect --precision-check": ["frames", "checkpoint"],
         "serve": ["checkpoint"],
         "train": ["--demos", str(tmp_path), "--out", "out"],
     }

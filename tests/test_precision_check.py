@@ -116,7 +116,7 @@ def test_the_command(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--instruction", "open it", "--embodiment", EMBODIMENT, "--num-threads", "1"]
     assert cli.main([*command, *options]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "2 moments, 4 chunks each" in printed
+    assert "2 moments, 4 chunks of each" in printed
     assert "recommended: " in printed
     assert all(name in printed for name in (*PRECISIONS, "other noise"))
     assert cli.main([*command, *options, "--json"]) == 0

@@ -172,7 +172,9 @@ def contenders(
         ours: dict[str, Connection] = {}
         for first, together in members.items():
             ours[first], theirs = spawn.Pipe()
-            process = spawn.Process(target=worker, args=(theirs, together, case, work_folder), daemon=True)
+            process = spawn.Process(
+                target=worker, name=first, args=(theirs, together, case, work_folder), daemon=True
+            )
             with environment_of(first, case, work_folder):
                 process.start()
             theirs.close()

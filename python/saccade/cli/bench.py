@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.resources
-import json
 import statistics
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,6 +13,8 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import saccade
 from saccade import _arguments as arguments
@@ -57,6 +58,8 @@ VARIED: dict[str, tuple[int, ...]] = {
     "future_refresh": (1, 2, 4),
 }
 DEFAULT_VL_TOKENS = 296  # one camera view of N1.5
+INSTRUCTION = "open the drawer"  # of the prompt whose tokens are counted
+FRAME_SIZE = 224  # of cameras whose size the checkpoint does not say
 
 note = partial(_output.note, "bench")
 
@@ -80,7 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     arguments.add_num_threads(parser)
     arguments.add_num_vl_tokens(
-        parser, None, f"vision-language tokens (default: the bundled policy's, else {DEFAULT_VL_TOKENS})"
+        parser,
+        None,
+        f"vision-language tokens (default: those of a prompt, else {DEFAULT_VL_TOKENS})",
     )
     arguments.add_num_steps(parser)
     arguments.add_integer(parser, "--num-samples", default=1, help="chunks per observation")
@@ -199,13 +204,22 @@ def head_source(args: argparse.Namespace) -> Iterator[tuple[Path, str]]:
 
 
 def default_vl_tokens(source: Path) -> int:
-    """T_vl of the backbone in the same config, if it has one."""
-    try:
-        backbone = json.loads((source / "config.json").read_text())["backbone_cfg"]
-        patches = (backbone["image_size"] // backbone["patch_size"]) ** 2
-        return int(backbone["num_cameras"] * patches + backbone["text_length"] + 1)  # the register
-    except (OSError, KeyError, TypeError, ValueError):
+    """T_vl of a prompt with a frame of each camera, if the checkpoint is whole and of one robot."""
+    from saccade.checkpoints.whole import robots_of
+    from saccade.errors import SaccadeError
+    from saccade.processor import Processor
+
+    robots = robots_of(source, state_history=1) if source.is_dir() else []
+    needs = robots[0].needs if len(robots) == 1 else None
+    cameras = None if needs is None else needs.cameras
+    if cameras is None:
         return DEFAULT_VL_TOKENS
+    sizes = [(camera.height or FRAME_SIZE, camera.width or FRAME_SIZE) for camera in cameras]
+    try:
+        inputs = Processor.load(source)([np.zeros((*size, 3), np.uint8) for size in sizes], INSTRUCTION)
+    except (SaccadeError, FileNotFoundError):
+        return DEFAULT_VL_TOKENS
+    return int(inputs.input_ids.shape[1])
 
 
 def options(call: Call) -> dict[str, int | None]:
