@@ -58,7 +58,7 @@ class TrainingSettings:
     vl_num_layers: int = 1
     num_future_tokens: int = 32
     horizon: int = 16
-    execute_steps: int = 8
+    execute_steps: int = 4
     num_steps: int = 4
     patch_size: int = 16
 
