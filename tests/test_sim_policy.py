@@ -156,7 +156,7 @@ def test_episodes_take_interventions_fixed_and_by_chunk(demo: Policy) -> None:
                 intervention=intervention,
                 on_step=lambda seen, episode: hands.append(seen.privileged_state()[:4]),
             )
-        assert episode.chunks == len(policy.given) == 3
+        assert episode.chunks == len(policy.given) == 5
         return policy.given, hands
 
     given, hands = drive(None)

@@ -140,6 +140,29 @@ def test_actions_are_those_of_act(release: str, served: Served, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("release", [release for release in RELEASES if release not in PICKLES])
+def test_the_bundled_policy_drives_its_robot(release: str) -> None:
+    """Through the server, by a client as released: the same episodes, bit for bit, as in process."""
+    demo = Path(saccade.__file__).parent / "sim" / "demo"
+    serve = [sys.executable, "-m", "saccade", "serve", str(demo), "--port", "0", "--log", "json"]
+    with subprocess.Popen([*serve, "--seed", str(SEED)], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        port = json.loads(server.stdout.readline())["address"].rpartition(":")[2]
+        program = Path(__file__).with_name("groot_episode.py")
+        done = subprocess.run(
+            [sys.executable, str(program), release, port, str(SEED)],
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            env=os.environ | {"PYTHONPATH": str(SOURCES / release)},
+        )
+        server.send_signal(signal.SIGTERM)
+    remote, local = json.loads(done.stdout.splitlines()[-1])
+    assert remote == local
+    assert [success for _, success, _ in remote] == [True, True]
+
+
+@pytest.mark.parametrize("release", [release for release in RELEASES if release not in PICKLES])
 def test_modality_configs_and_errors(release: str, served: Served, tmp_path: Path) -> None:
     found, given = served.result(release, tmp_path), served.observations()
     configs = found["modality"]
