@@ -6,6 +6,7 @@ VENV ?= .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 DEMO_OUT ?= out/demo-policy
+PICTURES_OUT ?= out/pictures
 
 PYTEST_ARGS ?=
 PEERS_VENV ?= .venv-peers
@@ -95,11 +96,11 @@ $(DEMO_OUT)/first.done:
 
 # The pictures of README and docs/attention.md, from the bundled policy.
 pictures: setup-rollout
-	$(BIN)/saccade rollout --episodes 1 --seed 2 --video --out $(DEMO_OUT)/gif
-	$(BIN)/python docs/make_pictures.py gif $(patsubst %,$(DEMO_OUT)/gif/videos/%-2.mp4,reach push drawer-open button-press-topdown window-open)
-	$(BIN)/saccade attention --task push --seed 3 --out $(DEMO_OUT)/look
-	$(BIN)/python docs/make_pictures.py map $(DEMO_OUT)/look/sheet.png
-	cp $(DEMO_OUT)/look/sheet.png docs/images/attention.png
+	$(BIN)/saccade rollout --episodes 1 --seed 2 --video --out $(PICTURES_OUT)/gif
+	$(BIN)/python docs/make_pictures.py gif $(patsubst %,$(PICTURES_OUT)/gif/videos/%-2.mp4,reach push drawer-open button-press-topdown window-open)
+	$(BIN)/saccade attention --task push --seed 3 --out $(PICTURES_OUT)/look
+	$(BIN)/python docs/make_pictures.py map $(PICTURES_OUT)/look/sheet.png
+	cp $(PICTURES_OUT)/look/sheet.png docs/images/attention.png
 
 # Other engines, in a separate environment. PEERS_ARGS=--help lists the options.
 bench-peers: setup-peers

@@ -146,7 +146,7 @@ def checkpoint(name: str, args: argparse.Namespace) -> Path:
 
         return DEMO_CHECKPOINT
     folder: Path = args.checkpoint or args.work / ("n15-small" if args.small else "n15")
-    if not (folder / "config.json").is_file():
+    if args.checkpoint is None and not (folder / "config.json").is_file():
         random_checkpoint.write(
             folder,
             backbone=random_checkpoint.small_backbone("n1.5") if args.small else None,

@@ -279,7 +279,7 @@ def small(args: argparse.Namespace, before: Report) -> Report:
     source = checkpoint(policy_config(), args.work / "policy")
     names = list(args.contenders or SMALL)
     for threads in sorted({1, args.threads}):
-        case = Case("head", threads, num_vl_tokens=57)
+        case = Case("head", threads, num_vl_tokens=98)
         seconds: dict[str, dict[str, list[float]]] = {name: {"sample": [], "both": []} for name in names}
         with Contenders(names, case, source, args.work) as contenders:
             for turn in range(args.rounds):
@@ -294,7 +294,7 @@ def small(args: argparse.Namespace, before: Report) -> Report:
 
 def small_table(report: Report) -> list[str]:
     """Times of a chunk, and their ratio to the first contender's."""
-    lines = ["The bundled policy's sizes: width 128, 4 blocks, T_vl 57, 4 Euler steps.", ""]
+    lines = ["The bundled policy's sizes: width 128, 4 blocks, T_vl 98, 4 Euler steps.", ""]
     lines += ["| contender | threads | sample, ms | encode and sample, ms | sample / saccade's |"]
     lines += ["|---|---|---|---|---|"]
     for run in report["runs"]:

@@ -32,6 +32,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,6 +45,8 @@ import saccade
 from saccade.checkpoints import random_checkpoint
 
 Actions = dict[str, Any]
+
+DEFAULT_CHECKPOINT = Path("out/control-loop/n15")
 
 
 class Robot:
@@ -101,6 +104,7 @@ class Thinker(threading.Thread):
         self.tick = -1  # the last one that was sent
         self.looking: list[float] = []
         self.sampling: list[float] = []
+        self._error: BaseException | None = None
         # The first chunk is there before the robot moves. The second tells how long one takes.
         self.plan = self._think(None)
         self.plan = self._think(None)
@@ -126,7 +130,8 @@ class Thinker(threading.Thread):
         self._recent.append(done - seen)
         self.looking.append(looked - seen)
         self.sampling.append(done - looked)
-        return Plan(chunk, tick, seen)
+        # Without an overlap the robot has stood still since the frames, so it begins with the first action.
+        return Plan(chunk, tick if options or last is None else self.tick + 1, seen)
 
     @property
     def delay(self) -> int:
@@ -135,14 +140,29 @@ class Thinker(threading.Thread):
 
     def run(self) -> None:
         """Runs until `stop`."""
-        self.plan = Plan(self.plan.chunk, 0, time.perf_counter())  # the robot has not moved since
-        while not self._stop_asked.is_set():
-            self.plan = self._think(self.plan)  # one reference: no lock is needed
+        self.plan = Plan(self.plan.chunk, 0, self.plan.seen)  # the robot has not moved since
+        try:
+            while not self._stop_asked.is_set():
+                self.plan = self._think(self.plan)  # one reference: no lock is needed
+        except BaseException as error:
+            self._error = error
+            self._stop_asked.set()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether there will be no more chunks: `stop` was called, or an error ended the thread."""
+        return self._stop_asked.is_set()
+
+    def ask_to_stop(self) -> None:
+        """No more chunks after the current one."""
+        self._stop_asked.set()
 
     def stop(self) -> None:
-        """Ends the thread after its current chunk."""
-        self._stop_asked.set()
+        """Ends the thread after its current chunk; raises what ended it before, if anything did."""
+        self.ask_to_stop()
         self.join()
+        if self._error is not None:
+            raise self._error
 
 
 @dataclass
@@ -159,7 +179,7 @@ def control(thinker: Thinker, robot: Robot, rate: float, seconds: float) -> Reco
     """The control loop: `rate` ticks a second."""
     record, period = Record(), 1 / rate
     start, tick = time.perf_counter(), 0
-    while tick < seconds * rate:
+    while tick < seconds * rate and not thinker.is_stopping:
         # Due times are absolute, so a late tick does not delay the next one.
         due = start + tick * period
         time.sleep(max(0.0, due - time.perf_counter()))
@@ -220,18 +240,17 @@ def run(policy: saccade.Policy, args: argparse.Namespace, busy: int) -> str:
         thinker.sampling.clear()
         thinker.start()
         try:
-            found: list[Any] = []
             # A thread of its own: what is started later would inherit a real-time priority.
-            loop = threading.Thread(
-                target=lambda: found.extend(
-                    (prefer_this_thread(), control(thinker, robot, args.rate, args.seconds))
+            with ThreadPoolExecutor(1) as executor:
+                loop = executor.submit(
+                    lambda: (prefer_this_thread(), control(thinker, robot, args.rate, args.seconds))
                 )
-            )
-            loop.start()
-            loop.join()
+                try:
+                    priority, record = loop.result()
+                finally:
+                    thinker.ask_to_stop()  # the robot too: Ctrl-C ends both
         finally:
             thinker.stop()
-    priority, record = found
     title = "quiet" if busy == 0 else f"{busy} busy processes"
     print(
         f"\n{title}, {priority}: {len(record.late)} ticks of {1e3 / args.rate:g} ms in {args.seconds:g} s, "
@@ -258,19 +277,19 @@ def quantiles(seconds: list[float]) -> str:
 
 def load(args: argparse.Namespace, stack: ExitStack) -> saccade.Policy:
     """The policy; a random checkpoint is written where there is none."""
-    folder: Path = args.checkpoint
+    source: str | Path = args.checkpoint or DEFAULT_CHECKPOINT
     if args.small:
         name = stack.enter_context(tempfile.TemporaryDirectory(prefix="saccade-control-loop-"))
-        folder = random_checkpoint.write(
+        source = random_checkpoint.write(
             Path(name) / "small",
             backbone=random_checkpoint.small_backbone("n1.5"),
             head=random_checkpoint.small_head("n1.5"),
         )
-    elif not folder.exists():
-        print(f"writing a random checkpoint of N1.5's size to {folder}, 4.8 GB", file=sys.stderr)
-        random_checkpoint.write(folder)
+    elif args.checkpoint is None and not DEFAULT_CHECKPOINT.exists():
+        print(f"writing a random checkpoint of N1.5's size to {source}, 4.8 GB", file=sys.stderr)
+        random_checkpoint.write(DEFAULT_CHECKPOINT)
     return saccade.Policy.load(
-        folder, precision=args.precision, num_threads=args.num_threads, cameras=args.cameras
+        source, precision=args.precision, num_threads=args.num_threads, cameras=args.cameras
     )
 
 
@@ -281,9 +300,7 @@ def main() -> None:
     )
     parser.add_argument(
         "--checkpoint",
-        type=Path,
-        default=Path("out/control-loop/n15"),
-        help="a whole checkpoint (default out/control-loop/n15, random and written if it is not there)",
+        help=f"a whole checkpoint (default: a random one, {DEFAULT_CHECKPOINT}, written if it is not there)",
     )
     parser.add_argument("--small", action="store_true", help="a small random checkpoint, for a quick trial")
     parser.add_argument("--cameras", nargs="+", help="which of its cameras (default: all)")

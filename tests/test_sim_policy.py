@@ -92,6 +92,19 @@ def test_both_engines_agree_along_a_trajectory(demo: Policy) -> None:
                 environment.advance(action)
 
 
+def test_a_batch_of_prompts_of_different_lengths_is_each_alone(demo: Policy) -> None:
+    """Also in torch, where the shorter prompt's padding must be removed."""
+    noise = np.random.default_rng(4).standard_normal((2, 16, 4), dtype=np.float32)
+    texts = ("open the drawer", "please press the button on the box")
+    for policy in (demo, Policy.load(engine="torch", num_threads=1)):
+        given = [policy.observation(seen(policy, fill=60, instruction=text)) for text in texts]
+        together = policy.whole.act(given, noise=noise)
+        for one, answer, own in zip(given, together, noise, strict=True):
+            alone = policy.whole.act(one, noise=own[None])
+            for name, part in alone.items():
+                np.testing.assert_allclose(answer[name], part, atol=1e-5)
+
+
 INTERVENTIONS: dict[str, Interventions] = {
     "cut": Intervention(cut=[("action", "future"), ("state", "future")]),
     "bias": Intervention(key_bias={("vl", range(30)): -1.5, ("future", (0, 3)): 2.0}, heads=[1, 2]),

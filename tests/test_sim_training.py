@@ -249,6 +249,19 @@ def test_patches_that_cannot_be_halved_are_refused(size: int) -> None:
         TrainingSettings(patch_size=size)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"width": 12}, "width: given 12, expected a multiple of 8"),
+        ({"num_heads": 3, "width": 96}, "num_heads: given 3, expected 1 or an even number"),
+        ({"vision_width": 100}, "vision_width: given 100, expected a multiple of vision_heads 3"),
+    ],
+)
+def test_sizes_that_cannot_be_loaded_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TrainingSettings(**wrong)
+
+
 @pytest.mark.parametrize(("size", "patch", "view"), [(68, 16, 64), (64, 16, 64), (64, 8, 64), (16, 32, 32)])
 def test_the_tower_sees_whole_patches(size: int, patch: int, view: int) -> None:
     """Preprocessing crops to 95 % and resizes to the nearest size that patches divide."""

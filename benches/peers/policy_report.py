@@ -145,10 +145,11 @@ def section(results: Results, case: Case) -> list[str]:
     for work in case.works:
         head += [f"{work}: median (quartiles)", "against lerobot"]
     failed = {
-        CONTENDERS[name].label: entry["failed"]
+        CONTENDERS[name].label: entry[how]
         for record in results.records(case)
         for name, entry in record["contenders"].items()
-        if "failed" in entry and results.rounds(case, name) == 1 << 30
+        for how in ("failed", "killed")
+        if how in entry and name not in results.names(case)
     }
     said = [f"- {label} could not run: {reason}" for label, reason in failed.items()]
     return [f"## {plural(case.threads).capitalize()}", table([*head, "error"], rows), "\n".join(said)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -106,7 +107,7 @@ def read_frames(
             )
             read(given, policy.requirements)
         except SaccadeError as error:
-            if str(error).startswith(str(folder)):
+            if str(error).startswith((f"{folder}{os.sep}", f"{folder}:")):
                 raise
             raise type(error)(f"{folder}: {error}") from None
         parts = folder.relative_to(directory).parts

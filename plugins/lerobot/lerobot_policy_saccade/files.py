@@ -2,12 +2,14 @@
 
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import snapshot_download
 from huggingface_hub.errors import HfHubHTTPError
 
+from saccade.errors import InputError
 from saccade.hub import PUBLISHED, resolve
 
 #: The folder of the checkpoint. It has a `config.json` of its own, as lerobot's policies do.
@@ -55,6 +57,7 @@ def copy_checkpoint(source: str, folder: Path) -> None:
         folder: The policy's directory.
 
     Raises:
+        InputError: ``folder`` is the checkpoint itself.
         OSError: The files cannot be copied; ``folder`` is then as before.
     """
     found = resolve(source)
@@ -62,12 +65,29 @@ def copy_checkpoint(source: str, folder: Path) -> None:
     target = folder / CHECKPOINT
     if target.is_dir() and target.samefile(found):
         return
+    if folder.samefile(found):
+        raise InputError(f"save_directory: expected another directory than the checkpoint's, got {folder}")
     with tempfile.TemporaryDirectory(dir=folder, prefix=f".{CHECKPOINT}-") as temporary:
         copied, replaced = Path(temporary, "new"), Path(temporary, "old")
-        for file in sorted({file for pattern in FILES for file in found.rglob(pattern)}):
+        for file in sorted(set(_files_of(found))):
             to = copied / file.relative_to(found)
             to.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, to)
         if target.exists():
             target.rename(replaced)
-        copied.rename(target)
+        try:
+            copied.rename(target)
+        except BaseException:
+            if replaced.exists():
+                replaced.rename(target)
+            raise
+
+
+def _files_of(checkpoint: Path) -> Iterator[Path]:
+    """The files of a checkpoint, without the intermediate ones that a training left in folders below it."""
+    yield from checkpoint.glob("*.safetensors")
+    for pattern in FILES:
+        if pattern != "*.safetensors":
+            for file in checkpoint.rglob(pattern):
+                if not any(part.startswith("checkpoint-") for part in file.relative_to(checkpoint).parts):
+                    yield file

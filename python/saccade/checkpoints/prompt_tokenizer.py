@@ -10,6 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
+from saccade.errors import InputError
+
 #: Words as byte-level BPE spells them ("Ġ" is a space), and their published ids.
 WORDS = {
     "Ġa": 264,
@@ -114,7 +116,12 @@ def tokenizer(*, published_ids: bool, words: Sequence[str] = ()) -> dict[str, An
             have no gaps; without `words` there are fewer than 512.
         words: words that are one token each, at the beginning of a text and after a space, in addition to
             `WORDS`. Only without published ids.
+
+    Raises:
+        InputError: `words` are given with published ids.
     """
+    if published_ids and words:
+        raise InputError("words: expected none with published_ids, which have no place for them")
     known = [word for spelled in words for word in (f"Ġ{spelled}", spelled)]
     known = list(dict.fromkeys((*WORDS, *known)))
     merges, parts = _merges(known)

@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_num_vl_tokens(
         parser,
         None,
-        f"vision-language tokens (default: those of a prompt, else {DEFAULT_VL_TOKENS})",
+        f"vision-language tokens (default: a prompt's, else {DEFAULT_VL_TOKENS})",
     )
     arguments.add_num_steps(parser)
     arguments.add_integer(parser, "--num-samples", default=1, help="chunks per observation")

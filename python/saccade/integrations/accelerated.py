@@ -281,12 +281,13 @@ class Accelerated(StandIn[ActionHead]):
         device = features.device.type
         autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
         key = (features.dtype, state.dtype, device, autocast)
-        if key not in self._kinds:
+        kinds = self._kinds  # another thread may replace it when weights change
+        if key not in kinds:
             reduced = bool(autocast) or features.dtype != torch.float32
             rounded = reduced or self._options["precision"] != "float32"
             inputs = check_inputs(module, head, features, state)
-            self._kinds[key] = agree(module, head, inputs, rounded)
-        return self._kinds[key]
+            kinds[key] = agree(module, head, inputs, rounded)
+        return kinds[key]
 
     def _chunk(
         self, action_input: Any, options: Mapping[str, Any] | None, dtype: torch.dtype

@@ -120,11 +120,12 @@ class AcceleratedBackbone(StandIn[Backbone]):
 
         to = torch.is_autocast_enabled(device.type) and torch.get_autocast_dtype(device.type)
         key = (device.type, to)
-        if key not in self._kinds:
+        kinds = self._kinds  # another thread may replace it when weights change
+        if key not in kinds:
             reduced = bool(to) or any(p.dtype != torch.float32 for p in module.parameters())
             rounded = reduced or backbone.precision != "float32"
-            self._kinds[key] = agree(module, backbone, device, rounded)
-        return self._kinds[key]
+            kinds[key] = agree(module, backbone, device, rounded)
+        return kinds[key]
 
 
 @contextlib.contextmanager

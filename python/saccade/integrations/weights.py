@@ -1,4 +1,4 @@
-"""Detects changes of a head's weights."""
+"""Detects changes of a module's weights."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from saccade.observation import Observation
 from saccade.policy import Policy
 from saccade.policy_context import PolicyContext
 
-MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the head
+MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the policy
 NOISES = 8  # draws that `other_noise` is computed from
 
 

@@ -76,7 +76,8 @@ def each(
                 yield running.pop(done), result_of(ray, done)
         finally:
             for reference in running:
-                ray.cancel(reference)
+                with contextlib.suppress(Exception):  # of a cluster that is gone, which another error says
+                    ray.cancel(reference)
 
 
 def run_piece(job: list[Any], piece: Any) -> Any:
@@ -118,6 +119,7 @@ def connected(address: str | None) -> Iterator[ModuleType]:
     if ray.is_initialized():
         yield ray
         return
+    address = address or os.environ.get("RAY_ADDRESS")
     try:
         check_reachable(address)
         # What processes print would run through the progress bar.

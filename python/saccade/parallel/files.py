@@ -66,7 +66,8 @@ def pack(path: Path, put: Callable[[UInt8Array], Any]) -> Shipment:
             digest.update(piece.data)
             pieces.append(put(piece))
         files[name] = tuple(pieces)
-    return Shipment(path.resolve().name, digest.hexdigest(), files)
+    # A link to a file keeps its own name, as its key does.
+    return Shipment(path.resolve().name if path.is_dir() else path.name, digest.hexdigest(), files)
 
 
 def place(shipment: Shipment, get: Callable[[Any], UInt8Array]) -> Path:
@@ -85,14 +86,20 @@ def place(shipment: Shipment, get: Callable[[Any], UInt8Array]) -> Path:
     cache = cache_directory()
     folder = cache / shipment.sha256
     found = folder / shipment.name
-    if found.exists():
+
+    def is_complete() -> bool:
+        """Whether no cleaner of temporary files took some of them away."""
+        return all((folder / name).is_file() for name in shipment.files)
+
+    if is_complete():
         return found
     with (cache / f"{shipment.sha256}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed, by a killed process too
-        if not found.exists():
+        if not is_complete():
             temporary = cache / f"{shipment.sha256}.part"
             shutil.rmtree(temporary, ignore_errors=True)
             _unpack(shipment, get, temporary)
+            shutil.rmtree(folder, ignore_errors=True)
             temporary.rename(folder)
     return found
 

@@ -39,8 +39,8 @@ class Episodes:
 
     Attributes:
         checkpoint: Directory of the policy.
-        engine: What computes the head, `"rust"` or `"torch"`.
-        num_threads: Threads of the head; None for its default.
+        engine: What computes backbone and head, `"rust"` or `"torch"`.
+        num_threads: Threads of the policy; None for its default.
         instruction_from: A task whose instruction the policy gets instead.
         video: Whether a video is made of each episode.
     """

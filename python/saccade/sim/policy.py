@@ -121,9 +121,11 @@ class Policy:
             if not (directory / name).is_file():
                 raise FileNotFoundError(f"{directory / name}: no such file")
         whole = load_whole(directory, engine, num_threads)
-        found = {group.key: group.size for group in whole.normalizer.state_groups}
-        if found != GROUPS:
-            raise CheckpointError(f"{directory}: expected a state of {GROUPS}, got {found}")
+        normalizer = whole.normalizer
+        for kind, groups in (("state", normalizer.state_groups), ("action", normalizer.action_groups)):
+            found = {group.key: group.size for group in groups}
+            if found != GROUPS:
+                raise CheckpointError(f"{directory}: {kind}: expected the groups {GROUPS}, got {found}")
         return cls(whole, config, directory, engine)
 
     @property

@@ -76,6 +76,8 @@ class SimulationConfig:
         except (TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: {error}") from None
         problems = []
+        if not config.tasks:
+            problems.append("tasks: expected at least one")
         if not config.cameras:
             problems.append("cameras: expected at least one")
         if config.image_size < 8:

@@ -25,9 +25,10 @@ from saccade.robots import Normalizer
 
 @dataclass(frozen=True)
 class TorchContext:
-    """What the head encoded: its vision-language tokens, `(batch, T_vl, context_dim)`."""
+    """What the head encoded: its tokens `(batch, T_vl, context_dim)`, and which of them are removed."""
 
     vl_embs: torch.Tensor
+    drop_vl: np.ndarray | None
 
     @property
     def batch(self) -> int:
@@ -70,14 +71,17 @@ class TorchHead:
         image_mask: ArrayLike | None = None,
         drop_vl: ArrayLike | None = None,
     ) -> Any:
-        """See `saccade.ActionHead.encode`. Masks change nothing in N1.5, and are not read."""
+        """See `saccade.ActionHead.encode`. The other masks change nothing in N1.5, and are not read."""
+        removed = None if drop_vl is None else np.asarray(drop_vl)
         with torch.no_grad():
-            return TorchContext(self._head.encode(np.asarray(backbone_features)))
+            return TorchContext(self._head.encode(np.asarray(backbone_features), drop_vl=removed), removed)
 
     def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
         """See `saccade.ActionHead.sample`; `noise` is required."""
         with torch.no_grad():
-            found = self._head.sample(context.vl_embs, np.asarray(state), embodiment_id, **options)
+            found = self._head.sample(
+                context.vl_embs, np.asarray(state), embodiment_id, drop_vl=context.drop_vl, **options
+            )
         return np.asarray(found.numpy())
 
 

@@ -1,10 +1,11 @@
 """Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
 
-A run is a directory with `training.pt` (all that is needed to continue), `config.json` and
-`model.safetensors` (the policy so far), `settings.json` (settings and demonstrations), `history.json` and
-`loss.png`. They are written about once a minute, each under a temporary name that is then renamed, so that a
-run can be interrupted at any time and continued. Every step draws its samples and noise from the seed and the
-number of the step, so that a continued run gives the same weights as an uninterrupted one.
+A run is a directory with `training.pt` (all that is needed to continue), the policy so far (`config.json`,
+`model.safetensors`, `tokenizer.json`, `experiment_cfg/metadata.json`), `settings.json` (settings and
+demonstrations), `history.json` and `loss.png`. They are written about once a minute, each under a temporary
+name that is then renamed, so that a run can be interrupted at any time and continued. Every step draws its
+samples and noise from the seed and the number of the step, so that a continued run gives the same weights as
+an uninterrupted one.
 """
 
 # Calls of torch modules are untyped.

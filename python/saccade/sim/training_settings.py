@@ -63,6 +63,18 @@ class TrainingSettings:
     patch_size: int = 16
 
     def __post_init__(self) -> None:
+        if self.width % (2 * self.num_heads):
+            raise InputError(
+                f"width: given {self.width}, expected a multiple of {2 * self.num_heads}, an even number for "
+                f"each of num_heads {self.num_heads}"
+            )
+        if self.num_heads > 1 and self.num_heads % 2:
+            raise InputError(f"num_heads: given {self.num_heads}, expected 1 or an even number")
+        if self.vision_width % self.vision_heads:
+            raise InputError(
+                f"vision_width: given {self.vision_width}, expected a multiple of vision_heads "
+                f"{self.vision_heads}"
+            )
         if self.patch_size < 2 or self.patch_size % 2:
             raise InputError(f"patch_size: given {self.patch_size}, expected an even number, at least 2")
         if not 0 <= self.alignment_weight < math.inf:

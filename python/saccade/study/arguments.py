@@ -95,7 +95,7 @@ def moments_of(args: argparse.Namespace) -> Moments:
         preprocessing=args.preprocessing,
         tokenizer=None if args.tokenizer is None else str(args.tokenizer),
         seed=args.seed,
-        num_threads=None if args.jobs == 1 else 1,
+        num_threads=None if workers_of(args).alone else 1,
     )
     _ = found.all
     return found

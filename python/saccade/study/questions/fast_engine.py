@@ -52,8 +52,10 @@ class ModeHead:
         """See `Head`."""
         return self._head.num_threads
 
-    def encode(self, backbone_features: ArrayLike, **masks: Any) -> Context:
-        """See `Head`. The masks change nothing in N1.5, and are not read."""
+    def encode(self, backbone_features: ArrayLike, *, drop_vl: Any = None, **masks: Any) -> Context:
+        """See `Head`. The other masks change nothing in N1.5, and are not read."""
+        if drop_vl is not None:
+            raise InputError("drop_vl: given a mask, expected None: a mode runs one observation at a time")
         features = np.asarray(backbone_features)
         return encode(
             self._head, self._mode, self._calibration, given(features, np.empty((1, 0), np.float32))

@@ -2,7 +2,7 @@
 
 Episodes of the policy in closed loop are traced. From the rows after each block, ridge regressions are fitted
 to what the simulator knows (positions of object, goal and hand, opening of the gripper), judged on episodes
-that they were not fitted to, and compared with probes of the tokens that the head reads.
+that they were not fitted to, and compared with probes of the image tokens that the head reads.
 """
 
 from __future__ import annotations
