@@ -49,6 +49,8 @@ from saccade.study.statistics import Estimate, bootstrap, paired_difference, sca
 
 Float32Array = NDArray[np.float32]
 ARMS = ("plain", "chunked")
+#: Control ticks between two observations.
+EVERY = 8
 #: No training, model selection or other experiment used seeds from here on.
 FIRST_SEED = 10_000
 #: The figure shows the first episode of this task, up to this tick.
@@ -138,7 +140,7 @@ def drive(
 ) -> Drive:
     """Runs an episode. The first chunk is available at the start; all others arrive late."""
     task = environment.task
-    every, horizon = thinker.policy.config.execute_steps, thinker.policy.horizon
+    every, horizon = EVERY, thinker.policy.horizon
     # The overlap is what remains of the last chunk at the next observation; its first `delay` actions will be
     # executed.
     chunking = saccade.Chunking(overlap=horizon - every, frozen=delay) if arm == "chunked" else None
@@ -315,7 +317,7 @@ def draw(results: Results, examples: Sequence[Drive], path: Path) -> None:
 def run(args: argparse.Namespace, seeds: range) -> None:
     """Runs the episodes that are not in the result file yet."""
     thinker = Thinker()
-    most = thinker.policy.horizon - thinker.policy.config.execute_steps
+    most = thinker.policy.horizon - EVERY
     if not all(0 <= delay <= most for delay in args.delays):
         raise InputError(f"--delays: expected 0 to {most}, the length of the overlap; got {args.delays}")
     file = writable_directory(args.out) / "results.json"

@@ -222,7 +222,7 @@ def connect(port: int, data: bytes = b"") -> socket.socket:
     return made
 
 
-def wait_until(condition: Any, seconds: float = 10.0) -> None:
+def wait_until(condition: Any, seconds: float = 60.0) -> None:
     """Waits until a condition holds.
 
     Raises:

@@ -104,7 +104,7 @@ def test_commands_on_pages_exist(page: Path) -> None:
     targets = set(re.findall(r"^([\w-]+):(?!=)", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for block in code_blocks(page, "bash"):
         for arguments in command_lines(block, "make"):
-            assert set(arguments) <= targets
+            assert {word for word in arguments if "=" not in word} <= targets  # variables aside
         for arguments in command_lines(block, "saccade"):
             assert_parses(arguments)
 

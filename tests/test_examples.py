@@ -89,7 +89,7 @@ def test_the_control_loop_holds_where_a_chunk_ends(monkeypatch: pytest.MonkeyPat
     monkeypatch.syspath_prepend(EXAMPLES)
     loop = importlib.import_module("control_loop")
     plan = loop.Plan({"arm": np.arange(8.0).reshape(1, 4, 2)}, 0, time.perf_counter())
-    thinker, sent = SimpleNamespace(plan=plan, tick=-1), []
+    thinker, sent = SimpleNamespace(plan=plan, tick=-1, is_stopping=False), []
     robot = SimpleNamespace(send=lambda action: sent.append((thinker.tick, *action["arm"])))
     record = loop.control(thinker, robot, rate=100, seconds=0.12)
     assert record.held >= 1
@@ -116,6 +116,30 @@ def test_the_control_loop_continues_the_last_chunk(monkeypatch: pytest.MonkeyPat
         assert np.abs(values[0, 3:11] - thinker.plan.chunk[part][0, 8:]).max() > 1e-3
     assert plan.action(5)["gripper"] == plan.chunk["gripper"][0, 0]
     assert plan.action(21) is None
+    # After the chunk has ended the robot stands still, so the next one begins with its first action.
+    thinker.tick = 30
+    later = thinker._think(plan)
+    assert later.tick == 31
+
+
+def test_the_control_loop_ends_with_what_ended_the_policy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    loop = importlib.import_module("control_loop")
+    small: dict[str, Any] = {
+        "backbone": random_checkpoint.small_backbone("n1.5"),
+        "head": random_checkpoint.small_head("n1.5"),
+    }
+    policy = saccade.Policy.load(random_checkpoint.write(tmp_path / "small", **small), num_threads=1)
+    robot = loop.Robot(policy, "open the drawer")
+    thinker = loop.Thinker(policy, robot, rate=10)
+    monkeypatch.setattr(robot, "look", lambda: {})
+    thinker.start()
+    record = loop.control(thinker, robot, rate=100, seconds=60)
+    assert len(record.late) < 1000
+    with pytest.raises(saccade.InputError):
+        thinker.stop()
 
 
 @pytest.fixture
