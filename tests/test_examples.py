@@ -134,7 +134,7 @@ def test_the_control_loop_ends_with_what_ended_the_policy(
     policy = saccade.Policy.load(random_checkpoint.write(tmp_path / "small", **small), num_threads=1)
     robot = loop.Robot(policy, "open the drawer")
     thinker = loop.Thinker(policy, robot, rate=10)
-    monkeypatch.setattr(robot, "look", lambda: {})
+    monkeypatch.setattr(robot, "look", dict)
     thinker.start()
     record = loop.control(thinker, robot, rate=100, seconds=60)
     assert len(record.late) < 1000
