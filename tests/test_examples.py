@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -98,14 +97,20 @@ def test_the_control_loop_holds_where_a_chunk_ends(monkeypatch: pytest.MonkeyPat
     assert len(record.late) + record.missed >= 12
 
 
+def small_policy(folder: Path) -> saccade.Policy:
+    """A small random policy, written below a folder."""
+    written = random_checkpoint.write(
+        folder / "small",
+        backbone=random_checkpoint.small_backbone("n1.5"),
+        head=random_checkpoint.small_head("n1.5"),
+    )
+    return saccade.Policy.load(written, num_threads=1)
+
+
 def test_the_control_loop_continues_the_last_chunk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     loop = importlib.import_module("control_loop")
-    small: dict[str, Any] = {
-        "backbone": random_checkpoint.small_backbone("n1.5"),
-        "head": random_checkpoint.small_head("n1.5"),
-    }
-    policy = saccade.Policy.load(random_checkpoint.write(tmp_path / "small", **small), num_threads=1)
+    policy = small_policy(tmp_path)
     thinker = loop.Thinker(policy, loop.Robot(policy, "open the drawer"), rate=10)
     thinker.tick = 4  # the next action is that of tick 5
     thinker._recent.append(0.25)
@@ -127,11 +132,7 @@ def test_the_control_loop_ends_with_what_ended_the_policy(
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     loop = importlib.import_module("control_loop")
-    small: dict[str, Any] = {
-        "backbone": random_checkpoint.small_backbone("n1.5"),
-        "head": random_checkpoint.small_head("n1.5"),
-    }
-    policy = saccade.Policy.load(random_checkpoint.write(tmp_path / "small", **small), num_threads=1)
+    policy = small_policy(tmp_path)
     robot = loop.Robot(policy, "open the drawer")
     thinker = loop.Thinker(policy, robot, rate=10)
     monkeypatch.setattr(robot, "look", dict)

@@ -17,12 +17,12 @@ from unittest import mock
 
 import torch
 from torch import Tensor, nn
-from transformers import Qwen3Config, Qwen3ForCausalLM, SiglipVisionConfig, SiglipVisionModel
 from transformers.models.qwen3_vl.configuration_qwen3_vl import Qwen3VLConfig
 from transformers.models.qwen3_vl.modeling_qwen3_vl import Qwen3VLForConditionalGeneration
 
 from saccade import BackboneInputs
 from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.reference.lerobot_backbone import eagle, text_config
 
 EAGLE = "lerobot.policies.groot.eagle2_hg_model"
 
@@ -45,54 +45,12 @@ def eagle_module() -> ModuleType:
         return importlib.import_module(f"{EAGLE}.modeling_eagle2_5_vl")
 
 
-def text_config(sizes: BackboneSizes) -> dict[str, Any]:
-    text = sizes.text
-    return {
-        "hidden_size": text.width,
-        "intermediate_size": text.mlp_width,
-        "num_hidden_layers": sizes.num_layers,
-        "num_attention_heads": text.num_heads,
-        "num_key_value_heads": text.num_key_heads,
-        "head_dim": text.head_dim,
-        "vocab_size": text.vocabulary,
-        "rms_norm_eps": text.eps,
-        "rope_theta": text.theta,
-        "tie_word_embeddings": True,
-    }
-
-
 class Eagle(nn.Module):
     """N1.5's backbone: lerobot's Eagle model, with torch's SDPA as its attention."""
 
     def __init__(self, sizes: BackboneSizes) -> None:
         super().__init__()
-        vision = sizes.vision
-        module = eagle_module()
-        side = round(vision.num_positions**0.5) * vision.patch_size
-        vision_config = {
-            "hidden_size": vision.width,
-            "intermediate_size": vision.mlp_width,
-            "num_hidden_layers": vision.num_layers,
-            "num_attention_heads": vision.num_heads,
-            "image_size": side,
-            "patch_size": vision.patch_size,
-            "layer_norm_eps": vision.eps,
-            "model_type": "siglip_vision_model",
-        }
-        config = module.Eagle25VLConfig(
-            vision_config=vision_config,
-            text_config={**text_config(sizes), "architectures": ["Qwen3ForCausalLM"]},
-            select_layer=-1,
-            image_token_index=sizes.image_token,
-            use_pixel_shuffle=sizes.merge == 2,
-            mlp_connector_layers=sizes.connector_layers,
-            _attn_implementation="eager",
-        )
-        self.eagle_model = module.Eagle25VLForConditionalGeneration(
-            config,
-            SiglipVisionModel(SiglipVisionConfig(**vision_config, attn_implementation="sdpa")),
-            Qwen3ForCausalLM(Qwen3Config(**text_config(sizes), attn_implementation="sdpa")),
-        )
+        self.eagle_model = eagle(eagle_module(), sizes)
         self.eval()
 
     def forward(self, inputs: BackboneInputs) -> Tensor:

@@ -276,24 +276,34 @@ WITH_FRAMES = (
 def add_frames(parser: argparse.ArgumentParser) -> None:
     """Declares pictures and words for a whole checkpoint; see `check_frames`."""
     seen = parser.add_argument_group("pictures and words for a whole checkpoint")
+    add_moments(seen, "--frames")
     seen.add_argument(
-        "--frames",
+        "--precision", choices=PRECISIONS, help="of the backbone (default: float32, as the head always)"
+    )
+    add_preprocessing(seen)
+
+
+def add_moments(parser: Arguments, flag: str) -> None:
+    """Declares a directory of pictures, for `saccade.frames.read_frames`, with words and a state.
+
+    Args:
+        parser: parser or group.
+        flag: flag of the directory.
+    """
+    parser.add_argument(
+        flag,
         type=Path,
         metavar="DIR",
         help="a picture for each camera, named after it (front.png), or a folder of them for each moment",
     )
-    seen.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
-    seen.add_argument(
+    parser.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
+    parser.add_argument(
         "--state",
         type=Path,
         metavar="FILE",
         help="JSON: the robot's state in its own units, for moments without a state.json (default: the "
         "middle of its range)",
     )
-    seen.add_argument(
-        "--precision", choices=PRECISIONS, help="of the backbone (default: float32, as the head always)"
-    )
-    add_preprocessing(seen)
 
 
 def check_frames(args: argparse.Namespace, *refused: str) -> None:

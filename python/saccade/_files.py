@@ -74,8 +74,10 @@ def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
     """
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
-    beside = [directory / name for name in ("config.json", "tokenizer.json", "experiment_cfg/metadata.json")]
+    companions = [
+        directory / name for name in ("config.json", "tokenizer.json", "experiment_cfg/metadata.json")
+    ]
     return {
         "name": checkpoint.resolve().name,
-        "sha256": sha256_of(*filter(Path.is_file, beside), *tensors),
+        "sha256": sha256_of(*filter(Path.is_file, companions), *tensors),
     }

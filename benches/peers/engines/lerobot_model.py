@@ -15,7 +15,6 @@ import importlib
 import importlib.util
 import io
 import json
-import sys
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -25,14 +24,12 @@ from unittest import mock
 
 import torch
 from safetensors import safe_open
-from torch import Tensor, nn
-from transformers import Qwen3Config, Qwen3ForCausalLM, SiglipVisionConfig, SiglipVisionModel
+from torch import Tensor
 from transformers.modeling_utils import no_init_weights
 
 from benches.backbone.setup import sizes_of
 from benches.peers.policy_inputs import Given
-from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.reference import lerobot_head
+from saccade.reference import lerobot_backbone, lerobot_head
 
 GROOT = "lerobot.policies.groot"
 
@@ -63,7 +60,9 @@ def build(source: Path, tensors: dict[str, Tensor], compute_dtype: torch.dtype) 
         contextlib.redirect_stdout(io.StringIO()),
         mock.patch.object(groot, "ensure_eagle_cache_ready", lambda *_: None),
         mock.patch.object(groot.AutoConfig, "from_pretrained", lambda *_, **__: None),
-        mock.patch.object(groot.AutoModel, "from_config", lambda *_, **__: vision_language(eagle, source)),
+        mock.patch.object(
+            groot.AutoModel, "from_config", lambda *_, **__: lerobot_backbone.eagle(eagle, sizes_of(source))
+        ),
         no_init_weights(),
     ):
         model: Any = groot.GR00TN15(
@@ -91,52 +90,6 @@ def build(source: Path, tensors: dict[str, Tensor], compute_dtype: torch.dtype) 
     if unread:
         raise ValueError(f"{source}: these tensors of lerobot's model are missing: {', '.join(unread)}")
     return model.eval()
-
-
-def vision_language(module: Any, source: Path) -> nn.Module:
-    """lerobot's Eagle model around transformers' SigLIP and Qwen3."""
-    sizes = sizes_of(source)
-    vision = {
-        "hidden_size": sizes.vision.width,
-        "intermediate_size": sizes.vision.mlp_width,
-        "num_hidden_layers": sizes.vision.num_layers,
-        "num_attention_heads": sizes.vision.num_heads,
-        "image_size": round(sizes.vision.num_positions**0.5) * sizes.vision.patch_size,
-        "patch_size": sizes.vision.patch_size,
-        "layer_norm_eps": sizes.vision.eps,
-        "model_type": "siglip_vision_model",
-    }
-    config = module.Eagle25VLConfig(
-        vision_config=vision,
-        text_config={**text_config(sizes), "architectures": ["Qwen3ForCausalLM"]},
-        select_layer=-1,
-        image_token_index=sizes.image_token,
-        use_pixel_shuffle=sizes.merge == 2,
-        mlp_connector_layers=sizes.connector_layers,
-        _attn_implementation="eager",
-    )
-    return module.Eagle25VLForConditionalGeneration(
-        config,
-        SiglipVisionModel(SiglipVisionConfig(**vision, attn_implementation="sdpa")),
-        Qwen3ForCausalLM(Qwen3Config(**text_config(sizes), attn_implementation="sdpa")),
-    )
-
-
-def text_config(sizes: BackboneSizes) -> dict[str, Any]:
-    """The sizes of Qwen3 as transformers names them."""
-    text = sizes.text
-    return {
-        "hidden_size": text.width,
-        "intermediate_size": text.mlp_width,
-        "num_hidden_layers": sizes.num_layers,
-        "num_attention_heads": text.num_heads,
-        "num_key_value_heads": text.num_key_heads,
-        "head_dim": text.head_dim,
-        "vocab_size": text.vocabulary,
-        "rms_norm_eps": text.eps,
-        "rope_theta": text.theta,
-        "tie_word_embeddings": True,
-    }
 
 
 def inputs_of(one: Given) -> dict[str, Tensor]:
@@ -169,18 +122,10 @@ def modules() -> tuple[Any, Any]:
     stubs = {stub.__name__: stub for stub in (constants, peft, tree)}
     for stub in stubs.values():
         stub.__spec__ = ModuleSpec(stub.__name__, None)  # diffusers asks for it
-    before = {name: sys.modules.get(name) for name in stubs}
-    with lerobot_head.empty_packages(Path(spec.submodule_search_locations[0])):
-        sys.modules.update(stubs)
-        try:
-            groot = importlib.import_module(f"{GROOT}.groot_n1")
-            return groot, importlib.import_module(f"{GROOT}.eagle2_hg_model.modeling_eagle2_5_vl")
-        finally:
-            for name, module in before.items():
-                if module is None:
-                    del sys.modules[name]
-                else:
-                    sys.modules[name] = module
+    root = Path(spec.submodule_search_locations[0])
+    with lerobot_head.empty_packages(root), lerobot_head.replaced_modules(stubs):
+        groot = importlib.import_module(f"{GROOT}.groot_n1")
+        return groot, importlib.import_module(f"{GROOT}.eagle2_hg_model.modeling_eagle2_5_vl")
 
 
 def map_values(function: Callable[[Any], Any], mapping: Any) -> Any:

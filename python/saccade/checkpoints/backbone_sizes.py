@@ -252,3 +252,16 @@ def merged(version: str, config: Mapping[str, Any]) -> dict[str, Any]:
         if token is not None:
             whole["image_token_index"] = token
     return whole
+
+
+def eagle_config(version: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config with the keys of `RELEASED` as it stands in a checkpoint, under ``backbone_cfg.eagle_config``.
+
+    ``select_layer`` and ``project_to_dim`` stand above it, in ``backbone_cfg``.
+    """
+    outer = ("select_layer", "project_to_dim", "image_token_index")
+    inner = {key: value for key, value in config.items() if key not in outer}
+    token = config["image_token_index"]
+    if version == "n1.7":
+        return inner | {"token_ids": {"image_token_id": token}}
+    return inner | {"image_token_index": token, "select_layer": -1}

@@ -25,10 +25,11 @@ import numpy as np
 import saccade._saccade as _saccade
 from saccade._files import write_json
 from saccade.checkpoints import head_configs
-from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes, merged
+from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes, eagle_config, merged
 from saccade.checkpoints.backbone_tensors import tensor_shapes, unread_tensor_shapes
 from saccade.checkpoints.prompt_tokenizer import FIRST_ADDED, token_id, tokenizer
 from saccade.checkpoints.random_tensors import Outliers, Tensor, pieces
+from saccade.checkpoints.robot_metadata import metadata
 from saccade.errors import InputError
 
 #: The robot of the checkpoint: its tag and published id, the width of each group of joints, its cameras.
@@ -215,12 +216,7 @@ def _config(
     """The content of `config.json`. It has sizes of the backbone only if they are not the published ones."""
     own: dict[str, Any] = {"select_layer": sizes.num_layers}
     if not released:
-        keys = ("select_layer", "project_to_dim", "image_token_index")
-        own["eagle_config"] = {key: value for key, value in backbone.items() if key not in keys}
-        if version == "n1.7":
-            own["eagle_config"]["token_ids"] = {"image_token_id": sizes.image_token}
-        else:
-            own["eagle_config"] |= {"image_token_index": sizes.image_token, "select_layer": -1}
+        own["eagle_config"] = eagle_config(version, backbone)
     if version == "n1.5":
         return {
             **head_configs.whole_config(head),
@@ -261,17 +257,11 @@ def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed:
         kind: {name: _group(rng, width) for name, width in GROUPS.items()} for kind in ("state", "action")
     }
     if version == "n1.5":
-        joint = {"absolute": True, "rotation_type": None, "continuous": True}
-        modalities: dict[str, Any] = {
-            "video": {name: {"resolution": [640, 480], "channels": 3, "fps": 30.0} for name in CAMERAS},
-            **{
-                kind: {name: joint | {"shape": [width]} for name, width in GROUPS.items()}
-                for kind in statistics
-            },
-        }
-        entry = {"statistics": statistics, "modalities": modalities, "embodiment_tag": EMBODIMENT}
+        video = {name: {"resolution": [640, 480], "channels": 3, "fps": 30.0} for name in CAMERAS}
         (folder / "experiment_cfg").mkdir()
-        write_json(folder / "experiment_cfg" / "metadata.json", {EMBODIMENT: entry})
+        write_json(
+            folder / "experiment_cfg" / "metadata.json", metadata(EMBODIMENT, statistics, GROUPS, video)
+        )
         return
     write_json(folder / "embodiment_id.json", {EMBODIMENT: EMBODIMENT_IDS[version]})
     write_json(folder / "statistics.json", {EMBODIMENT: {**statistics, "relative_action": {}}})

@@ -55,20 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     arguments.add_json(parser, "print JSON instead of tables")
     seen = parser.add_argument_group("compare the precisions on pictures and words")
-    seen.add_argument(
-        "--precision-check",
-        type=Path,
-        metavar="DIR",
-        help="a picture for each camera, named after it (front.png), or a folder of them for each moment",
-    )
-    seen.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
-    seen.add_argument(
-        "--state",
-        type=Path,
-        metavar="FILE",
-        help="JSON: the robot's state in its own units, for moments without a state.json (default: the "
-        "middle of its range)",
-    )
+    arguments.add_moments(seen, "--precision-check")
     arguments.add_preprocessing(seen)
     arguments.add_integer(seen, "--seed", minimum=0, help="seed of the noise (default: 0)")
     arguments.add_num_threads(seen, "threads (default: the physical cores)")

@@ -21,7 +21,7 @@ Trains a small whole checkpoint of GR00T N1.5's kind, a SigLIP, a Qwen3 and an a
 NVIDIA's layout for `saccade rollout --checkpoint DIR` and `saccade.Policy.load`. DIR also receives
 settings.json, history.json, loss.png and training.pt. All are written about once a minute. If the command is
 interrupted, run it again: it continues where it stopped, and the weights at the end are the same as those of
-an uninterrupted run. The defaults are those of the bundled policy; `make demo-policy` trains it anew.
+an uninterrupted run. The defaults are those of the bundled policy; `make demo-policy` trains it again.
 
 examples:
   saccade train --demos out/demos --out out/policy

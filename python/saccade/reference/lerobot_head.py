@@ -109,6 +109,13 @@ def empty_packages(root: Path) -> Iterator[None]:
     stubs["lerobot.utils"] = ModuleType("lerobot.utils")
     stubs["lerobot.utils.import_utils"] = ModuleType("lerobot.utils.import_utils")
     stubs["lerobot.utils.import_utils"]._transformers_available = True  # type: ignore[attr-defined]
+    with replaced_modules(stubs):
+        yield
+
+
+@contextlib.contextmanager
+def replaced_modules(stubs: Mapping[str, ModuleType]) -> Iterator[None]:
+    """Replaces imported modules by others of the same names, and restores them at the end."""
     before = {name: sys.modules.get(name) for name in stubs}
     sys.modules.update(stubs)
     try:

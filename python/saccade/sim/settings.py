@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._files import write_json
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config
 from saccade.checkpoints.prompt_tokenizer import token_id, tokenizer
+from saccade.checkpoints.robot_metadata import metadata
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
 from saccade.processor import Processor
@@ -152,8 +153,6 @@ class PolicyConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `config.json`: the published keys, and `simulation_cfg`."""
-        outer = ("select_layer", "project_to_dim", "image_token_index")
-        eagle = {key: value for key, value in self.backbone.items() if key not in outer}
         return {
             "model_type": "gr00t_n1_5",
             "architectures": ["GR00T_N1_5"],
@@ -164,11 +163,7 @@ class PolicyConfig:
             "backbone_cfg": {
                 "select_layer": self.backbone["select_layer"],
                 "project_to_dim": None,
-                "eagle_config": {
-                    **eagle,
-                    "image_token_index": self.backbone["image_token_index"],
-                    "select_layer": -1,
-                },
+                "eagle_config": eagle_config("n1.5", self.backbone),
             },
             "simulation_cfg": self.simulation.to_dict(),
         }
@@ -176,17 +171,9 @@ class PolicyConfig:
     def metadata(self) -> dict[str, Any]:
         """The content of `experiment_cfg/metadata.json`: statistics, joints and cameras."""
         size = self.simulation.image_size
-        joint = {"absolute": True, "rotation_type": None, "continuous": True}
-        video = {"resolution": [size, size], "channels": 3, "fps": 80.0}
-        modalities = {
-            "video": {camera.name: video for camera in self.simulation.cameras},
-            **{
-                kind: {name: {**joint, "shape": [width]} for name, width in GROUPS.items()}
-                for kind in ("state", "action")
-            },
-        }
-        entry = {"statistics": self.statistics, "modalities": modalities, "embodiment_tag": EMBODIMENT}
-        return {EMBODIMENT: entry}
+        about = {"resolution": [size, size], "channels": 3, "fps": 80.0}
+        video = {camera.name: about for camera in self.simulation.cameras}
+        return metadata(EMBODIMENT, self.statistics, GROUPS, video)
 
     def write(self, folder: Path) -> None:
         """Writes all files of the policy except its weights."""

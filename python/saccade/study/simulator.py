@@ -23,6 +23,7 @@ from saccade.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
 from saccade.sim.rollout import Episode, environment_for, run_episode
 from saccade.sim.settings import EMBODIMENT_ID
 from saccade.study.source import Source, episode_rng
+from saccade.study.wrapped_head import WrappedHead
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ class Recorded:
     privileged: PrivilegedState
 
 
-class Recorder:
+class Recorder(WrappedHead):
     """A head that records its inputs and passes them on; a `saccade.policy_head.Head`.
 
     Args:
@@ -209,35 +210,15 @@ class Recorder:
     """
 
     def __init__(self, head: Head, environment: TaskEnvironment) -> None:
-        self._head = head
+        super().__init__(head)
         self._environment = environment
         self._given: list[tuple[npt.NDArray[Any], ...]] = []
         self._encoded: tuple[Float32Array, BoolArray] | None = None
 
-    @property
-    def config(self) -> HeadConfig:
-        """See `Head`."""
-        return self._head.config
-
-    @property
-    def source(self) -> str | None:
-        """See `Head`."""
-        return self._head.source
-
-    @property
-    def embodiment_ids(self) -> tuple[int, ...]:
-        """See `Head`."""
-        return self._head.embodiment_ids
-
-    @property
-    def num_threads(self) -> int:
-        """See `Head`."""
-        return self._head.num_threads
-
     def encode(self, backbone_features: ArrayLike, **masks: Any) -> Any:
         """See `Head`."""
         self._encoded = np.array(backbone_features), np.array(masks["image_mask"])
-        return self._head.encode(backbone_features, **masks)
+        return self._wrapped.encode(backbone_features, **masks)
 
     def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Any:
         """See `Head`."""
@@ -246,7 +227,7 @@ class Recorder:
         known = (targets[None, :3], targets[None, 3:6], proprio[None, :3], proprio[None, 3:4])
         assert self._encoded is not None
         self._given.append((*self._encoded, np.array(state), np.array(options["noise"]), *known))
-        return self._head.sample(context, state, embodiment_id, **options)
+        return self._wrapped.sample(context, state, embodiment_id, **options)
 
     def recorded(self, episode: Episode) -> Recorded:
         """The recording, when the episode is over."""

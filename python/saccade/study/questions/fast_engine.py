@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from saccade._arrays import ArrayLike, Float32Array
-from saccade.config import HeadConfig
 from saccade.context import Context
 from saccade.errors import InputError
 from saccade.observation import Observation
@@ -16,9 +15,10 @@ from saccade.sim.policy import Policy
 from saccade.sim.settings import EMBODIMENT_ID
 from saccade.study.questions.fast_modes import Calibration, Mode, encode, sample
 from saccade.study.simulator import head_of, policy_of
+from saccade.study.wrapped_head import WrappedHead
 
 
-class ModeHead:
+class ModeHead(WrappedHead):
     """A policy's head in one of the modes, on one thread; a `saccade.policy_head.Head`.
 
     Args:
@@ -29,28 +29,9 @@ class ModeHead:
 
     def __init__(self, checkpoint: str, mode: Mode, calibration: Calibration) -> None:
         self._head = head_of(checkpoint, mode.precision)
+        super().__init__(self._head)
         self._mode = mode
         self._calibration = calibration
-
-    @property
-    def config(self) -> HeadConfig:
-        """See `Head`."""
-        return self._head.config
-
-    @property
-    def source(self) -> str | None:
-        """See `Head`."""
-        return self._head.source
-
-    @property
-    def embodiment_ids(self) -> tuple[int, ...]:
-        """See `Head`."""
-        return self._head.embodiment_ids
-
-    @property
-    def num_threads(self) -> int:
-        """See `Head`."""
-        return self._head.num_threads
 
     def encode(self, backbone_features: ArrayLike, *, drop_vl: Any = None, **masks: Any) -> Context:
         """See `Head`. The other masks change nothing in N1.5, and are not read."""
