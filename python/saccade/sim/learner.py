@@ -16,9 +16,11 @@ from saccade.backbone_inputs import BackboneInputs
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.config import HeadConfig
 from saccade.reference import ActionHead, Backbone
+from saccade.reference.backbone import BackboneFeatures
 
 TABLE_STD = 0.02  # initial scale of learned positions and embeddings
 NUM_TARGETS = 6  # object and goal position
+NUM_QUERIES = 12  # of ImageTargets: two for each view and position
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Batch:
     """Samples of a training step. Numbers are normalised.
 
     Attributes:
-        inputs: The observations; prompts are padded on the left, as the released processors do.
+        inputs: The observations, or the features of a backbone that is not trained; prompts are padded on the
+            left, as the released processors do.
         state: `(B, state_dim)`.
         actions: `(B, T, action_dim)`.
         mask: `(B, T, 1)`, 1 where an action is valid.
@@ -34,39 +37,48 @@ class Batch:
         later: With alignment, the observations after the chunk was executed.
     """
 
-    inputs: BackboneInputs
+    inputs: BackboneInputs | BackboneFeatures
     state: Tensor
     actions: Tensor
     mask: Tensor
     targets: Tensor
-    later: BackboneInputs | None = None
+    later: BackboneInputs | BackboneFeatures | None = None
 
 
 class Learner(nn.Module):
     """All modules that are trained.
 
-    In addition to the policy there is a linear layer that predicts object and goal positions from the last
-    token of the prompt, which has seen all others. Its loss makes the backbone locate them early in training.
-    With an `alignment_block` there is also a projector from the hidden rows of the future tokens to the
-    backbone's features one horizon later. Neither is part of the checkpoint.
+    In addition to the policy there is a layer that predicts object and goal positions, whose loss makes the
+    backbone locate them early in training: a linear one on the last token of the prompt, which has seen all
+    others, or :class:`ImageTargets` where the backbone is trained alone. With an `alignment_block` there is
+    also a projector from the hidden rows of the future tokens to the backbone's features one horizon later.
+    None of them is part of the checkpoint.
 
     Args:
         backbone_sizes: sizes of the backbone.
         head_config: sizes of the head.
         alignment_block: block of the head after which the future rows are aligned; None for no alignment.
+        only: what is trained, see `TrainingSettings`.
     """
 
     def __init__(
-        self, backbone_sizes: BackboneSizes, head_config: HeadConfig, alignment_block: int | None = None
+        self,
+        backbone_sizes: BackboneSizes,
+        head_config: HeadConfig,
+        alignment_block: int | None = None,
+        only: str = "",
     ) -> None:
         super().__init__()
+        self.only = only
         self.backbone = Backbone(backbone_sizes)
         for module in self.backbone.modules():
             if isinstance(module, nn.Embedding):
                 nn.init.normal_(module.weight, std=TABLE_STD)
         self.action_head = ActionHead(head_config)
         width = backbone_sizes.features_width
-        self.target_head = nn.Linear(width, NUM_TARGETS)
+        self.target_head = ImageTargets(width) if only == "backbone" else nn.Linear(width, NUM_TARGETS)
+        if only == "head":
+            self.backbone.requires_grad_(False)
         self.alignment_block = alignment_block
         if alignment_block is not None:
             # Created last, so that a seed gives the other layers the same weights with and without it.
@@ -87,10 +99,13 @@ class Learner(nn.Module):
             average: the averaged tensors of the policy, whose backbone encodes the later observations.
 
         Returns:
-            Scalars: `loss` of flow matching, `target_loss` of the positions and, with alignment,
-            `alignment_loss`.
+            Scalars: `loss` of flow matching, or of the positions where the backbone is trained alone;
+            `target_loss` of the positions where both are trained; with alignment `alignment_loss`.
         """
-        features = self.backbone(batch.inputs).backbone_features  # (B, S, width)
+        seen = self.seen(batch.inputs)
+        features = seen.backbone_features  # (B, S, width)
+        if self.only == "backbone":
+            return {"loss": F.mse_loss(self.target_head(seen), batch.targets)}
         noise = torch.randn(batch.actions.shape, generator=generator)
         time = self.action_head.sample_time(len(noise), generator)
         with self.watched_rows() as rows:
@@ -102,20 +117,25 @@ class Learner(nn.Module):
                 noise=noise,
                 time=time,
                 action_mask=batch.mask,
-                drop_vl=~torch.from_numpy(batch.inputs.attention_mask),
+                drop_vl=~seen.attention_mask,
             )
-        losses = {
-            "loss": flow,
-            "target_loss": F.mse_loss(self.target_head(features[:, -1]), batch.targets),
-        }
+        losses = {"loss": flow}
+        if not self.only:
+            losses["target_loss"] = F.mse_loss(self.target_head(features[:, -1]), batch.targets)
         if batch.later is not None:
             future = rows[0][:, 1 : 1 + self.action_head.config.num_future_tokens]  # (B, N, width)
             targets = self.alignment_targets(batch.later, average)
             losses["alignment_loss"] = 1 - F.cosine_similarity(self.projector(future), targets, dim=-1).mean()
         return losses
 
+    def seen(self, inputs: BackboneInputs | BackboneFeatures) -> BackboneFeatures:
+        """The backbone's features of observations, unless that is what is given."""
+        return inputs if isinstance(inputs, BackboneFeatures) else self.backbone(inputs)
+
     @torch.no_grad()
-    def alignment_targets(self, later: BackboneInputs, average: Mapping[str, Tensor]) -> Tensor:
+    def alignment_targets(
+        self, later: BackboneInputs | BackboneFeatures, average: Mapping[str, Tensor]
+    ) -> Tensor:
         """The targets of the future rows: what the averaged backbone sees later.
 
         Args:
@@ -129,9 +149,9 @@ class Learner(nn.Module):
         tensors = {
             name.removeprefix(prefix): tensor for name, tensor in average.items() if name.startswith(prefix)
         }
-        features = functional_call(self.backbone, tensors, (later,))
-        tokens = features.backbone_features[features.image_mask].unflatten(0, (later.batch, -1))
-        return pool_tokens(tokens, self.action_head.config.num_future_tokens)
+        if isinstance(later, BackboneInputs):
+            later = functional_call(self.backbone, tensors, (later,))
+        return pool_tokens(image_tokens(later), self.action_head.config.num_future_tokens)
 
     @contextmanager
     def watched_rows(self) -> Iterator[list[Tensor]]:
@@ -154,6 +174,31 @@ class Learner(nn.Module):
             for name, tensor in self.state_dict().items()
             if name.startswith(("backbone.", "action_head."))
         }
+
+
+class ImageTargets(nn.Module):
+    """Positions of object and goal from the image tokens alone.
+
+    Learned queries weight the tokens of all views by a softmax, and a linear layer reads the means that are
+    weighted so. No single token has to contain everything, unlike the last one of a prompt.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.queries = nn.Linear(width, NUM_QUERIES)
+        self.positions = nn.Linear(NUM_QUERIES * width, NUM_TARGETS)
+
+    def forward(self, features: BackboneFeatures) -> Tensor:
+        """`(B, 6)`."""
+        tokens = image_tokens(features)  # (B, image tokens, width)
+        weights = self.queries(tokens).softmax(dim=1)  # (B, image tokens, queries)
+        return self.positions((weights.transpose(1, 2) @ tokens).flatten(1))
+
+
+def image_tokens(features: BackboneFeatures) -> Tensor:
+    """The features of the image tokens, `(B, image tokens, width)`."""
+    tokens = features.backbone_features
+    return tokens[features.image_mask].unflatten(0, (len(tokens), -1))
 
 
 def pool_tokens(tokens: Tensor, count: int) -> Tensor:

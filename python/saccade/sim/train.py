@@ -33,8 +33,10 @@ from saccade._files import sha256_of, write_atomically, write_json
 from saccade.backbone_inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.processor import Processor
+from saccade.reference.backbone import BackboneFeatures
 from saccade.sim import demos
-from saccade.sim.dataset import PIXEL_CENTRE, Samples, describe, load_samples, normalized_actions
+from saccade.sim.dataset import Samples, describe, load_samples, normalized_actions
+from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
 from saccade.sim.learner import Batch, Learner
 from saccade.sim.settings import (
     CONFIG_FILE,
@@ -67,7 +69,6 @@ class Progress:
     step: int
     steps: int
     loss: float
-    target_loss: float
     validation_loss: float | None
 
 
@@ -134,7 +135,7 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
     """A run before its first step; for `demonstrations` see `dataset.describe`."""
     torch.manual_seed(settings.seed)
-    learner = Learner(config.backbone_sizes, config.head_config, settings.aligned_block)
+    learner = Learner(config.backbone_sizes, config.head_config, settings.aligned_block, settings.only)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
     optimizer = torch.optim.AdamW(
@@ -163,6 +164,7 @@ class Batches:
         targets: mean and standard deviation of the positions, `(6,)` each.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
+        frozen: the features of the samples' frames, if the backbone is not trained.
         with_later: whether batches contain the observations after the chunk was executed.
     """
 
@@ -175,9 +177,11 @@ class Batches:
         batch_size: int,
         *,
         absent_share: float = 0.0,
+        frozen: FrozenFeatures | None = None,
         with_later: bool = False,
     ) -> None:
         self._samples = samples
+        self._frozen = frozen
         self._with_later = with_later
         self._batch_size = batch_size
         self._absent_share = absent_share
@@ -185,11 +189,7 @@ class Batches:
         self._state = np.asarray(normalizer.state(samples.state))
         self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
         self._targets = (samples.targets - targets[0]) / targets[1]
-        shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
-        frames = [shown] * len(config.simulation.cameras)
-        self._prompts = [
-            [processor(frames, text).input_ids[0] for text in task.instructions] for task in TASKS.values()
-        ]  # per task and wording, (T,)
+        self._prompts = prompts_of(config, processor)
         known = [list(TASKS).index(name) for name in config.simulation.tasks]
         self._impossible = [
             [other for other in known if list(TASKS.values())[other].objects != task.objects]
@@ -219,15 +219,19 @@ class Batches:
             later=self._inputs(later, prompts) if self._with_later else None,
         )
 
-    def _inputs(self, frames: npt.NDArray[np.int64], prompts: list[npt.NDArray[np.int64]]) -> BackboneInputs:
-        """The inputs of the backbone for frames and prompts, which are padded on the left."""
-        images = self._samples.images[frames].astype(np.float32)
-        longest = max(map(len, prompts))
-        ids, mask = np.zeros((len(prompts), longest), np.int64), np.zeros((len(prompts), longest), np.bool_)
-        for row, prompt in enumerate(prompts):
-            ids[row, longest - len(prompt) :], mask[row, longest - len(prompt) :] = prompt, True
-        pixels = (images - PIXEL_CENTRE) / PIXEL_CENTRE
-        return BackboneInputs(pixels.reshape(-1, *pixels.shape[2:]), ids, mask)
+    def _inputs(
+        self, frames: npt.NDArray[np.int64], prompts: list[npt.NDArray[np.int64]]
+    ) -> BackboneInputs | BackboneFeatures:
+        if self._frozen is not None:
+            return self._frozen(frames)
+        return BackboneInputs(pixel_values(self._samples.images[frames]), *padded(prompts))
+
+
+def prompts_of(config: PolicyConfig, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:
+    """The token ids `(T,)` of every wording of every task in `TASKS`."""
+    shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
+    frames = [shown] * len(config.simulation.cameras)
+    return [[processor(frames, text).input_ids[0] for text in task.instructions] for task in TASKS.values()]
 
 
 def train_step(run: Run, batches: Batches) -> dict[str, float]:
@@ -239,9 +243,11 @@ def train_step(run: Run, batches: Batches) -> dict[str, float]:
         int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
     )
     losses = run.learner.losses(batches.draw(settings.seed, run.step), generator, run.average)
-    total = losses["loss"] + settings.target_weight * losses["target_loss"]
-    if "alignment_loss" in losses:
-        total = total + settings.alignment_weight * losses["alignment_loss"]
+    weights = {"target_loss": settings.target_weight, "alignment_loss": settings.alignment_weight}
+    total = losses["loss"]
+    for name, weight in weights.items():
+        if name in losses:
+            total = total + weight * losses[name]
     run.optimizer.zero_grad(set_to_none=True)
     total.backward()
     torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
@@ -323,23 +329,34 @@ def resume(run: Run, path: Path) -> None:
     run.average = state["average"]
 
 
-def config_of_start(config: PolicyConfig, policy: Path) -> PolicyConfig:
+def config_of_start(config: PolicyConfig, policy: Path, only: str = "") -> PolicyConfig:
     """The config with the statistics of the policy to start from: its weights know no others.
 
     Raises:
         FileNotFoundError: there is no policy.
-        InputError: the policy has other sizes, tasks or cameras.
+        InputError: the policy has other sizes, tasks or cameras. The head may have other sizes where it alone
+            is trained.
     """
     found, statistics = (json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE))
-    if found != described(config)[0]:
+    expected = described(config)[0]
+    if only == "head":
+        found, expected = (
+            {key: one.get(key) for key in ("backbone_cfg", "simulation_cfg")} for one in (found, expected)
+        )
+    if found != expected:
         raise InputError(f"{policy}: was trained with other sizes, tasks or cameras")
     return replace(config, statistics=statistics[EMBODIMENT]["statistics"])
 
 
 def start_from(run: Run, policy: Path) -> None:
-    """Starts from the weights of a policy."""
-    tensors = load_file(policy / TENSOR_FILE)
-    run.learner.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, strict=False)
+    """Starts from the weights of a policy; from those of its backbone where only the head is trained."""
+    prefix = "backbone." if run.settings.only == "head" else ""
+    tensors = {
+        name: tensor.float()
+        for name, tensor in load_file(policy / TENSOR_FILE).items()
+        if name.startswith(prefix)
+    }
+    run.learner.load_state_dict(tensors, strict=False)
     run.average = {name: tensor.detach().clone() for name, tensor in run.learner.policy_tensors().items()}
 
 
@@ -358,7 +375,8 @@ def train(
         out: directory of the run.
         settings: settings of the run.
         on_step: called after each step.
-        start: a policy to start from; None for random weights.
+        start: a policy to start from; None for random weights. Where only the head is trained, the features
+            of its backbone are kept in files beside `out`, for other runs.
 
     Returns:
         The config of the policy.
@@ -367,12 +385,16 @@ def train(
         FileNotFoundError: there are no demonstrations, or no policy to start from.
         InputError: demonstrations with different settings, or `out` contains a run with other settings.
     """
+    if settings.only == "head" and start is None:
+        raise InputError("start: given none, expected a policy, since only the head is trained")
     tasks = demos.recorded_tasks(demonstrations)
     recording = demos.read_settings(demonstrations, tasks)
     config = policy_config(settings, recording, tasks)
     processor = config.processor()
     training, validation = load_samples(demonstrations, tasks, settings.horizon, processor)
-    config = with_statistics(config, training) if start is None else config_of_start(config, start)
+    config = (
+        with_statistics(config, training) if start is None else config_of_start(config, start, settings.only)
+    )
     if start is not None:
         settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
     run = new_run(settings, config, describe(demonstrations, tasks))
@@ -380,18 +402,27 @@ def train(
         start_from(run, start)
     if (out / STATE_FILE).exists():
         resume(run, out / STATE_FILE)
-    with_later = settings.aligned_block is not None
     targets = (training.targets.mean(axis=0), training.targets.std(axis=0) + SMALLEST_DEVIATION)
-    batches = Batches(
-        training,
-        config,
-        processor,
-        targets,
-        settings.batch_size,
-        absent_share=settings.absent_share,
-        with_later=with_later,
-    )
-    held_out = Batches(validation, config, processor, targets, VALIDATION_FRAMES, with_later=with_later)
+
+    def batches_of(samples: Samples, name: str, size: int, absent_share: float) -> Batches:
+        frozen = None
+        if settings.only == "head":
+            known = f"{settings.start_sha256[:16]}-{run.demonstrations['sha256'][:16]}"
+            path = out.parent / f"features-{known}-{name}.npy"
+            frozen = FrozenFeatures(samples, prompts_of(config, processor), run.learner.backbone, path)
+        return Batches(
+            samples,
+            config,
+            processor,
+            targets,
+            size,
+            absent_share=absent_share,
+            frozen=frozen,
+            with_later=settings.aligned_block is not None,
+        )
+
+    batches = batches_of(training, "training", settings.batch_size, settings.absent_share)
+    held_out = batches_of(validation, "validation", VALIDATION_FRAMES, 0.0)
     try:
         loop(run, batches, held_out, out, on_step)
     finally:
@@ -416,7 +447,7 @@ def loop(
             save(run, out)
             latest = held_out_losses["loss"]
             saved, steps = time.monotonic(), []
-        on_step(Progress(run.step, run.settings.steps, means["loss"], means["target_loss"], latest))
+        on_step(Progress(run.step, run.settings.steps, means["loss"], latest))
 
 
 def plot_history(history: list[dict[str, Any]], path: Path) -> None:

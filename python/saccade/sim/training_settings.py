@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from saccade.errors import InputError
 
@@ -13,6 +14,10 @@ class TrainingSettings:
     """The settings of a training run. The defaults are those of the bundled policy.
 
     Attributes:
+        only: What is trained. ``""`` is the whole policy. ``"backbone"`` is the backbone without a head,
+            which learns to locate object and goal from the image tokens. ``"head"`` is the head alone, from
+            random weights, on the frozen backbone of the policy that the run starts from; each frame then has
+            one of the wordings of its instruction.
         steps: Optimiser steps; the learning rate falls to zero over them.
         batch_size: Frames per step. Many small steps are better than fewer large ones of the same total time.
         learning_rate: Learning rate of AdamW after the warm-up.
@@ -38,6 +43,7 @@ class TrainingSettings:
         patch_size: Pixels along each side of the patch behind an image token, an even number.
     """
 
+    only: Literal["", "backbone", "head"] = ""
     steps: int = 8000
     batch_size: int = 16
     learning_rate: float = 6e-4
@@ -63,6 +69,13 @@ class TrainingSettings:
     patch_size: int = 16
 
     def __post_init__(self) -> None:
+        if self.only not in ("", "backbone", "head"):
+            raise InputError(f"only: given {self.only!r}, expected '', 'backbone' or 'head'")
+        if self.only == "head" and self.absent_share:
+            raise InputError(
+                f"absent_share: given {self.absent_share}, expected 0 where only the head is trained: the "
+                "features of a frame are computed once, with an instruction of its own task"
+            )
         if self.width % (2 * self.num_heads):
             raise InputError(
                 f"width: given {self.width}, expected a multiple of {2 * self.num_heads}, an even number for "

@@ -1,0 +1,149 @@
+"""Training the backbone alone, and then heads on its frozen features."""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from saccade import InputError
+from saccade.reference import Backbone
+from saccade.sim import demos, train
+from saccade.sim.cameras import DEFAULT_CAMERAS
+from saccade.sim.dataset import load_samples
+from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
+from saccade.sim.policy import Policy
+from saccade.sim.training_settings import TrainingSettings
+
+RECORDING = demos.RecordingSettings(image_size=16, frame_stride=6, cameras=DEFAULT_CAMERAS[:2])
+TASKS = ["reach", "button-press-topdown"]  # whose wordings have different lengths
+BACKBONE = TrainingSettings(
+    only="backbone",
+    steps=4,
+    batch_size=4,
+    width=16,
+    num_layers=2,
+    num_heads=2,
+    language_layers=1,
+    vision_width=16,
+    vision_layers=1,
+    vision_heads=2,
+    num_future_tokens=3,
+    patch_size=8,
+)
+HEAD = dataclasses.replace(BACKBONE, only="head", absent_share=0.0, num_layers=3, seed=1)
+
+
+def ignore(progress: train.Progress) -> None:
+    """Shows no progress."""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A demonstration of two tasks."""
+    out = tmp_path_factory.mktemp("demos")
+    for task in TASKS:
+        demos.record_task(task, 1, out, RECORDING, lambda: None)
+    return out
+
+
+@pytest.fixture(scope="module")
+def pretrained(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A backbone that was trained alone."""
+    out = tmp_path_factory.mktemp("backbone")
+    train.train(recording, out, BACKBONE, ignore)
+    return out
+
+
+def test_the_backbone_alone_learns_positions_and_leaves_the_head(recording: Path, tmp_path: Path) -> None:
+    settings = dataclasses.replace(BACKBONE, steps=40, learning_rate=5e-3)
+    train.train(recording, tmp_path, settings, ignore)
+    history = json.loads((tmp_path / "history.json").read_text())
+    assert history[-1].keys() == {"step", "loss", "validation_loss"}
+    config = train.policy_config(settings, RECORDING, TASKS)
+    start = train.new_run(settings, config, {}).average
+    for name, tensor in load_file(tmp_path / "model.safetensors").items():
+        equal = torch.equal(tensor, start[name].to(torch.bfloat16))
+        assert equal == name.startswith("action_head."), name
+    # Positions are normalised: their mean has a squared error of 1.
+    assert history[-1]["validation_loss"] < 0.9
+
+
+def test_the_head_alone_leaves_the_backbone(recording: Path, pretrained: Path, tmp_path: Path) -> None:
+    train.train(recording, tmp_path / "one", HEAD, ignore, start=pretrained)
+    before, after = (load_file(one / "model.safetensors") for one in (pretrained, tmp_path / "one"))
+    config = train.policy_config(HEAD, RECORDING, TASKS)
+    start = train.new_run(HEAD, config, {}).average
+    for name, tensor in after.items():
+        if name.startswith("backbone."):
+            assert torch.equal(tensor, before[name]), name
+    changed = [name for name in start if not torch.equal(start[name].to(torch.bfloat16), after[name])]
+    assert any(name.startswith("action_head.future_tokens") for name in changed)
+    assert Policy.load(tmp_path / "one").head.config.num_layers == 3
+
+
+def test_features_are_those_of_the_backbone_and_are_shared(
+    recording: Path, pretrained: Path, tmp_path: Path
+) -> None:
+    train.train(recording, tmp_path / "one", HEAD, ignore, start=pretrained)
+    files = sorted(tmp_path.glob("features-*.npy"))
+    assert len(files) == 2
+    written = [path.stat().st_mtime_ns for path in files]
+    aligned = dataclasses.replace(HEAD, alignment_weight=0.2)
+    train.train(recording, tmp_path / "two", aligned, ignore, start=pretrained)
+    assert [path.stat().st_mtime_ns for path in files] == written
+    assert sorted(tmp_path.glob("features-*.npy")) == files
+    assert json.loads((tmp_path / "two" / "history.json").read_text())[-1]["alignment_loss"] > 0
+
+
+def test_features_of_a_frame_do_not_depend_on_its_batch(
+    recording: Path, pretrained: Path, tmp_path: Path
+) -> None:
+    config = train.policy_config(HEAD, RECORDING, TASKS)
+    processor = config.processor()
+    samples, _ = load_samples(recording, TASKS, HEAD.horizon, processor)
+    prompts = train.prompts_of(config, processor)
+    backbone = Backbone.load(pretrained)
+    frozen = FrozenFeatures(samples, prompts, backbone, tmp_path / "features.npy")
+    rows = np.array([3, 0, len(samples) - 1, 3])
+    found = frozen(samples.now[rows])
+    said = [prompts[samples.tasks[row]][samples.now[row] % 5] for row in rows]
+    for number, row in enumerate(rows):
+        images = samples.images[samples.now[[row]]]
+        with torch.no_grad():
+            alone = backbone(train.BackboneInputs(pixel_values(images), said[number][None]))
+        length = len(said[number])
+        assert not found.attention_mask[number, :-length].any()
+        assert found.attention_mask[number, -length:].all()
+        torch.testing.assert_close(
+            found.backbone_features[number, -length:], alone.backbone_features[0], rtol=1e-3, atol=2e-3
+        )
+        assert torch.equal(found.image_mask[number, -length:], alone.image_mask[0])
+    assert found.image_mask.shape[1] == max(map(len, said))
+
+
+def test_padded_to_a_length() -> None:
+    ids, mask = padded([np.array([5, 6]), np.array([7])], 4)
+    assert ids.tolist() == [[0, 0, 5, 6], [0, 0, 0, 7]]
+    assert mask.tolist() == [[False, False, True, True], [False, False, False, True]]
+
+
+def test_what_cannot_be_is_refused(recording: Path, pretrained: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="given 'vision', expected"):
+        dataclasses.replace(HEAD, only="vision")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"absent_share: given 0\.1, expected 0"):
+        dataclasses.replace(HEAD, absent_share=0.1)
+    with pytest.raises(InputError, match="start: given none"):
+        train.train(recording, tmp_path / "out", HEAD, ignore)
+    deeper = dataclasses.replace(HEAD, vision_layers=2)
+    with pytest.raises(InputError, match="other sizes, tasks or cameras"):
+        train.train(recording, tmp_path / "out", deeper, ignore, start=pretrained)
+    assert not (tmp_path / "out").exists()
