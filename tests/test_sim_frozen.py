@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 from saccade import InputError
+from saccade.backbone_inputs import BackboneInputs
 from saccade.reference import Backbone
 from saccade.sim import demos, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
@@ -119,7 +120,7 @@ def test_features_of_a_frame_do_not_depend_on_its_batch(
     for number, row in enumerate(rows):
         images = samples.images[samples.now[[row]]]
         with torch.no_grad():
-            alone = backbone(train.BackboneInputs(pixel_values(images), said[number][None]))
+            alone = backbone(BackboneInputs(pixel_values(images), said[number][None]))
         length = len(said[number])
         assert not found.attention_mask[number, :-length].any()
         assert found.attention_mask[number, -length:].all()

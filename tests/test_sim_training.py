@@ -220,6 +220,7 @@ def test_padding_changes_no_gradient(recording: Path) -> None:
     run, batches = make_batches(recording, dataclasses.replace(TINY, batch_size=6), with_later=False)
     run.learner.double()
     batch = batches.draw(0)
+    assert isinstance(batch.inputs, BackboneInputs)
     lengths = batch.inputs.attention_mask.sum(axis=1)
     assert len(set(lengths)) > 1
     features = run.learner.backbone(batch.inputs).backbone_features
@@ -375,11 +376,13 @@ def test_samples_point_at_their_own_demonstrations_pictures(recording: Path) -> 
 def test_who_is_told_to_stand_still_sees_the_same_later(recording: Path) -> None:
     _, batches = make_batches(recording, dataclasses.replace(ALIGNED, absent_share=1.0))
     batch = batches.draw(0)
-    assert batch.later is not None
+    assert isinstance(batch.inputs, BackboneInputs)
+    assert isinstance(batch.later, BackboneInputs)
     np.testing.assert_array_equal(batch.later.pixel_values, batch.inputs.pixel_values)
     _, batches = make_batches(recording, dataclasses.replace(ALIGNED, batch_size=8))
     batch = batches.draw(0)
-    assert batch.later is not None
+    assert isinstance(batch.inputs, BackboneInputs)
+    assert isinstance(batch.later, BackboneInputs)
     assert not np.array_equal(batch.later.pixel_values, batch.inputs.pixel_values)
 
 

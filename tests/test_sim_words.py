@@ -10,6 +10,7 @@ import pytest
 
 from saccade import BackboneInputs
 from saccade.processor import Processor
+from saccade.reference.backbone import BackboneFeatures
 from saccade.sim import demos, train
 from saccade.sim.dataset import Samples
 from saccade.sim.policy import Policy
@@ -42,8 +43,9 @@ def make_batches(tasks: list[str], absent_share: float) -> tuple[train.Batches, 
     return train.Batches(samples, config, processor, targets, 64, absent_share=absent_share), processor
 
 
-def tasks_told(inputs: BackboneInputs, processor: Processor) -> list[str]:
+def tasks_told(inputs: BackboneInputs | BackboneFeatures, processor: Processor) -> list[str]:
     """The task of each prompt."""
+    assert isinstance(inputs, BackboneInputs)
     frames = [np.zeros((16, 16, 3), np.uint8)] * 3
     wordings = {
         tuple(processor(frames, text).input_ids[0]): name
@@ -82,6 +84,8 @@ def test_drawing_does_not_change_the_samples() -> None:
     again = batches.draw(7)
     for name in ("state", "actions", "mask", "targets"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    assert isinstance(again.inputs, BackboneInputs)
+    assert isinstance(first.inputs, BackboneInputs)
     np.testing.assert_array_equal(again.inputs.pixel_values, first.inputs.pixel_values)
     np.testing.assert_array_equal(again.inputs.input_ids, first.inputs.input_ids)
 

@@ -74,7 +74,9 @@ class FrozenFeatures:
         self._backbone = backbone
         tasks = np.zeros(len(samples.images), np.int64)
         tasks[samples.now] = tasks[samples.later] = samples.tasks
-        self._prompts = [prompts[task][frame % len(prompts[task])] for frame, task in enumerate(tasks)]
+        self._prompts = [
+            prompts[task][frame % len(prompts[task])] for frame, task in enumerate(tasks.tolist())
+        ]
         self._length = max(map(len, self._prompts))
         if not path.exists():
             self._write(path)

@@ -145,13 +145,17 @@ class Learner(nn.Module):
         Returns:
             `(B, N, width)`: the image tokens, averaged over N runs of neighbours.
         """
-        prefix = "backbone."
-        tensors = {
-            name.removeprefix(prefix): tensor for name, tensor in average.items() if name.startswith(prefix)
-        }
         if isinstance(later, BackboneInputs):
-            later = functional_call(self.backbone, tensors, (later,))
-        return pool_tokens(image_tokens(later), self.action_head.config.num_future_tokens)
+            prefix = "backbone."
+            tensors = {
+                name.removeprefix(prefix): tensor
+                for name, tensor in average.items()
+                if name.startswith(prefix)
+            }
+            seen: BackboneFeatures = functional_call(self.backbone, tensors, (later,))
+        else:
+            seen = later
+        return pool_tokens(image_tokens(seen), self.action_head.config.num_future_tokens)
 
     @contextmanager
     def watched_rows(self) -> Iterator[list[Tensor]]:
