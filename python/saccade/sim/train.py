@@ -33,6 +33,7 @@ from saccade._files import sha256_of, write_atomically, write_json
 from saccade.backbone_inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.processor import Processor
+from saccade.reference.layers import TABLE_STD
 from saccade.sim import demos
 from saccade.sim.dataset import PIXEL_CENTRE, Samples, describe, load_samples, normalized_actions
 from saccade.sim.learner import Batch, Learner
@@ -57,6 +58,8 @@ WARMUP_STEPS = 200
 MAX_GRADIENT_NORM = 1.0
 WEIGHT_DECAY = 0.01
 BETAS = (0.9, 0.95)
+# The initial weights of every N are drawn as for this one, which is that of the bundled policy.
+SHARED_TOKENS = 32
 SMALLEST_DEVIATION = 1e-3  # metres; added where a position never changes
 
 
@@ -131,10 +134,33 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
     return replace(config, statistics={kind: statistics_of(values) for kind, values in recorded.items()})
 
 
+def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
+    """The modules with their initial weights.
+
+    Runs of one seed that differ in N start from the same weights of everything else, and the tokens of the
+    smaller N are the first ones of the larger N. So policies can be compared in pairs of one seed.
+    """
+    sizes, head, block = config.backbone_sizes, config.head_config, settings.aligned_block
+    torch.manual_seed(settings.seed)
+    drawn = Learner(sizes, replace(head, num_future_tokens=SHARED_TOKENS), block)
+    if head.num_future_tokens == SHARED_TOKENS:
+        return drawn
+    more = max(0, head.num_future_tokens - SHARED_TOKENS)
+    generator = torch.Generator().manual_seed(
+        int(np.random.default_rng((settings.seed, SHARED_TOKENS)).integers(2**63))
+    )
+    state = drawn.state_dict()
+    name = "action_head.future_tokens.weight"
+    extra = TABLE_STD * torch.randn((more, head.width), generator=generator)
+    state[name] = torch.cat((state[name], extra))[: head.num_future_tokens]
+    learner = Learner(sizes, head, block)
+    learner.load_state_dict(state)
+    return learner
+
+
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
     """A run before its first step; for `demonstrations` see `dataset.describe`."""
-    torch.manual_seed(settings.seed)
-    learner = Learner(config.backbone_sizes, config.head_config, settings.aligned_block)
+    learner = new_learner(settings, config)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
     optimizer = torch.optim.AdamW(
