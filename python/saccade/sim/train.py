@@ -49,9 +49,9 @@ from saccade.sim.settings import (
     statistics_of,
 )
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
+from saccade.sim.training_settings import STATE_FILE as STATE_FILE
 from saccade.sim.training_settings import TrainingSettings
 
-STATE_FILE = "training.pt"
 CHECKPOINT_SECONDS = 60.0
 VALIDATION_FRAMES = 256
 WARMUP_STEPS = 200

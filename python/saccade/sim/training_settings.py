@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from saccade.errors import InputError
 
+#: What `saccade train` writes only to continue a run.
+STATE_FILE = "training.pt"
+
 
 @dataclass(frozen=True)
 class TrainingSettings:

@@ -1,0 +1,273 @@
+"""`saccade study answer`: trains the policies of the plan and judges them, stage after stage."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pandas as pd
+
+from saccade._arguments import add_list
+from saccade._files import checkpoint_identity
+from saccade.errors import InputError
+from saccade.sim.training_settings import STATE_FILE
+from saccade.study.answer import plan as plans
+from saccade.study.answer.plan import Plan, PlannedPolicy, Recording
+from saccade.study.answer.results import PLAIN
+from saccade.study.answer.section import section
+from saccade.study.cell import Cell, Rows
+from saccade.study.runs import Planned, read_run, saved_step
+from saccade.study.section import Section
+from saccade.study.study import Study
+from saccade.study.table import Provenance
+
+EPILOG = """\
+Records demonstrations, trains the policies of the plan and judges them on the same episodes, stage after
+stage. DIR/answer/policies has the policies; one that is there and finished is not trained again, on any
+machine. DIR/answer/demos has the demonstrations, which only training needs; missing ones are recorded again.
+
+examples:
+  saccade study answer --stages core --jobs 2 --out out/answer
+  saccade study answer --out out/answer
+"""
+RECORDING, TRAINING, EPISODES = "recording", "training", "episodes"
+#: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
+NOT_KEPT = (STATE_FILE, "loss.png")
+
+
+@dataclass(frozen=True)
+class Answer(Study):
+    """Policies trained with different numbers of future tokens, and in other respects, judged alike.
+
+    Attributes:
+        plan: What is trained, and how it is judged.
+        stages: The stages that are run, in the order of the plan.
+        phase: How many of `phases` are over.
+        demos: Directory of each recording, by name; set by `begin`, as are `policies`.
+        policies: Directory of each policy, by name.
+        trained: Hash of each finished policy, by name.
+    """
+
+    plan: Plan
+    stages: tuple[str, ...]
+    phase: int = 0
+    demos: Mapping[str, Path] = field(default_factory=dict)
+    policies: Mapping[str, Path] = field(default_factory=dict)
+    trained: Mapping[str, str] = field(default_factory=dict)
+    name: ClassVar[str] = "answer"
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """See `Study`."""
+        parser.epilog = EPILOG
+        stages = ", ".join(plans.PLAN.stages)
+        add_list(parser, "--stages", help=f"stages to run (default: all: {stages})")
+
+    @classmethod
+    def from_arguments(cls, args: argparse.Namespace) -> Answer:
+        """See `Study`."""
+        from saccade.sim import graphics
+
+        plan = plans.PLAN
+        asked = plan.stages if args.stages is None else args.stages
+        unknown = [stage for stage in asked if stage not in plan.stages]
+        if unknown:
+            raise InputError(
+                f"stages: unknown name {', '.join(unknown)}, expected some of {', '.join(plan.stages)}"
+            )
+        graphics.check()
+        return cls(plan, tuple(stage for stage in plan.stages if stage in asked))
+
+    def begin(self, out: Path) -> Answer:
+        """See `Study`."""
+        own = out / self.name
+        demos = {recording.name: own / "demos" / recording.name for recording in self.plan.recordings}
+        names = [policy.name for stage in self.plan.stages for policy in self.plan.policies(stage)]
+        return replace(self, demos=demos, policies={name: own / "policies" / name for name in names})
+
+    def settings(self) -> Mapping[str, Any]:
+        """See `Study`."""
+        return {"engine": "rust", "tasks": list(self.plan.tasks), "episodes": list(self.plan.seeds)}
+
+    @property
+    def phases(self) -> list[tuple[str, str]]:
+        """Stage and kind of each phase. A stage is finished before the next one begins."""
+        return list(itertools.product(self.stages, (RECORDING, TRAINING, EPISODES)))
+
+    def cells(self) -> Sequence[Cell]:
+        """See `Study`: those of the phases so far."""
+        so_far = itertools.starmap(self.cells_of, self.phases[: self.phase + 1])
+        return list({cell.key: cell for cell in itertools.chain.from_iterable(so_far)}.values())
+
+    def cells_of(self, stage: str, kind: str) -> Iterator[Cell]:
+        """The cells of one phase. Stages may share a recording."""
+        for policy in self.plan.policies(stage):
+            recording = described(self.plan.recording(policy.recipe))
+            if kind == RECORDING:
+                yield Cell((RECORDING, policy.recipe.recording), recording)
+            elif kind == TRAINING:
+                planned = {"training": asdict(policy.training), "recording": recording}
+                yield Cell((TRAINING, policy.name), planned)
+            elif policy.name in self.trained:
+                judged = {"checkpoint": self.trained[policy.name], "episodes": list(self.plan.seeds)}
+                yield from (Cell((EPISODES, policy.name, PLAIN, task), judged) for task in self.plan.tasks)
+
+    @property
+    def num_cells(self) -> int:
+        """See `Study`."""
+        planned = [policy for stage in self.stages for policy in self.plan.policies(stage)]
+        recordings = {policy.recipe.recording for policy in planned}
+        return len(recordings) + len(planned) * (1 + len(self.plan.tasks))
+
+    def then(self, table: pd.DataFrame) -> Answer | None:
+        """See `Study`."""
+        if self.phase + 1 == len(self.phases):
+            return None
+        trained = table[table["kind"] == TRAINING].to_dict("records")
+        hashes = {row["policy"]: row["checkpoint_sha256"] for row in trained}
+        return replace(self, phase=self.phase + 1, trained=hashes)
+
+    @property
+    def files(self) -> tuple[str | Path, ...]:
+        """See `Study`: the finished policies. Demonstrations, and policies in training, stay in the output
+        directory, which other machines must share.
+        """
+        if self.phases[self.phase][1] != EPISODES:
+            return ()
+        return tuple(path for name, path in self.policies.items() if name in self.trained and path.is_dir())
+
+    def measure(self, cell: Cell) -> Rows:
+        """See `Study`; the first word of the key says what is measured."""
+        kind, name = str(cell.key[0]), str(cell.key[1])
+        if kind == RECORDING:
+            rows = [self.record(name)]
+        elif kind == TRAINING:
+            rows = [self.train(self.planned(name))]
+        else:
+            rows = self.judge(self.planned(name), str(cell.key[2]), str(cell.key[3]))
+        return [{"kind": kind, **row} for row in rows]
+
+    def planned(self, name: str) -> PlannedPolicy:
+        """A policy of the plan by its name."""
+        every = itertools.chain.from_iterable(map(self.plan.policies, self.plan.stages))
+        return next(policy for policy in every if policy.name == name)
+
+    def record(self, name: str) -> dict[str, Any]:
+        """Records what is missing of a recording, and describes it."""
+        from saccade.sim import demos, opened
+        from saccade.sim.dataset import describe
+
+        recording = next(one for one in self.plan.recordings if one.name == name)
+        start = time.perf_counter()
+        demos.record_tasks(recording.counts, self.demos[name], recording.settings, lambda task: None)
+        opened.close()
+        found = describe(self.demos[name], demos.recorded_tasks(self.demos[name]))
+        return {
+            "recording": name,
+            "demonstrations": sum(found["tasks"].values()),
+            "demonstrations_sha256": found["sha256"],
+            "seconds": time.perf_counter() - start,
+        }
+
+    def train(self, policy: PlannedPolicy) -> dict[str, Any]:
+        """Trains a policy unless that is done, and describes it.
+
+        A column `trained_from_step` says how many steps were done when this process began: with another
+        number than 0, `seconds` and `cpu` are those of the last part of the training only.
+        """
+        directory, recording = self.policies[policy.name], policy.recipe.recording
+        start, first = time.perf_counter(), self.steps_done(policy)
+        if first < policy.training.steps:
+            self.record(recording)
+            Planned(policy.name, str(self.demos[recording]), policy.training).train(directory)
+        for name in NOT_KEPT:
+            (directory / name).unlink(missing_ok=True)
+        run = read_run(directory, ("image_size", "num_cameras", "num_vl_tokens"))
+        known = {name: value for name, value in asdict(policy.training).items() if name != "seed"}
+        losses = {name: loss for name, loss in run.history[-1].items() if name != "step"}
+        return {
+            **identity(policy),
+            **known,
+            **run.point,
+            "recording": recording,
+            "demonstrations_sha256": run.settings["demonstrations"]["sha256"],
+            "checkpoint_sha256": run.checkpoint_sha256,
+            "policy_bytes": sum(file.stat().st_size for file in directory.rglob("*") if file.is_file()),
+            **losses,
+            "trained_from_step": first,
+            "seconds": time.perf_counter() - start,
+        }
+
+    def steps_done(self, policy: PlannedPolicy) -> int:
+        """The steps that a policy in its directory was trained for.
+
+        Raises:
+            InputError: it was trained with other settings.
+        """
+        directory = self.policies[policy.name]
+        if not (directory / "settings.json").is_file():
+            return 0
+        run = read_run(directory, ())
+        wanted = asdict(policy.training)
+        other = [name for name, value in wanted.items() if run.settings.get(name) != value]
+        if other:
+            raise InputError(f"{directory}: was trained with other settings ({', '.join(other)})")
+        counts = dict(self.plan.recording(policy.recipe).counts)
+        if run.settings["demonstrations"]["tasks"] != counts:
+            raise InputError(f"{directory}: was trained on other demonstrations, expected {counts}")
+        if run.finished:
+            return run.step
+        # Without its state, a run that was stopped cannot be continued, and is begun again.
+        return saved_step(directory / STATE_FILE)
+
+    def judge(self, policy: PlannedPolicy, arm: str, task: str) -> Rows:
+        """All episodes of a task, a row each.
+
+        Raises:
+            FileNotFoundError: the policy is not there.
+            InputError: it is not the one that the table describes.
+        """
+        from saccade.study.simulator import judge
+
+        directory, expected = self.policies[policy.name], self.trained[policy.name]
+        if not directory.is_dir():
+            raise FileNotFoundError(
+                f"{directory}: no such policy; it was trained, with the hash {expected}. Put it back, or "
+                "delete its file in answer/cells to train it again"
+            )
+        found = checkpoint_identity(directory)["sha256"]
+        if found != expected:
+            raise InputError(f"{directory}: has the hash {found}, expected {expected}, which was trained")
+        rows = []
+        for seed in self.plan.seeds:
+            episode = judge(str(directory), task, seed)
+            result = {"success": episode.success, "control_steps": episode.steps, "chunks": episode.chunks}
+            rows.append({**identity(policy), "arm": arm, "task": task, "seed": seed, **result})
+        return rows
+
+    @classmethod
+    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
+        """See `Study`."""
+        return section(table, provenance)
+
+
+def identity(policy: PlannedPolicy) -> dict[str, Any]:
+    """The columns that identify a policy."""
+    recipe = policy.recipe
+    return {
+        "stage": recipe.stage,
+        "recipe": recipe.name,
+        "policy": policy.name,
+        "training_seed": policy.seed,
+        "num_future_tokens": recipe.training.num_future_tokens,
+    }
+
+
+def described(recording: Recording) -> dict[str, Any]:
+    """A recording as JSON."""
+    return {"counts": dict(recording.counts), **recording.settings.to_dict()}

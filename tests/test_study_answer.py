@@ -1,0 +1,359 @@
+"""`saccade study answer` on a tiny plan: real training and real episodes, stage after stage."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from saccade.cli import main
+from saccade.errors import InputError
+from saccade.sim import demos, graphics, train
+from saccade.sim.cameras import DEFAULT_CAMERAS
+from saccade.sim.policy import Policy
+from saccade.sim.rollout import environment_for, run_episode
+from saccade.sim.training_settings import TrainingSettings
+from saccade.study.answer import plan as plans
+from saccade.study.answer.plan import Plan, Recipe, Recording
+from saccade.study.answer.power import power
+from saccade.study.answer.results import CONFIRMATORY, confirmed, judged, over_seeds, slope
+from saccade.study.answer.study import Answer
+from saccade.study.run import StudyError, run
+from saccade.study.sign_flip import sign_flip
+from saccade.study.statistics import holm
+from saccade.study.table import read_provenance, read_table
+
+TASK = "fork"  # its episodes are short
+TINY = TrainingSettings(
+    steps=2,
+    batch_size=2,
+    width=8,
+    num_layers=2,
+    num_heads=1,
+    language_layers=1,
+    vision_width=8,
+    vision_layers=1,
+    vision_heads=1,
+    patch_size=8,
+)
+RECORDING = Recording(
+    "tiny",
+    {TASK: 2},
+    demos.RecordingSettings(image_size=16, frame_stride=12, cameras=DEFAULT_CAMERAS[:1]),
+)
+
+
+def recipe(stage: str, name: str, **changes: Any) -> Recipe:
+    return Recipe(stage, name, replace(TINY, **changes), "tiny", (0, 1))
+
+
+PLAN = Plan(
+    recordings=(RECORDING,),
+    recipes=(
+        *(recipe("core", f"n-{count}", num_future_tokens=count) for count in (0, 4, 32)),
+        recipe("alignment", "n-4-aligned", num_future_tokens=4, alignment_weight=0.2),
+    ),
+    tasks=(TASK,),
+    seeds=range(2),
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick() -> Iterator[None]:
+    """Training without its picture, few frames held out, short episodes; the machine draws."""
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "plot_history", lambda history, path: None)
+        patch.setattr(train, "VALIDATION_FRAMES", 2)
+        patch.setattr(graphics, "check", lambda: None)
+        patch.setattr(plans, "PLAN", PLAN)
+        yield
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of the first stage."""
+    out = tmp_path_factory.mktemp("core")
+    assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_first_stage(core: Path) -> None:
+    table: Any = read_table(core / "answer.csv")
+    provenance = read_provenance(core / "answer.json")
+    assert provenance.complete
+    assert provenance.total == 1 + 6 + 6
+    trained = table[table["kind"] == "training"].set_index("policy")
+    assert sorted(trained.index) == sorted(f"n-{n}-seed-{seed}" for n in (0, 4, 32) for seed in (0, 1))
+    policies = core / "answer" / "policies"
+    row = trained.loc["n-4-seed-1"]
+    assert row["checkpoint_sha256"] == Policy.load(policies / "n-4-seed-1").checkpoint_sha256()
+    history = json.loads((policies / "n-4-seed-1" / "history.json").read_text())
+    assert row["validation_loss"] == history[-1]["validation_loss"]
+    assert (row["steps"], row["trained_from_step"], row["training_seed"]) == (2, 0, 1)
+    assert row["seconds"] > 0
+    recorded = table[table["kind"] == "recording"].iloc[0]
+    assert row["demonstrations_sha256"] == recorded["demonstrations_sha256"]
+    assert recorded["demonstrations"] == 2
+    kept = {path.name for path in (policies / "n-4-seed-1").rglob("*") if path.is_file()}
+    assert kept == {
+        "config.json",
+        "history.json",
+        "metadata.json",
+        "model.safetensors",
+        "settings.json",
+        "tokenizer.json",
+    }
+
+    policy = Policy.load(policies / "n-32-seed-0", num_threads=1)
+    environment = environment_for(policy, TASK)
+    episodes = table[table["kind"] == "episodes"].set_index(["policy", "seed"])
+    assert len(episodes) == 12
+    for seed in (0, 1):
+        episode = run_episode(environment, policy, seed)
+        row = episodes.loc[("n-32-seed-0", seed)]
+        found = (row["success"], row["control_steps"], row["chunks"])
+        assert found == (episode.success, episode.steps, episode.chunks)
+    environment.close()
+
+
+def test_all_policies_get_the_same_episodes(core: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same first images, states and noise, whatever N is."""
+    given: dict[str, list[Any]] = {}
+    for name in ("n-0-seed-0", "n-32-seed-1"):
+        policy = Policy.load(core / "answer" / "policies" / name, num_threads=1)
+        seen = given.setdefault(name, [])
+        act = policy.act
+
+        def watched(observation: Any, *, noise: Any, seen: Any = seen, act: Any = act, **more: Any) -> Any:
+            seen.append((observation["images"], observation["proprio"], observation["instruction"], noise))
+            return act(observation, noise=noise, **more)
+
+        monkeypatch.setattr(policy, "act", watched)
+        environment = environment_for(policy, TASK)
+        for seed in (3, 4):
+            seen.append(seed)
+            run_episode(environment, policy, seed)
+        environment.close()
+    one, other = given.values()
+    starts = [([place for place, item in enumerate(seen) if isinstance(item, int)]) for seen in (one, other)]
+    for first, second in zip(*starts, strict=True):
+        for left, right in zip(one[first + 1][:2], other[second + 1][:2], strict=True):
+            assert str(left) == str(right)
+        assert one[first + 1][2] == other[second + 1][2]
+        for chunk in range(1, 4):
+            assert np.array_equal(one[first + chunk][3], other[second + chunk][3])
+    assert not np.array_equal(one[starts[0][0] + 1][3], one[starts[0][1] + 1][3])
+
+
+def times(out: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in out.glob("answer/*/*/model.safetensors")}
+
+
+def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On another machine: without demonstrations, and with the policies and the finished cells."""
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    shutil.rmtree(out / "answer" / "demos")
+    before = times(out)
+    cells = {path: path.stat().st_mtime_ns for path in out.glob("answer/cells/*")}
+    arguments = ["study", "answer", "--stages", "core", "--out", str(out)]
+    assert main(arguments) == 0
+    assert times(out) == before
+    assert {path: path.stat().st_mtime_ns for path in out.glob("answer/cells/*")} == cells
+    assert not (out / "answer" / "demos").exists()
+
+    # Without the cells the policies are described and judged again, and not trained.
+    (described,) = [
+        path for path in cells if json.loads(path.read_text())["key"] == ["training", "n-4-seed-0"]
+    ]
+    described.unlink()
+    assert main(arguments) == 0
+    assert times(out) == before
+    table: Any = read_table(out / "answer.csv")
+    assert table.set_index("policy").loc["n-4-seed-0", "trained_from_step"].dropna().tolist() == [2.0]
+
+    # A policy that is gone is named, and the others are judged.
+    shutil.rmtree(out / "answer" / "policies" / "n-32-seed-1")
+    for path in cells:
+        if path.exists() and json.loads(path.read_text())["key"][0] == "episodes":
+            path.unlink()
+    capsys.readouterr()
+    assert main(arguments) != 0
+    assert "n-32-seed-1: no such policy; it was trained, with the hash" in capsys.readouterr().err
+    provenance = read_provenance(out / "answer.json")
+    assert (provenance.done, provenance.total) == (12, 13)
+    section = Answer.summarise(read_table(out / "answer.csv"), provenance)
+    assert "n-32-seed-1: left out, 0 of 2 episodes are done." in section.concluded
+    assert any("n-32 minus n-0: the training seed 1 lack" in line for line in section.concluded)
+
+
+def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
+    study = Answer(PLAN, ("core",)).begin(tmp_path)
+    policy = study.planned("n-4-seed-0")
+    shutil.copytree(core / "answer" / "demos", tmp_path / "answer" / "demos")
+
+    def stop(progress: train.Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train.train(study.demos["tiny"], study.policies[policy.name], policy.training, stop)
+    row = study.train(policy)
+    assert (row["trained_from_step"], row["steps"]) == (1, 2)
+    whole: Any = read_table(core / "answer.csv")
+    trained = whole[whole["kind"] == "training"].set_index("policy")
+    assert row["checkpoint_sha256"] == trained.loc["n-4-seed-0", "checkpoint_sha256"]
+
+    other = Answer(replace(PLAN, recipes=(recipe("core", "n-4", learning_rate=0.5),)), ("core",))
+    with pytest.raises(InputError, match=r"n-4-seed-0: was trained with other settings \(learning_rate"):
+        other.begin(tmp_path).train(other.planned("n-4-seed-0"))
+    changed = replace(PLAN, recordings=(replace(RECORDING, counts={TASK: 3}),))
+    with pytest.raises(InputError, match="was trained on other demonstrations"):
+        Answer(changed, ("core",)).begin(tmp_path).train(policy)
+    (study.policies[policy.name] / "config.json").write_text(
+        (study.policies[policy.name] / "config.json").read_text() + " "
+    )
+    judge = replace(study, trained={policy.name: row["checkpoint_sha256"]})
+    with pytest.raises(InputError, match=r"has the hash .* expected"):
+        judge.judge(policy, "plain", TASK)
+
+
+def test_a_later_stage_pairs_with_the_first(core: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    table: Any = run(Answer(PLAN, ("core", "alignment")), out)
+    assert set(table[table["kind"] == "episodes"]["recipe"]) == {"n-0", "n-4", "n-32", "n-4-aligned"}
+    assert read_provenance(out / "answer.json").total == 1 + 8 + 8
+    assert len(times(out)) == 8
+
+
+def rows_of(rates: dict[str, list[float]], episodes: int = 10) -> pd.DataFrame:
+    """A table of policies with these success rates on two tasks of `episodes` episodes."""
+    rows: list[dict[str, Any]] = []
+    for name, of_recipe in rates.items():
+        for seed, rate in enumerate(of_recipe):
+            policy = {"recipe": name, "policy": f"{name}-seed-{seed}", "training_seed": seed}
+            rows.append({"kind": "training", **policy})
+            for task in ("a", "b"):
+                for episode in range(episodes):
+                    result = {"task": task, "seed": episode, "success": episode < round(rate * episodes)}
+                    rows.append({"kind": "episodes", "arm": "plain", **policy, **result})
+    return pd.DataFrame(rows)
+
+
+RATES = {
+    "n-0": [0.1, 0.3, 0.2, 0.4, 0.2, 0.3, 0.1],
+    "n-4": [0.4, 0.5, 0.6, 0.5, 0.7, 0.5, 0.4],
+    "n-32": [0.5, 0.6, 0.5, 0.8, 0.6, 0.7, 0.6],
+}
+
+
+def test_the_analysis_by_hand() -> None:
+    found = judged(rows_of(RATES), ("a", "b"), range(10))
+    assert not found.missing
+    rates = np.array([RATES[name] for name in ("n-0", "n-4", "n-32")])
+    x = np.log2([1.0, 5.0, 33.0])
+    slopes = [np.polyfit(x, one, 1)[0] for one in rates.T]
+    expected = [sign_flip(rates[2] - rates[0]), sign_flip(rates[2] - rates[1]), sign_flip(slopes)]
+    tests = confirmed(found)
+    assert [one.contrast for one in tests] == list(CONFIRMATORY)
+    for one, test in zip(tests, expected, strict=True):
+        assert one.test is not None
+        assert one.test.p_value == test.p_value
+        assert one.test.difference.value == pytest.approx(test.difference.value)
+        assert (one.test.difference.low, one.test.difference.high) == pytest.approx(
+            (test.difference.low, test.difference.high)
+        )
+    assert [one.corrected for one in tests] == holm([test.p_value for test in expected])
+
+
+def test_what_is_incomplete_is_not_used() -> None:
+    table = rows_of({**RATES, "n-32": RATES["n-32"][:-1]})
+    table = table.drop(table[(table["policy"] == "n-4-seed-2") & (table["seed"] == 3)].index[:1])
+    found = judged(table, ("a", "b"), range(10))
+    assert [(one.policy, one.done, one.all) for one in found.missing] == [("n-4-seed-2", 19, 20)]
+    tests = confirmed(found)
+    assert [list(one.seeds) for one in tests] == [[0, 1, 2, 3, 4, 5], [0, 1, 3, 4, 5], [0, 1, 3, 4, 5]]
+    assert [list(one.unpaired) for one in tests] == [[6], [2, 6], [2, 6]]
+    none = over_seeds(found, slope({"n-0": 0, "n-64": 64}))
+    assert none.test is None
+    assert not none.seeds
+    twice = pd.concat([table, table[table["kind"] == "episodes"].tail(1)])
+    with pytest.raises(InputError, match="are not distinct ones of the plan"):
+        judged(twice, ("a", "b"), range(10))
+    with pytest.raises(InputError, match="are not distinct ones of the plan"):
+        judged(table, ("a",), range(10))
+    only = judged(table[table["kind"] == "training"].drop(columns=["arm"]), ("a", "b"), range(10))
+    assert not only.rates
+    assert [one.test for one in confirmed(only)] == [None] * 3
+
+
+def test_tasks_have_equal_weight() -> None:
+    table = rows_of({"n-0": [0.0]})
+    table.loc[table["task"] == "a", "success"] = True
+    assert judged(table, ("a", "b"), range(10)).rates == {"n-0": {0: 0.5}}
+
+
+def test_power_is_the_rate_of_rejection() -> None:
+    known: dict[str, Any] = {"run_deviation": 0.06, "correlation": 0.3, "rate": 0.5, "episodes": 100}
+    none = power(**known, num_seeds=10, effects=(0, 0, 0), draws=4000)
+    assert all(share < 0.03 for share in none.values())  # Holm's correction
+    few = power(**known, num_seeds=6, effects=(0, 0.2, 0.4), draws=200)
+    assert set(few.values()) == {0.0}  # p is at least 2 / 64, and corrected three times that
+    large = power(**known, num_seeds=8, effects=(-0.3, 0, 0.3), draws=200)
+    assert min(large.values()) > 0.95
+    less = power(**known, num_seeds=12, effects=(0, 0.05, 0.1), draws=2000)
+    more = power(**{**known, "correlation": 0.9}, num_seeds=12, effects=(0, 0.05, 0.1), draws=2000)
+    assert all(more[name] > less[name] for name in less)
+    for wrong in ({"rate": 1.5}, {"correlation": -1}, {"episodes": 0}, {"run_deviation": math.nan}):
+        with pytest.raises(InputError, match="rate, correlation"):
+            power(**{**known, **wrong}, num_seeds=6, effects=(0, 0, 0))
+    with pytest.raises(InputError, match="effects: given 2"):
+        power(**known, num_seeds=6, effects=(0, 0))
+
+
+def test_power_agrees_with_the_analysis_of_tables() -> None:
+    """One simulated study, analysed through its table, gives the verdicts that `power` counts."""
+    rng = np.random.default_rng(0)
+    rejected = np.zeros(3)
+    for _ in range(40):
+        true = np.clip(0.5 + np.array([0, 0.1, 0.2]) + 0.05 * rng.standard_normal((7, 3)), 0, 1)
+        rates = rng.binomial(20, true) / 20
+        table = rows_of(dict(zip(("n-0", "n-4", "n-32"), rates.T.tolist(), strict=True)), 20)
+        tests = confirmed(judged(table, ("a", "b"), range(20)))
+        rejected += [one.corrected is not None and one.corrected <= 0.05 for one in tests]
+    # The two tasks of `rows_of` succeed in the same episodes, so a policy has 20 of them.
+    known: Any = {"run_deviation": 0.05, "correlation": 0.0, "rate": 0.5, "episodes": 20, "num_seeds": 7}
+    expected = list(power(**known, effects=(0, 0.1, 0.2)).values())
+    np.testing.assert_allclose(rejected / 40, expected, atol=4 * 0.5 / math.sqrt(40))
+
+
+def test_plans_that_cannot_be(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="recipes: two have the same name in n-0, n-4, n-32, n-4-aligned, n"):
+        replace(PLAN, recipes=(*PLAN.recipes, PLAN.recipes[0]))
+    with pytest.raises(InputError, match="recordings: n-0 has tiny, which is not one of them"):
+        replace(PLAN, recordings=())
+    with pytest.raises(InputError, match="recordings: tiny does not have all of reach"):
+        replace(PLAN, tasks=("reach",))
+    assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
+    assert "stages: unknown name cor, expected some of core, alignment" in capsys.readouterr().err
+
+
+def test_failing_cells_do_not_stop_the_others(core: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    (out / "answer" / "policies" / "n-4-aligned-seed-0").mkdir()
+    (out / "answer" / "policies" / "n-4-aligned-seed-0" / "settings.json").write_text("no JSON")
+    with pytest.raises(StudyError, match="n-4-aligned-seed-0: not written by `saccade train`"):
+        run(Answer(PLAN, ("core", "alignment")), out)
+    table: Any = read_table(out / "answer.csv")
+    assert "n-4-aligned-seed-1" in set(table["policy"])
