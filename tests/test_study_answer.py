@@ -15,13 +15,15 @@ import pandas as pd
 import pytest
 import torch
 
+from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import main
 from saccade.errors import InputError
 from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
-from saccade.sim.policy import Policy
+from saccade.sim.policy import Policy, num_vl_tokens
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.training_settings import TrainingSettings
+from saccade.study.answer import costs
 from saccade.study.answer import plan as plans
 from saccade.study.answer.plan import Plan, Recipe, Recording
 from saccade.study.answer.power import power
@@ -32,6 +34,7 @@ from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import holm
 from saccade.study.table import read_provenance, read_table
 
+WHOLE_PLAN = plans.PLAN
 TASK = "fork"  # its episodes are short
 TINY = TrainingSettings(
     steps=2,
@@ -101,6 +104,9 @@ def test_the_first_stage(core: Path) -> None:
     assert row["validation_loss"] == history[-1]["validation_loss"]
     assert (row["steps"], row["trained_from_step"], row["training_seed"]) == (2, 0, 1)
     assert row["seconds"] > 0
+    expected = costs.cost(replace(TINY, num_future_tokens=4), RECORDING)
+    assert row["chunk_multiply_adds"] == expected.chunk
+    assert row["training_multiply_adds"] == expected.sample * TINY.batch_size * TINY.steps
     recorded = table[table["kind"] == "recording"].iloc[0]
     assert row["demonstrations_sha256"] == recorded["demonstrations_sha256"]
     assert recorded["demonstrations"] == 2
@@ -234,6 +240,53 @@ def test_a_later_stage_pairs_with_the_first(core: Path, tmp_path: Path) -> None:
     assert set(table[table["kind"] == "episodes"]["recipe"]) == {"n-0", "n-4", "n-32", "n-4-aligned"}
     assert read_provenance(out / "answer.json").total == 1 + 8 + 8
     assert len(times(out)) == 8
+
+
+def test_costs_by_hand() -> None:
+    settings = replace(TINY, num_future_tokens=5, vl_num_layers=1)
+    config = train.policy_config(settings, RECORDING.settings, [TASK])
+    sizes, head = config.backbone_sizes, config.head_config
+    vision, text = sizes.vision, sizes.text
+    patches, merged = vision.num_positions, vision.num_positions // 4
+    tower = patches * 3 * vision.patch_size**2 * vision.width + vision.num_layers * (
+        patches * vision.width * (4 * vision.width + 2 * vision.mlp_width) + 2 * patches**2 * vision.width
+    )
+    connector = merged * 4 * vision.width * text.width
+    (context,) = {num_vl_tokens(config.processor(), config.simulation)}
+    inner = text.num_heads * text.head_dim
+    layer = context * text.width * (2 * inner + 2 * text.num_key_heads * text.head_dim + 3 * text.mlp_width)
+    backbone = tower + connector + sizes.num_layers * (layer + 2 * context**2 * inner)
+    call = Call.of(head, context)
+    of_head = [total(work(head, call)).multiply_adds for work in (encode_work, sample_work)]
+    found = costs.cost(settings, RECORDING)
+    assert found.chunk == backbone + sum(of_head)
+    # Backward costs twice as much as forward, except where no gradient is needed: at the pixels.
+    assert 2.5 * backbone < found.sample < 3 * (backbone + sum(of_head))
+    aligned = costs.cost(replace(settings, alignment_weight=0.1), RECORDING)
+    assert aligned.chunk == found.chunk
+    assert aligned.sample > found.sample + backbone
+
+
+def test_costs_that_are_matched() -> None:
+    settings = replace(TINY, num_future_tokens=64, width=16, num_heads=2)
+    wanted = costs.cost(settings, RECORDING)
+
+    def without(**changes: Any) -> costs.Cost:
+        return costs.cost(replace(settings, num_future_tokens=0, **changes), RECORDING)
+
+    width = costs.matched_width(settings, RECORDING)
+    assert width > 16
+    errors = [abs(without(width=one).chunk - wanted.chunk) for one in (width - 4, width, width + 4)]
+    assert errors[1] == min(errors)
+    steps = costs.matched_steps(settings, RECORDING)
+    assert abs(steps * without().sample - settings.steps * wanted.sample) <= without().sample / 2
+
+
+def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
+    (plain,) = [one for one in WHOLE_PLAN.recordings if one.name == "plain"]
+    assert plans.BASE.num_future_tokens == 32
+    assert costs.matched_width(plans.BASE, plain) == plans.WIDTH
+    assert costs.matched_steps(plans.BASE, plain) == plans.STEPS
 
 
 def rows_of(rates: dict[str, list[float]], episodes: int = 10) -> pd.DataFrame:

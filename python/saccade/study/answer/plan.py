@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from saccade.errors import InputError
+from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.demos import RecordingSettings
 from saccade.sim.training_settings import TrainingSettings
 
@@ -122,25 +124,50 @@ class Plan:
             yield from (PlannedPolicy(recipe, seed) for recipe in recipes if seed in recipe.seeds)
 
 
-def tokens(stage: str, counts: Sequence[int], *, aligned: bool = False) -> Iterator[Recipe]:
-    """Recipes that differ from `BASE` in N, and in the alignment loss."""
+def recipes(
+    stage: str, suffix: str, counts: Sequence[int], recording: str = "plain", **changes: Any
+) -> Iterator[Recipe]:
+    """Recipes that differ from `BASE` in N and in `changes`.
+
+    Args:
+        stage: Their stage.
+        suffix: What follows `n-N` in their names.
+        counts: Each N.
+        recording: Name of their recording.
+        changes: Training settings and their values.
+    """
     for count in counts:
-        changed = replace(BASE, num_future_tokens=count, alignment_weight=ALIGNMENT if aligned else 0.0)
-        yield Recipe(stage, f"n-{count}" + ("-aligned" if aligned else ""), changed, "plain", SEEDS)
+        training = replace(BASE, num_future_tokens=count, **changes)
+        yield Recipe(stage, f"n-{count}{suffix}", training, recording, SEEDS)
 
 
-ALIGNMENT = 0.2  # the weight of the loss in FLARE
-SEEDS = tuple(range(8))  # of training
 TASKS = ("reach", "two-goals", "stereo-reach", "two-stage")
+COUNTS = dict.fromkeys(TASKS, 200)  # demonstrations of each task
+EPISODES = range(25)  # seeds of the episodes of each task
+SEEDS = tuple(range(8))  # of training
 BASE = TrainingSettings(steps=3200, width=64, learning_rate=2e-3, ema_decay=0.995)
+ALIGNMENT = 0.2  # the weight of the loss in FLARE
+# What makes a policy without future tokens as costly as `BASE`: `costs.matched_width` for a chunk,
+# `costs.matched_steps` for the training. A test computes them again.
+WIDTH, STEPS = 88, 3511
 
 PLAN = Plan(
-    recordings=(Recording("plain", dict.fromkeys(TASKS, 200), RecordingSettings()),),
+    recordings=(
+        Recording("plain", COUNTS, RecordingSettings()),
+        Recording("one-camera", COUNTS, RecordingSettings(cameras=DEFAULT_CAMERAS[:1])),
+    ),
     recipes=(
-        *tokens("core", (0, 4, 32)),
-        *tokens("alignment", (4, 32), aligned=True),
-        *tokens("numbers", (1, 16, 64)),
+        *recipes("core", "", (0, 4, 32)),
+        *recipes("alignment", "-aligned", (4, 32), alignment_weight=ALIGNMENT),
+        *recipes("numbers", "", (1, 16, 64)),
+        *recipes("compute", "-wide", (0,), width=WIDTH),
+        *recipes("compute", "-long", (0,), steps=STEPS),
+        *recipes("vision", "-one-camera", (4, 32), "one-camera"),
+        *recipes("vision", "-patch-32", (4, 32), patch_size=32),
+        *recipes("vision", "-patch-8", (4, 32), patch_size=8),
+        *recipes("vlsa", "-vlsa-0", (4, 32), vl_num_layers=0),
+        *recipes("vlsa", "-vlsa-4", (4, 32), vl_num_layers=4),
     ),
     tasks=TASKS,
-    seeds=range(25),
+    seeds=EPISODES,
 )

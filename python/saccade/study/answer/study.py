@@ -17,6 +17,7 @@ from saccade._files import checkpoint_identity
 from saccade.errors import InputError
 from saccade.sim.training_settings import STATE_FILE
 from saccade.study.answer import plan as plans
+from saccade.study.answer.costs import cost
 from saccade.study.answer.plan import Plan, PlannedPolicy, Recording
 from saccade.study.answer.results import PLAIN
 from saccade.study.answer.section import section
@@ -185,9 +186,11 @@ class Answer(Study):
         if first < policy.training.steps:
             self.record(recording)
             Planned(policy.name, str(self.demos[recording]), policy.training).train(directory)
+        seconds = time.perf_counter() - start
         for name in NOT_KEPT:
             (directory / name).unlink(missing_ok=True)
         run = read_run(directory, ("image_size", "num_cameras", "num_vl_tokens"))
+        found = cost(policy.training, self.plan.recording(policy.recipe))
         known = {name: value for name, value in asdict(policy.training).items() if name != "seed"}
         losses = {name: loss for name, loss in run.history[-1].items() if name != "step"}
         return {
@@ -200,7 +203,9 @@ class Answer(Study):
             "policy_bytes": sum(file.stat().st_size for file in directory.rglob("*") if file.is_file()),
             **losses,
             "trained_from_step": first,
-            "seconds": time.perf_counter() - start,
+            "seconds": seconds,
+            "chunk_multiply_adds": found.chunk,
+            "training_multiply_adds": found.sample * policy.training.batch_size * policy.training.steps,
         }
 
     def steps_done(self, policy: PlannedPolicy) -> int:
