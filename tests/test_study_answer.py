@@ -1,9 +1,9 @@
-"""`saccade study answer` on a tiny plan: real training and real episodes, stage after stage."""
+"""`saccade study answer` on a tiny plan: real training and real episodes, stage after stage; costs."""
 
 from __future__ import annotations
 
+import itertools
 import json
-import math
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -25,13 +24,10 @@ from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.training_settings import TrainingSettings
 from saccade.study.answer import costs
 from saccade.study.answer import plan as plans
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
 from saccade.study.answer.plan import Plan, Recipe, Recording
-from saccade.study.answer.power import power
-from saccade.study.answer.results import CONFIRMATORY, confirmed, judged, over_seeds, slope
 from saccade.study.answer.study import Answer
 from saccade.study.run import StudyError, run
-from saccade.study.sign_flip import sign_flip
-from saccade.study.statistics import holm
 from saccade.study.table import read_provenance, read_table
 
 WHOLE_PLAN = plans.PLAN
@@ -200,7 +196,7 @@ def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.Cap
     assert (provenance.done, provenance.total) == (12, 13)
     section = Answer.summarise(read_table(out / "answer.csv"), provenance)
     assert "n-32-seed-1: left out, 0 of 2 episodes are done." in section.concluded
-    assert any("n-32 minus n-0: the training seed 1 lack" in line for line in section.concluded)
+    assert any("n-32 minus n-0: the training seed 1 lacks" in line for line in section.concluded)
 
 
 def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
@@ -289,105 +285,11 @@ def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
     assert costs.matched_steps(plans.BASE, plain) == plans.STEPS
 
 
-def rows_of(rates: dict[str, list[float]], episodes: int = 10) -> pd.DataFrame:
-    """A table of policies with these success rates on two tasks of `episodes` episodes."""
-    rows: list[dict[str, Any]] = []
-    for name, of_recipe in rates.items():
-        for seed, rate in enumerate(of_recipe):
-            policy = {"recipe": name, "policy": f"{name}-seed-{seed}", "training_seed": seed}
-            rows.append({"kind": "training", **policy})
-            for task in ("a", "b"):
-                for episode in range(episodes):
-                    result = {"task": task, "seed": episode, "success": episode < round(rate * episodes)}
-                    rows.append({"kind": "episodes", "arm": "plain", **policy, **result})
-    return pd.DataFrame(rows)
-
-
-RATES = {
-    "n-0": [0.1, 0.3, 0.2, 0.4, 0.2, 0.3, 0.1],
-    "n-4": [0.4, 0.5, 0.6, 0.5, 0.7, 0.5, 0.4],
-    "n-32": [0.5, 0.6, 0.5, 0.8, 0.6, 0.7, 0.6],
-}
-
-
-def test_the_analysis_by_hand() -> None:
-    found = judged(rows_of(RATES), ("a", "b"), range(10))
-    assert not found.missing
-    rates = np.array([RATES[name] for name in ("n-0", "n-4", "n-32")])
-    x = np.log2([1.0, 5.0, 33.0])
-    slopes = [np.polyfit(x, one, 1)[0] for one in rates.T]
-    expected = [sign_flip(rates[2] - rates[0]), sign_flip(rates[2] - rates[1]), sign_flip(slopes)]
-    tests = confirmed(found)
-    assert [one.contrast for one in tests] == list(CONFIRMATORY)
-    for one, test in zip(tests, expected, strict=True):
-        assert one.test is not None
-        assert one.test.p_value == test.p_value
-        assert one.test.difference.value == pytest.approx(test.difference.value)
-        assert (one.test.difference.low, one.test.difference.high) == pytest.approx(
-            (test.difference.low, test.difference.high)
-        )
-    assert [one.corrected for one in tests] == holm([test.p_value for test in expected])
-
-
-def test_what_is_incomplete_is_not_used() -> None:
-    table = rows_of({**RATES, "n-32": RATES["n-32"][:-1]})
-    table = table.drop(table[(table["policy"] == "n-4-seed-2") & (table["seed"] == 3)].index[:1])
-    found = judged(table, ("a", "b"), range(10))
-    assert [(one.policy, one.done, one.all) for one in found.missing] == [("n-4-seed-2", 19, 20)]
-    tests = confirmed(found)
-    assert [list(one.seeds) for one in tests] == [[0, 1, 2, 3, 4, 5], [0, 1, 3, 4, 5], [0, 1, 3, 4, 5]]
-    assert [list(one.unpaired) for one in tests] == [[6], [2, 6], [2, 6]]
-    none = over_seeds(found, slope({"n-0": 0, "n-64": 64}))
-    assert none.test is None
-    assert not none.seeds
-    twice = pd.concat([table, table[table["kind"] == "episodes"].tail(1)])
-    with pytest.raises(InputError, match="are not distinct ones of the plan"):
-        judged(twice, ("a", "b"), range(10))
-    with pytest.raises(InputError, match="are not distinct ones of the plan"):
-        judged(table, ("a",), range(10))
-    only = judged(table[table["kind"] == "training"].drop(columns=["arm"]), ("a", "b"), range(10))
-    assert not only.rates
-    assert [one.test for one in confirmed(only)] == [None] * 3
-
-
-def test_tasks_have_equal_weight() -> None:
-    table = rows_of({"n-0": [0.0]})
-    table.loc[table["task"] == "a", "success"] = True
-    assert judged(table, ("a", "b"), range(10)).rates == {"n-0": {0: 0.5}}
-
-
-def test_power_is_the_rate_of_rejection() -> None:
-    known: dict[str, Any] = {"run_deviation": 0.06, "correlation": 0.3, "rate": 0.5, "episodes": 100}
-    none = power(**known, num_seeds=10, effects=(0, 0, 0), draws=4000)
-    assert all(share < 0.03 for share in none.values())  # Holm's correction
-    few = power(**known, num_seeds=6, effects=(0, 0.2, 0.4), draws=200)
-    assert set(few.values()) == {0.0}  # p is at least 2 / 64, and corrected three times that
-    large = power(**known, num_seeds=8, effects=(-0.3, 0, 0.3), draws=200)
-    assert min(large.values()) > 0.95
-    less = power(**known, num_seeds=12, effects=(0, 0.05, 0.1), draws=2000)
-    more = power(**{**known, "correlation": 0.9}, num_seeds=12, effects=(0, 0.05, 0.1), draws=2000)
-    assert all(more[name] > less[name] for name in less)
-    for wrong in ({"rate": 1.5}, {"correlation": -1}, {"episodes": 0}, {"run_deviation": math.nan}):
-        with pytest.raises(InputError, match="rate, correlation"):
-            power(**{**known, **wrong}, num_seeds=6, effects=(0, 0, 0))
-    with pytest.raises(InputError, match="effects: given 2"):
-        power(**known, num_seeds=6, effects=(0, 0))
-
-
-def test_power_agrees_with_the_analysis_of_tables() -> None:
-    """One simulated study, analysed through its table, gives the verdicts that `power` counts."""
-    rng = np.random.default_rng(0)
-    rejected = np.zeros(3)
-    for _ in range(40):
-        true = np.clip(0.5 + np.array([0, 0.1, 0.2]) + 0.05 * rng.standard_normal((7, 3)), 0, 1)
-        rates = rng.binomial(20, true) / 20
-        table = rows_of(dict(zip(("n-0", "n-4", "n-32"), rates.T.tolist(), strict=True)), 20)
-        tests = confirmed(judged(table, ("a", "b"), range(20)))
-        rejected += [one.corrected is not None and one.corrected <= 0.05 for one in tests]
-    # The two tasks of `rows_of` succeed in the same episodes, so a policy has 20 of them.
-    known: Any = {"run_deviation": 0.05, "correlation": 0.0, "rate": 0.5, "episodes": 20, "num_seeds": 7}
-    expected = list(power(**known, effects=(0, 0.1, 0.2)).values())
-    np.testing.assert_allclose(rejected / 40, expected, atol=4 * 0.5 / math.sqrt(40))
+def test_every_contrast_is_of_recipes_of_the_plan() -> None:
+    """And every recipe of the plan is in a contrast of its stage, or in the core."""
+    contrasts = [*CONFIRMATORY, *itertools.chain.from_iterable(EXPLORATORY.values())]
+    assert set().union(*(one.recipes for one in contrasts)) == {one.name for one in WHOLE_PLAN.recipes}
+    assert WHOLE_PLAN.stages == ("core", *EXPLORATORY)
 
 
 def test_plans_that_cannot_be(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -397,6 +299,8 @@ def test_plans_that_cannot_be(capsys: pytest.CaptureFixture[str], tmp_path: Path
         replace(PLAN, recordings=())
     with pytest.raises(InputError, match="recordings: tiny does not have all of reach"):
         replace(PLAN, tasks=("reach",))
+    with pytest.raises(InputError, match="expected evaluation seeds"):
+        replace(PLAN, seeds=range(2_000_000, 2_000_025))
     assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
     assert "stages: unknown name cor, expected some of core, alignment" in capsys.readouterr().err
 

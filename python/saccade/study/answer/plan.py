@@ -13,6 +13,7 @@ from typing import Any
 from saccade.errors import InputError
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.demos import RecordingSettings
+from saccade.sim.tasks import check_evaluation_seeds
 from saccade.sim.training_settings import TrainingSettings
 
 
@@ -84,7 +85,7 @@ class Plan:
 
     Raises:
         InputError: two recipes or recordings have the same name, a recipe's recording is unknown, or a task
-            is not in every recording.
+            is not in every recording, or a seed is not for evaluation.
     """
 
     recordings: tuple[Recording, ...]
@@ -93,6 +94,7 @@ class Plan:
     seeds: range
 
     def __post_init__(self) -> None:
+        check_evaluation_seeds(self.seeds.start, len(self.seeds))
         for what, names in (
             ("recordings", [recording.name for recording in self.recordings]),
             ("recipes", [recipe.name for recipe in self.recipes]),
@@ -124,23 +126,6 @@ class Plan:
             yield from (PlannedPolicy(recipe, seed) for recipe in recipes if seed in recipe.seeds)
 
 
-def recipes(
-    stage: str, suffix: str, counts: Sequence[int], recording: str = "plain", **changes: Any
-) -> Iterator[Recipe]:
-    """Recipes that differ from `BASE` in N and in `changes`.
-
-    Args:
-        stage: Their stage.
-        suffix: What follows `n-N` in their names.
-        counts: Each N.
-        recording: Name of their recording.
-        changes: Training settings and their values.
-    """
-    for count in counts:
-        training = replace(BASE, num_future_tokens=count, **changes)
-        yield Recipe(stage, f"n-{count}{suffix}", training, recording, SEEDS)
-
-
 TASKS = ("reach", "two-goals", "stereo-reach", "two-stage")
 COUNTS = dict.fromkeys(TASKS, 200)  # demonstrations of each task
 EPISODES = range(25)  # seeds of the episodes of each task
@@ -150,6 +135,31 @@ ALIGNMENT = 0.2  # the weight of the loss in FLARE
 # What makes a policy without future tokens as costly as `BASE`: `costs.matched_width` for a chunk,
 # `costs.matched_steps` for the training. A test computes them again.
 WIDTH, STEPS = 88, 3511
+
+
+def recipes(
+    stage: str,
+    suffix: str,
+    counts: Sequence[int],
+    *,
+    recording: str = "plain",
+    seeds: tuple[int, ...] = SEEDS,
+    **changes: Any,
+) -> Iterator[Recipe]:
+    """Recipes that differ from `BASE` in N and in `changes`.
+
+    Args:
+        stage: Their stage.
+        suffix: What follows `n-N` in their names.
+        counts: Each N.
+        recording: Name of their recording.
+        seeds: Their training seeds.
+        changes: Training settings and their values.
+    """
+    for count in counts:
+        training = replace(BASE, num_future_tokens=count, **changes)
+        yield Recipe(stage, f"n-{count}{suffix}", training, recording, seeds)
+
 
 PLAN = Plan(
     recordings=(
@@ -162,7 +172,7 @@ PLAN = Plan(
         *recipes("numbers", "", (1, 16, 64)),
         *recipes("compute", "-wide", (0,), width=WIDTH),
         *recipes("compute", "-long", (0,), steps=STEPS),
-        *recipes("vision", "-one-camera", (4, 32), "one-camera"),
+        *recipes("vision", "-one-camera", (4, 32), recording="one-camera"),
         *recipes("vision", "-patch-32", (4, 32), patch_size=32),
         *recipes("vision", "-patch-8", (4, 32), patch_size=8),
         *recipes("vlsa", "-vlsa-0", (4, 32), vl_num_layers=0),

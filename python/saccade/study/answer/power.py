@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from saccade.errors import InputError
-from saccade.study.answer.results import CONFIRMATORY, CORE
+from saccade.study.answer.contrasts import CONFIRMATORY, CORE
 from saccade.study.sign_flip import sign_flip_p
 from saccade.study.statistics import CONFIDENCE, holm
 
@@ -51,7 +51,7 @@ def power(
         >>> found = power(run_deviation=0.06, correlation=0.3, rate=0.4, episodes=100, num_seeds=12,
         ...               effects=(0.0, 0.15, 0.2))
         >>> {name: round(share, 1) for name, share in found.items()}
-        {'n-32 minus n-0': 1.0, 'n-32 minus n-4': 0.3, 'slope over log2(N + 1)': 1.0}
+        {'n-32 minus n-0': 1.0, 'n-32 minus n-4': 0.3, 'slope over log2(N + 1), N = 0, 4, 32': 1.0}
     """
     if not (0 <= rate <= 1 and 0 <= correlation <= 1 and run_deviation >= 0 and min(episodes, draws) >= 1):
         raise InputError(
@@ -67,13 +67,8 @@ def power(
     true = np.clip(rate + np.asarray(effects) + run_deviation * (shared + own), 0.0, 1.0)
     rates = rng.binomial(episodes, true) / episodes
     names = list(CORE)
-    p_values = np.stack(
-        [
-            sign_flip_p(contrast.function(rates[..., [names.index(recipe) for recipe in contrast.recipes]]))
-            for contrast in CONFIRMATORY
-        ],
-        axis=-1,
-    )
+    values = [one.of(rates[..., [names.index(recipe) for recipe in one.recipes]]) for one in CONFIRMATORY]
+    p_values = np.stack([sign_flip_p(of_test) for of_test in values], axis=-1)
     rejected = np.array([holm(row) for row in p_values]) <= 1 - CONFIDENCE
     return {
         contrast.name: float(share) for contrast, share in zip(CONFIRMATORY, rejected.mean(0), strict=True)

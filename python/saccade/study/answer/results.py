@@ -2,61 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
 from saccade.errors import InputError
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, Contrast
 from saccade.study.sign_flip import SignFlip, sign_flip
-from saccade.study.statistics import holm
+from saccade.study.statistics import CONFIDENCE, holm
 from saccade.study.table import truths
 
 PLAIN = "plain"  # the arm of an unchanged policy
-CORE = {"n-0": 0, "n-4": 4, "n-32": 32}  # N of the recipes of the confirmatory tests
 Float64Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """A number that is computed from the success rates of policies of one training seed.
-
-    Attributes:
-        name: What it is, for tables.
-        recipes: The recipes that it needs.
-        function: Function from their rates `(..., recipes)` to `(...)`.
-    """
-
-    name: str
-    recipes: tuple[str, ...]
-    function: Callable[[Float64Array], Float64Array]
-
-
-def difference(second: str, first: str) -> Contrast:
-    """The success of one recipe minus that of another."""
-    return Contrast(f"{second} minus {first}", (first, second), lambda rates: rates[..., 1] - rates[..., 0])
-
-
-def slope(counts: Mapping[str, int]) -> Contrast:
-    """The least-squares slope of success over log2(N + 1).
-
-    Args:
-        counts: N of each recipe.
-
-    Example:
-        >>> float(slope({"none": 0, "one": 1, "three": 3}).function(np.array([0.1, 0.2, 0.3])).round(6))
-        0.1
-    """
-    x = np.log2(np.array(list(counts.values())) + 1.0)
-    weights = (x - x.mean()) / ((x - x.mean()) ** 2).sum()
-    return Contrast("slope over log2(N + 1)", tuple(counts), lambda rates: rates @ weights)
-
-
-#: The tests that were decided beforehand: the primary one, then the secondary ones. Holm's correction is over
-#: all three.
-CONFIRMATORY = (difference("n-32", "n-0"), difference("n-32", "n-4"), slope(CORE))
+#: In words: `more` or `less` for a contrast that is not zero, `small` for one within its margin.
+Finding: TypeAlias = Literal["more", "less", "small", "undecided", "not measured"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +42,7 @@ class Judged:
     """The success of complete policies.
 
     Attributes:
-        rates: Mean over tasks of the success rate, by recipe and training seed.
+        rates: Mean over tasks of the success rate, by recipe, in the order of stage and N, and training seed.
         missing: Policies that lack episodes.
     """
 
@@ -113,6 +77,27 @@ class ContrastResult:
     test: SignFlip | None
     corrected: float | None = None
 
+    @property
+    def finding(self) -> Finding:
+        """What the result shows, by rules that were decided beforehand. The first that holds decides:
+
+        1. `not measured`: no training seed has all policies.
+        2. `more`, `less`: a confirmatory test rejects at the 5 % level after Holm's correction; for an
+           exploratory contrast, its interval excludes zero.
+        3. `small`: the interval is inside the margin on both sides.
+        4. `undecided`: anything else, and whatever has no interval.
+        """
+        if self.test is None:
+            return "not measured"
+        found = self.test.difference
+        rejected = found.low > 0 or found.high < 0
+        if self.corrected is not None:
+            rejected = self.corrected <= 1 - CONFIDENCE
+        if rejected:
+            return "more" if found.value > 0 else "less"
+        inside = not math.isnan(found.low) and max(-found.low, found.high) < self.contrast.margin
+        return "small" if inside else "undecided"
+
 
 def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm: str = PLAIN) -> Judged:
     """The success rates of policies, each task weighted alike.
@@ -130,6 +115,9 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
     episodes = table[(table["kind"] == "episodes") & (table["arm"] == arm)] if "arm" in table else trained[:0]
     rates: dict[str, dict[int, float]] = {}
     missing = []
+    stages = ["core", *EXPLORATORY]
+    trained = trained.assign(order=trained["stage"].map(stages.index))
+    trained = trained.sort_values(["order", "num_future_tokens", "recipe", "training_seed"])
     for policy, row in trained.set_index("policy").iterrows():
         rows = episodes[episodes["policy"] == policy]
         pairs = set(zip(rows["task"], rows["seed"], strict=True)) if len(rows) else set()
@@ -147,7 +135,7 @@ def over_seeds(found: Judged, contrast: Contrast) -> ContrastResult:
     """Tests a contrast over the training seeds for which all its recipes are complete."""
     seeds, rates = found.paired(contrast.recipes)
     have = [set(found.rates.get(recipe, {})) for recipe in contrast.recipes]
-    values = contrast.function(rates)
+    values = contrast.of(rates)
     test = sign_flip(values) if seeds else None
     return ContrastResult(contrast, seeds, sorted(set.union(*have) - set(seeds)), list(values), test)
 
@@ -160,3 +148,13 @@ def confirmed(found: Judged) -> list[ContrastResult]:
     results = [over_seeds(found, contrast) for contrast in CONFIRMATORY]
     corrected = holm([1.0 if one.test is None else one.test.p_value for one in results])
     return [replace(one, corrected=p) for one, p in zip(results, corrected, strict=True)]
+
+
+def explored(found: Judged) -> dict[str, list[ContrastResult]]:
+    """The exploratory contrasts of which something was measured, by stage."""
+    results = {}
+    for stage, contrasts in EXPLORATORY.items():
+        measured = [one for one in (over_seeds(found, each) for each in contrasts) if one.test is not None]
+        if measured:
+            results[stage] = measured
+    return results
