@@ -125,6 +125,11 @@ class Plan:
         for seed in sorted({seed for recipe in recipes for seed in recipe.seeds}):
             yield from (PlannedPolicy(recipe, seed) for recipe in recipes if seed in recipe.seeds)
 
+    def all_policies(self) -> Iterator[PlannedPolicy]:
+        """The policies of all stages."""
+        for stage in self.stages:
+            yield from self.policies(stage)
+
 
 TASKS = ("reach", "two-goals", "stereo-reach", "two-stage")
 COUNTS = dict.fromkeys(TASKS, 200)  # demonstrations of each task

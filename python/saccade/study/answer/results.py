@@ -13,11 +13,11 @@ import pandas as pd
 
 from saccade.errors import InputError
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, Contrast
+from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.sign_flip import SignFlip, sign_flip
 from saccade.study.statistics import CONFIDENCE, holm
 from saccade.study.table import truths
 
-PLAIN = "plain"  # the arm of an unchanged policy
 Float64Array = npt.NDArray[np.float64]
 #: In words: `more` or `less` for a contrast that is not zero, `small` for one within its margin.
 Finding: TypeAlias = Literal["more", "less", "small", "undecided", "not measured"]

@@ -17,15 +17,16 @@ from saccade._files import checkpoint_identity
 from saccade.errors import InputError
 from saccade.sim.training_settings import STATE_FILE
 from saccade.study.answer import plan as plans
+from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
 from saccade.study.answer.plan import Plan, PlannedPolicy, Recording
-from saccade.study.answer.results import PLAIN
 from saccade.study.answer.section import section
 from saccade.study.cell import Cell, Rows
+from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.runs import Planned, read_run, saved_step
 from saccade.study.section import Section
 from saccade.study.study import Study
-from saccade.study.table import Provenance
+from saccade.study.table import Provenance, read_table, table_path
 
 EPILOG = """\
 Records demonstrations, trains the policies of the plan and judges them on the same episodes, stage after
@@ -66,7 +67,7 @@ class Answer(Study):
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """See `Study`."""
         parser.epilog = EPILOG
-        stages = ", ".join(plans.PLAN.stages)
+        stages = ", ".join((*plans.PLAN.stages, *ARMS))
         add_list(parser, "--stages", help=f"stages to run (default: all: {stages})")
 
     @classmethod
@@ -74,22 +75,24 @@ class Answer(Study):
         """See `Study`."""
         from saccade.sim import graphics
 
-        plan = plans.PLAN
-        asked = plan.stages if args.stages is None else args.stages
-        unknown = [stage for stage in asked if stage not in plan.stages]
+        known = (*plans.PLAN.stages, *ARMS)
+        asked = known if args.stages is None else args.stages
+        unknown = [stage for stage in asked if stage not in known]
         if unknown:
             raise InputError(
-                f"stages: unknown name {', '.join(unknown)}, expected some of {', '.join(plan.stages)}"
+                f"stages: unknown name {', '.join(unknown)}, expected some of {', '.join(known)}"
             )
         graphics.check()
-        return cls(plan, tuple(stage for stage in plan.stages if stage in asked))
+        return cls(plans.PLAN, tuple(stage for stage in known if stage in asked))
 
     def begin(self, out: Path) -> Answer:
         """See `Study`."""
         own = out / self.name
         demos = {recording.name: own / "demos" / recording.name for recording in self.plan.recordings}
-        names = [policy.name for stage in self.plan.stages for policy in self.plan.policies(stage)]
-        return replace(self, demos=demos, policies={name: own / "policies" / name for name in names})
+        policies = {policy.name: own / "policies" / policy.name for policy in self.plan.all_policies()}
+        found = replace(self, demos=demos, policies=policies)
+        path = table_path(out, self.name)  # of an earlier run, which may have had other stages
+        return found.with_trained(read_table(path)) if path.exists() else found
 
     def settings(self) -> Mapping[str, Any]:
         """See `Study`."""
@@ -98,7 +101,11 @@ class Answer(Study):
     @property
     def phases(self) -> list[tuple[str, str]]:
         """Stage and kind of each phase. A stage is finished before the next one begins."""
-        return list(itertools.product(self.stages, (RECORDING, TRAINING, EPISODES)))
+        return [
+            (stage, kind)
+            for stage in self.stages
+            for kind in ((EPISODES,) if stage in ARMS else (RECORDING, TRAINING, EPISODES))
+        ]
 
     def cells(self) -> Sequence[Cell]:
         """See `Study`: those of the phases so far."""
@@ -107,31 +114,54 @@ class Answer(Study):
 
     def cells_of(self, stage: str, kind: str) -> Iterator[Cell]:
         """The cells of one phase. Stages may share a recording."""
+        if kind == EPISODES:
+            yield from self.episode_cells(stage)
+            return
         for policy in self.plan.policies(stage):
             recording = described(self.plan.recording(policy.recipe))
             if kind == RECORDING:
                 yield Cell((RECORDING, policy.recipe.recording), recording)
-            elif kind == TRAINING:
+            else:
                 planned = {"training": asdict(policy.training), "recording": recording}
                 yield Cell((TRAINING, policy.name), planned)
-            elif policy.name in self.trained:
-                judged = {"checkpoint": self.trained[policy.name], "episodes": list(self.plan.seeds)}
-                yield from (Cell((EPISODES, policy.name, PLAIN, task), judged) for task in self.plan.tasks)
+
+    def episode_cells(self, stage: str) -> Iterator[Cell]:
+        """A cell for each task of each trained policy and arm: its own policies, or the arms of a stage that
+        trains none, with all policies.
+        """
+        for policy, arm in self.judged(stage):
+            if policy.name in self.trained:
+                settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.plan.seeds)}
+                yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
+
+    def judged(self, stage: str) -> Iterator[tuple[PlannedPolicy, str]]:
+        """The policies and arms of a stage, trained or not."""
+        if stage not in ARMS:
+            yield from ((policy, PLAIN) for policy in self.plan.policies(stage))
+            return
+        for policy in self.plan.all_policies():
+            count = policy.training.num_future_tokens
+            yield from ((policy, arm.name) for arm in ARMS[stage] if arm.applies(count))
 
     @property
     def num_cells(self) -> int:
-        """See `Study`."""
+        """See `Study`. Arms count for the policies that these stages train, or earlier ones have trained."""
         planned = [policy for stage in self.stages for policy in self.plan.policies(stage)]
+        known = {policy.name for policy in planned} | set(self.trained)
+        runs = [policy for stage in self.stages for policy, _ in self.judged(stage) if policy.name in known]
         recordings = {policy.recipe.recording for policy in planned}
-        return len(recordings) + len(planned) * (1 + len(self.plan.tasks))
+        return len(recordings) + len(planned) + len(runs) * len(self.plan.tasks)
 
     def then(self, table: pd.DataFrame) -> Answer | None:
         """See `Study`."""
         if self.phase + 1 == len(self.phases):
             return None
-        trained = table[table["kind"] == TRAINING].to_dict("records")
-        hashes = {row["policy"]: row["checkpoint_sha256"] for row in trained}
-        return replace(self, phase=self.phase + 1, trained=hashes)
+        return replace(self.with_trained(table), phase=self.phase + 1)
+
+    def with_trained(self, table: pd.DataFrame) -> Answer:
+        """The study with the hashes of the policies that the table describes."""
+        rows = [] if table.empty else table[table["kind"] == TRAINING].to_dict("records")
+        return replace(self, trained={row["policy"]: row["checkpoint_sha256"] for row in rows})
 
     @property
     def files(self) -> tuple[str | Path, ...]:
@@ -155,8 +185,7 @@ class Answer(Study):
 
     def planned(self, name: str) -> PlannedPolicy:
         """A policy of the plan by its name."""
-        every = itertools.chain.from_iterable(map(self.plan.policies, self.plan.stages))
-        return next(policy for policy in every if policy.name == name)
+        return next(policy for policy in self.plan.all_policies() if policy.name == name)
 
     def record(self, name: str) -> dict[str, Any]:
         """Records what is missing of a recording, and describes it."""
@@ -237,8 +266,6 @@ class Answer(Study):
             FileNotFoundError: the policy is not there.
             InputError: it is not the one that the table describes.
         """
-        from saccade.study.simulator import judge
-
         directory, expected = self.policies[policy.name], self.trained[policy.name]
         if not directory.is_dir():
             raise FileNotFoundError(
@@ -250,7 +277,7 @@ class Answer(Study):
             raise InputError(f"{directory}: has the hash {found}, expected {expected}, which was trained")
         rows = []
         for seed in self.plan.seeds:
-            episode = judge(str(directory), task, seed)
+            episode = judge(str(directory), task, seed, find_arm(arm))
             result = {"success": episode.success, "control_steps": episode.steps, "chunks": episode.chunks}
             rows.append({**identity(policy), "arm": arm, "task": task, "seed": seed, **result})
         return rows
