@@ -17,12 +17,13 @@ import torch
 from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import main
 from saccade.errors import InputError
+from saccade.intervention import Intervention
 from saccade.sim import demos, graphics, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import Policy, num_vl_tokens
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.training_settings import TrainingSettings
-from saccade.study.answer import costs
+from saccade.study.answer import arms, costs
 from saccade.study.answer import plan as plans
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
 from saccade.study.answer.plan import Plan, Recipe, Recording
@@ -236,6 +237,73 @@ def test_a_later_stage_pairs_with_the_first(core: Path, tmp_path: Path) -> None:
     assert set(table[table["kind"] == "episodes"]["recipe"]) == {"n-0", "n-4", "n-32", "n-4-aligned"}
     assert read_provenance(out / "answer.json").total == 1 + 8 + 8
     assert len(times(out)) == 8
+
+
+def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stage that trains nothing: a cut, and one Euler step, which a changed config must give as well."""
+    unread = replace(arms.of_cuts("future-unread"), applies=lambda count: count == 4)
+    one_step = replace(arms.steps_of(1), applies=lambda count: count == 0)
+    monkeypatch.setitem(arms.ARMS, "instrument", (unread, one_step))
+    monkeypatch.delitem(arms.ARMS, "steps")  # which has an arm of that name
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    assert main(["study", "answer", "--stages", "instrument", "--out", str(out)]) == 0
+    table: Any = read_table(out / "answer.csv")
+    assert read_provenance(out / "answer.json").total == 13 + 4
+    found = table[table["kind"] == "episodes"].set_index(["policy", "arm", "seed"])
+    policies = core / "answer" / "policies"
+
+    def expected(directory: Path, seed: int, change: Intervention | None) -> tuple[bool, int]:
+        policy = Policy.load(directory, num_threads=1)
+        environment = environment_for(policy, TASK)
+        episode = run_episode(environment, policy, seed, intervention=change)
+        environment.close()
+        return episode.success, episode.steps
+
+    cut = Intervention(cut=[("state", "future"), ("action", "future")])
+    row = found.loc[("n-4-seed-1", "future-unread", 1)]
+    assert (row["success"], row["control_steps"]) == expected(policies / "n-4-seed-1", 1, cut)
+    stepped = tmp_path / "stepped"
+    shutil.copytree(policies / "n-0-seed-0", stepped)
+    config = json.loads((stepped / "config.json").read_text())
+    config["action_head_cfg"]["num_inference_timesteps"] = 1
+    (stepped / "config.json").write_text(json.dumps(config))
+    row = found.loc[("n-0-seed-0", "steps of 1", 0)]
+    assert (row["success"], row["control_steps"]) == expected(stepped, 0, None)
+    section = Answer.summarise(table, read_provenance(out / "answer.json"))
+    assert section.grids[-1].columns == ("recipe", "future-unread", "steps of 1")
+    assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
+
+
+def test_a_step_count_reaches_the_head(core: Path) -> None:
+    """Episodes of policies that never succeed look alike, so the actions themselves are compared."""
+    policy = Policy.load(core / "answer" / "policies" / "n-4-seed-0", num_threads=1)
+    seen = policy.blank("reach")
+    noise = policy.noise(np.random.default_rng(0))
+    features = policy.features(seen)
+    for count in (1, 3):
+        stepped = policy.with_head(arms.SteppedHead(policy.head, count))
+        direct = policy.head.sample(
+            policy.head.encode(features), policy.state(seen), 0, noise=noise, num_steps=count
+        )
+        found = stepped.act(seen, noise=noise).actions
+        np.testing.assert_allclose(found, policy.robot_actions(np.asarray(direct))[0], atol=1e-6)
+
+
+def test_the_arms_of_the_stages_that_train_nothing() -> None:
+    names = [arm.name for of_stage in arms.ARMS.values() for arm in of_stage]
+    assert len(set(names)) == len(names)
+    for name in names:
+        found = arms.find_arm(name)
+        assert found is not None
+        rng, tokens = np.random.default_rng(0), np.random.default_rng(1).standard_normal((8, 4))
+        change = found.arm.intervention(tokens.astype(np.float32), rng)
+        assert (change is None) == (found.num_steps is not None)
+        assert found.applies(8)
+        assert found.applies(0) == (found.num_steps is not None)
+    assert arms.find_arm("plain") is None
+    assert [arms.mass_of(4).applies(count) for count in (0, 4, 32)] == [False, False, True]
+    assert [arms.merged_to(4).applies(count) for count in (0, 4, 32)] == [False, False, True]
 
 
 def test_costs_by_hand() -> None:

@@ -13,7 +13,7 @@ import pytest
 from saccade.errors import InputError
 from saccade.study.answer.contrasts import CONFIRMATORY, slope
 from saccade.study.answer.power import power
-from saccade.study.answer.results import confirmed, judged, over_seeds
+from saccade.study.answer.results import changes, confirmed, judged, over_seeds
 from saccade.study.answer.study import Answer
 from saccade.study.section import Section
 from saccade.study.sign_flip import sign_flip
@@ -165,6 +165,21 @@ def test_later_stages_have_their_tables() -> None:
     (costly,) = [line for line in section.concluded if line.startswith("Exploratory: ")]
     assert "succeed more often than wider policies without tokens that cost as much" in costly
     assert "(table 5)" in costly
+
+
+def test_changes_of_arms_are_those_of_the_same_policies() -> None:
+    table = rows_of({"n-4": FEWER, "n-32": MORE})
+    cut = rows_of({"n-4": MORE, "n-32": [0.0] * 8})
+    cut = cut[(cut["kind"] == "episodes") & (cut["policy"] != "n-4-seed-7")].assign(arm="future-unread")
+    table = pd.concat([table, cut])
+    found = changes(table, judged(table, ("a", "b"), range(10)), ("a", "b"), range(10))
+    assert [(one.recipe, one.arm, one.test.pairs) for one in found] == [
+        ("n-4", "future-unread", 7),
+        ("n-32", "future-unread", 8),
+    ]
+    expected = sign_flip(-np.array(MORE))
+    assert found[1].test.p_value == expected.p_value
+    assert found[1].test.difference.value == pytest.approx(expected.difference.value)
 
 
 def test_nothing_trained() -> None:

@@ -150,6 +150,38 @@ def confirmed(found: Judged) -> list[ContrastResult]:
     return [replace(one, corrected=p) for one, p in zip(results, corrected, strict=True)]
 
 
+@dataclass(frozen=True)
+class Change:
+    """What an arm changes in the success of the policies of a recipe.
+
+    Attributes:
+        recipe, arm: Their names.
+        test: The success under the arm minus that of the same unchanged policies, over training seeds.
+    """
+
+    recipe: str
+    arm: str
+    test: SignFlip
+
+
+def changes(table: pd.DataFrame, found: Judged, tasks: Sequence[str], seeds: Sequence[int]) -> list[Change]:
+    """What every arm changes, for the policies that are complete with and without it.
+
+    Args:
+        table, tasks, seeds: As of `judged`.
+        found: The unchanged policies.
+    """
+    results = []
+    for arm in dict.fromkeys(table["arm"].dropna()) if "arm" in table else ():
+        under = judged(table, tasks, seeds, arm).rates if arm != PLAIN else {}
+        for recipe, rates in under.items():
+            plain = found.rates.get(recipe, {})
+            values = [rates[seed] - plain[seed] for seed in rates if seed in plain]
+            if values:
+                results.append(Change(recipe, arm, sign_flip(np.round(values, 12))))
+    return results
+
+
 def explored(found: Judged) -> dict[str, list[ContrastResult]]:
     """The exploratory contrasts of which something was measured, by stage."""
     results = {}

@@ -10,8 +10,9 @@ import pandas as pd
 from matplotlib.figure import Figure as Picture
 
 from saccade.study import figures
+from saccade.study.answer.arms import ARMS
 from saccade.study.answer.contrasts import ALL, MARGIN
-from saccade.study.answer.results import ContrastResult, Judged, confirmed, explored, judged
+from saccade.study.answer.results import Change, ContrastResult, Judged, changes, confirmed, explored, judged
 from saccade.study.section import Figure, Grid, Prose, Section, number, points
 from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import Estimate, scaled
@@ -46,6 +47,11 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
     grids = [test_grid(prose, tests), policy_grid(prose, found, losses)]
     for place, (stage, results) in enumerate(others.items(), start=3):
         grids.append(contrast_grid(prose.line("caption_contrasts", place, stage), results))
+    for stage, arms in ARMS.items():
+        names = [arm.name for arm in arms]
+        of_stage = [one for one in changes(table, found, tasks, seeds) if one.arm in names]
+        if of_stage:
+            grids.append(change_grid(prose.line("caption_changes", len(grids) + 1, stage), of_stage, names))
     shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
     pictures = [Figure("success", prose.line("caption_success"), success_picture(shown))] if shown else []
     return prose.section(pictures, grids)
@@ -123,6 +129,15 @@ def contrast_grid(caption: str, results: Sequence[ContrastResult]) -> Grid:
     """The exploratory contrasts of a stage."""
     lines = [[one.contrast.name, str(len(one.seeds)), percent(one), one.finding] for one in results]
     return Grid(caption, ("contrast", "pairs", "points (95 % interval)", "finding"), lines)
+
+
+def change_grid(caption: str, changed: Sequence[Change], arms: Sequence[str]) -> Grid:
+    """What the arms of a stage change: a row for each recipe, a column for each arm."""
+    lines = []
+    for recipe in dict.fromkeys(one.recipe for one in changed):
+        by_arm = {one.arm: points(one.test.difference) for one in changed if one.recipe == recipe}
+        lines.append([recipe, *(by_arm.get(arm, "") for arm in arms)])
+    return Grid(caption, ("recipe", *arms), lines)
 
 
 def percent(result: ContrastResult) -> str:
