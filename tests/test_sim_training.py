@@ -24,7 +24,7 @@ from saccade.processor import Processor
 from saccade.sim import demos, train
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.dataset import chunks, describe, later_frames, load_samples, prepared
-from saccade.sim.learner import Learner, pool_tokens
+from saccade.sim.learner import Learner, new_learner, pool_tokens
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.tasks import DEMONSTRATION_SEEDS
 from saccade.sim.training_settings import TrainingSettings
@@ -396,6 +396,35 @@ def test_pooling_means_runs_of_neighbours() -> None:
     assert pool_tokens(tokens, 9).shape == (2, 9, 5)
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.2])
+def test_runs_of_one_seed_differ_in_their_tokens_only(weight: float) -> None:
+    def initial(count: int, seed: int = 5) -> dict[str, torch.Tensor]:
+        settings = dataclasses.replace(
+            TINY, num_future_tokens=count, seed=seed, alignment_weight=weight if count else 0.0
+        )
+        run = train.new_run(settings, train.policy_config(settings, RECORDING, TASKS), {})
+        assert all(torch.equal(run.average[name], run.learner.state_dict()[name]) for name in run.average)
+        return run.learner.state_dict()
+
+    tokens = "action_head.future_tokens.weight"
+    settings = dataclasses.replace(TINY, num_future_tokens=32, seed=5, alignment_weight=weight)
+    config = train.policy_config(settings, RECORDING, TASKS)
+    torch.manual_seed(5)
+    shared = Learner(config.backbone_sizes, config.head_config, settings.aligned_block).state_dict()
+    for count in (0, 1, 4, 32, 33, 64):
+        found = initial(count)
+        assert found[tokens].shape == (count, TINY.width)
+        assert torch.equal(found[tokens][:32], shared[tokens][:count])
+        for name in found.keys() - {tokens}:
+            assert torch.equal(found[name], shared[name]), (count, name)
+        assert found.keys() == {name for name in shared if count or not name.startswith("projector.")}
+    rows = initial(64)[tokens]
+    assert torch.equal(initial(40)[tokens], rows[:40])
+    assert len(torch.unique(rows, dim=0)) == 64
+    assert 0.015 < float(rows[32:].std()) < 0.025
+    assert not torch.equal(initial(64, seed=6)[tokens][32:], rows[32:])
+
+
 def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Path) -> None:
     run, batches = make_batches(recording, dataclasses.replace(ALIGNED, batch_size=3))
     with torch.no_grad():
@@ -477,8 +506,7 @@ def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) ->
     for name, tensor in run.learner.state_dict().items():
         assert torch.equal(tensor, other.learner.state_dict()[name]), name
 
-    torch.manual_seed(settings.seed)
-    learner = Learner(run.config.backbone_sizes, run.config.head_config)
+    learner = new_learner(settings, run.config)
     optimizer = torch.optim.AdamW(
         [
             {"params": [p for p in learner.parameters() if p.ndim >= 2], "weight_decay": 0.01},

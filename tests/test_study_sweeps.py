@@ -23,7 +23,8 @@ from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.training_settings import TrainingSettings
-from saccade.study.questions import resized, sweeps, sweeps_cost, sweeps_results, sweeps_runs
+from saccade.study import runs
+from saccade.study.questions import resized, sweeps, sweeps_cost, sweeps_results
 from saccade.study.questions.resized_section import BASELINE, TWICE, TWICE_EQUAL
 from saccade.study.questions.sweeps import FutureTokens, VlSelfAttention, VlTokens
 from saccade.study.questions.sweeps_results import PLAIN
@@ -169,13 +170,13 @@ def test_a_sweep_that_trains(recording: Path, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path) -> None:
-    runs = sweeps_runs.find_runs([policies], NAMES)
-    FutureTokens.check_comparable(runs)
-    assert [run.name for run in runs[:2]] == ["n2-seed0", "n2-seed1"]
+    found = runs.find_runs([policies], NAMES)
+    FutureTokens.check_comparable(found)
+    assert [run.name for run in found[:2]] == ["n2-seed0", "n2-seed1"]
     with pytest.raises(
         InputError, match=r"alignment_weight: .*\. num_future_tokens: 2 \(n2-seed0, n2-seed1\); 4 \("
     ):
-        VlSelfAttention.check_comparable(sweeps_runs.find_runs([policies], VlSelfAttention.varied.names))
+        VlSelfAttention.check_comparable(runs.find_runs([policies], VlSelfAttention.varied.names))
 
     mixed = tmp_path / "mixed"
     shutil.copytree(policies, mixed)
@@ -183,11 +184,11 @@ def test_policies_that_differ_in_more_are_refused(policies: Path, tmp_path: Path
     changed |= {"learning_rate": 0.5, "demonstrations": {**changed["demonstrations"], "sha256": "other"}}
     (mixed / "n4-seed0" / "settings.json").write_text(json.dumps(changed))
     with pytest.raises(InputError, match=r"learning_rate: .* 0.5 \(n4-seed0\)\. demonstrations: .*other"):
-        FutureTokens.check_comparable(sweeps_runs.find_runs([mixed], NAMES))
+        FutureTokens.check_comparable(runs.find_runs([mixed], NAMES))
     shutil.copytree(policies / "n2-seed0", mixed / "again")
     shutil.rmtree(mixed / "n4-seed0")
     with pytest.raises(InputError, match="again and n2-seed0 are the same point with the same seed"):
-        FutureTokens.check_comparable(sweeps_runs.find_runs([mixed], NAMES))
+        FutureTokens.check_comparable(runs.find_runs([mixed], NAMES))
 
 
 def test_a_run_in_training_is_not_measured(policies: Path, tmp_path: Path) -> None:

@@ -5,8 +5,9 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -17,9 +18,13 @@ from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.config import HeadConfig
 from saccade.reference import ActionHead, Backbone
 from saccade.reference.backbone import BackboneFeatures
+from saccade.reference.layers import TABLE_STD
+from saccade.sim.settings import PolicyConfig
+from saccade.sim.training_settings import TrainingSettings
 
-TABLE_STD = 0.02  # initial scale of learned positions and embeddings
 NUM_TARGETS = 6  # object and goal position
+# The initial weights of every N are drawn as for this one, which is that of the bundled policy.
+SHARED_TOKENS = 32
 NUM_QUERIES = 12  # of ImageTargets: two for each view and position
 
 
@@ -178,6 +183,30 @@ class Learner(nn.Module):
             for name, tensor in self.state_dict().items()
             if name.startswith(("backbone.", "action_head."))
         }
+
+
+def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
+    """The modules with their initial weights.
+
+    Runs of one seed that differ in N start from the same weights of everything else, and the tokens of the
+    smaller N are the first ones of the larger N. So policies can be compared in pairs of one seed.
+    """
+    sizes, head, block = config.backbone_sizes, config.head_config, settings.aligned_block
+    torch.manual_seed(settings.seed)
+    drawn = Learner(sizes, replace(head, num_future_tokens=SHARED_TOKENS), block, settings.only)
+    if head.num_future_tokens == SHARED_TOKENS:
+        return drawn
+    more = max(0, head.num_future_tokens - SHARED_TOKENS)
+    generator = torch.Generator().manual_seed(
+        int(np.random.default_rng((settings.seed, SHARED_TOKENS)).integers(2**63))
+    )
+    state = drawn.state_dict()
+    name = "action_head.future_tokens.weight"
+    extra = TABLE_STD * torch.randn((more, head.width), generator=generator)
+    state[name] = torch.cat((state[name], extra))[: head.num_future_tokens]
+    learner = Learner(sizes, head, block, settings.only)
+    learner.load_state_dict(state)
+    return learner
 
 
 class ImageTargets(nn.Module):

@@ -37,7 +37,7 @@ from saccade.reference.backbone import BackboneFeatures
 from saccade.sim import demos
 from saccade.sim.dataset import Samples, describe, load_samples, normalized_actions
 from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
-from saccade.sim.learner import Batch, Learner
+from saccade.sim.learner import Batch, Learner, new_learner
 from saccade.sim.settings import (
     CONFIG_FILE,
     EMBODIMENT,
@@ -50,9 +50,9 @@ from saccade.sim.settings import (
     statistics_of,
 )
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
+from saccade.sim.training_settings import STATE_FILE as STATE_FILE
 from saccade.sim.training_settings import TrainingSettings
 
-STATE_FILE = "training.pt"
 CHECKPOINT_SECONDS = 60.0
 VALIDATION_FRAMES = 256
 WARMUP_STEPS = 200
@@ -134,8 +134,7 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
 
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
     """A run before its first step; for `demonstrations` see `dataset.describe`."""
-    torch.manual_seed(settings.seed)
-    learner = Learner(config.backbone_sizes, config.head_config, settings.aligned_block, settings.only)
+    learner = new_learner(settings, config)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
     optimizer = torch.optim.AdamW(

@@ -8,6 +8,9 @@ from typing import Literal
 
 from saccade.errors import InputError
 
+#: What `saccade train` writes only to continue a run.
+STATE_FILE = "training.pt"
+
 
 @dataclass(frozen=True)
 class TrainingSettings:

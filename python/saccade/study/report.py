@@ -16,7 +16,7 @@ from saccade.study.study import STUDIES, load_study
 from saccade.study.table import provenance_path, read_study, table_path
 
 ATTENTION = "attention"  # the directory that `saccade attention` writes
-SEPARATE = ("fast",)  # studies with a question of their own: a report of these alone names no others
+SEPARATE = ("answer", "fast")  # studies with a question of their own: one of these alone names no others
 PNG_DOTS_PER_INCH = 130
 
 
@@ -42,7 +42,7 @@ def write_report(directory: Path) -> tuple[Path, Path]:
             f"{directory}: contains no study; expected a table such as {next(iter(STUDIES))}.csv, "
             "written by `saccade study`"
         )
-    separate = set(measured) <= set(SEPARATE)
+    separate = len(measured) == 1 and measured[0] in SEPARATE
     title = Prose("words").line("report_title", measured[0] if separate else "")
     parts = [make_part(directory, name) for name in (measured if separate else STUDIES)]
     if (directory / ATTENTION).is_dir():

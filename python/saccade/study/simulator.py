@@ -129,8 +129,7 @@ class Simulator(Source):
         unchanged = self.recorded(task, seed)
         episode = unchanged.episode
         if intervention is not None:
-            environment = environment_of(self.checkpoint, task)
-            episode = run_episode(environment, self.policy, seed, intervention=intervention)
+            episode = judge(self.checkpoint, task, seed, intervention, self.engine)
         return {
             "success": episode.success,
             "steps": episode.steps,
@@ -235,6 +234,16 @@ class Recorder(WrappedHead):
         ids = np.full(len(features), EMBODIMENT_ID)
         observation = Observation(features, state, ids, noise, image_mask=images)
         return Recorded(episode, observation, PrivilegedState(*known))
+
+
+def judge(
+    checkpoint: str, task: str, seed: int, intervention: Intervention | None = None, engine: str = "rust"
+) -> Episode:
+    """Runs an episode of a policy. Layout, wording and noise depend on task and seed alone, so that all
+    policies and interventions are judged on the same episodes.
+    """
+    policy = policy_of(checkpoint, engine)
+    return run_episode(environment_of(checkpoint, task), policy, seed, intervention=intervention)
 
 
 def record_episode(environment: TaskEnvironment, policy: Policy, seed: int) -> Recorded:

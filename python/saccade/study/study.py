@@ -51,6 +51,10 @@ STUDIES: dict[str, tuple[str, str]] = {
         "saccade.study.questions.sweeps:VlSelfAttention",
         "policies with different depths of VL self-attention",
     ),
+    "answer": (
+        "saccade.study.answer.study:Answer",
+        "how many future tokens a policy needs: many policies, trained and judged",
+    ),
     "fast": (
         "saccade.study.questions.fast:Fast",
         "what faster modes cost in actions and in success, and what they save",

@@ -13,7 +13,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -25,15 +25,15 @@ from saccade.intervention import Intervention
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.sweeps_cost import cost
 from saccade.study.questions.sweeps_results import PLAIN, Varied
-from saccade.study.questions.sweeps_runs import Run, describe_run, find_runs, read_run
 from saccade.study.questions.sweeps_section import detectable_lines, section
+from saccade.study.runs import Planned, Run, describe_run, find_runs, read_run
 from saccade.study.section import Section
 from saccade.study.statistics import detectable_between_runs, detectable_difference
 from saccade.study.study import Study
 from saccade.study.table import Provenance
 
 if TYPE_CHECKING:
-    from saccade.sim.training_settings import TrainingSettings
+    pass
 
 EPILOG = """\
 Reads finished runs of `saccade train` (--policies), which must differ in nothing else, or trains them
@@ -48,21 +48,6 @@ examples:
 TRAINING, EPISODES, COST = range(3)  # the stages
 # Assumptions of what can be detected; with few runs neither can be known beforehand.
 SUPPOSED_RATE, SUPPOSED_DEVIATIONS, SUPPOSED_DISCORDANT = 0.7, (0.04, 0.08), (0.1, 0.25)
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A run to be trained.
-
-    Attributes:
-        name: Name of its directory.
-        demonstrations: Directory of `saccade demos`.
-        training: Its settings.
-    """
-
-    name: str
-    demonstrations: str
-    training: TrainingSettings
 
 
 @dataclass(frozen=True)
@@ -256,7 +241,7 @@ class Sweep(Study):
         training: dict[str, Any] = {"alignment_block": None}
         for name in self.runs:
             planned = self.planned.get(name)
-            training |= self.held_equal(planned_settings(planned) if planned else self.read(name).settings)
+            training |= self.held_equal(planned.settings() if planned else self.read(name).settings)
         return {"varied": list(self.varied.names), "engine": "rust", "training": training}
 
     @property
@@ -279,7 +264,7 @@ class Sweep(Study):
         cells = [Cell(("before",), self.before)]
         for name in self.runs:
             planned = self.planned.get(name)
-            settings = planned_settings(planned) if planned else {"step": self.read(name).step}
+            settings = planned.settings() if planned else {"step": self.read(name).step}
             cells.append(Cell(("training", name), settings))
         if self.stage >= EPISODES:
             cells += self.episode_cells()
@@ -352,13 +337,7 @@ class Sweep(Study):
     def training(self, name: str) -> dict[str, Any]:
         """Trains the run if it is planned, then describes how its training ended."""
         if name in self.planned:
-            import torch
-
-            from saccade.sim.train import train
-
-            torch.set_num_threads(1)
-            plan = self.planned[name]
-            train(Path(plan.demonstrations), self.runs[name], plan.training, lambda progress: None)
+            self.planned[name].train(self.runs[name])
         run = self.read(name)
         note = None if run.finished else f"in training, step {run.step} of {run.settings['steps']}"
         loss = run.history[-1]["validation_loss"] if run.finished else None
@@ -366,15 +345,12 @@ class Sweep(Study):
 
     def episode(self, cell: Cell) -> dict[str, Any]:
         """One episode of one policy; an arm other than `PLAIN` weights the future keys like another N."""
-        from saccade.sim.rollout import run_episode
-        from saccade.study.simulator import environment_of, policy_of
+        from saccade.study.simulator import judge
 
         _, name, arm, task, seed = cell.key
         run, mass = self.read(str(name)), cell.settings["mass"]
-        checkpoint = str(run.directory)
         change = None if mass is None else equal_mass(int(run.point["num_future_tokens"]), int(mass))
-        environment = environment_of(checkpoint, str(task))
-        episode = run_episode(environment, policy_of(checkpoint), int(seed), intervention=change)
+        episode = judge(str(run.directory), str(task), int(seed), change)
         result = {"arm": arm, "task": task, "seed": seed, "success": episode.success, "steps": episode.steps}
         return {**describe_run(run), **result}
 
@@ -390,15 +366,6 @@ def weight(word: str) -> float:
     if not math.isfinite(value):
         raise ValueError(word)
     return value
-
-
-def planned_settings(plan: Planned) -> dict[str, Any]:
-    """What `settings.json` of a planned run will contain."""
-    from saccade.sim import demos
-    from saccade.sim.dataset import describe
-
-    directory = Path(plan.demonstrations)
-    return {**asdict(plan.training), "demonstrations": describe(directory, demos.recorded_tasks(directory))}
 
 
 def equal_mass(num_tokens: int, like: int) -> Intervention:

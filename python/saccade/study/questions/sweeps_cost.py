@@ -11,7 +11,7 @@ import numpy as np
 from saccade.head import ActionHead
 from saccade.observation import Observation
 from saccade.study.cell import Rows
-from saccade.study.questions.sweeps_runs import Run, describe_run
+from saccade.study.runs import Run, describe_run
 from saccade.study.statistics import bootstrap
 
 ROUNDS = 200  # each round times every policy once

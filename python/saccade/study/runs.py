@@ -1,17 +1,59 @@
-"""Reading runs of `saccade train` for the sweeps."""
+"""Runs of `saccade train` in a study: planned, trained and read."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from saccade._files import checkpoint_identity
 from saccade.errors import InputError
 
+if TYPE_CHECKING:
+    from saccade.sim.training_settings import TrainingSettings
+
 SETTINGS_FILE = "settings.json"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A run to be trained.
+
+    Attributes:
+        name: Name of its directory.
+        demonstrations: Directory of `saccade demos`.
+        training: Its settings.
+    """
+
+    name: str
+    demonstrations: str
+    training: TrainingSettings
+
+    def settings(self) -> dict[str, Any]:
+        """What `settings.json` of the run will contain."""
+        from saccade.sim import demos
+        from saccade.sim.dataset import describe
+
+        directory = Path(self.demonstrations)
+        return {
+            **asdict(self.training),
+            "demonstrations": describe(directory, demos.recorded_tasks(directory)),
+        }
+
+    def train(self, out: Path) -> None:
+        """Trains the run on one thread, or continues the one in `out`.
+
+        Args:
+            out: The run's directory.
+        """
+        import torch
+
+        from saccade.sim.train import train
+
+        torch.set_num_threads(1)  # runs are spread over processes
+        train(Path(self.demonstrations), out, self.training, lambda progress: None)
 
 
 @dataclass(frozen=True)
@@ -82,6 +124,15 @@ def read_run(directory: Path, varied: Sequence[str]) -> Run:
         return Run(directory.name, directory, settings, history, {name: known[name] for name in varied})
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{directory}: not written by `saccade train`: {error}") from None
+
+
+def saved_step(state: Path) -> int:
+    """The step at which a run can be continued from its `training.pt`; 0 if there is none."""
+    if not state.is_file():
+        return 0
+    import torch
+
+    return int(torch.load(state, weights_only=True)["step"])
 
 
 def find_runs(directories: Iterable[Path], varied: Sequence[str]) -> list[Run]:

@@ -1,0 +1,120 @@
+"""What `saccade study answer` compares: sums of weighted success rates of policies of one training seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+#: A difference of success rates that would matter. Smaller ones count as none.
+MARGIN = 0.10
+CORE = {"n-0": 0, "n-4": 4, "n-32": 32}  # N of the recipes of the confirmatory tests
+ALL = {"n-0": 0, "n-1": 1, "n-4": 4, "n-16": 16, "n-32": 32, "n-64": 64}
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A number that is computed from the success rates of policies of one training seed.
+
+    Attributes:
+        name: What it is, for tables.
+        weights: The weight of each recipe.
+        margin: The smallest absolute value that would matter.
+        unit: What a value of 1 is 100 of.
+    """
+
+    name: str
+    weights: Mapping[str, float]
+    margin: float = MARGIN
+    unit: str = "points"
+
+    @property
+    def recipes(self) -> tuple[str, ...]:
+        """The recipes that it needs."""
+        return tuple(self.weights)
+
+    def of(self, rates: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Its values.
+
+        Args:
+            rates: Success rates of `recipes`, `(..., recipes)`.
+
+        Returns:
+            `(...)`, where equal rates give exactly 0, so that rounding has no sign that a test could see.
+        """
+        return np.asarray(np.round(rates @ np.array(list(self.weights.values())), 12))
+
+
+def difference(second: str, first: str) -> Contrast:
+    """The success of one recipe minus that of another."""
+    return Contrast(f"{second} minus {first}", {second: 1.0, first: -1.0})
+
+
+def interaction(suffix: str) -> Contrast:
+    """What 32 tokens instead of 4 change in policies of another kind, minus the same in plain ones."""
+    weights = {f"n-32{suffix}": 1.0, f"n-4{suffix}": -1.0, "n-32": -1.0, "n-4": 1.0}
+    return Contrast(f"(n-32{suffix} minus n-4{suffix}) minus (n-32 minus n-4)", weights)
+
+
+def slope(counts: Mapping[str, int]) -> Contrast:
+    """The least-squares slope of success over log2(N + 1).
+
+    Its margin is that of the difference between the smallest and the largest N.
+
+    Args:
+        counts: N of each recipe.
+
+    Example:
+        >>> found = slope({"none": 0, "one": 1, "three": 3})
+        >>> found.weights, found.margin
+        ({'none': -0.5, 'one': 0.0, 'three': 0.5}, 0.05)
+    """
+    x = np.log2(np.array(list(counts.values())) + 1.0)
+    weights = (x - x.mean()) / ((x - x.mean()) ** 2).sum()
+    shown = ", ".join(map(str, counts.values()))
+    return Contrast(
+        f"slope over log2(N + 1), N = {shown}",
+        dict(zip(counts, weights.tolist(), strict=True)),
+        MARGIN / float(x.max() - x.min()),
+        "points per unit of log2(N + 1)",
+    )
+
+
+#: The tests that were decided beforehand: the primary one, then the secondary ones. Holm's correction is over
+#: all three.
+CONFIRMATORY = (difference("n-32", "n-0"), difference("n-32", "n-4"), slope(CORE))
+
+#: Everything else, by stage: intervals without a test.
+EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
+    "alignment": (
+        difference("n-4-aligned", "n-4"),
+        difference("n-32-aligned", "n-32"),
+        difference("n-32-aligned", "n-4-aligned"),
+        difference("n-32-aligned", "n-0"),
+    ),
+    "numbers": (
+        difference("n-1", "n-0"),
+        difference("n-4", "n-0"),
+        difference("n-16", "n-4"),
+        difference("n-64", "n-32"),
+        slope(ALL),
+    ),
+    "compute": (
+        difference("n-32", "n-0-wide"),
+        difference("n-32", "n-0-long"),
+        difference("n-0-wide", "n-0"),
+        difference("n-0-long", "n-0"),
+    ),
+    "vision": tuple(
+        contrast
+        for suffix in ("-one-camera", "-patch-32", "-patch-8")
+        for contrast in (difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix))
+    ),
+    "vlsa": tuple(
+        contrast
+        for suffix in ("-vlsa-0", "-vlsa-4")
+        for contrast in (difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix))
+    ),
+}

@@ -1,0 +1,192 @@
+"""The analysis of `saccade study answer`, from its table alone: policies are paired by training seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from saccade.errors import InputError
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, Contrast
+from saccade.study.questions.sweeps_results import PLAIN
+from saccade.study.sign_flip import SignFlip, sign_flip
+from saccade.study.statistics import CONFIDENCE, holm
+from saccade.study.table import truths
+
+Float64Array = npt.NDArray[np.float64]
+#: In words: `more` or `less` for a contrast that is not zero, `small` for one within its margin.
+Finding: TypeAlias = Literal["more", "less", "small", "undecided", "not measured"]
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A policy that is not used.
+
+    Attributes:
+        policy: Its name.
+        done, all: Number of its episodes, and of those that it should have run.
+    """
+
+    policy: str
+    done: int
+    all: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The success of complete policies.
+
+    Attributes:
+        rates: Mean over tasks of the success rate, by recipe, in the order of stage and N, and training seed.
+        missing: Policies that lack episodes.
+    """
+
+    rates: Mapping[str, Mapping[int, float]]
+    missing: Sequence[Missing]
+
+    def paired(self, recipes: Sequence[str]) -> tuple[list[int], Float64Array]:
+        """The training seeds that all recipes have, and their rates `(seeds, recipes)`."""
+        have = [set(self.rates.get(recipe, {})) for recipe in recipes]
+        seeds = sorted(set.intersection(*have))
+        rates = [[self.rates[recipe][seed] for recipe in recipes] for seed in seeds]
+        return seeds, np.array(rates, dtype=float).reshape(len(seeds), len(recipes))
+
+
+@dataclass(frozen=True)
+class ContrastResult:
+    """A contrast, tested over training seeds.
+
+    Attributes:
+        contrast: What was tested.
+        seeds: The training seeds that were used.
+        unpaired: Those that some of the recipes have and others lack.
+        values: The contrast at each seed.
+        test: The exact test, or None without a seed.
+        corrected: Its p value after Holm's correction; None if the test is exploratory.
+    """
+
+    contrast: Contrast
+    seeds: Sequence[int]
+    unpaired: Sequence[int]
+    values: Sequence[float]
+    test: SignFlip | None
+    corrected: float | None = None
+
+    @property
+    def finding(self) -> Finding:
+        """What the result shows, by rules that were decided beforehand. The first that holds decides:
+
+        1. `not measured`: no training seed has all policies.
+        2. `more`, `less`: a confirmatory test rejects at the 5 % level after Holm's correction; for an
+           exploratory contrast, its interval excludes zero.
+        3. `small`: the interval is inside the margin on both sides.
+        4. `undecided`: anything else, and whatever has no interval.
+        """
+        if self.test is None:
+            return "not measured"
+        found = self.test.difference
+        rejected = found.low > 0 or found.high < 0
+        if self.corrected is not None:
+            rejected = self.corrected <= 1 - CONFIDENCE
+        if rejected:
+            return "more" if found.value > 0 else "less"
+        inside = not math.isnan(found.low) and max(-found.low, found.high) < self.contrast.margin
+        return "small" if inside else "undecided"
+
+
+def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm: str = PLAIN) -> Judged:
+    """The success rates of policies, each task weighted alike.
+
+    Args:
+        table: Table of the study.
+        tasks, seeds: The episodes of every policy.
+        arm: What was done to the policies.
+
+    Raises:
+        InputError: an episode is in the table twice, or is not one of those.
+    """
+    expected = len(tasks) * len(seeds)
+    trained = table[table["kind"] == "training"]
+    episodes = table[(table["kind"] == "episodes") & (table["arm"] == arm)] if "arm" in table else trained[:0]
+    rates: dict[str, dict[int, float]] = {}
+    missing = []
+    stages = ["core", *EXPLORATORY]
+    trained = trained.assign(order=trained["stage"].map(stages.index))
+    trained = trained.sort_values(["order", "num_future_tokens", "recipe", "training_seed"])
+    for policy, row in trained.set_index("policy").iterrows():
+        rows = episodes[episodes["policy"] == policy]
+        pairs = set(zip(rows["task"], rows["seed"], strict=True)) if len(rows) else set()
+        if len(pairs) != len(rows) or not pairs <= {(task, seed) for task in tasks for seed in seeds}:
+            raise InputError(f"episodes: those of {policy} are not distinct ones of the plan")
+        if len(rows) < expected:
+            missing.append(Missing(str(policy), len(rows), expected))
+            continue
+        by_task = rows.assign(success=truths(rows["success"])).groupby("task")["success"].mean()
+        rates.setdefault(str(row["recipe"]), {})[int(row["training_seed"])] = float(by_task.mean())
+    return Judged(rates, missing)
+
+
+def over_seeds(found: Judged, contrast: Contrast) -> ContrastResult:
+    """Tests a contrast over the training seeds for which all its recipes are complete."""
+    seeds, rates = found.paired(contrast.recipes)
+    have = [set(found.rates.get(recipe, {})) for recipe in contrast.recipes]
+    values = contrast.of(rates)
+    test = sign_flip(values) if seeds else None
+    return ContrastResult(contrast, seeds, sorted(set.union(*have) - set(seeds)), list(values), test)
+
+
+def confirmed(found: Judged) -> list[ContrastResult]:
+    """The confirmatory tests, with Holm's correction over all of them.
+
+    A test without a pair counts as one with p = 1, so that the others are corrected as planned.
+    """
+    results = [over_seeds(found, contrast) for contrast in CONFIRMATORY]
+    corrected = holm([1.0 if one.test is None else one.test.p_value for one in results])
+    return [replace(one, corrected=p) for one, p in zip(results, corrected, strict=True)]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What an arm changes in the success of the policies of a recipe.
+
+    Attributes:
+        recipe, arm: Their names.
+        test: The success under the arm minus that of the same unchanged policies, over training seeds.
+    """
+
+    recipe: str
+    arm: str
+    test: SignFlip
+
+
+def changes(table: pd.DataFrame, found: Judged, tasks: Sequence[str], seeds: Sequence[int]) -> list[Change]:
+    """What every arm changes, for the policies that are complete with and without it.
+
+    Args:
+        table, tasks, seeds: As of `judged`.
+        found: The unchanged policies.
+    """
+    results = []
+    for arm in dict.fromkeys(table["arm"].dropna()) if "arm" in table else ():
+        under = judged(table, tasks, seeds, arm).rates if arm != PLAIN else {}
+        for recipe, rates in under.items():
+            plain = found.rates.get(recipe, {})
+            values = [rates[seed] - plain[seed] for seed in rates if seed in plain]
+            if values:
+                results.append(Change(recipe, arm, sign_flip(np.round(values, 12))))
+    return results
+
+
+def explored(found: Judged) -> dict[str, list[ContrastResult]]:
+    """The exploratory contrasts of which something was measured, by stage."""
+    results = {}
+    for stage, contrasts in EXPLORATORY.items():
+        measured = [one for one in (over_seeds(found, each) for each in contrasts) if one.test is not None]
+        if measured:
+            results[stage] = measured
+    return results

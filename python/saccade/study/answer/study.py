@@ -1,0 +1,305 @@
+"""`saccade study answer`: trains the policies of the plan and judges them, stage after stage."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pandas as pd
+
+from saccade._arguments import add_list
+from saccade._files import checkpoint_identity
+from saccade.errors import InputError
+from saccade.sim.training_settings import STATE_FILE
+from saccade.study.answer import plan as plans
+from saccade.study.answer.arms import ARMS, find_arm, judge
+from saccade.study.answer.costs import cost
+from saccade.study.answer.plan import Plan, PlannedPolicy, Recording
+from saccade.study.answer.section import section
+from saccade.study.cell import Cell, Rows
+from saccade.study.questions.sweeps_results import PLAIN
+from saccade.study.runs import Planned, read_run, saved_step
+from saccade.study.section import Section
+from saccade.study.study import Study
+from saccade.study.table import Provenance, read_table, table_path
+
+EPILOG = """\
+Records demonstrations, trains the policies of the plan and judges them on the same episodes, stage after
+stage. DIR/answer/policies has the policies; one that is there and finished is not trained again, on any
+machine. DIR/answer/demos has the demonstrations, which only training needs; missing ones are recorded again.
+
+examples:
+  saccade study answer --stages core --jobs 2 --out out/answer
+  saccade study answer --out out/answer
+"""
+RECORDING, TRAINING, EPISODES = "recording", "training", "episodes"
+#: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
+NOT_KEPT = (STATE_FILE, "loss.png")
+
+
+@dataclass(frozen=True)
+class Answer(Study):
+    """Policies trained with different numbers of future tokens, and in other respects, judged alike.
+
+    Attributes:
+        plan: What is trained, and how it is judged.
+        stages: The stages that are run, in the order of the plan.
+        phase: How many of `phases` are over.
+        demos: Directory of each recording, by name; set by `begin`, as are `policies`.
+        policies: Directory of each policy, by name.
+        trained: Hash of each finished policy, by name.
+    """
+
+    plan: Plan
+    stages: tuple[str, ...]
+    phase: int = 0
+    demos: Mapping[str, Path] = field(default_factory=dict)
+    policies: Mapping[str, Path] = field(default_factory=dict)
+    trained: Mapping[str, str] = field(default_factory=dict)
+    name: ClassVar[str] = "answer"
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """See `Study`."""
+        parser.epilog = EPILOG
+        stages = ", ".join((*plans.PLAN.stages, *ARMS))
+        add_list(parser, "--stages", help=f"stages to run (default: all: {stages})")
+
+    @classmethod
+    def from_arguments(cls, args: argparse.Namespace) -> Answer:
+        """See `Study`."""
+        from saccade.sim import graphics
+
+        known = (*plans.PLAN.stages, *ARMS)
+        asked = known if args.stages is None else args.stages
+        unknown = [stage for stage in asked if stage not in known]
+        if unknown:
+            raise InputError(
+                f"stages: unknown name {', '.join(unknown)}, expected some of {', '.join(known)}"
+            )
+        graphics.check()
+        return cls(plans.PLAN, tuple(stage for stage in known if stage in asked))
+
+    def begin(self, out: Path) -> Answer:
+        """See `Study`."""
+        own = out / self.name
+        demos = {recording.name: own / "demos" / recording.name for recording in self.plan.recordings}
+        policies = {policy.name: own / "policies" / policy.name for policy in self.plan.all_policies()}
+        found = replace(self, demos=demos, policies=policies)
+        path = table_path(out, self.name)  # of an earlier run, which may have had other stages
+        return found.with_trained(read_table(path)) if path.exists() else found
+
+    def settings(self) -> Mapping[str, Any]:
+        """See `Study`."""
+        return {"engine": "rust", "tasks": list(self.plan.tasks), "episodes": list(self.plan.seeds)}
+
+    @property
+    def phases(self) -> list[tuple[str, str]]:
+        """Stage and kind of each phase. A stage is finished before the next one begins."""
+        return [
+            (stage, kind)
+            for stage in self.stages
+            for kind in ((EPISODES,) if stage in ARMS else (RECORDING, TRAINING, EPISODES))
+        ]
+
+    def cells(self) -> Sequence[Cell]:
+        """See `Study`: those of the phases so far."""
+        so_far = itertools.starmap(self.cells_of, self.phases[: self.phase + 1])
+        return list({cell.key: cell for cell in itertools.chain.from_iterable(so_far)}.values())
+
+    def cells_of(self, stage: str, kind: str) -> Iterator[Cell]:
+        """The cells of one phase. Stages may share a recording."""
+        if kind == EPISODES:
+            yield from self.episode_cells(stage)
+            return
+        for policy in self.plan.policies(stage):
+            recording = described(self.plan.recording(policy.recipe))
+            if kind == RECORDING:
+                yield Cell((RECORDING, policy.recipe.recording), recording)
+            else:
+                planned = {"training": asdict(policy.training), "recording": recording}
+                yield Cell((TRAINING, policy.name), planned)
+
+    def episode_cells(self, stage: str) -> Iterator[Cell]:
+        """A cell for each task of each trained policy and arm: its own policies, or the arms of a stage that
+        trains none, with all policies.
+        """
+        for policy, arm in self.judged(stage):
+            if policy.name in self.trained:
+                settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.plan.seeds)}
+                yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
+
+    def judged(self, stage: str) -> Iterator[tuple[PlannedPolicy, str]]:
+        """The policies and arms of a stage, trained or not."""
+        if stage not in ARMS:
+            yield from ((policy, PLAIN) for policy in self.plan.policies(stage))
+            return
+        for policy in self.plan.all_policies():
+            count = policy.training.num_future_tokens
+            yield from ((policy, arm.name) for arm in ARMS[stage] if arm.applies(count))
+
+    @property
+    def num_cells(self) -> int:
+        """See `Study`. Arms count for the policies that these stages train, or earlier ones have trained."""
+        planned = [policy for stage in self.stages for policy in self.plan.policies(stage)]
+        known = {policy.name for policy in planned} | set(self.trained)
+        runs = [policy for stage in self.stages for policy, _ in self.judged(stage) if policy.name in known]
+        recordings = {policy.recipe.recording for policy in planned}
+        return len(recordings) + len(planned) + len(runs) * len(self.plan.tasks)
+
+    def then(self, table: pd.DataFrame) -> Answer | None:
+        """See `Study`."""
+        if self.phase + 1 == len(self.phases):
+            return None
+        return replace(self.with_trained(table), phase=self.phase + 1)
+
+    def with_trained(self, table: pd.DataFrame) -> Answer:
+        """The study with the hashes of the policies that the table describes."""
+        rows = [] if table.empty else table[table["kind"] == TRAINING].to_dict("records")
+        return replace(self, trained={row["policy"]: row["checkpoint_sha256"] for row in rows})
+
+    @property
+    def files(self) -> tuple[str | Path, ...]:
+        """See `Study`: the finished policies. Demonstrations, and policies in training, stay in the output
+        directory, which other machines must share.
+        """
+        if self.phases[self.phase][1] != EPISODES:
+            return ()
+        return tuple(path for name, path in self.policies.items() if name in self.trained and path.is_dir())
+
+    def measure(self, cell: Cell) -> Rows:
+        """See `Study`; the first word of the key says what is measured."""
+        kind, name = str(cell.key[0]), str(cell.key[1])
+        if kind == RECORDING:
+            rows = [self.record(name)]
+        elif kind == TRAINING:
+            rows = [self.train(self.planned(name))]
+        else:
+            rows = self.judge(self.planned(name), str(cell.key[2]), str(cell.key[3]))
+        return [{"kind": kind, **row} for row in rows]
+
+    def planned(self, name: str) -> PlannedPolicy:
+        """A policy of the plan by its name."""
+        return next(policy for policy in self.plan.all_policies() if policy.name == name)
+
+    def record(self, name: str) -> dict[str, Any]:
+        """Records what is missing of a recording, and describes it."""
+        from saccade.sim import demos, opened
+        from saccade.sim.dataset import describe
+
+        recording = next(one for one in self.plan.recordings if one.name == name)
+        start = time.perf_counter()
+        demos.record_tasks(recording.counts, self.demos[name], recording.settings, lambda task: None)
+        opened.close()
+        found = describe(self.demos[name], demos.recorded_tasks(self.demos[name]))
+        return {
+            "recording": name,
+            "demonstrations": sum(found["tasks"].values()),
+            "demonstrations_sha256": found["sha256"],
+            "seconds": time.perf_counter() - start,
+        }
+
+    def train(self, policy: PlannedPolicy) -> dict[str, Any]:
+        """Trains a policy unless that is done, and describes it.
+
+        A column `trained_from_step` says how many steps were done when this process began: with another
+        number than 0, `seconds` and `cpu` are those of the last part of the training only.
+        """
+        directory, recording = self.policies[policy.name], policy.recipe.recording
+        start, first = time.perf_counter(), self.steps_done(policy)
+        if first < policy.training.steps:
+            self.record(recording)
+            Planned(policy.name, str(self.demos[recording]), policy.training).train(directory)
+        seconds = time.perf_counter() - start
+        for name in NOT_KEPT:
+            (directory / name).unlink(missing_ok=True)
+        run = read_run(directory, ("image_size", "num_cameras", "num_vl_tokens"))
+        found = cost(policy.training, self.plan.recording(policy.recipe))
+        known = {name: value for name, value in asdict(policy.training).items() if name != "seed"}
+        losses = {name: loss for name, loss in run.history[-1].items() if name != "step"}
+        return {
+            **identity(policy),
+            **known,
+            **run.point,
+            "recording": recording,
+            "demonstrations_sha256": run.settings["demonstrations"]["sha256"],
+            "checkpoint_sha256": run.checkpoint_sha256,
+            "policy_bytes": sum(file.stat().st_size for file in directory.rglob("*") if file.is_file()),
+            **losses,
+            "trained_from_step": first,
+            "seconds": seconds,
+            "chunk_multiply_adds": found.chunk,
+            "training_multiply_adds": found.sample * policy.training.batch_size * policy.training.steps,
+        }
+
+    def steps_done(self, policy: PlannedPolicy) -> int:
+        """The steps that a policy in its directory was trained for.
+
+        Raises:
+            InputError: it was trained with other settings.
+        """
+        directory = self.policies[policy.name]
+        if not (directory / "settings.json").is_file():
+            return 0
+        run = read_run(directory, ())
+        wanted = asdict(policy.training)
+        other = [name for name, value in wanted.items() if run.settings.get(name) != value]
+        if other:
+            raise InputError(f"{directory}: was trained with other settings ({', '.join(other)})")
+        counts = dict(self.plan.recording(policy.recipe).counts)
+        if run.settings["demonstrations"]["tasks"] != counts:
+            raise InputError(f"{directory}: was trained on other demonstrations, expected {counts}")
+        if run.finished:
+            return run.step
+        # Without its state, a run that was stopped cannot be continued, and is begun again.
+        return saved_step(directory / STATE_FILE)
+
+    def judge(self, policy: PlannedPolicy, arm: str, task: str) -> Rows:
+        """All episodes of a task, a row each.
+
+        Raises:
+            FileNotFoundError: the policy is not there.
+            InputError: it is not the one that the table describes.
+        """
+        directory, expected = self.policies[policy.name], self.trained[policy.name]
+        if not directory.is_dir():
+            raise FileNotFoundError(
+                f"{directory}: no such policy; it was trained, with the hash {expected}. Put it back, or "
+                "delete its file in answer/cells to train it again"
+            )
+        found = checkpoint_identity(directory)["sha256"]
+        if found != expected:
+            raise InputError(f"{directory}: has the hash {found}, expected {expected}, which was trained")
+        rows = []
+        for seed in self.plan.seeds:
+            episode = judge(str(directory), task, seed, find_arm(arm))
+            result = {"success": episode.success, "control_steps": episode.steps, "chunks": episode.chunks}
+            rows.append({**identity(policy), "arm": arm, "task": task, "seed": seed, **result})
+        return rows
+
+    @classmethod
+    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
+        """See `Study`."""
+        return section(table, provenance)
+
+
+def identity(policy: PlannedPolicy) -> dict[str, Any]:
+    """The columns that identify a policy."""
+    recipe = policy.recipe
+    return {
+        "stage": recipe.stage,
+        "recipe": recipe.name,
+        "policy": policy.name,
+        "training_seed": policy.seed,
+        "num_future_tokens": recipe.training.num_future_tokens,
+    }
+
+
+def described(recording: Recording) -> dict[str, Any]:
+    """A recording as JSON."""
+    return {"counts": dict(recording.counts), **recording.settings.to_dict()}

@@ -1,0 +1,384 @@
+"""`saccade study answer` on a tiny plan: real training and real episodes, stage after stage; costs."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from saccade.bench.work import Call, encode_work, sample_work, total
+from saccade.cli import main
+from saccade.errors import InputError
+from saccade.intervention import Intervention
+from saccade.sim import demos, graphics, train
+from saccade.sim.cameras import DEFAULT_CAMERAS
+from saccade.sim.policy import Policy, num_vl_tokens
+from saccade.sim.rollout import environment_for, run_episode
+from saccade.sim.training_settings import TrainingSettings
+from saccade.study.answer import arms, costs
+from saccade.study.answer import plan as plans
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
+from saccade.study.answer.plan import Plan, Recipe, Recording
+from saccade.study.answer.study import Answer
+from saccade.study.run import StudyError, run
+from saccade.study.table import read_provenance, read_table
+
+WHOLE_PLAN = plans.PLAN
+TASK = "fork"  # its episodes are short
+TINY = TrainingSettings(
+    steps=2,
+    batch_size=2,
+    width=8,
+    num_layers=2,
+    num_heads=1,
+    language_layers=1,
+    vision_width=8,
+    vision_layers=1,
+    vision_heads=1,
+    patch_size=8,
+)
+RECORDING = Recording(
+    "tiny",
+    {TASK: 2},
+    demos.RecordingSettings(image_size=16, frame_stride=12, cameras=DEFAULT_CAMERAS[:1]),
+)
+
+
+def recipe(stage: str, name: str, **changes: Any) -> Recipe:
+    return Recipe(stage, name, replace(TINY, **changes), "tiny", (0, 1))
+
+
+PLAN = Plan(
+    recordings=(RECORDING,),
+    recipes=(
+        *(recipe("core", f"n-{count}", num_future_tokens=count) for count in (0, 4, 32)),
+        recipe("alignment", "n-4-aligned", num_future_tokens=4, alignment_weight=0.2),
+    ),
+    tasks=(TASK,),
+    seeds=range(2),
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick() -> Iterator[None]:
+    """Training without its picture, few frames held out, short episodes; the machine draws."""
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "plot_history", lambda history, path: None)
+        patch.setattr(train, "VALIDATION_FRAMES", 2)
+        patch.setattr(graphics, "check", lambda: None)
+        patch.setattr(plans, "PLAN", PLAN)
+        yield
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of the first stage."""
+    out = tmp_path_factory.mktemp("core")
+    assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_first_stage(core: Path) -> None:
+    table: Any = read_table(core / "answer.csv")
+    provenance = read_provenance(core / "answer.json")
+    assert provenance.complete
+    assert provenance.total == 1 + 6 + 6
+    trained = table[table["kind"] == "training"].set_index("policy")
+    assert sorted(trained.index) == sorted(f"n-{n}-seed-{seed}" for n in (0, 4, 32) for seed in (0, 1))
+    policies = core / "answer" / "policies"
+    row = trained.loc["n-4-seed-1"]
+    assert row["checkpoint_sha256"] == Policy.load(policies / "n-4-seed-1").checkpoint_sha256()
+    history = json.loads((policies / "n-4-seed-1" / "history.json").read_text())
+    assert row["validation_loss"] == history[-1]["validation_loss"]
+    assert (row["steps"], row["trained_from_step"], row["training_seed"]) == (2, 0, 1)
+    assert row["seconds"] > 0
+    expected = costs.cost(replace(TINY, num_future_tokens=4), RECORDING)
+    assert row["chunk_multiply_adds"] == expected.chunk
+    assert row["training_multiply_adds"] == expected.sample * TINY.batch_size * TINY.steps
+    recorded = table[table["kind"] == "recording"].iloc[0]
+    assert row["demonstrations_sha256"] == recorded["demonstrations_sha256"]
+    assert recorded["demonstrations"] == 2
+    kept = {path.name for path in (policies / "n-4-seed-1").rglob("*") if path.is_file()}
+    assert kept == {
+        "config.json",
+        "history.json",
+        "metadata.json",
+        "model.safetensors",
+        "settings.json",
+        "tokenizer.json",
+    }
+
+    policy = Policy.load(policies / "n-32-seed-0", num_threads=1)
+    environment = environment_for(policy, TASK)
+    episodes = table[table["kind"] == "episodes"].set_index(["policy", "seed"])
+    assert len(episodes) == 12
+    for seed in (0, 1):
+        episode = run_episode(environment, policy, seed)
+        row = episodes.loc[("n-32-seed-0", seed)]
+        found = (row["success"], row["control_steps"], row["chunks"])
+        assert found == (episode.success, episode.steps, episode.chunks)
+    environment.close()
+
+
+def test_all_policies_get_the_same_episodes(core: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same first images, states and noise, whatever N is."""
+    given: dict[str, list[Any]] = {}
+    for name in ("n-0-seed-0", "n-32-seed-1"):
+        policy = Policy.load(core / "answer" / "policies" / name, num_threads=1)
+        seen = given.setdefault(name, [])
+        act = policy.act
+
+        def watched(observation: Any, *, noise: Any, seen: Any = seen, act: Any = act, **more: Any) -> Any:
+            seen.append((observation["images"], observation["proprio"], observation["instruction"], noise))
+            return act(observation, noise=noise, **more)
+
+        monkeypatch.setattr(policy, "act", watched)
+        environment = environment_for(policy, TASK)
+        for seed in (3, 4):
+            seen.append(seed)
+            run_episode(environment, policy, seed)
+        environment.close()
+    one, other = given.values()
+    starts = [([place for place, item in enumerate(seen) if isinstance(item, int)]) for seen in (one, other)]
+    for first, second in zip(*starts, strict=True):
+        for left, right in zip(one[first + 1][:2], other[second + 1][:2], strict=True):
+            assert str(left) == str(right)
+        assert one[first + 1][2] == other[second + 1][2]
+        for chunk in range(1, 4):
+            assert np.array_equal(one[first + chunk][3], other[second + chunk][3])
+    assert not np.array_equal(one[starts[0][0] + 1][3], one[starts[0][1] + 1][3])
+
+
+def times(out: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in out.glob("answer/*/*/model.safetensors")}
+
+
+def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On another machine: without demonstrations, and with the policies and the finished cells."""
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    shutil.rmtree(out / "answer" / "demos")
+    before = times(out)
+    cells = {path: path.stat().st_mtime_ns for path in out.glob("answer/cells/*")}
+    arguments = ["study", "answer", "--stages", "core", "--out", str(out)]
+    assert main(arguments) == 0
+    assert times(out) == before
+    assert {path: path.stat().st_mtime_ns for path in out.glob("answer/cells/*")} == cells
+    assert not (out / "answer" / "demos").exists()
+
+    # Without the cells the policies are described and judged again, and not trained.
+    (described,) = [
+        path for path in cells if json.loads(path.read_text())["key"] == ["training", "n-4-seed-0"]
+    ]
+    described.unlink()
+    assert main(arguments) == 0
+    assert times(out) == before
+    table: Any = read_table(out / "answer.csv")
+    assert table.set_index("policy").loc["n-4-seed-0", "trained_from_step"].dropna().tolist() == [2.0]
+
+    # A policy that is gone is named, and the others are judged.
+    shutil.rmtree(out / "answer" / "policies" / "n-32-seed-1")
+    for path in cells:
+        if path.exists() and json.loads(path.read_text())["key"][0] == "episodes":
+            path.unlink()
+    capsys.readouterr()
+    assert main(arguments) != 0
+    assert "n-32-seed-1: no such policy; it was trained, with the hash" in capsys.readouterr().err
+    provenance = read_provenance(out / "answer.json")
+    assert (provenance.done, provenance.total) == (12, 13)
+    section = Answer.summarise(read_table(out / "answer.csv"), provenance)
+    assert "n-32-seed-1: left out, 0 of 2 episodes are done." in section.concluded
+    assert any("n-32 minus n-0: the training seed 1 lacks" in line for line in section.concluded)
+
+
+def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
+    study = Answer(PLAN, ("core",)).begin(tmp_path)
+    policy = study.planned("n-4-seed-0")
+    shutil.copytree(core / "answer" / "demos", tmp_path / "answer" / "demos")
+
+    def stop(progress: train.Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train.train(study.demos["tiny"], study.policies[policy.name], policy.training, stop)
+    row = study.train(policy)
+    assert (row["trained_from_step"], row["steps"]) == (1, 2)
+    whole: Any = read_table(core / "answer.csv")
+    trained = whole[whole["kind"] == "training"].set_index("policy")
+    assert row["checkpoint_sha256"] == trained.loc["n-4-seed-0", "checkpoint_sha256"]
+
+    other = Answer(replace(PLAN, recipes=(recipe("core", "n-4", learning_rate=0.5),)), ("core",))
+    with pytest.raises(InputError, match=r"n-4-seed-0: was trained with other settings \(learning_rate"):
+        other.begin(tmp_path).train(other.planned("n-4-seed-0"))
+    changed = replace(PLAN, recordings=(replace(RECORDING, counts={TASK: 3}),))
+    with pytest.raises(InputError, match="was trained on other demonstrations"):
+        Answer(changed, ("core",)).begin(tmp_path).train(policy)
+    (study.policies[policy.name] / "config.json").write_text(
+        (study.policies[policy.name] / "config.json").read_text() + " "
+    )
+    judge = replace(study, trained={policy.name: row["checkpoint_sha256"]})
+    with pytest.raises(InputError, match=r"has the hash .* expected"):
+        judge.judge(policy, "plain", TASK)
+
+
+def test_a_later_stage_pairs_with_the_first(core: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    table: Any = run(Answer(PLAN, ("core", "alignment")), out)
+    assert set(table[table["kind"] == "episodes"]["recipe"]) == {"n-0", "n-4", "n-32", "n-4-aligned"}
+    assert read_provenance(out / "answer.json").total == 1 + 8 + 8
+    assert len(times(out)) == 8
+
+
+def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stage that trains nothing: a cut, and one Euler step, which a changed config must give as well."""
+    unread = replace(arms.of_cuts("future-unread"), applies=lambda count: count == 4)
+    one_step = replace(arms.steps_of(1), applies=lambda count: count == 0)
+    monkeypatch.setitem(arms.ARMS, "instrument", (unread, one_step))
+    monkeypatch.delitem(arms.ARMS, "steps")  # which has an arm of that name
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    assert main(["study", "answer", "--stages", "instrument", "--out", str(out)]) == 0
+    table: Any = read_table(out / "answer.csv")
+    assert read_provenance(out / "answer.json").total == 13 + 4
+    found = table[table["kind"] == "episodes"].set_index(["policy", "arm", "seed"])
+    policies = core / "answer" / "policies"
+
+    def expected(directory: Path, seed: int, change: Intervention | None) -> tuple[bool, int]:
+        policy = Policy.load(directory, num_threads=1)
+        environment = environment_for(policy, TASK)
+        episode = run_episode(environment, policy, seed, intervention=change)
+        environment.close()
+        return episode.success, episode.steps
+
+    cut = Intervention(cut=[("state", "future"), ("action", "future")])
+    row = found.loc[("n-4-seed-1", "future-unread", 1)]
+    assert (row["success"], row["control_steps"]) == expected(policies / "n-4-seed-1", 1, cut)
+    stepped = tmp_path / "stepped"
+    shutil.copytree(policies / "n-0-seed-0", stepped)
+    config = json.loads((stepped / "config.json").read_text())
+    config["action_head_cfg"]["num_inference_timesteps"] = 1
+    (stepped / "config.json").write_text(json.dumps(config))
+    row = found.loc[("n-0-seed-0", "steps of 1", 0)]
+    assert (row["success"], row["control_steps"]) == expected(stepped, 0, None)
+    section = Answer.summarise(table, read_provenance(out / "answer.json"))
+    assert section.grids[-1].columns == ("recipe", "future-unread", "steps of 1")
+    assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
+
+
+def test_a_step_count_reaches_the_head(core: Path) -> None:
+    """Episodes of policies that never succeed look alike, so the actions themselves are compared."""
+    policy = Policy.load(core / "answer" / "policies" / "n-4-seed-0", num_threads=1)
+    seen = policy.blank("reach")
+    noise = policy.noise(np.random.default_rng(0))
+    features = policy.features(seen)
+    for count in (1, 3):
+        stepped = policy.with_head(arms.SteppedHead(policy.head, count))
+        direct = policy.head.sample(
+            policy.head.encode(features), policy.state(seen), 0, noise=noise, num_steps=count
+        )
+        found = stepped.act(seen, noise=noise).actions
+        np.testing.assert_allclose(found, policy.robot_actions(np.asarray(direct))[0], atol=1e-6)
+
+
+def test_the_arms_of_the_stages_that_train_nothing() -> None:
+    names = [arm.name for of_stage in arms.ARMS.values() for arm in of_stage]
+    assert len(set(names)) == len(names)
+    for name in names:
+        found = arms.find_arm(name)
+        assert found is not None
+        rng, tokens = np.random.default_rng(0), np.random.default_rng(1).standard_normal((8, 4))
+        change = found.arm.intervention(tokens.astype(np.float32), rng)
+        assert (change is None) == (found.num_steps is not None)
+        assert found.applies(8)
+        assert found.applies(0) == (found.num_steps is not None)
+    assert arms.find_arm("plain") is None
+    assert [arms.mass_of(4).applies(count) for count in (0, 4, 32)] == [False, False, True]
+    assert [arms.merged_to(4).applies(count) for count in (0, 4, 32)] == [False, False, True]
+
+
+def test_costs_by_hand() -> None:
+    settings = replace(TINY, num_future_tokens=5, vl_num_layers=1)
+    config = train.policy_config(settings, RECORDING.settings, [TASK])
+    sizes, head = config.backbone_sizes, config.head_config
+    vision, text = sizes.vision, sizes.text
+    patches, merged = vision.num_positions, vision.num_positions // 4
+    tower = patches * 3 * vision.patch_size**2 * vision.width + vision.num_layers * (
+        patches * vision.width * (4 * vision.width + 2 * vision.mlp_width) + 2 * patches**2 * vision.width
+    )
+    connector = merged * 4 * vision.width * text.width
+    (context,) = {num_vl_tokens(config.processor(), config.simulation)}
+    inner = text.num_heads * text.head_dim
+    layer = context * text.width * (2 * inner + 2 * text.num_key_heads * text.head_dim + 3 * text.mlp_width)
+    backbone = tower + connector + sizes.num_layers * (layer + 2 * context**2 * inner)
+    call = Call.of(head, context)
+    of_head = [total(work(head, call)).multiply_adds for work in (encode_work, sample_work)]
+    found = costs.cost(settings, RECORDING)
+    assert found.chunk == backbone + sum(of_head)
+    # Backward costs twice as much as forward, except where no gradient is needed: at the pixels.
+    assert 2.5 * backbone < found.sample < 3 * (backbone + sum(of_head))
+    aligned = costs.cost(replace(settings, alignment_weight=0.1), RECORDING)
+    assert aligned.chunk == found.chunk
+    assert aligned.sample > found.sample + backbone
+
+
+def test_costs_that_are_matched() -> None:
+    settings = replace(TINY, num_future_tokens=64, width=16, num_heads=2)
+    wanted = costs.cost(settings, RECORDING)
+
+    def without(**changes: Any) -> costs.Cost:
+        return costs.cost(replace(settings, num_future_tokens=0, **changes), RECORDING)
+
+    width = costs.matched_width(settings, RECORDING)
+    assert width > 16
+    errors = [abs(without(width=one).chunk - wanted.chunk) for one in (width - 4, width, width + 4)]
+    assert errors[1] == min(errors)
+    steps = costs.matched_steps(settings, RECORDING)
+    assert abs(steps * without().sample - settings.steps * wanted.sample) <= without().sample / 2
+
+
+def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
+    (plain,) = [one for one in WHOLE_PLAN.recordings if one.name == "plain"]
+    assert plans.BASE.num_future_tokens == 32
+    assert costs.matched_width(plans.BASE, plain) == plans.WIDTH
+    assert costs.matched_steps(plans.BASE, plain) == plans.STEPS
+
+
+def test_every_contrast_is_of_recipes_of_the_plan() -> None:
+    """And every recipe of the plan is in a contrast of its stage, or in the core."""
+    contrasts = [*CONFIRMATORY, *itertools.chain.from_iterable(EXPLORATORY.values())]
+    assert set().union(*(one.recipes for one in contrasts)) == {one.name for one in WHOLE_PLAN.recipes}
+    assert WHOLE_PLAN.stages == ("core", *EXPLORATORY)
+
+
+def test_plans_that_cannot_be(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="recipes: two have the same name in n-0, n-4, n-32, n-4-aligned, n"):
+        replace(PLAN, recipes=(*PLAN.recipes, PLAN.recipes[0]))
+    with pytest.raises(InputError, match="recordings: n-0 has tiny, which is not one of them"):
+        replace(PLAN, recordings=())
+    with pytest.raises(InputError, match="recordings: tiny does not have all of reach"):
+        replace(PLAN, tasks=("reach",))
+    with pytest.raises(InputError, match="expected evaluation seeds"):
+        replace(PLAN, seeds=range(2_000_000, 2_000_025))
+    assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
+    assert "stages: unknown name cor, expected some of core, alignment" in capsys.readouterr().err
+
+
+def test_failing_cells_do_not_stop_the_others(core: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    (out / "answer" / "policies" / "n-4-aligned-seed-0").mkdir()
+    (out / "answer" / "policies" / "n-4-aligned-seed-0" / "settings.json").write_text("no JSON")
+    with pytest.raises(StudyError, match="n-4-aligned-seed-0: not written by `saccade train`"):
+        run(Answer(PLAN, ("core", "alignment")), out)
+    table: Any = read_table(out / "answer.csv")
+    assert "n-4-aligned-seed-1" in set(table["policy"])
