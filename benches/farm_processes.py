@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ import saccade
 TASKS = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
 PATIENCE = 900.0  # seconds that a process waits for the others
 LEAST = 2  # calls of each process, however long they take
+ENOUGH, STOP = "enough", "stop"
 
 
 @dataclass(frozen=True)
@@ -72,14 +76,28 @@ def measure(setting: Setting, checkpoint: Path, seconds: float) -> dict[str, Any
     theirs.close()
     try:
         found = ours.recv()
+        holder.join()
     except EOFError:
+        end(holder)
         found = {"failed": "a process died"}
-    holder.join()
+    except BaseException:  # this program is interrupted
+        end(holder)
+        raise
     return dict(found)
+
+
+def end(holder: SpawnProcess) -> None:
+    """Kills the process that `measure` started, and those that it started."""
+    assert holder.pid is not None
+    with contextlib.suppress(ProcessLookupError):  # it is not so far yet, or they are gone
+        os.killpg(holder.pid, signal.SIGKILL)
+    holder.kill()
+    holder.join()
 
 
 def hold(pipe: Connection, setting: Setting, checkpoint: Path, seconds: float) -> None:
     """The process that starts the others, and with `fork` loads the policy for them."""
+    os.setsid()  # so that all of them can be ended together
     try:
         pipe.send(run(setting, checkpoint, seconds))
     except (EOFError, BrokenPipeError, TimeoutError):
@@ -111,6 +129,10 @@ def run(setting: Setting, checkpoint: Path, seconds: float) -> dict[str, Any]:
         receive(one)  # it is ready
     for one in pipes:
         one.send("begin")
+    for one in pipes:
+        receive(one)  # it has done enough, and goes on until all have: none computes alone at the end
+    for one in pipes:
+        one.send(STOP)
     found = [receive(one) for one in pipes]
     ids = [process.pid for process in processes]
     memory = [memory_of(pid) for pid in (([os.getpid()] if policy is not None else []) + ids)]
@@ -142,15 +164,18 @@ def work(
         pipe.send("ready")
         receive(pipe)
         ended.clear()
-        begin, done = time.perf_counter(), 0
-        while True:
+        begin, done, said = time.perf_counter(), 0, False
+        while not (said and pipe.poll()):
+            done += step()
             elapsed = time.perf_counter() - begin
             if setting.least_episodes:
-                if len(ended) >= setting.least_episodes:
-                    break
-            elif elapsed >= seconds and done >= LEAST * setting.batch:
-                break
-            done += step()
+                enough = len(ended) >= setting.least_episodes
+            else:
+                enough = elapsed >= seconds and done >= LEAST * setting.batch
+            if enough and not said:
+                pipe.send(ENOUGH)
+                said = True
+        receive(pipe)
         successes = sum(success for success, _ in ended)
         lengths = sum(length for _, length in ended)
         pipe.send(

@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser, pieces: str) -> None:
         "--jobs",
         type=int,
         metavar="N",
-        help=f"{pieces} computed at the same time, each in a process of its own; -1 for one per core; 1 works "
-        "in the command itself (default: 1; with ray -1)",
+        help=f"{pieces} computed at the same time, in processes of their own; -1 for one per core; with 1 "
+        "the command itself computes (default: 1; with ray -1)",
     )
     group.add_argument(
         "--backend",

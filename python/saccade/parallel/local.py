@@ -46,7 +46,7 @@ def each(
 def _spread(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], chosen: Sequence[int], processes: int
 ) -> Iterator[tuple[int, Result | Lost]]:
-    """Index and result of chosen pieces. If a process dies, those that were given out are `LOST`, and it ends."""
+    """Index and result of chosen pieces. If a process dies, those that were given out are `LOST`: the end."""
     from joblib.externals.loky import get_reusable_executor
 
     threads = {name: os.environ.get(name, str(_threads(processes))) for name in THREADS}
