@@ -1,6 +1,6 @@
 """Farms: chunks a second and episodes an hour by processes, threads and batch, and the memory they take.
 
-    python -m benches.farm                             at most 10 minutes; writes out/farm/results.json
+    python -m benches.farm                             about 10 minutes; writes out/farm/results.json
     python -m benches.farm --minutes 60 --seconds 20   longer
     python -m benches.farm --policies demo             without the full-size policy
     python -m benches.farm report                      print the tables of existing measurements
@@ -134,27 +134,25 @@ def name_of(policy: str, args: argparse.Namespace) -> str:
 def settings(args: argparse.Namespace) -> Iterator[Setting]:
     """What is measured, in the order of its importance: time may end before."""
     cores = args.cores
-    shapes = [(processes, cores // processes) for processes in divisors(cores)]  # all use all cores
-    most = max(shapes)
+    shapes = [(processes, cores // processes) for processes in reversed(divisors(cores))]  # all use all cores
     for policy, section in (("demo", "chunks"), ("demo", "episodes"), ("full", "chunks")):
         if policy not in args.policies or section not in args.sections:
             continue
         full = policy == "full"
-        batches = args.full_batches if full else args.batches
         precision = args.precision if full else "float32"
         common: dict[str, Any] = {"section": section, "policy": policy, "precision": precision}
+        torch = {**common, "precision": "float32", "engine": "torch", "sharing": "spawn"}
         if not full:
             least = args.episodes if section == "episodes" else 0
             yield Setting(**common, processes=1, threads=1, batch=1, least_episodes=least)
-        for processes, threads in reversed(shapes):
-            for batch in batches:
+        for number, batch in enumerate(args.full_batches if full else args.batches):
+            for processes, threads in shapes:
                 yield Setting(**common, processes=processes, threads=threads, batch=batch)
-        if most[0] > 1 and section == "chunks":
-            yield Setting(**common, processes=most[0], threads=most[1], batch=1, sharing="spawn")
-        if "torch" in args.engines:
-            torch = {**common, "precision": "float32", "engine": "torch", "sharing": "spawn"}
-            for processes, threads in reversed(shapes):
-                for batch in batches[: 1 if section == "episodes" or full else None]:
+            if number == 0 and cores > 1 and section == "chunks":
+                processes, threads = shapes[0]
+                yield Setting(**common, processes=processes, threads=threads, batch=batch, sharing="spawn")
+            if "torch" in args.engines and (number == 0 or (section == "chunks" and not full)):
+                for processes, threads in shapes:
                     yield Setting(**torch, processes=processes, threads=threads, batch=batch)
 
 
@@ -235,7 +233,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add("--episodes", type=int, default=20, metavar="N", help="whose length is measured (default: 20)")
     add("--cores", type=int, default=len(os.sched_getaffinity(0)), metavar="N", help="default: all")
-    add("--seconds", type=float, default=8.0, metavar="X", help="of each setting, at least (default: 8)")
+    add("--seconds", type=float, default=6.0, metavar="X", help="of each setting, at least (default: 6)")
     add("--minutes", type=float, default=10.0, metavar="X", help="no setting begins later (default: 10)")
     add("--demo", type=Path, metavar="DIR", help="another policy of the simulator")
     add("--checkpoint", type=Path, metavar="DIR", help="another full-size policy, of one robot")

@@ -21,8 +21,6 @@ import saccade
 
 TASKS = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
 PATIENCE = 900.0  # seconds that a process waits for the others
-LEAST = 2  # calls of each process, however long they take
-ENOUGH, STOP = "enough", "stop"
 
 
 @dataclass(frozen=True)
@@ -129,10 +127,6 @@ def run(setting: Setting, checkpoint: Path, seconds: float) -> dict[str, Any]:
         receive(one)  # it is ready
     for one in pipes:
         one.send("begin")
-    for one in pipes:
-        receive(one)  # it has done enough, and goes on until all have: none computes alone at the end
-    for one in pipes:
-        one.send(STOP)
     found = [receive(one) for one in pipes]
     ids = [process.pid for process in processes]
     memory = [memory_of(pid) for pid in (([os.getpid()] if policy is not None else []) + ids)]
@@ -164,18 +158,12 @@ def work(
         pipe.send("ready")
         receive(pipe)
         ended.clear()
-        begin, done, said = time.perf_counter(), 0, False
-        while not (said and pipe.poll()):
+        begin, done, enough = time.perf_counter(), 0, False
+        while not enough:  # all begin together; a step that takes longer than the time is done once
             done += step()
             elapsed = time.perf_counter() - begin
-            if setting.least_episodes:
-                enough = len(ended) >= setting.least_episodes
-            else:
-                enough = elapsed >= seconds and done >= LEAST * setting.batch
-            if enough and not said:
-                pipe.send(ENOUGH)
-                said = True
-        receive(pipe)
+            least = setting.least_episodes
+            enough = len(ended) >= least if least else elapsed >= seconds
         successes = sum(success for success, _ in ended)
         lengths = sum(length for _, length in ended)
         pipe.send(

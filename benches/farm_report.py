@@ -48,8 +48,14 @@ def machine(held: Results) -> str:
 
 
 def rows_of(results: Results, policy: str, section: str) -> list[Row]:
-    """The measurements of one policy."""
-    return [row for row in results["rows"] if (row["policy"], row["section"]) == (policy, section)]
+    """The measurements of one policy, by engine, processes and batch.
+
+    There are no episodes an hour without one setting that ran whole episodes.
+    """
+    found = [row for row in results["rows"] if (row["policy"], row["section"]) == (policy, section)]
+    if section == "episodes" and not any(row["least_episodes"] for row in found):
+        return []
+    return sorted(found, key=lambda row: (row["engine"], -row["processes"], row["sharing"], row["batch"]))
 
 
 def rate(results: Results, row: Row) -> float:
@@ -119,6 +125,11 @@ def choices(results: Results) -> Iterator[str]:
                 )
     if lines:
         yield "### What to choose here"
+        yield (
+            "The fastest settings of saccade, with one copy of the weights for all processes, and the memory of "
+            "all of them. Times torch's best: the rate over that of torch's fastest setting, of any batch, in "
+            "float32."
+        )
         head = ["", "for", "processes x threads", "batch", "rate", "times torch's best", "GB"]
         yield table(head, lines)
 
@@ -172,6 +183,11 @@ def memory(results: Results) -> Iterator[str]:
             )
     if lines:
         yield "### Memory"
+        yield (
+            "The same processes with the policy loaded once, by a process that then forks them, and loaded by "
+            "each (spawn). In all: the PSS of all processes, with fork also of the one that only loaded. "
+            "Alone: what a computing process shares with no other, on average."
+        )
         head = ["", "processes", "weights", "GB in all", "GB of one process alone", "chunks a second"]
         yield table(head, lines)
 

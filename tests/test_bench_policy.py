@@ -208,7 +208,9 @@ def test_objects_of_files_of_the_same_name_are_kept_apart(tmp_path: Path) -> Non
     for folder in (clone / "scripts", environment / "ggml" / "source/vendor/llama.cpp/gguf-py", tools):
         folder.mkdir(parents=True)
     # A compiler that writes nothing but what it was asked for.
-    (tools / "c++").write_text('#!/bin/sh\nall="$*"\nuntil [ "$1" = -o ]; do shift; done\necho "$all" > "$2"\n')
+    (tools / "c++").write_text(
+        '#!/bin/sh\nall="$*"\nuntil [ "$1" = -o ]; do shift; done\necho "$all" > "$2"\n'
+    )
     (tools / "c++").chmod(0o755)
     script = Path(command.__file__).with_name("build_vla.sh")
     path = f"{tools}:{os.environ['PATH']}"
