@@ -126,9 +126,9 @@ def choices(results: Results) -> Iterator[str]:
     if lines:
         yield "### What to choose here"
         yield (
-            "The fastest settings of saccade, with one copy of the weights for all processes, and the memory of "
-            "all of them. Times torch's best: the rate over that of torch's fastest setting, of any batch, in "
-            "float32."
+            "The fastest settings of saccade, with one copy of the weights for all processes, and the memory "
+            "of all of them. Times torch's best: the rate over that of torch's fastest setting, of any "
+            "batch, in float32."
         )
         head = ["", "for", "processes x threads", "batch", "rate", "times torch's best", "GB"]
         yield table(head, lines)
@@ -184,8 +184,8 @@ def memory(results: Results) -> Iterator[str]:
     if lines:
         yield "### Memory"
         yield (
-            "The same processes with the policy loaded once, by a process that then forks them, and loaded by "
-            "each (spawn). In all: the PSS of all processes, with fork also of the one that only loaded. "
+            "The same processes with the policy loaded once, by a process that then forks them, and loaded "
+            "by each (spawn). In all: the PSS of all processes, with fork also of the one that only loaded. "
             "Alone: what a computing process shares with no other, on average."
         )
         head = ["", "processes", "weights", "GB in all", "GB of one process alone", "chunks a second"]

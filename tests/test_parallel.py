@@ -54,7 +54,7 @@ def test_one_process_for_each_core_is_not_this_one_where_there_is_one_core(
 
 
 def test_a_caller_may_stop(tmp_path: Path) -> None:
-    found = each(Square(tmp_path / "log"), range(100), TWO)
+    found: Any = each(Square(tmp_path / "log"), range(100), TWO)
     next(found)
     found.close()
     assert len(Square(tmp_path / "log").attempts) < 100
