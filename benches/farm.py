@@ -1,11 +1,14 @@
 """Farms: chunks a second and episodes an hour by processes, threads and batch, and the memory they take.
 
-    python -m benches.farm                             at most 10 minutes; writes out/farm/results.json
+    python -m benches.farm                             about 10 minutes; writes out/farm/results.json
     python -m benches.farm --minutes 60 --seconds 20   longer
     python -m benches.farm --policies demo             without the full-size policy
     python -m benches.farm report                      print the tables of existing measurements
     python -m benches.farm report --write              write them to docs/farms.md and keep the measurements
     python -m benches.farm --small --seconds 0.1       a quick trial of the program itself
+
+Each setting is written to the results when it is done. The next run on the same machine measures what is
+missing, so a run may be interrupted, or end by --minutes, and be continued.
 
 A setting is a number of processes, the threads of each, and the observations that each computes together. For
 `chunks`, processes act on random frames without pause. For `episodes`, they run the simulator, with as many
@@ -21,20 +24,22 @@ Memory is the sum of the proportional shares (PSS) of all processes, from /proc.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from benches import farm_report
+from benches import checkpoints, farm_report, pages
 from benches.farm_processes import Setting, measure
 from benches.peers import machine
 from benches.peers.results import rounded
-from saccade.checkpoints import random_checkpoint
+from saccade._files import write_json
 
 SECTIONS = ("chunks", "episodes")
 POLICIES = ("demo", "full")
@@ -49,55 +54,105 @@ FREE = 0.85
 def main(arguments: list[str] | None = None) -> int:
     """The exit status."""
     args = parse(arguments)
-    path: Path = args.work / "results.json"
+    path: Path = args.work / ("results-small.json" if args.small else "results.json")
     if args.command == "report":
-        return farm_report.command(path, write=args.write)
-    checkpoints = {name: checkpoint(name, args) for name in args.policies}
-    results: dict[str, Any] = {"machine": machine.describe(), "rows": [], "left_out": []}
-    results["bytes"] = {name: weight(folder) for name, folder in checkpoints.items()}
+        return pages.report(
+            path,
+            farm_report.COMMITTED,
+            farm_report.PAGE,
+            farm_report.document,
+            program="benches.farm",
+            write=args.write,
+        )
     args.work.mkdir(parents=True, exist_ok=True)
+    folders = {name: checkpoint(name, args) for name in args.policies}
+    results = begin(path, folders, args)
     end = time.monotonic() + 60 * args.minutes
+    done = {Setting(**{field.name: row[field.name] for field in fields(Setting)}) for row in results["rows"]}
     for setting in settings(args):
+        if setting in done:
+            continue
         reason = why_not(setting, results["bytes"][setting.policy], end)
         if reason is None:
             note(f"{setting.name} ...")
-            measured = measure(setting, checkpoints[setting.policy], args.seconds)
+            measured = measure(setting, folders[setting.policy], args.seconds)
             reason = measured.get("failed")
             if reason is None:
                 results["rows"].append(asdict(setting) | measured)
         if reason is not None:
             results["left_out"].append({"setting": asdict(setting), "reason": reason})
             note(f"{setting.name}: left out, {reason}")
-        path.write_text(json.dumps(rounded(results), indent=1) + "\n")
+        write_json(path, rounded(results))
     print(farm_report.document(results))
     note(f"wrote {path}")
     return 0
 
 
+def begin(path: Path, folders: dict[str, Path], args: argparse.Namespace) -> dict[str, Any]:
+    """The results so far, if they are of this machine, this build and these policies; otherwise none.
+
+    Others are set aside under another name, because no table may mix them.
+
+    Args:
+        path: The JSON file.
+        folders: Directory of each policy.
+        args: The arguments.
+    """
+    now: dict[str, Any] = {
+        "machine": machine.describe(),
+        "seconds": args.seconds,
+        "names": {name: name_of(name, args) for name in folders},
+        "bytes": {name: weight(folder) for name, folder in folders.items()},
+        "rows": [],
+    }
+    if path.exists():
+        before = json.loads(path.read_text())
+        same = all(before["machine"][key] == now["machine"][key] for key in ("cpu", "build", "versions"))
+        for key in ("names", "bytes"):
+            same = same and all(before[key].get(name, value) == value for name, value in now[key].items())
+        if same and before["seconds"] == args.seconds:
+            for key in ("names", "bytes"):  # also those of a run with other --policies
+                now[key] = before[key] | now[key]
+            now["rows"] = before["rows"]
+            note(f"{path} has {len(now['rows'])} settings already; delete it to measure them again")
+        else:
+            aside = path.with_name(f"{path.stem}-{time.strftime('%Y%m%d-%H%M%S')}{path.suffix}")
+            path.replace(aside)
+            note(f"{path} has another machine, build, policy or --seconds; it is now {aside}")
+    return {**now, "left_out": []}
+
+
+def name_of(policy: str, args: argparse.Namespace) -> str:
+    """What tables call a policy."""
+    if policy == "demo":
+        return "bundled policy" if args.demo is None else f"policy {args.demo.resolve().name}"
+    if args.checkpoint is not None:
+        return f"policy {args.checkpoint.resolve().name}"
+    return "small random N1.5, for a trial" if args.small else "random N1.5 of the published size"
+
+
 def settings(args: argparse.Namespace) -> Iterator[Setting]:
     """What is measured, in the order of its importance: time may end before."""
     cores = args.cores
-    shapes = [(processes, cores // processes) for processes in divisors(cores)]  # all use all cores
-    most = max(shapes)
+    shapes = [(processes, cores // processes) for processes in reversed(divisors(cores))]  # all use all cores
     for policy, section in (("demo", "chunks"), ("demo", "episodes"), ("full", "chunks")):
         if policy not in args.policies or section not in args.sections:
             continue
         full = policy == "full"
-        batches = args.full_batches if full else args.batches
         precision = args.precision if full else "float32"
         common: dict[str, Any] = {"section": section, "policy": policy, "precision": precision}
+        torch = {**common, "precision": "float32", "engine": "torch", "sharing": "spawn"}
         if not full:
             least = args.episodes if section == "episodes" else 0
             yield Setting(**common, processes=1, threads=1, batch=1, least_episodes=least)
-        for processes, threads in reversed(shapes):
-            for batch in batches:
+        for number, batch in enumerate(args.full_batches if full else args.batches):
+            for processes, threads in shapes:
                 yield Setting(**common, processes=processes, threads=threads, batch=batch)
-        if most[0] > 1 and section == "chunks":
-            yield Setting(**common, processes=most[0], threads=most[1], batch=1, sharing="spawn")
-        if "torch" in args.engines:
-            torch = {**common, "precision": "float32", "engine": "torch", "sharing": "spawn"}
-            for processes, threads in reversed(shapes):
-                for batch in batches[: 1 if section == "episodes" or full else None]:
+            if number == 0 and cores > 1 and section == "chunks":
+                processes, threads = shapes[0]
+                yield Setting(**common, processes=processes, threads=threads, batch=batch, sharing="spawn")
+            if "torch" in args.engines and (number == 0 or (section == "chunks" and not full)):
+                for processes, threads in shapes:
                     yield Setting(**torch, processes=processes, threads=threads, batch=batch)
 
 
@@ -139,20 +194,13 @@ def available_memory() -> int:
 
 def checkpoint(name: str, args: argparse.Namespace) -> Path:
     """The directory of a policy; a random one is written if it is not there."""
-    if name == "demo":
-        if args.demo is not None:
-            return Path(args.demo)
-        from saccade.sim.policy import DEMO_CHECKPOINT
+    if name == "full":
+        return checkpoints.n15(args.work, small=args.small, given=args.checkpoint)
+    if args.demo is not None:
+        return checkpoints.existing(args.demo)
+    from saccade.sim.policy import DEMO_CHECKPOINT
 
-        return DEMO_CHECKPOINT
-    folder: Path = args.checkpoint or args.work / ("n15-small" if args.small else "n15")
-    if args.checkpoint is None and not (folder / "config.json").is_file():
-        random_checkpoint.write(
-            folder,
-            backbone=random_checkpoint.small_backbone("n1.5") if args.small else None,
-            head=random_checkpoint.small_head("n1.5") if args.small else None,
-        )
-    return folder
+    return DEMO_CHECKPOINT
 
 
 def weight(folder: Path) -> int:
@@ -185,13 +233,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add("--episodes", type=int, default=20, metavar="N", help="whose length is measured (default: 20)")
     add("--cores", type=int, default=len(os.sched_getaffinity(0)), metavar="N", help="default: all")
-    add("--seconds", type=float, default=8.0, metavar="X", help="of each setting, at least (default: 8)")
+    add("--seconds", type=float, default=6.0, metavar="X", help="of each setting, at least (default: 6)")
     add("--minutes", type=float, default=10.0, metavar="X", help="no setting begins later (default: 10)")
     add("--demo", type=Path, metavar="DIR", help="another policy of the simulator")
     add("--checkpoint", type=Path, metavar="DIR", help="another full-size policy, of one robot")
     add("--work", type=Path, default=Path("out/farm"), metavar="DIR", help="default: out/farm")
     add("--small", action="store_true", help="a small policy in place of the full-size one, for a trial")
     args = parser.parse_args(arguments)
+    if args.small and args.write:
+        parser.error("--write: not with --small, which is a trial")
     if min(*args.batches, *args.full_batches, args.cores, args.episodes) < 1 or args.seconds <= 0:
         parser.error(
             "--batches, --full-batches, --cores and --episodes must be at least 1, --seconds above 0"
@@ -201,4 +251,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    sys.exit(main())
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # also ends the processes of the setting
+    with contextlib.suppress(KeyboardInterrupt):
+        sys.exit(main())
+    sys.exit(130)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,6 @@ import saccade
 
 TASKS = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
 PATIENCE = 900.0  # seconds that a process waits for the others
-LEAST = 2  # calls of each process, however long they take
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,28 @@ def measure(setting: Setting, checkpoint: Path, seconds: float) -> dict[str, Any
     theirs.close()
     try:
         found = ours.recv()
+        holder.join()
     except EOFError:
+        end(holder)
         found = {"failed": "a process died"}
-    holder.join()
+    except BaseException:  # this program is interrupted
+        end(holder)
+        raise
     return dict(found)
+
+
+def end(holder: SpawnProcess) -> None:
+    """Kills the process that `measure` started, and those that it started."""
+    assert holder.pid is not None
+    with contextlib.suppress(ProcessLookupError):  # it is not so far yet, or they are gone
+        os.killpg(holder.pid, signal.SIGKILL)
+    holder.kill()
+    holder.join()
 
 
 def hold(pipe: Connection, setting: Setting, checkpoint: Path, seconds: float) -> None:
     """The process that starts the others, and with `fork` loads the policy for them."""
+    os.setsid()  # so that all of them can be ended together
     try:
         pipe.send(run(setting, checkpoint, seconds))
     except (EOFError, BrokenPipeError, TimeoutError):
@@ -142,15 +158,12 @@ def work(
         pipe.send("ready")
         receive(pipe)
         ended.clear()
-        begin, done = time.perf_counter(), 0
-        while True:
-            elapsed = time.perf_counter() - begin
-            if setting.least_episodes:
-                if len(ended) >= setting.least_episodes:
-                    break
-            elif elapsed >= seconds and done >= LEAST * setting.batch:
-                break
+        begin, done, enough = time.perf_counter(), 0, False
+        while not enough:  # all begin together; a step that takes longer than the time is done once
             done += step()
+            elapsed = time.perf_counter() - begin
+            least = setting.least_episodes
+            enough = len(ended) >= least if least else elapsed >= seconds
         successes = sum(success for success, _ in ended)
         lengths = sum(length for _, length in ended)
         pipe.send(

@@ -2,41 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from benches.peers.results import rounded
 from benches.peers.text import table
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "farms.md"
 COMMITTED = Path(__file__).with_name("farm.json")
-#: The part of the page that `report --write` replaces.
-MEASURED = re.compile(r"(?<=<!-- measured -->\n).*(?=<!-- end of measured -->)", re.DOTALL)
 
-POLICIES = {"demo": "bundled policy", "full": "N1.5 at its published size"}
+POLICIES = ("demo", "full")
 SECTIONS = {"chunks": "chunks a second", "episodes": "episodes an hour"}
 
 Results = dict[str, Any]
 Row = dict[str, Any]
-
-
-def command(path: Path, *, write: bool) -> int:
-    """Prints the tables, or writes them to the page and keeps the measurements next to the program."""
-    path = path if path.exists() else COMMITTED
-    if not path.exists():
-        raise SystemExit("benches.farm: nothing measured yet; run python -m benches.farm")
-    results = json.loads(path.read_text())
-    if write:
-        COMMITTED.write_text(json.dumps(rounded(results), indent=1) + "\n")
-        page = PAGE.read_text()
-        PAGE.write_text(MEASURED.sub(lambda found: f"\n{document(results)}\n", page))
-        print(PAGE)
-    else:
-        print(document(results))
-    return 0
 
 
 def document(results: Results) -> str:
@@ -50,7 +29,7 @@ def document(results: Results) -> str:
         for section, title in SECTIONS.items():
             rows = rows_of(results, policy, section)
             if rows:
-                name = POLICIES[policy]
+                name = results["names"][policy]
                 parts += [f"### {name[0].upper()}{name[1:]}: {title}", *speeds(results, rows)]
     parts += memory(results)
     parts += left_out(results)
@@ -69,8 +48,14 @@ def machine(held: Results) -> str:
 
 
 def rows_of(results: Results, policy: str, section: str) -> list[Row]:
-    """The measurements of one policy."""
-    return [row for row in results["rows"] if (row["policy"], row["section"]) == (policy, section)]
+    """The measurements of one policy, by engine, processes and batch.
+
+    There are no episodes an hour without one setting that ran whole episodes.
+    """
+    found = [row for row in results["rows"] if (row["policy"], row["section"]) == (policy, section)]
+    if section == "episodes" and not any(row["least_episodes"] for row in found):
+        return []
+    return sorted(found, key=lambda row: (row["engine"], -row["processes"], row["sharing"], row["batch"]))
 
 
 def rate(results: Results, row: Row) -> float:
@@ -129,7 +114,7 @@ def choices(results: Results) -> Iterator[str]:
                 times = "" if theirs is None else f"{rate(results, found) / rate(results, theirs):.1f}"
                 lines.append(
                     [
-                        f"{POLICIES[policy]}, {found['precision']}: {title}",
+                        f"{results['names'][policy]}, {found['precision']}: {title}",
                         use,
                         shape(found),
                         str(found["batch"]),
@@ -140,6 +125,11 @@ def choices(results: Results) -> Iterator[str]:
                 )
     if lines:
         yield "### What to choose here"
+        yield (
+            "The fastest settings of saccade, with one copy of the weights for all processes, and the memory "
+            "of all of them. Times torch's best: the rate over that of torch's fastest setting, of any "
+            "batch, in float32."
+        )
         head = ["", "for", "processes x threads", "batch", "rate", "times torch's best", "GB"]
         yield table(head, lines)
 
@@ -183,7 +173,7 @@ def memory(results: Results) -> Iterator[str]:
             private = sum(one["private"] for one in working) / len(working)
             lines.append(
                 [
-                    f"{POLICIES[row['policy']]}, {row['precision']}",
+                    f"{results['names'][row['policy']]}, {row['precision']}",
                     str(row["processes"]),
                     "fork: one copy of the weights" if sharing == "fork" else "spawn: one copy each",
                     f"{total_memory(row) / 1e9:.2f}",
@@ -193,6 +183,11 @@ def memory(results: Results) -> Iterator[str]:
             )
     if lines:
         yield "### Memory"
+        yield (
+            "The same processes with the policy loaded once, by a process that then forks them, and loaded "
+            "by each (spawn). In all: the PSS of all processes, with fork also of the one that only loaded. "
+            "Alone: what a computing process shares with no other, on average."
+        )
         head = ["", "processes", "weights", "GB in all", "GB of one process alone", "chunks a second"]
         yield table(head, lines)
 
@@ -202,7 +197,7 @@ def left_out(results: Results) -> Iterator[str]:
     if results["left_out"]:
         yield "Not measured:"
         yield "\n".join(
-            f"- {POLICIES[one['setting']['policy']]}, {SECTIONS[one['setting']['section']]}, "
+            f"- {results['names'][one['setting']['policy']]}, {SECTIONS[one['setting']['section']]}, "
             f"{one['setting']['engine']}, {shape(one['setting'])}, batch {one['setting']['batch']}, "
             f"{one['setting']['sharing']}: {one['reason']}"
             for one in results["left_out"]

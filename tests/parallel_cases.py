@@ -17,17 +17,20 @@ class Square:
         dies_once: Numbers whose process is killed at the first attempt.
         dies: Numbers whose process is killed at every attempt.
         fails: Numbers that raise an error.
+        holds: Seconds that each attempt takes.
     """
 
     log: Path
     dies_once: tuple[int, ...] = ()
     dies: tuple[int, ...] = ()
     fails: tuple[int, ...] = ()
+    holds: float = 0.0
 
     def __call__(self, number: int) -> int:
         first = number not in self.attempts
         with self.log.open("a") as log:
             log.write(f"{os.getpid()} {number}\n")
+        time.sleep(self.holds)
         if number in self.dies or (first and number in self.dies_once):
             os._exit(9)
         if number in self.fails:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -11,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benches import farm, farm_processes, farm_report
+from benches import checkpoints, farm, farm_processes, farm_report
 from benches.farm_processes import Robot, Setting
 from saccade.checkpoints import random_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +35,10 @@ def test_settings_use_all_cores_and_the_important_ones_come_first() -> None:
     assert all(one.processes * one.threads == 4 for one in found if one.policy == "full")
     first = [one for one in found if one.policy == "demo" and one.section == "chunks"]
     assert found[: len(first)] == first
-    shapes = [(one.processes, one.threads, one.batch) for one in first if one.engine == "saccade"]
-    assert shapes[:3] == [(1, 1, 1), (4, 1, 1), (4, 1, 2)]
+    shapes = [(one.processes, one.threads, one.batch) for one in first if one.sharing == "fork"]
+    assert shapes == [(1, 1, 1), *((n, 4 // n, batch) for batch in (1, 2) for n in (4, 2, 1))]
+    engines = [(one.engine, one.batch) for one in found if one.policy == "full"]
+    assert engines.index(("torch", 1)) < engines.index(("saccade", 4))  # time may end before the last ones
     assert {one.section for one in found if one.policy == "full"} == {"chunks"}
     assert [one for one in found if one.sharing == "spawn" and one.engine == "saccade"] == [
         Setting("chunks", "demo", "float32", 4, 1, 1, sharing="spawn"),
@@ -62,14 +69,116 @@ def test_processes_run_and_their_memory_is_read(checkpoint: Path, tmp_path: Path
     assert [(row["processes"], row["threads"], row["batch"], row["sharing"]) for row in rows] == [
         (2, 1, 2, "fork"),
         (1, 2, 2, "fork"),
-        (2, 1, 1, "spawn"),
+        (2, 1, 2, "spawn"),
     ]
     for row in rows:
         assert len(row["chunks"]) == row["processes"]
-        assert min(row["chunks"]) >= 2 * row["batch"]
+        assert min(row["chunks"]) >= row["batch"]
         assert len(row["memory"]) == row["processes"] + (row["sharing"] == "fork")
         assert all(0 < one["private"] <= one["pss"] for one in row["memory"])
     assert farm.main(["report", "--work", str(tmp_path)]) == 0
+
+
+def measured_by_nobody(setting: Setting, checkpoint: Path, seconds: float) -> dict[str, Any]:
+    """What `measure` returns, at once."""
+    count = setting.processes
+    numbers = {"chunks": 7, "seconds": 2.0, "episodes": 3, "successes": 2, "lengths": 30}
+    memory = [{"pss": 10**9, "private": 10**8}] * (count + (setting.sharing == "fork"))
+    return {name: [value] * count for name, value in numbers.items()} | {"memory": memory}
+
+
+def test_a_run_goes_on_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun: list[Setting] = []
+
+    def stopped(setting: Setting, checkpoint: Path, seconds: float) -> dict[str, Any]:
+        begun.append(setting)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        return measured_by_nobody(setting, checkpoint, seconds)
+
+    monkeypatch.setattr(farm, "measure", stopped)
+    arguments = ["--policies", "demo", "--cores", "2", "--work", str(tmp_path), "--seconds", "1"]
+    with pytest.raises(KeyboardInterrupt):
+        farm.main(arguments)
+    assert len(json.loads((tmp_path / "results.json").read_text())["rows"]) == 2
+    assert farm.main(arguments) == 0
+    assert begun[2] == begun[3]  # it was interrupted
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    assert len(rows) == len(list(farm.settings(farm.parse(arguments)))) == len(begun) - 1
+    assert farm.main(arguments) == 0
+    assert len(begun) == len(rows) + 1  # nothing was left to do
+
+    # Other settings are added; other seconds are another measurement.
+    capsys.readouterr()
+    assert farm.main([*arguments, "--batches", "3"]) == 0
+    assert len(json.loads((tmp_path / "results.json").read_text())["rows"]) > len(rows)
+    assert farm.main([*arguments[:-1], "2"]) == 0
+    assert "it is now" in capsys.readouterr().err
+    assert len(json.loads((tmp_path / "results.json").read_text())["rows"]) == len(rows)
+    assert len(list(tmp_path.glob("results-*.json"))) == 1
+
+
+def descendants(pid: int) -> list[int]:
+    """The processes that a process started, and those that they started."""
+    try:
+        children = [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+    return [*children, *(below for child in children for below in descendants(child))]
+
+
+def command_of(pid: int) -> str:
+    """What a process runs, empty if it is gone."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return ""
+
+
+@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupted_run_leaves_no_process(checkpoint: Path, tmp_path: Path, sign: signal.Signals) -> None:
+    few = ["--policies", "full", "--engines", "saccade", "--cores", "2", "--full-batches", "1"]
+    own = ["--checkpoint", str(checkpoint), "--seconds", "600", "--work", str(tmp_path)]
+    program = subprocess.Popen([sys.executable, "-m", "benches.farm", *few, *own], cwd=ROOT)
+    try:
+        # The holder, its two forked processes, and multiprocessing's own.
+        while len(found := descendants(program.pid)) < 4:
+            assert program.poll() is None
+            time.sleep(0.02)
+        program.send_signal(sign)
+        assert program.wait(60) == {signal.SIGTERM: 143, signal.SIGINT: 130}[sign]
+    finally:
+        program.kill()
+        program.wait()
+    end = time.monotonic() + 60
+    while any(map(command_of, found)):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_mistyped_checkpoint_is_refused_and_stays_empty(tmp_path: Path) -> None:
+    for flag in ("--checkpoint", "--demo"):
+        with pytest.raises(SystemExit, match="expected the directory of a checkpoint"):
+            farm.main([flag, str(tmp_path / "typo"), "--work", str(tmp_path / "work"), "--small"])
+    assert not (tmp_path / "typo").exists()
+
+
+def test_a_random_checkpoint_is_written_once_and_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "n15-small.part").mkdir()
+    (tmp_path / "n15-small.part" / "half").touch()  # of a run that was killed
+    folder = checkpoints.n15(tmp_path, small=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["n15-small"]
+    assert not (folder / "half").exists()
+    monkeypatch.setattr(random_checkpoint, "write", None)
+    assert checkpoints.n15(tmp_path, small=True) == folder
+    assert checkpoints.n15(tmp_path, small=False, given=folder) == folder
+    (folder / "config.json").unlink()
+    with pytest.raises(SystemExit, match="expected a checkpoint or an empty directory"):
+        checkpoints.n15(tmp_path, small=True)
 
 
 def test_a_process_that_fails_is_reported(tmp_path: Path) -> None:
@@ -126,6 +235,7 @@ def results() -> dict[str, Any]:
             "versions": {"saccade": "1", "torch": "2"},
             "commit": "abc",
         },
+        "names": {"demo": "bundled policy", "full": "random N1.5"},
         "rows": [
             row(Setting("chunks", "demo", "float32", 2, 1, 1), 100, 140),
             row(Setting("chunks", "demo", "float32", 2, 1, 4), 400, 400),
@@ -158,9 +268,7 @@ def test_the_page(
     assert "An episode takes 10.0 chunks in the mean of 20, of which 18 succeeded." in page
     assert "| bundled policy, float32 | 2 | fork: one copy of the weights | 3.00 | 0.50 | 120 |" in page
     assert "| bundled policy, float32 | 2 | spawn: one copy each | 6.00 | 1.50 | 120 |" in page
-    assert (
-        "- N1.5 at its published size, chunks a second, saccade, 2 x 1, batch 4, fork: no time left" in page
-    )
+    assert "- random N1.5, chunks a second, saccade, 2 x 1, batch 4, fork: no time left" in page
 
     (tmp_path / "results.json").write_text(json.dumps(results))
     written = tmp_path / "farms.md"
@@ -176,6 +284,7 @@ def test_the_page(
 
 
 def test_arguments_are_checked() -> None:
-    for arguments in (["--batches", "0"], ["--seconds", "0"], ["--policies", "other"], ["--cores", "0"]):
+    wrong = (["--batches", "0"], ["--seconds", "0"], ["--policies", "other"], ["--cores", "0"])
+    for arguments in (*wrong, ["report", "--small", "--write"]):
         with pytest.raises(SystemExit):
             farm.parse(arguments)

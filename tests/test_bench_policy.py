@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ import numpy as np
 import pytest
 from test_bench_peers import run
 
+from benches.checkpoints import n15
 from benches.peers import __main__ as command
 from benches.peers import policy_inputs, policy_report
 from benches.peers.cases import Case
-from benches.peers.contenders import CONTENDERS, POLICY_GROUPS
+from benches.peers.contenders import CONTENDERS, POLICY_GROUPS, PROCESSES
 from benches.peers.engines import Task, vla_cpp
 from benches.peers.processes import difference, sharing
 from benches.peers.results import RECORDS, Results, records
@@ -41,7 +44,7 @@ def test_every_engine_computes_what_the_reference_does(name: str, work: Path) ->
     if contender.engine == "vla_cpp":
         pytest.skip("vla.cpp has only the published size")
     arrays = policy_inputs.expected_of(SMALL, work)
-    source = policy_inputs.checkpoint(SMALL, work)
+    source = n15(work, small=True)
     task = Task(SMALL, dict(contender.options), source, arrays, work)
     built = importlib.import_module(f"benches.peers.engines.{contender.engine}").build(task)
     error, scale = difference(built.result(), arrays["expected"])
@@ -55,7 +58,7 @@ def test_every_engine_computes_what_the_reference_does(name: str, work: Path) ->
 def test_what_is_not_built_says_how(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SACCADE_PEERS_VLA", str(work / "nowhere"))
     arrays = policy_inputs.expected_of(SMALL, work)
-    task = Task(SMALL, {}, policy_inputs.checkpoint(SMALL, work), arrays, work)
+    task = Task(SMALL, {}, n15(work, small=True), arrays, work)
     with pytest.raises(FileNotFoundError, match="make bench-peers VLA_SOURCE"):
         vla_cpp.build(task)
 
@@ -169,12 +172,13 @@ def test_what_matters_most_is_measured_together_and_first(tmp_path: Path) -> Non
     names = [goal.ours for goal in policy_report.GOALS] + list(policy_report.LEROBOT_BF16)
     assert set(names) <= set(found[0])
     for batch in found:
-        assert sum(CONTENDERS[name].gigabytes for name in batch) <= args.memory
+        assert command.gigabytes(CASE, batch) <= args.memory
     assert {name for batch in found for name in batch} == {
         name for group in POLICY_GROUPS.values() for name in group
     }
-    with pytest.raises(SystemExit):
-        command.parse(["--only", "policy", "head"])
+    for wrong in (["head"], ["--steps", "8"], ["--num-vl-tokens", "74"]):
+        with pytest.raises(SystemExit):
+            command.parse(["--only", "policy", *wrong])
     assert "policy" not in command.parse(["--full"]).only
 
 
@@ -184,6 +188,36 @@ def test_contenders_of_one_process_share_it() -> None:
         together[0]: together,
         "policy-saccade-int8": ("policy-saccade-int8",),
     }
+
+
+def test_shared_weights_count_once_and_for_whoever_is_left() -> None:
+    pure, autocast, int8 = "policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16", "policy-saccade-int8"
+    alone = [command.gigabytes(CASE, [name]) for name in (pure, autocast, int8)]
+    assert min(alone[:2]) > PROCESSES["lerobot-bfloat16"]
+    together = command.gigabytes(CASE, [pure, autocast, int8])
+    assert together == pytest.approx(sum(alone) - PROCESSES["lerobot-bfloat16"])
+    assert {one.process for one in CONTENDERS.values()} == {"", *PROCESSES}
+
+
+def test_objects_of_files_of_the_same_name_are_kept_apart(tmp_path: Path) -> None:
+    clone, environment, tools = tmp_path / "clone", tmp_path / "environment", tmp_path / "tools"
+    sources = ("model.cpp", "modules/head.cpp", "models/head.cpp")
+    for source in sources:
+        (clone / "src" / source).parent.mkdir(parents=True, exist_ok=True)
+        (clone / "src" / source).touch()
+    for folder in (clone / "scripts", environment / "ggml" / "source/vendor/llama.cpp/gguf-py", tools):
+        folder.mkdir(parents=True)
+    # A compiler that writes nothing but what it was asked for.
+    (tools / "c++").write_text(
+        '#!/bin/sh\nall="$*"\nuntil [ "$1" = -o ]; do shift; done\necho "$all" > "$2"\n'
+    )
+    (tools / "c++").chmod(0o755)
+    script = Path(command.__file__).with_name("build_vla.sh")
+    path = f"{tools}:{os.environ['PATH']}"
+    subprocess.run(["sh", script, environment, clone], check=True, env={"PATH": path})
+    objects = list((environment / "vla" / "objects").iterdir())
+    found = {source for source in sources for one in objects if f"src/{source}" in one.read_text()}
+    assert found == set(sources)
 
 
 def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

@@ -409,13 +409,13 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
 def test_maps_are_those_of_the_reference(head: saccade.ActionHead, pushed: View) -> None:
     selection = record.Selection(blocks=(0, 3), steps=(1,), heads=(0, 2), shown_heads=())
-    rows, attention = record.look(head, pushed, selection)
+    rows, attention = record.attention_maps(head, pushed, selection)
     assert rows == {"state": slice(0, 1), "future": slice(1, 33), "action": slice(33, 49)}
     assert list(attention) == [(1, 0), (1, 3)]
     assert pushed.observation.noise is not None
     reference = ReferenceHead.load(DEMO_CHECKPOINT, dtype=torch.float64)
     tokens = record.random_tokens(head.future_tokens, seed=4)
-    other = record.look_redrawn(head, pushed, selection, tokens)
+    other = record.redrawn_maps(head, pushed, selection, tokens)
     for intervention, found in ((None, attention), (Intervention(future_tokens=tokens), other)):
         with torch.no_grad():
             expected = reference.trace(

@@ -24,7 +24,7 @@ from saccade.maps.grid import by_token, region_of, view_pictures
 from saccade.maps.layout import Camera
 from saccade.maps.occlusion import Place, behind, measure
 from saccade.maps.view import View, from_policy
-from saccade.whole import parts_of
+from saccade.policy_parts import parts_of
 
 LAYOUTS = ("isaac", "lerobot", "n16", "n17")
 TOKENIZER = DATA / "tiny_tokenizer.json"

@@ -42,6 +42,25 @@ def test_a_piece_that_always_kills_its_process_is_given_up_and_no_other(tmp_path
     assert found == {number: number**2 for number in range(8) if number != 3}
 
 
+def test_one_process_for_each_core_is_not_this_one_where_there_is_one_core(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("joblib.cpu_count", lambda: 1)
+    work = Square(tmp_path / "log", dies_once=(2,))
+    assert sorted(each(work, range(4), Workers(jobs=-1))) == [(number, number**2) for number in range(4)]
+    processes = {int(line.split()[0]) for line in (tmp_path / "log").read_text().splitlines()}
+    assert len(processes) == 2  # one at a time: the one that died, and the next
+    assert os.getpid() not in processes
+
+
+def test_a_caller_may_stop(tmp_path: Path) -> None:
+    found: Any = each(Square(tmp_path / "log"), range(100), TWO)
+    next(found)
+    found.close()
+    assert len(Square(tmp_path / "log").attempts) < 100
+    assert sorted(each(Square(tmp_path / "other"), range(3), TWO)) == [(0, 0), (1, 1), (2, 4)]
+
+
 def test_errors_of_the_work_are_raised(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot square 1"):
         list(each(Square(tmp_path / "log", fails=(1,)), [0, 1], TWO))
@@ -150,12 +169,46 @@ class Outer:
 
 
 def test_paths_are_replaced_wherever_they_are() -> None:
-    places = {"a/b": Path("/cache/b"), "c": Path("/cache/c")}
-    value = Outer(Inner("a/b"), {"one": Path("c"), "a/b": Path("d")}, ("c", "d"))
+    places = {"/a/b": Path("/cache/b"), "/c": Path("/cache/c")}
+    value = Outer(Inner("/a/b"), {"one": Path("/c"), "/a/b": Path("d")}, ("/c", "d"), "see /a/b")
     found = files.relocated(value, places)
     assert found == Outer(
-        Inner("/cache/b"), {"one": Path("/cache/c"), "a/b": Path("d")}, ("/cache/c", "d"), "see a/b"
+        Inner("/cache/b"), {"one": Path("/cache/c"), "/a/b": Path("d")}, ("/cache/c", "d"), "see /a/b"
     )
     assert files.relocated(value.inner.method, places)() == "/cache/b"
     untouched = Outer(Inner("x"), {}, ())
     assert files.relocated(untouched, places) is untouched
+
+
+def test_a_path_may_be_written_in_any_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here" / "policy").mkdir(parents=True)
+    (tmp_path / "here" / "reach").write_text("")
+    (tmp_path / "link").symlink_to("here")
+    monkeypatch.chdir(tmp_path / "here")
+    policy = str(tmp_path / "here" / "policy")
+    names = ("policy", "./policy", "../here/policy", str(tmp_path / "link" / "policy"), policy)
+    for file in (*names, Path("policy")):
+        value = Outer(Inner("../link/policy"), {"one": Path("policy")}, names[1:], "policies")
+        sources, found = files.located(value, [file, "owner/name", "./policy"])
+        assert sources == {policy: Path(policy)}
+        assert found == Outer(Inner(policy), {"one": Path(policy)}, (policy,) * 4, "policies")
+    # A word that could be a path is one only if it was given in this way.
+    assert files.located(Inner("reach"), ["./reach"])[1] == Inner("reach")
+    assert files.located(Inner("reach"), ["reach"])[1] == Inner(str(tmp_path / "here" / "reach"))
+    assert files.located(Inner("a/b\0"), ["policy"])[1] == Inner("a/b\0")
+    assert files.located(Inner("/" * 5000 + "a" * 300), ["policy"])[1].checkpoint.endswith("aaa")
+
+
+def test_a_link_to_a_file_keeps_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "blobs" / "0123").write_text("weights")
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(name)
+        (tmp_path / name / "model.safetensors").symlink_to("../blobs/0123")
+    given = [str(tmp_path / name / "model.safetensors") for name in ("one", "two")]
+    sources, _ = files.located((), given)
+    assert list(sources) == given
+    shipments = [files.pack(path, lambda piece: piece) for path in sources.values()]
+    assert {shipment.name for shipment in shipments} == {"model.safetensors"}
+    assert shipments[0].sha256 != shipments[1].sha256  # each has the config beside it

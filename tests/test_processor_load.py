@@ -15,6 +15,7 @@ from published import published
 import saccade
 from saccade import hub
 from saccade.errors import CheckpointError, InputError
+from saccade.processor import tokenizer_path
 
 NOISE = np.random.default_rng(0).integers(0, 256, (90, 120, 3), np.uint8)
 
@@ -179,6 +180,8 @@ def test_the_checkpoints_own_tokenizer(tmp_path: Path) -> None:
         folder.mkdir(exist_ok=True)
         shutil.copy(TOKENIZER, folder / "tokenizer.json")
         assert "tokens=443" in repr(saccade.Processor.load(source))
+        assert tokenizer_path(source) is None
+        assert tokenizer_path(source, TOKENIZER) == TOKENIZER
         (folder / "tokenizer.json").unlink()
 
 
@@ -213,6 +216,7 @@ def test_the_released_tokenizer_in_the_cache(cache: Path, fixture: str, name: st
     snapshot = in_cache(cache, name)
     assert "tokens=443" in repr(saccade.Processor.load(source))
     assert hub.cached(name) == snapshot
+    assert tokenizer_path(source) == tokenizer_path(source, name) == snapshot
     assert "tokens=443" in repr(saccade.Processor.load(source, tokenizer=name))
     assert "tokens=443" in repr(saccade.Processor.load(source, tokenizer=f"{name}@4af2b622"))
     (snapshot / "tokenizer.json").unlink()  # an incomplete download

@@ -6,6 +6,7 @@ file; `SACCADE_RAY=1 python -m pytest tests/test_ray.py` fails instead of skippi
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -14,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pandas as pd
 import pytest
@@ -23,6 +25,7 @@ import saccade
 from saccade.cli import main, rollout
 from saccade.errors import InputError
 from saccade.parallel import ALONE, Lost, Workers, each
+from saccade.parallel import cluster as parallel_cluster
 from saccade.sim import demos, graphics
 from saccade.sim.policy import DEMO_CHECKPOINT
 from saccade.study.cell import Cell, Rows
@@ -38,12 +41,17 @@ SETTINGS = {"checkpoint": "abc"}
 
 
 class TwoNodes:
-    """The cluster. Each node has two cores and its own directory for temporary files."""
+    """The cluster. Each node has two cores and its own directory for temporary files.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: Where these directories are.
+        **environment: Variables of all processes of the nodes.
+    """
+
+    def __init__(self, folder: Path, **environment: str) -> None:
         from ray.cluster_utils import Cluster
 
-        self.folder = folder
+        self.folder, self.environment = folder, environment
         self.cluster = Cluster()
         self.cluster.add_node(**self.options("first"))  # the head, which this process connects to
         self.second = self.cluster.add_node(**self.options("second"))
@@ -53,7 +61,8 @@ class TwoNodes:
     def options(self, name: str) -> dict[str, Any]:
         """What a node is started with."""
         (self.folder / name).mkdir()
-        return {"num_cpus": 2, "env_vars": {"TMPDIR": str(self.folder / name)}, "include_dashboard": False}
+        environment = {**self.environment, "TMPDIR": str(self.folder / name)}
+        return {"num_cpus": 2, "env_vars": environment, "include_dashboard": False}
 
     def processes(self, name: str) -> list[int]:
         """The processes of a node that work on a piece at this moment."""
@@ -89,19 +98,25 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-@pytest.fixture
-def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoNodes]:
-    """A cluster for one test."""
+@contextlib.contextmanager
+def cluster(folder: Path, **environment: str) -> Iterator[TwoNodes]:
+    """A cluster that runs meanwhile; arguments as `TwoNodes`."""
     import ray
 
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(SEARCHED))
-    monkeypatch.setattr(graphics, "check", lambda: None)
-    found = TwoNodes(tmp_path)
+    found = TwoNodes(folder, PYTHONPATH=os.pathsep.join(SEARCHED), **environment)
     try:
         yield found
     finally:
         ray.shutdown()
         found.cluster.shutdown()
+
+
+@pytest.fixture
+def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoNodes]:
+    """A cluster for one test."""
+    monkeypatch.setattr(graphics, "check", lambda: None)
+    with cluster(tmp_path) as found:
+        yield found
 
 
 class Deaths:
@@ -214,6 +229,21 @@ def test_pieces_that_kill_their_process_are_given_up_and_errors_are_raised(
         list(each(work, [1], Workers("ray", 1, nodes.cluster.address, num_threads=64)))
     with pytest.raises(StudyError, match=r"1 of 1 cells failed: square 1: .* 4 attempts"):
         run_cells("demo", [Cell(("square", 1))], Dies(), tmp_path, settings={}, workers=nodes.workers)
+
+
+def test_pieces_that_run_out_of_memory_are_given_up_too(tmp_path: Path) -> None:
+    # Ray's own monitor ends every piece, since more than no memory is in use.
+    monitor = {"RAY_memory_usage_threshold": "0.0", "RAY_memory_monitor_refresh_ms": "100"}
+    work = Square(tmp_path / "log", holds=60.0)
+    counted = mock.patch.object(parallel_cluster, "result_of", wraps=parallel_cluster.result_of)
+    with cluster(tmp_path, **monitor) as starved, counted as attempts:
+        found = dict(each(work, range(3), starved.workers))
+    assert sorted(found) == [0, 1, 2]
+    for lost in found.values():
+        assert isinstance(lost, Lost)
+        assert "died in each of 4 attempts: " in lost.reason
+        assert "memory" in lost.reason
+    assert attempts.call_count == 3 * 4
 
 
 class Dies:

@@ -17,11 +17,11 @@ from whole_checkpoints import EMBODIMENT, whole
 from saccade import BackboneInputs, Policy
 from saccade.cli import main
 from saccade.frames import read_frames
+from saccade.policy_parts import as_head_takes_it, parts_of
 from saccade.reference import ActionHead, Backbone
 from saccade.study import input_derivatives as derivatives
-from saccade.study.moments import Moments, look
+from saccade.study.moments import Moments, encode
 from saccade.study.table import read_provenance, read_table
-from saccade.whole import as_head_takes_it, parts_of
 
 torch.set_num_threads(1)
 
@@ -173,8 +173,8 @@ def test_tokens_at_run_time(frames: Path, tmp_path: Path, capsys: pytest.Capture
 def test_derivatives_are_those_of_one_graph(layout: str, frames: Path) -> None:
     """Against torch's derivative of the actions by pixels, through backbone and head at once."""
     source = Moments(str(whole(layout)), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1)
-    looked = look(source)
-    inputs, layout_of_row = looked.inputs[0], looked.layouts[0]
+    encoded = encode(source)
+    inputs, layout_of_row = encoded.inputs[0], encoded.layouts[0]
     head, backbone = ActionHead.load(source.checkpoint), Backbone.load(source.checkpoint)
     row = source.all.row(0).with_noise(np.random.default_rng(0), source.config)
     noise = row.noise
@@ -201,13 +201,13 @@ def test_derivatives_are_those_of_one_graph(layout: str, frames: Path) -> None:
     for pixels, expected in zip(found.pixels, whole_graph, strict=True):
         joined = derivatives.times_joined(expected, backbone).abs().numpy()
         np.testing.assert_allclose(pixels, joined, rtol=2e-3, atol=1e-4 * joined.max())
-    by_view = derivatives.by_image_token(found, inputs, looked.backbone_config, layout_of_row)
+    by_view = derivatives.by_image_token(found, inputs, encoded.backbone_config, layout_of_row)
     rows = derivatives.part_rows(found, layout_of_row, by_view)
     for kind in ("tokens", "pixels"):
         shares = [one["share"] for one in rows if one["input"] == kind and "row" not in one]
         assert sum(shares) == pytest.approx(1)
     total = sum(float(np.square(pixels).sum()) for pixels in found.pixels)
-    copies = 2 if looked.backbone_config.version == "n1.7" else 1  # N1.7 is given each pixel twice
+    copies = 2 if encoded.backbone_config.version == "n1.7" else 1  # N1.7 is given each pixel twice
     squares = [one["norm"] ** 2 for one in rows if "row" in one]
     assert sum(squares) == pytest.approx(total / copies, rel=1e-4)
 

@@ -21,6 +21,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from benches import checkpoints, pages
 from benches.backbone import accuracy, memory, report, reuse, setup
 from benches.backbone.contenders import GROUPS, Task, contenders, note, round_of
 from benches.peers import machine
@@ -36,7 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     path = args.work / ("results-small.json" if args.small else "results.json")
     if args.sections == ["report"]:
-        return report.command(path, write=args.write)
+        return pages.report(
+            path, report.COMMITTED, report.PAGE, report.document, program="benches.backbone", write=args.write
+        )
     results: Results = json.loads(path.read_text()) if path.exists() else {}
     results["machine"] = machine.describe()
     results["machine"]["versions"]["transformers"] = machine.version("transformers")
@@ -49,9 +52,14 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+def checkpoint(args: argparse.Namespace) -> Path:
+    """The checkpoint of the sections that run at full size."""
+    return checkpoints.n15(args.work, small=args.small, given=args.checkpoint)
+
+
 def speed(args: argparse.Namespace) -> list[Results]:
     """The backbone alone, by threads: peaks, and the seconds of each piece of each contender."""
-    folder = setup.checkpoint(args)
+    folder = checkpoint(args)
     given = {str(views): setup.inputs_of(setup.sizes_of(folder), views) for views in args.views}
     for views in args.views:
         setup.expected(folder, views, args.work)
@@ -82,7 +90,7 @@ def speed(args: argparse.Namespace) -> list[Results]:
 
 def reuse_section(args: argparse.Namespace) -> list[Results]:
     """Steps of a whole policy with unchanged views."""
-    folder, found = setup.checkpoint(args), []
+    folder, found = checkpoint(args), []
     for threads in args.threads:
         for precision in PRECISIONS:
             note(f"reuse: {precision}, {threads} threads")
@@ -93,7 +101,7 @@ def reuse_section(args: argparse.Namespace) -> list[Results]:
 
 def memory_section(args: argparse.Namespace) -> list[Results]:
     """Peak memory and cold loads."""
-    folder, found = setup.checkpoint(args), []
+    folder, found = checkpoint(args), []
     for what in memory.WHATS:
         for precision in PRECISIONS:
             note(f"memory: {what}, {precision}")

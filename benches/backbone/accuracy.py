@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from benches.backbone import setup
+from benches.checkpoints import written
 from saccade._arrays import Float32Array
 from saccade.checkpoints import head_configs, random_checkpoint
 from saccade.checkpoints.backbone_sizes import RELEASED
@@ -48,10 +49,7 @@ def checkpoint(work: Path, *, outliers: bool, layers: tuple[int, int] | None, sm
         config["vision_config"] = {**config["vision_config"], "num_hidden_layers": layers[0]}
         config["select_layer"] = layers[1]
         name += f"-{layers[0]}-{layers[1]}"
-    folder = work / name
-    if not (folder / "config.json").is_file():
-        random_checkpoint.write(folder, backbone=config, head=head, outliers=outliers)
-    return folder
+    return written(work / name, backbone=config, head=head, outliers=outliers)
 
 
 def measure(folder: Path, views: int, note: Any) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from benches.backbone import memory, reuse
 from benches.backbone.work import backbone_work, floor_seconds
-from benches.peers.results import TOLERANCE, rounded
+from benches.peers.results import TOLERANCE
 from benches.peers.text import plural, table
 from saccade.bench.cost import Machine
 from saccade.bench.timing import quartiles
@@ -28,21 +27,6 @@ GOALS = (
 FLOOR_GOALS = (0.80, 0.88)
 
 Results = dict[str, Any]
-
-
-def command(path: Path, *, write: bool) -> int:
-    """Prints the report, or writes the page and keeps a copy of the measurements next to the program."""
-    path = path if path.exists() else COMMITTED
-    if not path.exists():
-        raise SystemExit("benches.backbone: nothing measured yet; run python -m benches.backbone")
-    results = json.loads(path.read_text())
-    if write:
-        COMMITTED.write_text(json.dumps(rounded(results), indent=1) + "\n")
-        PAGE.write_text(document(results))
-        print(PAGE)
-    else:
-        print(document(results))
-    return 0
 
 
 def document(results: Results) -> str:

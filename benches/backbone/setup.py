@@ -1,17 +1,15 @@
-"""The checkpoint, the inputs and the expected features that all sections share."""
+"""The inputs and the expected features that all sections share."""
 
 from __future__ import annotations
 
 import json
 import multiprocessing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from saccade import BackboneInputs
 from saccade._arrays import Float32Array
-from saccade.checkpoints import random_checkpoint
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.checkpoints.prompt_tokenizer import FIRST_ADDED, WORDS, token_id
 
@@ -32,18 +30,6 @@ SYSTEM = (
 USER = ("<|im_start|>", "user", "Ċ")
 INSTRUCTION = ("['", "open", "Ġthe", "Ġdrawer", "']", "<|im_end|>", "Ċ", "<|im_start|>", "assistant", "Ċ")
 INSTRUCTION_TEXT = "open the drawer"
-
-
-def checkpoint(args: Any) -> Path:
-    """The checkpoint, written if it is not there."""
-    folder: Path = args.checkpoint or args.work / ("n15-small" if args.small else "n15")
-    if not (folder / "config.json").is_file():
-        random_checkpoint.write(
-            folder,
-            backbone=random_checkpoint.small_backbone("n1.5") if args.small else None,
-            head=random_checkpoint.small_head("n1.5") if args.small else None,
-        )
-    return folder
 
 
 def sizes_of(folder: Path) -> BackboneSizes:

@@ -38,12 +38,14 @@ from typing import Any
 
 from benches.peers import machine, policy_report, processes, report
 from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
-from benches.peers.contenders import CONTENDERS, GROUPS, POLICY_GROUPS, able
+from benches.peers.contenders import CONTENDERS, GROUPS, POLICY_GROUPS, PROCESSES, able
 from benches.peers.goals import NEEDED
 from benches.peers.processes import KilledError, Ready, note
 from benches.peers.results import RECORDS, Results
 from benches.peers.text import usual
 
+SIZES = ("num-vl-tokens", "num-future-tokens", "batch", "samples", "steps")
+"""Flags that change a size of every case; the whole policy has no choice of them."""
 BUILDING = {"policy": 150.0}
 """Seconds to build the slowest batch of a piece, once its graphs are written; of others `BUILDING_PARTS`."""
 BUILDING_PARTS = 40.0
@@ -116,7 +118,7 @@ def chosen_cases(args: argparse.Namespace) -> list[Case]:
     cases = full_cases(args.threads) if args.full else default_cases(args.threads)
     changed = {
         name: getattr(args, name)
-        for name in ("num_vl_tokens", "num_future_tokens", "batch", "samples", "steps")
+        for name in (flag.replace("-", "_") for flag in SIZES)
         if getattr(args, name) is not None
     }
     cases = [replace(case, size=args.size, **changed) for case in cases if case.piece in args.only]
@@ -134,11 +136,10 @@ def batches(results: Results, case: Case, args: argparse.Namespace, names: Seque
             continue
         anchor = able[0] if able else ""
         while pending:
-            batch, used = [anchor], gigabytes(case, anchor)
+            batch = [anchor]
             for name in [name for name in pending if name != anchor]:
-                if used + gigabytes(case, name) <= args.memory:
+                if gigabytes(case, [*batch, name]) <= args.memory:
                     batch.append(name)
-                    used += gigabytes(case, name)
             if len(batch) == 1 and pending != [anchor]:
                 batch = pending[:1]  # it does not fit into memory together with the anchor
             found.append(batch)
@@ -146,9 +147,14 @@ def batches(results: Results, case: Case, args: argparse.Namespace, names: Seque
     return found
 
 
-def gigabytes(case: Case, name: str) -> float:
-    """Memory of a contender, roughly: the weights of the whole policy or head, or of a fifth of it."""
-    return CONTENDERS[name].gigabytes * (1.0 if case.piece in (*WHOLE, "policy") else 0.3)
+def gigabytes(case: Case, names: Sequence[str]) -> float:
+    """Memory of contenders together, roughly: the weights of the whole policy or head, or of a fifth of it.
+
+    A process needs the weights that its contenders share also if only one of them is left to measure.
+    """
+    shared = {CONTENDERS[name].process for name in names} - {""}
+    own = sum(CONTENDERS[name].gigabytes for name in names) + sum(PROCESSES[process] for process in shared)
+    return own * (1.0 if case.piece in (*WHOLE, "policy") else 0.3)
 
 
 def measure(results: Results, case: Case, names: list[str], args: argparse.Namespace, end: float) -> None:
@@ -234,8 +240,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--prepare", action="store_true", help="write inputs and graphs, compare results, time nothing"
     )
-    for name in ("num-vl-tokens", "num-future-tokens", "batch", "samples", "steps"):
-        parser.add_argument(f"--{name}", type=int, help="use this value in every case")
+    for name in SIZES:
+        parser.add_argument(f"--{name}", type=int, help="use this value in every case of the head")
     parser.add_argument("--size", choices=("full", "small"), default="full", help="small: for a quick trial")
     parser.add_argument(
         "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
@@ -254,6 +260,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     if "policy" in args.only and args.only != ["policy"]:
         parser.error(f"--only: expected policy alone, got {' '.join(args.only)}")
     is_policy = args.only == ["policy"]
+    given = [f"--{name}" for name in SIZES if getattr(args, name.replace("-", "_")) is not None]
+    if is_policy and given:
+        parser.error(f"{', '.join(given)}: not with --only policy, whose sizes are those of its checkpoint")
     args.results = args.results or args.work / ("policy.json" if is_policy else "results.json")
     args.record = args.record or (RECORDS / "policy" if is_policy else RECORDS)
     args.threads = args.threads or default_threads(args.only)

@@ -12,9 +12,11 @@ cd "$environment/vla"
 for source in model loader options vla_c_api modules/* models/*; do
     for file in "$clone"/src/${source%.*}.cpp; do
         [ -e "$file" ] || continue
+        # Two folders may have files of the same name.
+        object=$(printf %s "${file#"$clone"/src/}" | tr / -).o
         # As CMake's release build of it; -march=native as in ggml.
         c++ -std=c++17 -O3 -DNDEBUG -march=native -fPIC -I "$clone/src" -I "$clone/include" -I "$llama/vendor" \
-            -I "$llama/ggml/include" -c "$file" -o "objects/$(basename "$file").o"
+            -I "$llama/ggml/include" -c "$file" -o "objects/$object"
     done
 done
 c++ -shared -o libvla.so objects/*.o -L "$libraries" -lggml -lggml-base -lggml-cpu "-Wl,-rpath,$libraries"

@@ -15,13 +15,14 @@ class Contender:
         label: Its name in tables.
         engine: The module of `benches.peers.engines` that builds it.
         pieces: What it can run.
-        gigabytes: Of memory while it runs the whole head at full size, roughly.
+        gigabytes: Of memory while it runs the whole head or policy at full size, roughly; without what its
+            process holds for all.
         options: What the engine's `build` reads.
         environment: Set in its process.
         usual: Whether it is part of a run that names nobody; the others are settings that were tried and
             that another setting of the same engine beats, or that take minutes to compile.
-        process: Contenders of the same process, if it is not empty, run in one and share the weights;
-            `gigabytes` is then what each adds.
+        process: Contenders of the same process, a key of `PROCESSES` if it is not empty, run in one and share
+            the weights.
     """
 
     label: str
@@ -144,6 +145,10 @@ contenders of the targets come first, so that they share rounds.
 """
 
 
+PROCESSES: Mapping[str, float] = {"lerobot-bfloat16": 4.9, "lerobot-float32": 11.5}
+"""Gigabytes of the weights that the contenders of a process share, roughly."""
+
+
 def _policy(label: str, engine: str, gigabytes: float, process: str = "", **options: Any) -> Contender:
     return Contender(label, engine, ("policy",), gigabytes, options, process=process)
 
@@ -155,7 +160,7 @@ POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "policy-lerobot-bfloat16-pure": _policy(
             "lerobot 0.4.4 bfloat16, no autocast",
             "lerobot_policy",
-            5.4,
+            0.5,
             "lerobot-bfloat16",
             arithmetic="bfloat16",
         ),
@@ -181,7 +186,7 @@ POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
         "policy-lerobot-default": _policy(
             "lerobot 0.4.4, its default: float32 weights, autocast to bfloat16",
             "lerobot_policy",
-            12.0,
+            0.5,
             "lerobot-float32",
             arithmetic="float32",
             autocast=True,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benches.backbone.setup import INSTRUCTION_TEXT
+from benches.checkpoints import n15
 from benches.peers.cases import WORKS, Case
-from saccade.checkpoints import random_checkpoint
 from saccade.dialects import CameraSources
 
 if TYPE_CHECKING:
@@ -52,21 +52,6 @@ def given(arrays: Arrays, views: int) -> Given:
     )
 
 
-def checkpoint(case: Case, folder: Path) -> Path:
-    """The random checkpoint of the case's size under `folder`, written if it is not there: 4.8 GB at full
-    size.
-    """
-    path = folder / ("n15" if case.size == "full" else "n15-small")
-    if not (path / "config.json").is_file():
-        small = case.size == "small"
-        random_checkpoint.write(
-            path,
-            backbone=random_checkpoint.small_backbone("n1.5") if small else None,
-            head=random_checkpoint.small_head("n1.5") if small else None,
-        )
-    return path
-
-
 def with_views(policy: saccade.Policy, views: int) -> saccade.Policy:
     """The same policy with the first of its cameras."""
     import saccade
@@ -96,7 +81,7 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     if path.exists():
         with np.load(path) as held:
             return dict(held)
-    source = checkpoint(case, folder)
+    source = n15(folder, small=case.size == "small")
     arrays = inputs_of(source)
     arrays["expected"] = np.stack([reference_actions(source, given(arrays, views)) for views in VIEWS])
     part = path.with_suffix(".part.npz")

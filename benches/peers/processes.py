@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from benches.checkpoints import n15
 from benches.peers import inputs, policy_inputs
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
@@ -85,7 +86,7 @@ def build(name: str, case: Case, work_folder: Path, shared: dict[str, Any]) -> t
     graphs.mkdir(parents=True, exist_ok=True)
     if case.piece == "policy":
         arrays = policy_inputs.expected_of(case, work_folder)
-        source = policy_inputs.checkpoint(case, work_folder)
+        source = n15(work_folder, small=case.size == "small")
     else:
         arrays = inputs.expected_of(case, work_folder)
         # Values are the same in both; who holds them in fewer bits has less to read.

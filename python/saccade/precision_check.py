@@ -16,9 +16,9 @@ import numpy.typing as npt
 from saccade._arrays import Float32Array, integer
 from saccade.frames import Moment, read_frames
 from saccade.policy import Policy
+from saccade.policy_parts import parts_of
 from saccade.processor import Preprocessing
 from saccade.robots import Group
-from saccade.whole import parts_of
 
 #: The precisions that are compared, the exact one first.
 PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(

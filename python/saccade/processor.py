@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -116,11 +117,8 @@ class Processor:
         """
         held = _saccade.ProcessorSource(os.fspath(resolve(source)))
         chosen = None if preprocessing is None else text("preprocessing", preprocessing)
-        files = None if tokenizer is None else _tokenizer(tokenizer)
-        if files is None and not held.has_tokenizer:
-            files = _published_tokenizer(held)
         processor = cls.__new__(cls)
-        processor._processor = _saccade.Processor.load(held, files, chosen)
+        processor._processor = _saccade.Processor.load(held, _tokenizer_of(held, tokenizer), chosen)
         return processor
 
     @property
@@ -267,6 +265,28 @@ class Processor:
 
 
 _text = text  # in a method with an argument of that name
+
+
+def tokenizer_path(
+    source: str | os.PathLike[str], tokenizer: str | os.PathLike[str] | None = None
+) -> Path | None:
+    """Where :meth:`Processor.load` finds the tokenizer, if that is outside the checkpoint.
+
+    Args:
+        source, tokenizer: As in :meth:`Processor.load`, which says what is raised.
+
+    Returns:
+        A file or a directory. None: the checkpoint's own is used.
+    """
+    found = _tokenizer_of(_saccade.ProcessorSource(os.fspath(resolve(source))), tokenizer)
+    return None if found is None else Path(found)
+
+
+def _tokenizer_of(source: _saccade.ProcessorSource, given: Any) -> str | None:
+    """The path of the tokenizer that is read instead of the checkpoint's own; None for that one."""
+    if given is not None:
+        return _tokenizer(given)
+    return None if source.has_tokenizer else _published_tokenizer(source)
 
 
 def _tokenizer(given: Any) -> str:

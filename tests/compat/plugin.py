@@ -24,6 +24,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from huggingface_hub import errors
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
@@ -229,13 +230,89 @@ def test_saved_and_loaded(
     assert torch.equal(torch.stack(actions, 1), expected[:, :2])
 
 
-def test_a_full_disk_keeps_what_was_saved(policy: SaccadePolicy, tmp_path: Path) -> None:
-    policy.save_pretrained(tmp_path)
-    held = {path: path.stat().st_mtime_ns for path in (tmp_path / "checkpoint").rglob("*")}
-    with mock.patch("shutil.copyfile", side_effect=OSError(28, "full")), pytest.raises(OSError):
-        policy.save_pretrained(tmp_path)
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "checkpoint").rglob("*")} == held
-    assert not list(tmp_path.glob(".*"))
+def without_tokenizer(checkpoint: Path, folder: Path) -> tuple[Path, Path]:
+    """A checkpoint without a tokenizer, as the released ones, and its tokenizer, under another name."""
+    shutil.copytree(checkpoint, folder / "bare")
+    (folder / "bare" / "tokenizer.json").rename(folder / "words.json")
+    return folder / "bare", folder / "words.json"
+
+
+@pytest.mark.parametrize("where", ["file", "directory", "cache"])
+def test_a_saved_policy_has_its_tokenizer(
+    checkpoint: Path,
+    policy: SaccadePolicy,
+    batch: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))
+    bare, words = without_tokenizer(checkpoint, tmp_path)
+    given: str | None = str(words)
+    if where == "directory":
+        folder = tmp_path / "words"
+        folder.mkdir()
+        shutil.copy(words, folder / "tokenizer.json")
+        (folder / "model.bin").write_bytes(b"large")
+        given = str(folder)
+    if where == "cache":
+        given = None
+        snapshots = tmp_path / "cache" / "models--lerobot--eagle2hg-processor-groot-n1p5" / "snapshots"
+        (snapshots / "main").mkdir(parents=True)
+        shutil.copy(words, snapshots / "main" / "tokenizer.json")
+    config = SaccadeConfig(checkpoint=str(bare), tokenizer=given, num_threads=1, seed=7)
+    saved = SaccadePolicy(config)
+    for _ in range(2):
+        saved.save_pretrained(tmp_path / "saved")
+    # To another machine.
+    shutil.move(tmp_path / "saved", tmp_path / "elsewhere")
+    for path in (bare, words.parent / "words", tmp_path / "cache"):
+        shutil.rmtree(path, ignore_errors=True)
+    words.unlink()
+    assert PreTrainedConfig.from_pretrained(tmp_path / "elsewhere").tokenizer is None
+    folder = tmp_path / "elsewhere" / "tokenizer"
+    assert [path.name for path in folder.iterdir()] == ["tokenizer.json"]
+    loaded = SaccadePolicy.from_pretrained(tmp_path / "elsewhere")
+    policy.reset()
+    expected = policy.predict_action_chunk(batch)
+    assert torch.equal(loaded.predict_action_chunk(batch), expected)
+    loaded.save_pretrained(tmp_path / "elsewhere")  # onto itself
+    loaded.save_pretrained(tmp_path / "again")
+    again = SaccadePolicy.from_pretrained(tmp_path / "again")
+    assert torch.equal(again.predict_action_chunk(batch), expected)
+    # One with a tokenizer of its own leaves none behind.
+    policy.save_pretrained(tmp_path / "again")
+    assert not (tmp_path / "again" / "tokenizer").exists()
+
+
+@pytest.mark.parametrize("fails", ["copyfile", "rename"])
+def test_a_full_disk_keeps_what_was_saved(
+    checkpoint: Path, policy: SaccadePolicy, tmp_path: Path, fails: str
+) -> None:
+    bare, words = without_tokenizer(checkpoint, tmp_path)
+    saved = tmp_path / "saved"
+    SaccadePolicy(SaccadeConfig(checkpoint=str(bare), tokenizer=str(words))).save_pretrained(saved)
+
+    def found() -> dict[Path, int]:
+        files = [path for name in ("checkpoint", "tokenizer") for path in (saved / name).rglob("*")]
+        return {path: path.stat().st_mtime_ns for path in files}
+
+    held, rename = found(), Path.rename
+
+    def last_fails(path: Path, target: Path) -> Path:
+        if path == saved / "tokenizer":
+            raise OSError(28, "full")
+        return rename(path, target)
+
+    failing = (
+        mock.patch("shutil.copyfile", side_effect=OSError(28, "full"))
+        if fails == "copyfile"
+        else mock.patch.object(Path, "rename", last_fails)
+    )
+    with failing, pytest.raises(OSError):
+        policy.save_pretrained(saved)
+    assert found() == held
+    assert not list(saved.glob(".*"))
 
 
 def cached(checkpoint: Path, cache: Path, commit: str) -> None:
@@ -273,16 +350,37 @@ def test_published_repositories(
 def test_every_option_reaches_the_hub(checkpoint: Path) -> None:
     given: dict[str, Any] = {
         "force_download": True,
-        "resume_download": None,
-        "proxies": {"https": "proxy"},
         "token": "secret",
         "cache_dir": "cache",
         "local_files_only": False,
         "revision": "main",
     }
-    with mock.patch.object(files, "snapshot_download", return_value=str(checkpoint)) as download:
+    with mock.patch.object(
+        files, "snapshot_download", autospec=True, return_value=str(checkpoint)
+    ) as download:
         SaccadePolicy.from_pretrained("owner/robot", **given)
     assert download.call_args == mock.call("owner/robot", allow_patterns=list(files.FILES), **given)
+
+
+@pytest.mark.parametrize(
+    ("kind", "raised"),
+    [
+        (errors.RepositoryNotFoundError, FileNotFoundError),
+        (errors.RevisionNotFoundError, FileNotFoundError),
+        (errors.GatedRepoError, errors.GatedRepoError),
+        (errors.HfHubHTTPError, errors.HfHubHTTPError),
+    ],
+)
+def test_only_what_is_not_there_is_said_not_to_be_there(
+    kind: type[errors.HfHubHTTPError], raised: type[Exception]
+) -> None:
+    error = kind("the Hub's words", response=mock.MagicMock(headers={}))
+    with (
+        mock.patch.object(files, "snapshot_download", side_effect=error),
+        pytest.raises(raised, match="the Hub's words") as found,
+    ):
+        SaccadePolicy.from_pretrained("owner/robot")
+    assert ("is not on the Hub" in str(found.value)) == (raised is FileNotFoundError)
 
 
 def action_of(width: int) -> dict[str, PolicyFeature]:

@@ -1,22 +1,36 @@
-"""Where a policy's files are: a directory or a published repository, and the checkpoint inside."""
+"""Where a policy's files are: a directory or a published repository, with checkpoint and tokenizer inside."""
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import snapshot_download
-from huggingface_hub.errors import HfHubHTTPError
+from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError, RevisionNotFoundError
 
 from saccade.errors import InputError
 from saccade.hub import PUBLISHED, resolve
+from saccade.processor import tokenizer_path
 
 #: The folder of the checkpoint. It has a `config.json` of its own, as lerobot's policies do.
 CHECKPOINT = "checkpoint"
 
+#: The folder of the tokenizer, if the checkpoint's own is not used.
+TOKENIZER = "tokenizer"
+
 #: What saccade reads of a checkpoint. Other files, such as an optimizer's state, are not fetched or copied.
 FILES = ("*.json", "*.safetensors", "*.txt")
+
+#: What saccade reads in the folder of a tokenizer; a tokenizer in one file may have any name.
+TOKENIZER_FILES = (
+    "tokenizer.json",
+    "vocab.json",
+    "merges.txt",
+    "added_tokens.json",
+    "tokenizer_config.json",
+    "preprocessor_config.json",
+)
 
 
 def folder_of(name: str | Path, *, revision: str | None, **hub_options: Any) -> Path:
@@ -28,7 +42,8 @@ def folder_of(name: str | Path, *, revision: str | None, **hub_options: Any) -> 
         **hub_options: As in ``huggingface_hub.snapshot_download``.
 
     Raises:
-        FileNotFoundError: There is neither the directory nor the repository.
+        FileNotFoundError: There is neither the directory nor the repository or revision.
+        huggingface_hub.errors.HfHubHTTPError: The Hub refuses, or fails in another way.
     """
     path = Path(name)
     if path.is_dir():
@@ -45,42 +60,70 @@ def folder_of(name: str | Path, *, revision: str | None, **hub_options: Any) -> 
                 **hub_options,
             )
         )
-    except HfHubHTTPError as error:
+    except GatedRepoError:  # it is there, for those who have accepted its conditions
+        raise
+    except (RepositoryNotFoundError, RevisionNotFoundError) as error:
         raise FileNotFoundError(f"pretrained_name_or_path: {name} is not on the Hub: {error}") from error
 
 
-def copy_checkpoint(source: str, folder: Path) -> None:
-    """Copies a checkpoint into the folder of a policy. What was there before is replaced at the end only.
+def copy_checkpoint(source: str, tokenizer: str | None, folder: Path) -> None:
+    """Copies a checkpoint into the folder of a policy, and the tokenizer if it is elsewhere.
+
+    The folder then needs no other file: also where the local cache has no tokenizer. What was there before is
+    replaced at the end only.
 
     Args:
         source: The directory or id of a checkpoint, or its weights.
+        tokenizer: As :meth:`saccade.Policy.load` takes it.
         folder: The policy's directory.
 
     Raises:
         InputError: ``folder`` is the checkpoint itself.
         OSError: The files cannot be copied; ``folder`` is then as before.
     """
-    found = resolve(source)
-    found = found if found.is_dir() else found.parent
-    target = folder / CHECKPOINT
-    if target.is_dir() and target.samefile(found):
-        return
-    if folder.samefile(found):
+    checkpoint = resolve(source)
+    files = tokenizer_path(checkpoint, tokenizer)
+    checkpoint = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    if folder.samefile(checkpoint):
         raise InputError(f"save_directory: expected another directory than the checkpoint's, got {folder}")
-    with tempfile.TemporaryDirectory(dir=folder, prefix=f".{CHECKPOINT}-") as temporary:
-        copied, replaced = Path(temporary, "new"), Path(temporary, "old")
-        for file in sorted(set(_files_of(found))):
-            to = copied / file.relative_to(found)
-            to.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, to)
-        if target.exists():
-            target.rename(replaced)
-        try:
-            copied.rename(target)
-        except BaseException:
-            if replaced.exists():
-                replaced.rename(target)
-            raise
+    parts: dict[str, Mapping[Path, Path]] = {}
+    if not _is(folder / CHECKPOINT, checkpoint):
+        parts[CHECKPOINT] = {file.relative_to(checkpoint): file for file in _files_of(checkpoint)}
+    if files is None:
+        parts[TOKENIZER] = {}
+    elif not _is(folder / TOKENIZER, files):
+        parts[TOKENIZER] = _files_of_tokenizer(files)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as temporary:
+        for name, part in parts.items():
+            for below, file in part.items():
+                to = Path(temporary, name, below)
+                to.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, to)
+        _replace(parts, folder, Path(temporary))
+
+
+def _is(path: Path, other: Path) -> bool:
+    """Whether two paths lead to the same file or directory."""
+    return path.exists() and path.samefile(other)
+
+
+def _replace(names: Iterable[str], folder: Path, temporary: Path) -> None:
+    """Moves new folders into place, if they are there, instead of the old ones; all of them or none."""
+    moves: list[tuple[Path, Path]] = []
+
+    def move(source: Path, target: Path) -> None:
+        if source.exists():
+            source.rename(target)
+            moves.append((source, target))
+
+    try:
+        for name in names:
+            move(folder / name, temporary / f"old-{name}")
+            move(temporary / name, folder / name)
+    except BaseException:
+        for source, target in reversed(moves):
+            target.rename(source)
+        raise
 
 
 def _files_of(checkpoint: Path) -> Iterator[Path]:
@@ -91,3 +134,12 @@ def _files_of(checkpoint: Path) -> Iterator[Path]:
             for file in checkpoint.rglob(pattern):
                 if not any(part.startswith("checkpoint-") for part in file.relative_to(checkpoint).parts):
                     yield file
+
+
+def _files_of_tokenizer(path: Path) -> dict[Path, Path]:
+    """The files of a tokenizer, by their names in a directory of their own."""
+    if path.is_dir():
+        return {Path(name): path / name for name in TOKENIZER_FILES if (path / name).is_file()}
+    beside = path.with_name("preprocessor_config.json")
+    found = {Path("tokenizer.json"): path}
+    return found | ({Path(beside.name): beside} if beside.is_file() else {})

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import saccade
 from lerobot_policy_saccade.configuration_saccade import NO_TRAINING, SaccadeConfig
-from lerobot_policy_saccade.files import CHECKPOINT, copy_checkpoint, folder_of
+from lerobot_policy_saccade.files import CHECKPOINT, TOKENIZER, copy_checkpoint, folder_of
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
 
 OBSERVATION, TASK = "observation.", "task"
@@ -57,7 +57,7 @@ class SaccadePolicy(PreTrainedPolicy):
         super().__init__(config)
         if config.checkpoint is None:
             raise saccade.InputError("checkpoint: expected a path or an id, got none (--policy.checkpoint)")
-        self._checkpoint = config.checkpoint
+        self._checkpoint, self._tokenizer = config.checkpoint, config.tokenizer
         self.policy = saccade.Policy.load(
             config.checkpoint,
             embodiment=_embodiment(config.embodiment),
@@ -149,9 +149,12 @@ class SaccadePolicy(PreTrainedPolicy):
         raise NotImplementedError(NO_TRAINING)
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
-        """Writes what ``--policy.path`` needs: options, processors, and a copy of the checkpoint."""
-        copy_checkpoint(self._checkpoint, save_directory)
-        replace(self.config, checkpoint=None)._save_pretrained(save_directory)
+        """Writes what ``--policy.path`` needs on any machine.
+
+        These are options, processors, a copy of the checkpoint, and the tokenizer if the checkpoint has none.
+        """
+        copy_checkpoint(self._checkpoint, self._tokenizer, save_directory)
+        replace(self.config, checkpoint=None, tokenizer=None)._save_pretrained(save_directory)
         for processor in make_saccade_pre_post_processors(self.config):
             processor.save_pretrained(save_directory)
 
@@ -162,8 +165,6 @@ class SaccadePolicy(PreTrainedPolicy):
         *,
         config: SaccadeConfig | None = None,
         force_download: bool = False,
-        resume_download: bool | None = None,
-        proxies: dict[str, str] | None = None,
         token: str | bool | None = None,
         cache_dir: str | Path | None = None,
         local_files_only: bool = False,
@@ -178,14 +179,15 @@ class SaccadePolicy(PreTrainedPolicy):
         Args:
             pretrained_name_or_path: What ``save_pretrained`` wrote, or any whole GR00T checkpoint.
             config: The options. Default: those that were saved, or the defaults.
-            force_download, resume_download, proxies, token, cache_dir, local_files_only, revision: As in
+            force_download, token, cache_dir, local_files_only, revision: As in
                 ``huggingface_hub.snapshot_download``. Unused for a directory.
             strict: Unused: tensors that are missing are always an error.
             dataset_stats, dataset_meta: Unused; lerobot passes them.
             **options: Options that replace those of ``config``, such as ``embodiment`` and ``precision``.
 
         Raises:
-            FileNotFoundError: There is neither the directory nor the repository.
+            FileNotFoundError: There is neither the directory nor the repository or revision.
+            huggingface_hub.errors.HfHubHTTPError: The Hub refuses, or fails in another way.
             ValueError, saccade.CheckpointError: As the class.
 
         Example:
@@ -198,17 +200,17 @@ class SaccadePolicy(PreTrainedPolicy):
             revision=revision,
             cache_dir=cache_dir,
             force_download=force_download,
-            resume_download=resume_download,
-            proxies=proxies,
             token=token,
             local_files_only=local_files_only,
         )
-        saved = folder / CHECKPOINT
+        saved, tokenizer = folder / CHECKPOINT, folder / TOKENIZER
         if config is None:
             config = PreTrainedConfig.from_pretrained(folder) if saved.is_dir() else SaccadeConfig()
         config = replace(config, **options)
         if config.checkpoint is None:
             config.checkpoint = str(saved if saved.is_dir() else folder)
+            if saved.is_dir() and tokenizer.is_dir() and config.tokenizer is None:
+                config.tokenizer = str(tokenizer)
         policy = cls(config)
         policy.eval()
         return policy

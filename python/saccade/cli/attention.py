@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     from saccade.maps.page import write_page
     from saccade.maps.sheet import write_sheet
 
-    maps = look(args)
+    maps = compute(args)
     writable_directory(args.out)
     # 21 s with 16 blocks, 32 heads, T_vl 825
     with _output.console(stderr=True).status("numbers, sheet and page"):
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def look(args: argparse.Namespace) -> Maps:
+def compute(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
     from saccade._files import checkpoint_identity
     from saccade.hub import resolve
@@ -172,11 +172,11 @@ def maps_of(args: argparse.Namespace, checkpoint: dict[str, str], head: ActionHe
     shown = heads if named or (args.heads is None and few) else ()
     selection = record.Selection(blocks, steps, heads, shown)
     cell = cell_for(view.layout, args.cell)
-    rows, attention = record.look(head, view, selection)
+    rows, attention = record.attention_maps(head, view, selection)
     redrawn = None
     if head.config.num_future_tokens:
         tokens = record.random_tokens(head.future_tokens, seed=0)
-        redrawn = record.look_redrawn(head, view, selection, tokens)
+        redrawn = record.redrawn_maps(head, view, selection, tokens)
     return record.Maps(
         checkpoint=checkpoint,
         config=head.config,
@@ -238,9 +238,9 @@ def take_simulator(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHe
     """The head of a policy of the simulator, and what it sees in the episode that the arguments ask for."""
     from saccade.errors import CheckpointError
     from saccade.maps.view import from_simulator
+    from saccade.policy_parts import parts_of
     from saccade.sim import graphics
     from saccade.sim.policy import Policy, check_trained_on
-    from saccade.whole import parts_of
 
     try:
         policy = Policy.load(checkpoint, num_threads=args.num_threads)
@@ -260,7 +260,7 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     from saccade.frames import read_frames
     from saccade.maps.view import from_policy
     from saccade.policy import Policy
-    from saccade.whole import parts_of
+    from saccade.policy_parts import parts_of
 
     with _output.progress_bar("loading", transient=True):
         policy = Policy.load(

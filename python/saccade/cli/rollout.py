@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     workers = workers_of(args, args.num_threads)
     require("rollout")
     session = prepare(args, seeds, workers)
-    from saccade.sim import opened
+    from saccade.sim import environment_cache
     from saccade.sim.report import write_contact_sheet
 
     writable_directory(session.out)
@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         interrupted = True
     finally:
-        opened.close()
+        environment_cache.close()
     write_json(session.out / "results.json", session.record())
     pictures = [(rolled.episode, rolled.picture) for rolled in session.done if rolled.picture is not None]
     if pictures:

@@ -14,8 +14,8 @@ from saccade.backbone_inputs import BackboneInputs
 from saccade.errors import ShapeError
 from saccade.maps.layout import WHOLE, Camera, Layout, Region, kind_of
 from saccade.policy import Policy
+from saccade.policy_parts import parts_of
 from saccade.processor import Processor
-from saccade.whole import parts_of
 
 #: Axes of N1.7's patches: a patch holds the same picture twice, as if it were two moments of a video.
 N17_TIME = 2

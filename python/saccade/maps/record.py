@@ -218,14 +218,14 @@ def reads_vl(config: HeadConfig, block: int) -> bool:
     return not (config.interleave_self_attention and block % 2)
 
 
-def look(
+def attention_maps(
     head: ActionHead, view: View, selection: Selection
 ) -> tuple[dict[str, slice], dict[tuple[int, int], Float32Array]]:
     """The slices of the groups of rows, and the chosen maps with the learned future tokens."""
     return _trace(head, view, selection, None)
 
 
-def look_redrawn(
+def redrawn_maps(
     head: ActionHead, view: View, selection: Selection, tokens: Float32Array
 ) -> dict[tuple[int, int], Float32Array]:
     """The chosen maps of the future rows, with other future tokens."""

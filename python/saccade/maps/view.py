@@ -21,7 +21,7 @@ from saccade.maps.layout import Layout
 from saccade.maps.occlusion import BlankedFrames, DroppedPositions, Occluder
 from saccade.observation import Observation, as_mask, from_arrays, read_arrays
 from saccade.policy import Policy
-from saccade.whole import as_head_takes_it
+from saccade.policy_parts import as_head_takes_it
 
 if TYPE_CHECKING:
     from saccade.sim.policy import Policy as SimulatorPolicy

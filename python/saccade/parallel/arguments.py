@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser, pieces: str) -> None:
         "--jobs",
         type=int,
         metavar="N",
-        help=f"{pieces} computed at the same time; -1 for one per core (default: 1; with ray -1)",
+        help=f"{pieces} computed at the same time, in processes of their own; -1 for one per core; with 1 "
+        "the command itself computes (default: 1; with ray -1)",
     )
     group.add_argument(
         "--backend",

@@ -1,4 +1,4 @@
-"""Pieces in the processes of a Ray cluster. Ray repeats the pieces of processes and machines that died."""
+"""Pieces in the processes of a Ray cluster. Those of processes and machines that died are repeated."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import functools
 import logging
 import os
 import socket
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 import saccade
 from saccade import _extras
 from saccade.errors import InputError, SaccadeError
-from saccade.parallel.files import Shipment, pack, place, relocated
+from saccade.parallel.files import Shipment, located, pack, place, relocated
 from saccade.parallel.workers import RETRIES, Lost, Piece, Result, Workers
 
 SECONDS_TO_CONNECT = 10.0
@@ -32,7 +33,7 @@ class Job:
 
     Attributes:
         work: See `saccade.parallel.each`.
-        shipments: Files and directories, by the paths that `work` has for them.
+        shipments: Files and directories, by the absolute paths that `work` has for them.
         version: The saccade that sends it.
     """
 
@@ -49,31 +50,39 @@ def each(
 ) -> Iterator[tuple[Piece, Result | Lost]]:
     """As `saccade.parallel.each`.
 
-    Files are put into Ray's object store here; each machine fetches them when its first piece begins. Ray
-    itself repeats pieces whose process, machine or result was lost, at most `RETRIES` times each.
+    Files are put into Ray's object store here; each machine fetches them when its first piece begins. A piece
+    whose process, machine or result was lost is given to Ray again after the others, which leaves time for
+    memory to become free. Ray itself would repeat one that ran out of memory without limit.
     """
     _extras.require("ray")
     with connected(workers.address) as ray:
         check_cluster(ray, workers)
-        paths = [path for path in dict.fromkeys(map(str, files)) if Path(path).exists()]
-        shipments = {path: pack(Path(path), ray.put) for path in paths}
+        sources, work = located(work, files)
+        shipments = {path: pack(source, ray.put) for path, source in sources.items()}
         # In a list, because Ray would replace the reference by the job, once for every piece.
         job = [ray.put(Job(work, shipments, saccade.__version__))]
         task = ray.remote(run_piece).options(
-            num_cpus=workers.num_threads, max_retries=RETRIES, scheduling_strategy="SPREAD"
+            num_cpus=workers.num_threads, max_retries=0, scheduling_strategy="SPREAD"
         )
-        running: dict[Any, Piece] = {}
-        waiting = iter(pieces)
+        attempts = [0] * len(pieces)
+        waiting = deque(range(len(pieces)))
+        running: dict[Any, int] = {}
         try:
-            while True:
-                for piece in waiting:
-                    running[task.remote(job, piece)] = piece
-                    if len(running) >= most_at_once(ray, workers):
-                        break
-                if not running:
-                    return
+            while waiting or running:
+                while waiting and len(running) < most_at_once(ray, workers):
+                    index = waiting.popleft()
+                    attempts[index] += 1
+                    running[task.remote(job, pieces[index])] = index
                 (done,), _ = ray.wait(list(running), num_returns=1)
-                yield running.pop(done), result_of(ray, done)
+                index = running.pop(done)
+                result = result_of(ray, done)
+                if not isinstance(result, Died):
+                    yield pieces[index], result
+                elif attempts[index] <= RETRIES:
+                    waiting.append(index)
+                else:
+                    died = f"its process or machine died in each of {RETRIES + 1} attempts: {result.reason}"
+                    yield pieces[index], Lost(died)
         finally:
             for reference in running:
                 with contextlib.suppress(Exception):  # of a cluster that is gone, which another error says
@@ -104,6 +113,17 @@ def received(reference: Any) -> Callable[[Any], Any]:
     places = {path: place(shipment, ray.get) for path, shipment in job.shipments.items()}
     work: Callable[[Any], Any] = relocated(job.work, places)
     return work
+
+
+@dataclass(frozen=True)
+class Died:
+    """What takes the place of a result if the process or the machine of a piece died.
+
+    Attributes:
+        reason: What Ray says of it.
+    """
+
+    reason: str
 
 
 @contextlib.contextmanager
@@ -162,7 +182,7 @@ def most_at_once(ray: ModuleType, workers: Workers) -> int:
 
 
 def result_of(ray: ModuleType, reference: Any) -> Any:
-    """The result of a piece, or `Lost`.
+    """The result of a piece, or `Died`.
 
     Raises:
         ClusterError: Ray cannot go on.
@@ -181,7 +201,6 @@ def result_of(ray: ModuleType, reference: Any) -> Any:
         gone.OutOfMemoryError,
         gone.ObjectLostError,
     ) as error:
-        reason = str(error).strip().splitlines()[0]
-        return Lost(f"its process or machine died in each of {RETRIES + 1} attempts: {reason}")
+        return Died(str(error).strip().splitlines()[0])
     except gone.RayError as error:
         raise ClusterError(f"ray: {str(error).strip().splitlines()[-1]}") from None

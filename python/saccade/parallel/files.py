@@ -8,7 +8,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MethodType
@@ -136,32 +136,78 @@ def cache_directory() -> Path:
     return path
 
 
-def relocated(value: Any, places: Mapping[str, Path]) -> Any:
-    """A value in which paths are replaced; the value itself if it contains none of them.
+def located(work: Any, files: Iterable[str | Path]) -> tuple[dict[str, Path], Any]:
+    """The files to bring, by absolute paths, and the work with these paths in place of its own.
+
+    A path may be relative, contain `..` or lead through links; it means what it means here. Files that do not
+    exist, for example because they are names of published checkpoints, are left as they are.
 
     Args:
-        value: strings and paths are compared as a whole; dataclasses, bound methods, sequences and mappings
+        work: As `relocated` takes values. A string is a path if it is one of `files` or contains a separator.
+        files: Files and directories, each named in any way.
+    """
+    given = {str(file): _absolute(file) for file in files if Path(file).exists()}
+    sources = {str(path): path for path in given.values()}
+
+    def absolute(text: str, is_path: bool) -> str:
+        if text in given:
+            return str(given[text])
+        path = str(_absolute(text)) if is_path or os.sep in text else text
+        return path if path in sources else text
+
+    return sources, _replaced(work, absolute)
+
+
+def relocated(work: Any, places: Mapping[str, Path]) -> Any:
+    """Work in which paths are replaced; the work itself if it contains none of them.
+
+    Args:
+        work: Strings and paths are compared as a whole; dataclasses, bound methods, sequences and mappings
             are searched.
-        places: new path by old one.
+        places: New path by old one.
 
     Example:
-        >>> relocated({"run": Path("a/b"), "name": "a"}, {"a/b": Path("/tmp/b")})
+        >>> relocated({"run": Path("/a/b"), "name": "a"}, {"/a/b": Path("/tmp/b")})
         {'run': PosixPath('/tmp/b'), 'name': 'a'}
     """
+    return _replaced(work, lambda text, is_path: str(places.get(text, text)))
+
+
+def _absolute(path: str | Path) -> Path:
+    """An absolute path without `..` and links, except that a link to a file keeps its own name.
+
+    A file's name tells its type, and the files beside it belong to it; in the cache of `huggingface_hub` it
+    is a link to a file without either.
+    """
+    path = Path(path)
+    try:
+        return path.resolve() if path.is_dir() else path.parent.resolve() / path.name
+    except (OSError, RuntimeError, ValueError):  # a text that cannot be a path; links in a circle
+        return path
+
+
+def _replaced(value: Any, replace: Callable[[str, bool], str]) -> Any:
+    """A value in which `replace` was applied to strings and paths; the value itself if nothing changed.
+
+    Args:
+        value: See `relocated`.
+        replace: Gets the text, and whether it is that of a `Path`.
+    """
     if isinstance(value, (str, Path)):
-        return type(value)(places[str(value)]) if str(value) in places else value
+        text = replace(str(value), isinstance(value, Path))
+        return value if text == str(value) else type(value)(text)
     if isinstance(value, MethodType):
-        owner = relocated(value.__self__, places)
+        owner = _replaced(value.__self__, replace)
         return value if owner is value.__self__ else getattr(owner, value.__name__)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         held = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
-        changed = {name: relocated(inner, places) for name, inner in held.items()}
+        changed = {name: _replaced(inner, replace) for name, inner in held.items()}
         same = all(changed[name] is inner for name, inner in held.items())
         return value if same else dataclasses.replace(value, **changed)
     if isinstance(value, Mapping):
-        inner = {key: relocated(held, places) for key, held in value.items()}
+        inner = {key: _replaced(held, replace) for key, held in value.items()}
         return value if all(inner[key] is held for key, held in value.items()) else inner
     if isinstance(value, (tuple, list)) and not hasattr(value, "_fields"):
-        items = [relocated(held, places) for held in value]
+        items = [_replaced(held, replace) for held in value]
         return value if all(map(lambda new, old: new is old, items, value)) else type(value)(items)
     return value

@@ -1,85 +1,88 @@
-"""Pieces in processes of this machine, by joblib. A process that dies costs its piece a retry."""
+"""Pieces in processes of this machine, by joblib's loky. A process that dies costs its piece a retry."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from saccade import _extras
 from saccade.parallel.workers import RETRIES, Lost, Piece, Result
 
-LOST = f"a worker process died in each of {RETRIES + 1} attempts, perhaps out of memory"
+LOST = Lost(f"a worker process died in each of {RETRIES + 1} attempts, perhaps out of memory")
+IDLE = 300  # seconds after which a process that has nothing to do ends
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # of torch and NumPy
 
 
 def each(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int
 ) -> Iterator[tuple[Piece, Result | Lost]]:
-    """As `saccade.parallel.each`, in `jobs` processes; -1 for one per core.
+    """As `saccade.parallel.each`, in `jobs` processes, never in this one; -1 for one per core.
 
-    joblib says that a process died, but not in which piece. The pieces that were given out then wait until
-    the others are done, and are computed in one process, one after the other: now it is known which one ends
-    its process, and pieces that only ran at the same time are not given up.
+    loky says that a process died, but not in which piece. The pieces that were given out then wait until the
+    others are done, and are computed in one process, one after the other: now it is known which one ends its
+    process, and pieces that only ran at the same time are not given up.
     """
     _extras.require("joblib")
+    from joblib import cpu_count
+
+    processes = cpu_count() if jobs == -1 else jobs
     suspects: list[int] = []
-    left = list(range(len(pieces)))
+    left = dict.fromkeys(range(len(pieces)))
     while left:
-        given: list[int] = []
-        try:
-            for index, result in _spread(work, pieces, left, jobs, given):
-                given.remove(index)
-                left.remove(index)
+        for index, result in _spread(work, pieces, list(left), processes):
+            del left[index]
+            if result is LOST:
+                suspects.append(index)
+            else:
                 yield pieces[index], result
-        except BrokenProcessPool:
-            suspects += given
-            left = [index for index in left if index not in given]
     for index in suspects:
         yield pieces[index], _alone(work, pieces, index)
 
 
 def _spread(
-    work: Callable[[Piece], Result],
-    pieces: Sequence[Piece],
-    chosen: Sequence[int],
-    jobs: int,
-    given: list[int],
-) -> Iterator[tuple[int, Result]]:
-    """Index and result of chosen pieces. `given` receives the indices that were given out.
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], chosen: Sequence[int], processes: int
+) -> Iterator[tuple[int, Result | Lost]]:
+    """Index and result of chosen pieces. If a process dies, those that were given out are `LOST`: the end."""
+    from joblib.externals.loky import get_reusable_executor
 
-    Raises:
-        BrokenProcessPool: a process died.
-    """
-    import joblib
+    threads = {name: os.environ.get(name, str(_threads(processes))) for name in THREADS}
+    pool = get_reusable_executor(max_workers=processes, timeout=IDLE, env=threads)
+    waiting = iter(chosen)
+    running: dict[Any, int] = {}
+    try:
+        while True:
+            # Twice as many as processes, so that none has to wait for its next piece.
+            for index in islice(waiting, 2 * processes - len(running)):
+                running[pool.submit(work, pieces[index])] = index
+            if not running:
+                return
+            for done in wait(running, return_when=FIRST_COMPLETED).done:
+                result = done.result()
+                yield running.pop(done), result
+    except BrokenProcessPool:
+        for index in running.values():
+            yield index, LOST
+        running.clear()
+    finally:
+        if running:  # of a caller that wants no more, or of work that raised an error
+            pool.shutdown(wait=False, kill_workers=True)
 
-    def tasks() -> Iterator[Any]:
-        for index in list(chosen):
-            given.append(index)
-            yield joblib.delayed(_Numbered(work))(index, pieces[index])
 
-    # A process that is alone must not be this one, which has to survive.
-    parallel = joblib.Parallel(n_jobs=jobs, backend="loky", return_as="generator_unordered", batch_size=1)
-    yield from parallel(tasks())
+def _threads(processes: int) -> int:
+    """Threads that libraries of each process may use."""
+    from joblib import cpu_count
+
+    return max(1, int(cpu_count()) // processes)
 
 
 def _alone(work: Callable[[Piece], Result], pieces: Sequence[Piece], index: int) -> Result | Lost:
     """The result of one piece in one process that does nothing else at the same time."""
     for _ in range(RETRIES):  # one attempt has been made
-        try:
-            # Two processes, of which one has nothing to do: with one, joblib would work in this process.
-            ((_, result),) = _spread(work, pieces, [index], 2, [])
+        ((_, result),) = _spread(work, pieces, [index], 1)
+        if result is not LOST:
             return result
-        except BrokenProcessPool:
-            continue
-    return Lost(LOST)
-
-
-@dataclass(frozen=True)
-class _Numbered:
-    """`work` that also returns the index of its piece."""
-
-    work: Callable[[Any], Any]
-
-    def __call__(self, index: int, piece: Any) -> tuple[int, Any]:
-        return index, self.work(piece)
+    return LOST

@@ -16,17 +16,19 @@ def each(
 ) -> Iterator[tuple[Piece, Result | Lost]]:
     """Computes pieces, in this process or in others, and yields each with its result when it is done.
 
-    A piece whose process or machine died is computed again, so its result must not depend on how often it is
-    begun. If its processes die `RETRIES` + 1 times, its result is `Lost`, and the others go on.
+    A piece whose process or machine died, for whatever reason, is computed again, so its result must not
+    depend on how often it is begun. If its processes die `RETRIES` + 1 times, its result is `Lost`, and the
+    others go on.
 
     Args:
         work: function from a piece to its result. In other processes it is pickled, and keeps nothing from
             one call to the next but what its module keeps.
         pieces: arguments of `work`.
         workers: where they run.
-        files: files and directories that `work` reads, exactly as its fields name them: strings or paths,
-            also in dataclasses, sequences and mappings. They are brought to each machine of a cluster once,
-            and `work` then gets their paths there. Those that do not exist are left as they are.
+        files: files and directories that `work` reads. Its fields name them by strings or paths, also in
+            dataclasses, sequences and mappings; relative paths and links mean what they mean here. They are
+            brought to each machine of a cluster once, and `work` then gets their paths there. Those that do
+            not exist are left as they are.
 
     Yields:
         Piece and result, in the order of `pieces` if `workers.alone`, otherwise in any order.

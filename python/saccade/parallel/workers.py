@@ -21,6 +21,7 @@ class Workers:
     Attributes:
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
         jobs: Number of pieces at the same time. -1: one for each core, of this machine or of the cluster.
+            With loky 1 stands for this process, which a piece may then end; -1 never does, also on one core.
         address: Address of the Ray cluster. Default: that of the environment variable `RAY_ADDRESS`, then a
             cluster that runs on this machine, then one that is started here for this run.
         num_threads: Threads of one piece, which it reserves on a Ray cluster.

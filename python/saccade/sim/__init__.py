@@ -13,8 +13,8 @@ Modules: `tasks` (instructions, seeds), `scenarios` (layouts, success, experts' 
 `environment` (observations and actions), `graphics` and `rendering` (OpenGL), `experts` and `demos`
 (demonstrations), `settings` (the files of a policy), `policy` and `torch_engine` (a whole policy in the
 simulator), `dataset`, `learner`, `training_settings` and `train` (training in torch), `rollout`, `episodes`,
-`opened`, `report` and `video` (closed loop), `lerobot` (lerobot's keys). Needs the extra `sim`. Opens no
-window.
+`environment_cache`, `report` and `video` (closed loop), `lerobot` (lerobot's keys). Needs the extra `sim`.
+Opens no window.
 """
 
 from saccade.sim import graphics

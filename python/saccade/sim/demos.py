@@ -21,7 +21,7 @@ import numpy.typing as npt
 from saccade._files import write_atomically, write_json
 from saccade.errors import InputError, SaccadeError
 from saccade.parallel import ALONE, Lost, Workers, each
-from saccade.sim import opened
+from saccade.sim import environment_cache
 from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, Camera
 from saccade.sim.experts import Expert, NoiseBursts
 from saccade.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
@@ -146,7 +146,7 @@ class Recorder:
 
         task, seed = piece
         settings = self.settings
-        environment = opened.opened(
+        environment = environment_cache.cached_environment(
             (task, settings),
             lambda: TaskEnvironment(task, image_size=settings.image_size, cameras=settings.cameras),
         )
@@ -262,7 +262,7 @@ def record_tasks(
             if lost:
                 raise SaccadeError(f"{len(lost)} episodes are missing: {'; '.join(lost[:3])}")
     finally:
-        opened.close()
+        environment_cache.close()
 
 
 def record_task(

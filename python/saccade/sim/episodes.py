@@ -11,7 +11,7 @@ from typing import Any
 from saccade._arrays import UInt8Array
 from saccade.sim import rollout
 from saccade.sim.environment import TaskEnvironment
-from saccade.sim.opened import opened
+from saccade.sim.environment_cache import cached_environment
 from saccade.sim.policy import Policy
 from saccade.sim.report import tile
 from saccade.sim.rollout import Episode, environment_for
@@ -60,7 +60,7 @@ class Episodes:
         """Runs the episode of a task and a seed."""
         task, seed = piece
         policy = self.policy
-        environment = opened(
+        environment = cached_environment(
             (self.checkpoint, task), lambda: environment_for(policy, task, render_mode="rgb_array")
         )
         episode, video = (

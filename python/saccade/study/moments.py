@@ -25,8 +25,8 @@ from saccade.maps.layout import Layout
 from saccade.observation import Observation
 from saccade.policy import Policy
 from saccade.policy_context import longer
+from saccade.policy_parts import as_head_takes_it, parts_of
 from saccade.study.recording import NOISES, Recorded, num_episodes
-from saccade.whole import as_head_takes_it, parts_of
 
 Preprocessing = Literal["lerobot", "isaac"]
 
@@ -35,7 +35,7 @@ Preprocessing = Literal["lerobot", "isaac"]
 class Moments(Recorded):
     """A whole checkpoint, and pictures of moments for it.
 
-    The policy looks at all moments once in a process, and is then let go. Where a study needs the head, it is
+    The policy encodes all moments once in a process, and is then let go. Where a study needs the head, it is
     loaded alone, in float32: what computes gradients in torch has the memory for itself.
 
     Attributes:
@@ -72,17 +72,17 @@ class Moments(Recorded):
 
     def describe(self) -> dict[str, Any]:
         """See `Source`."""
-        looked = look(self)
-        other = described(self.other_frames or self.frames, looked.others) if looked.others else None
+        encoded = encode(self)
+        other = described(self.other_frames or self.frames, encoded.others) if encoded.others else None
         return {
-            "checkpoint": self.describe_head(looked.identity),
+            "checkpoint": self.describe_head(encoded.identity),
             "frames": {
-                **described(self.frames, looked.moments),
-                "episodes": num_episodes(looked.observation),
+                **described(self.frames, encoded.moments),
+                "episodes": num_episodes(encoded.observation),
                 "noise": f"{NOISES} draws an observation",
                 "precision": self.precision,
-                "preprocessing": looked.preprocessing,
-                "embodiment_id": int(looked.observation.embodiment_id[0]),
+                "preprocessing": encoded.preprocessing,
+                "embodiment_id": int(encoded.observation.embodiment_id[0]),
                 "other": other,
             },
             "seed": self.seed,
@@ -98,25 +98,25 @@ class Moments(Recorded):
     @property
     def config(self) -> HeadConfig:
         """See `Source`."""
-        return look(self).config
+        return encode(self).config
 
     @property
     def all(self) -> Observation:
         """See `Recorded`; raises as `read_frames` and `saccade.Policy.load`."""
-        return look(self).observation
+        return encode(self).observation
 
     @property
     def others(self) -> Observation | None:
         """For each moment the one in the same place of the other directory, or with the other instruction."""
-        return look(self).other_observation
+        return encode(self).other_observation
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:
         """See `Source`; with the name of the moment."""
-        return {**super().labels(task, seed), "moment": look(self).moments[seed].name}
+        return {**super().labels(task, seed), "moment": encode(self).moments[seed].name}
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
+class Encoded:
     """What a policy made of the moments of a source.
 
     Attributes:
@@ -143,8 +143,8 @@ class Looked:
 
 
 @functools.lru_cache(maxsize=1)
-def look(source: Moments) -> Looked:
-    """Loads the policy and looks at all moments; cached for the next cell."""
+def encode(source: Moments) -> Encoded:
+    """Loads the policy and encodes all moments; cached for the next cell."""
     policy = Policy.load(
         source.checkpoint,
         embodiment=source.embodiment,
@@ -172,7 +172,7 @@ def look(source: Moments) -> Looked:
             other = others[place].observation
             (features,) = policy.features(policy.inputs(other), previous=context)
             compared.append(as_head_takes_it(policy, other, features))
-    return Looked(
+    return Encoded(
         config=parts.head.config,
         identity=checkpoint_identity(Path(source.checkpoint)),
         preprocessing=parts.processor.preprocessing,

@@ -25,7 +25,7 @@ from saccade.observation import MASKS, Observation
 from saccade.study.arguments import source_of
 from saccade.study.arms import NO_TOKENS
 from saccade.study.cell import Cell, Rows
-from saccade.study.moments import Moments, look
+from saccade.study.moments import Moments, encode
 from saccade.study.paths import ALL_PATHS, PATHS
 from saccade.study.questions.gradients_section import section
 from saccade.study.recording import Recorded
@@ -184,8 +184,8 @@ class Gradients(Study):
 
         from saccade.study import input_derivatives as derivatives
 
-        looked = look(source)
-        inputs, layout, config = looked.inputs[row], looked.layouts[row], looked.backbone_config
+        encoded = encode(source)
+        inputs, layout, config = encoded.inputs[row], encoded.layouts[row], encoded.backbone_config
         count = layout.num_tokens  # what is behind it is padding
         features = torch.from_numpy(source.all.row(row).backbone_features)[:, :count]
         by_features = derivatives.feature_derivatives(reference_of(source), features, by_vl[:, :count])

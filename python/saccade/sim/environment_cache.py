@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 _open: dict[Hashable, TaskEnvironment] = {}  # at most one
 
 
-def opened(key: Hashable, create: Callable[[], TaskEnvironment]) -> TaskEnvironment:
+def cached_environment(key: Hashable, create: Callable[[], TaskEnvironment]) -> TaskEnvironment:
     """The environment of that key, created if it is not the one that is open."""
     if key not in _open:
         close()
