@@ -21,6 +21,8 @@ MOST_UNREAD = 8_000_000
 FAREWELL_SECONDS = 2.0
 #: Seconds between two looks at connections that may have stalled.
 TICK = 0.5
+#: Bytes that are received by one call at most.
+RECEIVED_BYTES = 1 << 18
 OUT_OF_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 HTTP = """\
@@ -48,6 +50,7 @@ class Connection:
         self.unsent: deque[memoryview] = deque()
         self.num_unsent = 0
         self.progress = time.monotonic()
+        self.writes = False  # whether the selector waits until more can be sent
         self.farewell: float | None = None  # when it is closed at the latest, once it was refused
 
     @property
@@ -86,6 +89,7 @@ class Connections:
         self._listener: socket.socket | None = listener
         self._clients: set[Connection] = set()
         self._paused_until = self._looked = 0.0
+        self._received = memoryview(bytearray(RECEIVED_BYTES))
         self._waker, self._woken = socket.socketpair()
         for end in (self._waker, self._woken):
             end.setblocking(False)
@@ -213,28 +217,33 @@ class Connections:
                 if not connection.socket.recv(1 << 16):
                     self._forget(connection)
                 return
-            with connection.peer.space() as space:
-                count = connection.socket.recv_into(space)
-            connection.progress = time.monotonic()
-            if not count:
-                self._lost(connection)
-                return
-            found = connection.peer.filled(count)
+            count = connection.socket.recv_into(self._received)
         except BlockingIOError:
             return
         except OSError:  # reset, timed out: the client died
             self._lost(connection)
             return
+        connection.progress = time.monotonic()
+        if not count:
+            self._lost(connection)
+            return
+        try:
+            for request in connection.peer.receive(self._received[:count]):
+                self._send_output(connection)
+                if connection not in self._clients:
+                    return
+                connection.waiting += 1
+                self._on_request(connection, request)
+            self._send_output(connection)
         except zmtp.ProtocolError as error:
             self._refuse(connection, error)
-            return
-        if connection.peer.output:
+
+    def _send_output(self, connection: Connection) -> None:
+        """Sends what the protocol answers by itself, which comes before the answer to a request."""
+        if connection.peer.output and connection in self._clients:
             self._append(connection, bytes(connection.peer.output))
             connection.peer.output.clear()
             self._write(connection)
-        for request in found:
-            connection.waiting += 1
-            self._on_request(connection, request)
 
     def _write(self, connection: Connection) -> None:
         try:
@@ -255,8 +264,10 @@ class Connections:
         if connection.farewell is not None and not connection.unsent:
             with contextlib.suppress(OSError):
                 connection.socket.shutdown(socket.SHUT_WR)
-        writes = selectors.EVENT_WRITE if connection.unsent else 0
-        self._selector.modify(connection.socket, selectors.EVENT_READ | writes, connection)
+        if connection.writes != bool(connection.unsent):
+            connection.writes = bool(connection.unsent)
+            writes = selectors.EVENT_WRITE if connection.writes else 0
+            self._selector.modify(connection.socket, selectors.EVENT_READ | writes, connection)
 
     def _append(self, connection: Connection, piece: bytes) -> None:
         connection.unsent.append(memoryview(piece))

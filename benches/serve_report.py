@@ -1,0 +1,103 @@
+"""The tables of docs/serve.md, from the JSON of the measurements."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benches.peers.results import rounded
+from benches.peers.text import table
+from saccade._files import write_json
+from saccade.bench.timing import quartiles
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "serve.md"
+#: What was measured here, and what is committed: a file for each policy.
+MEASURED_HERE = Path("out/serve")
+COMMITTED = Path(__file__).with_name("serve_results")
+#: The part of the page that `report --write` replaces.
+MEASURED = re.compile(r"(?<=<!-- measured -->\n).*(?=<!-- end of measured -->)", re.DOTALL)
+
+POLICIES = {"demo": "The bundled policy", "full": "N1.5 at its published size, random weights"}
+
+Results = dict[str, Any]
+Row = dict[str, Any]
+
+
+def command(*, write: bool) -> int:
+    """Prints the tables, or writes them to the page and keeps the measurements next to the program."""
+    results = {}
+    for name in POLICIES:
+        found = [folder / f"{name}.json" for folder in (MEASURED_HERE, COMMITTED)]
+        path = next((path for path in found if path.exists()), None)
+        if path is not None:
+            results[name] = json.loads(path.read_text())
+    if not results:
+        raise SystemExit("benches.serve: nothing measured yet; run python -m benches.serve")
+    if not write:
+        print(document(results))
+        return 0
+    COMMITTED.mkdir(exist_ok=True)
+    for name, result in results.items():
+        write_json(COMMITTED / f"{name}.json", rounded(result))
+    page = PAGE.read_text()
+    PAGE.write_text(MEASURED.sub(lambda found: f"\n{document(results)}\n", page))
+    print(PAGE)
+    return 0
+
+
+def document(results: dict[str, Results]) -> str:
+    """The measured part of the page."""
+    parts = [
+        "Written by `python -m benches.serve report --write` from `benches/serve_results`, which "
+        "`python -m benches.serve` measured."
+    ]
+    for name, result in results.items():
+        parts += [f"### {POLICIES[name]}, {result['precision']}", *section(result)]
+    return "\n\n".join(parts) + "\n"
+
+
+def section(result: Results) -> Iterator[str]:
+    """What was measured of one policy."""
+    held, rows = result["machine"], result["rows"]
+    yield (
+        f"{held['cpu']} ({held['name']}, {held['isa']}), {held['cores']} cores, {held['memory_gb']} GB; "
+        f"{result['num_threads']} threads, {result['weights'] / 1e6:.0f} MB of weights; saccade "
+        f"{held['versions']['saccade']}, commit {held['commit']}."
+    )
+    head = ["clients", "a second (quartiles)", "x one", "p50 ms", "p99 ms", "batch", "in process"]
+    head += ["of in process (quartiles)", "lost", "memory MB", "ms of processor: server, clients"]
+    yield table(head, [cells(row, rows[0]) for row in rows])
+
+
+def cells(row: Row, first: Row) -> list[str]:
+    """A line of the table."""
+    sizes = {int(size): count for size, count in row["batches"].items()}
+    mean = sum(size * size * count for size, count in sizes.items()) / sum(
+        size * count for size, count in sizes.items()
+    )
+    shares = [mine / act for mine, act in zip(row["per_second"], row["in_process"], strict=True)]
+    times = [mine / one for mine, one in zip(row["per_second"], first["per_second"], strict=True)]
+    low, middle, high = quartiles(row["per_second"])
+    least, share, most = quartiles(shares)
+    return [
+        str(row["clients"]),
+        f"{number(middle)} ({number(low)} to {number(high)})",
+        f"{quartiles(times)[1]:.2f}",
+        f"{row['p50']:.1f}",
+        f"{row['p99']:.1f}",
+        f"{mean:.1f}",
+        number(quartiles(row["in_process"])[1]),
+        f"{share:.0%} ({least:.0%} to {most:.0%})",
+        f"{row['lost']} of {row['requests']}",
+        f"{row['memory'][0]:.0f}, {row['memory'][-1]:.0f}",
+        f"{quartiles(row['server_cpu'])[1]:.2f}, {quartiles(row['client_cpu'])[1]:.2f}",
+    ]
+
+
+def number(value: float) -> str:
+    """Three digits or more."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.3f}"
