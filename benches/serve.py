@@ -77,7 +77,7 @@ class Row:
     per_second: list[float] = field(default_factory=list)
     in_process: list[float] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
-    batches: Counter[int] = field(default_factory=Counter)
+    batches: dict[int, int] = field(default_factory=dict)
     server_cpu: list[float] = field(default_factory=list)
     client_cpu: list[float] = field(default_factory=list)
     p50: float = 0.0
@@ -97,6 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     latencies: dict[int, list[float]] = {clients: [] for clients in args.clients}
     out = args.out / f"{'demo' if args.random is None else 'full'}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
+    here = machine.describe()
     with server(checkpoint, args, out.with_suffix(".jsonl")) as running:
         load(running, observations, 1, 2)  # the first request allocates memory
         for number in range(args.rounds):
@@ -113,16 +114,15 @@ def main(arguments: list[str] | None = None) -> int:
                 row.server_cpu.append(1e3 * found.server_cpu / requests)
                 row.client_cpu.append(1e3 * found.client_cpu / requests)
                 row.memory.append(running.memory())
-                row.batches += batches
+                row.batches = dict(Counter(row.batches) + batches)
                 row.in_process.append(rate_in_process(policy, observations, batches))
                 print(f"round {number + 1}: {line(row)}", flush=True)
             for clients, row in rows.items():
                 row.p50, row.p99 = (1e3 * float(at) for at in np.percentile(latencies[clients], (50, 99)))
             result = {
                 "precision": args.precision,
-                "weights": policy.head.nbytes + (0 if policy.backbone is None else policy.backbone.nbytes),
                 "num_threads": policy.head.num_threads,
-                "machine": machine.describe(),
+                "machine": here,
                 "rows": [asdict(row) for row in rows.values()],
             }
             write_json(out, result)

@@ -65,8 +65,7 @@ def section(result: Results) -> Iterator[str]:
     held, rows = result["machine"], result["rows"]
     yield (
         f"{held['cpu']} ({held['name']}, {held['isa']}), {held['cores']} cores, {held['memory_gb']} GB; "
-        f"{result['num_threads']} threads, {result['weights'] / 1e6:.0f} MB of weights; saccade "
-        f"{held['versions']['saccade']}, commit {held['commit']}."
+        f"{result['num_threads']} threads; saccade {held['versions']['saccade']}, commit {held['commit']}."
     )
     head = ["clients", "a second (quartiles)", "x one", "p50 ms", "p99 ms", "batch", "in process"]
     head += ["of in process (quartiles)", "lost", "memory MB", "ms of processor: server, clients"]

@@ -36,7 +36,7 @@ class MemoryPolicy:
         batches: The sizes of the batches of which features were computed.
         chunkings: The `Chunking` of each call of `sample`, or None.
         gate: Features are computed once it is set.
-        nbytes: Size of its weights.
+        nbytes: Size of its backbone.
     """
 
     version: str = "n1.5"
@@ -48,8 +48,8 @@ class MemoryPolicy:
     def __post_init__(self) -> None:
         self.gate.set()
         config = SimpleNamespace(action_horizon=HORIZON, encoder_action_dim=WIDTH, version=self.version)
-        self.head = SimpleNamespace(config=config, source=None, num_threads=2, nbytes=self.nbytes)
-        self.backbone = None
+        self.head = SimpleNamespace(config=config, source=None, num_threads=2)
+        self.backbone = SimpleNamespace(nbytes=self.nbytes)
         self.normalizer = SimpleNamespace(state_groups=GROUPS, action_groups=GROUPS, action_horizon=HORIZON)
         self.requirements = Requirements(
             "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_key="annotation.task"

@@ -16,7 +16,8 @@ PARTS = st.lists(st.binary(max_size=255), max_size=4)
 
 def feed(peer: Peer, data: bytes, sizes: Sequence[int]) -> list[Request]:
     """Gives a peer bytes in pieces of at most these sizes, in turn."""
-    found, position, turn = [], 0, 0
+    found: list[Request] = []
+    position = turn = 0
     while position < len(data):
         count = sizes[turn % len(sizes)]
         found += peer.receive(memoryview(data)[position : position + count])

@@ -28,9 +28,10 @@ from saccade.robots import Normalizer, padded
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-#: One observation in a form of `saccade.dialects`, or what was read of it; or several of them.
-Observation = Mapping[str, Any] | Reading
-Observations = Observation | Sequence[Observation]
+#: One observation in a form of `saccade.dialects`, with or without a batch axis.
+Observation = Mapping[str, Any]
+#: Or what was read of it, or several of them.
+Observations = Observation | Reading | Sequence[Observation | Reading]
 
 
 class Policy:
@@ -216,8 +217,8 @@ class Policy:
         context = self._encoded(readings, previous)
         return self._sampled(context.context, observation, readings, options)
 
-    def read(self, observation: Mapping[str, Any], *, most_rows: int | None = None) -> Reading:
-        """Reads and checks an observation, and computes nothing.
+    def read(self, observation: Observation, *, most_rows: int | None = None) -> Reading:
+        """Reads and checks an observation.
 
         Every method of this policy takes the result in place of the observation, and does not check it again.
 
@@ -229,8 +230,7 @@ class Policy:
             InputError, ShapeError, DtypeError: As :meth:`encode`.
 
         Example:
-            >>> import saccade
-            >>> def chunks(policy: saccade.Policy, observation: dict) -> list:
+            >>> def chunks(policy: Policy, observation: dict) -> list:
             ...     reading = policy.read(observation)
             ...     return [policy.act(reading, seed=seed) for seed in range(3)]
         """
@@ -359,10 +359,8 @@ class Policy:
         if not _is_observation(observation_or_state):
             return self._of_state(held, observation_or_state, options)  # type: ignore[arg-type]
         observations = _listed(observation_or_state)  # type: ignore[arg-type]
-        readings = [
-            one if isinstance(one, StateReading) else read_state(one, self.requirements)
-            for one in observations
-        ]
+        needs = self.requirements
+        readings = [one if isinstance(one, Reading) else read_state(one, needs) for one in observations]
         return self._sampled(held, observation_or_state, readings, options)  # type: ignore[arg-type]
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
@@ -408,7 +406,7 @@ class Policy:
             raise InputError(
                 f"observation: expected {context.batch}, as many as in context, got {len(state)}"
             )
-        is_single = isinstance(observation, Mapping | StateReading)
+        is_single = isinstance(observation, Mapping | Reading)
         options = options.copy()
         previous, noise = options.get("previous_chunk"), options.get("noise")
         if previous is not None:
@@ -475,17 +473,17 @@ class Policy:
 def _is_observation(value: Any) -> bool:
     """Whether a value is an observation or a sequence of them, and not an array."""
     if isinstance(value, (list, tuple)):
-        return bool(value) and isinstance(value[0], Mapping | StateReading)
-    return isinstance(value, Mapping | StateReading)
+        return bool(value) and isinstance(value[0], Mapping | Reading)
+    return isinstance(value, Mapping | Reading)
 
 
-def _listed(observation: Observations) -> list[Observation]:
+def _listed(observation: Observations) -> list[Observation | Reading]:
     """Observations as a list.
 
     Raises:
         InputError: There is none.
     """
-    if isinstance(observation, Mapping | StateReading):
+    if isinstance(observation, Mapping | Reading):
         return [observation]
     found = list(observation) if isinstance(observation, (list, tuple)) else []
     if not found:

@@ -34,10 +34,6 @@ class Head(Protocol):
     def num_threads(self) -> int:
         """Number of threads of a call."""
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the weights in memory, in bytes."""
-
     def encode(
         self,
         backbone_features: ArrayLike,

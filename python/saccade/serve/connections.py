@@ -19,8 +19,8 @@ from saccade.serve.limits import Limits
 MOST_UNREAD = 8_000_000
 #: Time that a program of another protocol gets to read why it is refused.
 FAREWELL_SECONDS = 2.0
-#: Seconds between two looks at connections that may have stalled.
-TICK = 0.5
+#: Seconds between two checks for connections that have stalled.
+CHECK_SECONDS = 0.5
 #: Bytes that are received by one call at most.
 RECEIVED_BYTES = 1 << 18
 OUT_OF_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
@@ -88,7 +88,7 @@ class Connections:
         self._selector = selectors.DefaultSelector()
         self._listener: socket.socket | None = listener
         self._clients: set[Connection] = set()
-        self._paused_until = self._looked = 0.0
+        self._paused_until = self._checked = 0.0
         self._received = memoryview(bytearray(RECEIVED_BYTES))
         self._waker, self._woken = socket.socketpair()
         for end in (self._waker, self._woken):
@@ -140,9 +140,9 @@ class Connections:
                 if events & selectors.EVENT_READ and connection in self._clients:
                     self._read(connection)
         now = time.monotonic()
-        if now - self._looked >= TICK:
-            self._looked = now
-            self._look_after(now)
+        if now - self._checked >= CHECK_SECONDS:
+            self._checked = now
+            self._check_connections(now)
 
     def send(self, connection: Connection, address: tuple[bytes, ...], payload: bytes) -> None:
         """Answers a request; nothing happens if its client is gone.
@@ -282,7 +282,7 @@ class Connections:
             self._append(connection, HTTP.encode())
         self._write(connection)
 
-    def _look_after(self, now: float) -> None:
+    def _check_connections(self, now: float) -> None:
         if self._paused_until and now >= self._paused_until and self._listener is not None:
             self._paused_until = 0.0
             self._selector.register(self._listener, selectors.EVENT_READ)

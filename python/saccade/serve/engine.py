@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
 #: The parts of which the time is reported, in their order. "wait" is the time in the queue.
 PARTS = ("wait", "inputs", "backbone", "head")
-#: Of a policy with at most so many bytes of weights, each thread computes a batch of its own. Loops are short
-#: there, and threads that share them wait for each other.
-SMALL_POLICY = 32 << 20
+#: With a backbone of at most so many bytes, each thread computes a batch of its own. Loops are short there:
+#: threads that share them wait for each other. Larger weights would be read from memory by each thread.
+#: Measured on 2 cores (Zen 3), two batches of 4 at a time against batches of 8, float32, by the size of
+#: backbone and head: 1.17 x at 4 MB, 1.10 x at 27 MB, 1.05 x at 157 MB.
+SMALL_BACKBONE = 16 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,8 @@ class Engine:
         self._sessions = sessions
         self._running = 0
         self._lock = threading.Lock()
-        self.num_workers = policy.head.num_threads if _num_bytes(policy) <= SMALL_POLICY else 1
+        is_small = policy.backbone is not None and policy.backbone.nbytes <= SMALL_BACKBONE
+        self.num_workers = policy.head.num_threads if is_small else 1
 
     def prepare(self, job: Job) -> None:
         """Prepares what the backbone takes of a request; nothing happens if it is prepared."""
@@ -185,11 +188,6 @@ class Engine:
                 Outcome(work.job, action_answer(work.job.call, actions, _info(work)), batch=batch)
             )
         return outcomes
-
-
-def _num_bytes(policy: Policy) -> int:
-    """Size of the weights in memory."""
-    return policy.head.nbytes + (0 if policy.backbone is None else policy.backbone.nbytes)
 
 
 @contextmanager

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MOST_KNOWN = 4096
 #: Characters of an error that are sent.
 LONGEST_ERROR = 4000
-#: Seconds between two looks at the files of the checkpoint.
+#: Seconds between two checks of the files of the checkpoint.
 WATCH_SECONDS = 5.0
 #: Time to send the last answers, once all are computed.
 FLUSH_SECONDS = 5.0
