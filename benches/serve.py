@@ -65,7 +65,7 @@ class Row:
         lost: Requests without an answer, or with an error.
         per_second: Answers a second.
         in_process: Observations a second that `policy.act` computes in batches of the same sizes.
-        memory: Resident memory of the server after the round, in MB.
+        memory: Resident memory of the server after its part of the round, in MB.
         batches: Number of batches by their size.
         server_cpu, client_cpu: Processor time for each request, in milliseconds.
         p50, p99: Latency as a client sees it, in milliseconds.

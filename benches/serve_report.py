@@ -68,8 +68,14 @@ def section(result: Results) -> Iterator[str]:
         f"{result['num_threads']} threads; saccade {held['versions']['saccade']}, commit {held['commit']}."
     )
     head = ["clients", "a second (quartiles)", "x one", "p50 ms", "p99 ms", "batch", "in process"]
-    head += ["of in process (quartiles)", "lost", "memory MB", "ms of processor: server, clients"]
+    head += ["of in process (quartiles)", "lost", "ms of processor: server, clients"]
     yield table(head, [cells(row, rows[0]) for row in rows])
+    memory = rows[-1]["memory"]
+    requests = sum(row["requests"] for row in rows)
+    yield (
+        f"Memory of the server: {memory[0]:.0f} MB after the first of {len(memory)} rounds, "
+        f"{memory[-1]:.0f} MB after the last, {max(memory):.0f} MB at most; {requests} requests in all."
+    )
 
 
 def cells(row: Row, first: Row) -> list[str]:
@@ -92,7 +98,6 @@ def cells(row: Row, first: Row) -> list[str]:
         number(quartiles(row["in_process"])[1]),
         f"{share:.0%} ({least:.0%} to {most:.0%})",
         f"{row['lost']} of {row['requests']}",
-        f"{row['memory'][0]:.0f}, {row['memory'][-1]:.0f}",
         f"{quartiles(row['server_cpu'])[1]:.2f}, {quartiles(row['client_cpu'])[1]:.2f}",
     ]
 

@@ -56,7 +56,6 @@ def test_ratios_are_those_of_the_same_round() -> None:
         "100",
         "175% (162% to 188%)",
         "1 of 100",
-        "50, 51",
         "9.00, 0.10",
     ]
 

@@ -137,6 +137,27 @@ def test_several_observations_are_answered_as_if_alone(layout: str) -> None:
         made.sample(context, given)
 
 
+def test_what_was_read_stands_for_the_observation() -> None:
+    made = policy("nvidia")
+    given = [nested(made), flat(nested(made, batch=2)), lerobot(nested(made))]
+    readings = [made.read(one) for one in given]
+    expected = made.act(given, seed=3)
+    context = made.encode(readings)
+    for found in (
+        made.act(readings, seed=3),
+        made.act([given[0], readings[1], given[2]], seed=3),
+        made.sample(context, readings, seed=3),
+    ):
+        for one, other in zip(found, expected, strict=True):
+            assert len(one) == len(other)
+            for key in one if isinstance(one, dict) else (0,):
+                np.testing.assert_array_equal(one[key], other[key])
+    np.testing.assert_equal(made.act(readings[0], seed=4), made.act(given[0], seed=4))
+    made.read(given[1], most_rows=2)
+    with pytest.raises(InputError, match="expected at most 1 rows, got 2"):
+        made.read({"state": nested(made, batch=2)["state"]}, most_rows=1)  # before frames are looked at
+
+
 def test_one_string_a_row_of_a_batch_is_plain() -> None:
     made = policy("isaac")
     given = nested(made, batch=2)

@@ -179,6 +179,26 @@ def test_requests_of_many_clients_are_one_batch_with_the_same_bits() -> None:
             assert all(np.array_equal(chunk[key], alone[key]) for key in alone)
 
 
+def test_a_small_policy_computes_several_batches_at_a_time() -> None:
+    policy = MemoryPolicy(nbytes=1000)
+    policy.gate.clear()
+    with serving(policy) as running:
+
+        def act(seed: int) -> Any:
+            with Client(port=running.port) as client:
+                return client.get_action(observation(seed), {"seed": seed})[0]
+
+        with ThreadPoolExecutor(5) as threads:
+            several = [threads.submit(act, seed) for seed in range(5)]
+            wait_until(lambda: running.server._engine._running == 2)
+            policy.gate.set()
+            chunks = [one.result() for one in several]
+        assert sum(policy.batches) == 5
+        for seed, chunk in enumerate(chunks):
+            alone = act(seed)
+            assert all(np.array_equal(chunk[key], alone[key]) for key in alone)
+
+
 @pytest.mark.parametrize(("text", "message"), [("explode", "RuntimeError: exploded"), ("crash", "crashed")])
 def test_a_request_that_fails_does_not_harm_its_batch(text: str, message: str) -> None:
     policy = MemoryPolicy()
