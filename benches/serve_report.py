@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ def command(*, write: bool) -> int:
         found = [folder / f"{name}.json" for folder in (MEASURED_HERE, COMMITTED)]
         path = next((path for path in found if path.exists()), None)
         if path is not None:
-            results[name] = json.loads(path.read_text())
+            results[name] = rounded(json.loads(path.read_text()))
     if not results:
         raise SystemExit("benches.serve: nothing measured yet; run python -m benches.serve")
     if not write:
@@ -42,7 +42,7 @@ def command(*, write: bool) -> int:
         return 0
     COMMITTED.mkdir(exist_ok=True)
     for name, result in results.items():
-        write_json(COMMITTED / f"{name}.json", rounded(result))
+        write_json(COMMITTED / f"{name}.json", result)
     page = PAGE.read_text()
     PAGE.write_text(MEASURED.sub(lambda found: f"\n{document(results)}\n", page))
     print(PAGE)
@@ -73,8 +73,8 @@ def section(result: Results) -> Iterator[str]:
     memory = rows[-1]["memory"]
     requests = sum(row["requests"] for row in rows)
     yield (
-        f"Memory of the server: {memory[0]:.0f} MB after the first of {len(memory)} rounds, "
-        f"{memory[-1]:.0f} MB after the last, {max(memory):.0f} MB at most; {requests} requests in all."
+        f"{requests} requests in {len(memory)} rounds. Memory of the server: {memory[0]:.0f} MB after the "
+        f"first round, {memory[-1]:.0f} MB after the last."
     )
 
 
@@ -86,22 +86,27 @@ def cells(row: Row, first: Row) -> list[str]:
     )
     shares = [mine / act for mine, act in zip(row["per_second"], row["in_process"], strict=True)]
     times = [mine / one for mine, one in zip(row["per_second"], first["per_second"], strict=True)]
-    low, middle, high = quartiles(row["per_second"])
-    least, share, most = quartiles(shares)
     return [
         str(row["clients"]),
-        f"{number(middle)} ({number(low)} to {number(high)})",
+        spread(row["per_second"], number),
         f"{quartiles(times)[1]:.2f}",
-        f"{row['p50']:.1f}",
-        f"{row['p99']:.1f}",
+        number(row["p50"]),
+        number(row["p99"]),
         f"{mean:.1f}",
         number(quartiles(row["in_process"])[1]),
-        f"{share:.0%} ({least:.0%} to {most:.0%})",
+        spread(shares, "{:.0%}".format),
         f"{row['lost']} of {row['requests']}",
-        f"{quartiles(row['server_cpu'])[1]:.2f}, {quartiles(row['client_cpu'])[1]:.2f}",
+        f"{number(quartiles(row['server_cpu'])[1])}, {number(quartiles(row['client_cpu'])[1])}",
     ]
+
+
+def spread(values: list[float], shown: Callable[[float], str]) -> str:
+    """The median, with the quartiles if there are several rounds."""
+    low, middle, high = map(shown, quartiles(values))
+    return f"{middle} ({low} to {high})" if len(values) > 1 else middle
 
 
 def number(value: float) -> str:
     """Three digits or more."""
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.3f}"
+    digits = 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3
+    return f"{value:.{digits}f}"

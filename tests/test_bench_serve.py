@@ -50,13 +50,13 @@ def test_ratios_are_those_of_the_same_round() -> None:
         "16",
         "175 (162 to 188)",
         "2.50",
-        "8.0",
+        "8.00",
         "12.0",
         "3.0",  # as a request sees it: 2 of 6 are alone, 4 of 6 in a batch of 4
         "100",
         "175% (162% to 188%)",
         "1 of 100",
-        "9.00, 0.10",
+        "9.00, 0.100",
     ]
 
 
