@@ -73,7 +73,7 @@ def section(result: Results) -> Iterator[str]:
     memory = rows[-1]["memory"]
     requests = sum(row["requests"] for row in rows)
     yield (
-        f"{requests} requests in {len(memory)} rounds. Memory of the server: {memory[0]:.0f} MB after the "
+        f"Requests: {requests}; rounds: {len(memory)}. Memory of the server: {memory[0]:.0f} MB after the "
         f"first round, {memory[-1]:.0f} MB after the last."
     )
 

@@ -8,7 +8,8 @@ import signal
 import socket
 import threading
 import time
-from collections import OrderedDict, deque
+import weakref
+from collections import deque
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -29,8 +30,6 @@ from saccade.serve.zmtp import Request
 if TYPE_CHECKING:
     from saccade.policy import Policy
 
-#: Connections whose release is remembered, for `get_modality_config`.
-MOST_KNOWN = 4096
 #: Characters of an error that are sent.
 LONGEST_ERROR = 4000
 #: Seconds between two checks of the files of the checkpoint.
@@ -47,7 +46,8 @@ class Server:
         listener: The socket that clients will connect to, from :func:`saccade.serve.connections.bind`.
         log: Where it says what happens.
         limits: What it takes at most.
-        max_batch: Observations that are computed together.
+        max_batch: Observations that are computed at a time: together, or with a small policy in a batch for
+            each thread.
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
         seed: Seed of the noise of requests that bring none, or None for noise that is different each time.
         api_token: A secret that every request must contain, or None.
@@ -82,7 +82,7 @@ class Server:
         self._seed = seed
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
-        self._forms: OrderedDict[Connection, str] = OrderedDict()
+        self._forms: weakref.WeakKeyDictionary[Connection, str] = weakref.WeakKeyDictionary()
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
         self._engine = engine.Engine(policy, self._sessions)
         self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self._engine.num_workers)
@@ -220,9 +220,6 @@ class Server:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
         reading = self._policy.read(call.observation, most_rows=self._limits.rows)
         self._forms[connection] = "text" if call.is_bare else "map"
-        self._forms.move_to_end(connection)
-        while len(self._forms) > MOST_KNOWN:
-            self._forms.popitem(last=False)
         self._unanswered += 1
         reply = (connection, request.address)
         self._queue.put(Job(call, reading, connection, request.size, is_msgpack_numpy, reply=reply))
