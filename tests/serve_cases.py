@@ -20,7 +20,7 @@ import msgpack
 import numpy as np
 import zmq
 
-from saccade.dialects import Camera, Requirements, read, read_state
+from saccade.dialects import Camera, Reading, Requirements, read
 from saccade.serve import Limits, Server
 from saccade.serve.connections import bind
 
@@ -36,24 +36,29 @@ class MemoryPolicy:
         batches: The sizes of the batches of which features were computed.
         chunkings: The `Chunking` of each call of `sample`, or None.
         gate: Features are computed once it is set.
+        nbytes: Size of its backbone.
     """
 
     version: str = "n1.5"
     batches: list[int] = field(default_factory=list)
     chunkings: list[Any] = field(default_factory=list)
     gate: threading.Event = field(default_factory=threading.Event)
+    nbytes: int = 1 << 32
 
     def __post_init__(self) -> None:
         self.gate.set()
         config = SimpleNamespace(action_horizon=HORIZON, encoder_action_dim=WIDTH, version=self.version)
         self.head = SimpleNamespace(config=config, source=None, num_threads=2)
+        self.backbone = SimpleNamespace(nbytes=self.nbytes)
         self.normalizer = SimpleNamespace(state_groups=GROUPS, action_groups=GROUPS, action_horizon=HORIZON)
         self.requirements = Requirements(
             "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_key="annotation.task"
         )
 
-    def inputs(self, observation: Mapping[str, Any]) -> list[Any]:
-        reading = read(observation, self.requirements)
+    def read(self, observation: Mapping[str, Any], *, most_rows: int | None = None) -> Reading:
+        return read(observation, self.requirements, most_rows)
+
+    def inputs(self, reading: Reading) -> list[Any]:
         if "explode" in str(reading.instructions[0]):
             raise RuntimeError("exploded")
         return [
@@ -71,9 +76,8 @@ class MemoryPolicy:
     def context(self, features: Sequence[Any]) -> Any:
         return np.array(features)
 
-    def sample(self, context: Any, observations: Sequence[Mapping[str, Any]], **options: Any) -> list[Any]:
+    def sample(self, context: Any, readings: Sequence[Reading], **options: Any) -> list[Any]:
         self.chunkings.append(options.get("chunking"))
-        readings = [read_state(one, self.requirements) for one in observations]
         state = np.concatenate([reading.state[:, -1] for reading in readings])
         actions = options["noise"] + state[:, None] + context[:, None, None].astype(np.float32)
         if options.get("chunking") is not None:

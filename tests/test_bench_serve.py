@@ -1,36 +1,70 @@
-"""The load test runs."""
+"""The load test of the server, small, and its report."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
-import whole_checkpoints
 
-from benches import serve
+from benches import serve, serve_report
 
 
-def test_a_small_load(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(serve, "COMPARED_SECONDS", 0.1)
-    out = tmp_path / "results.json"
-    options = ["--requests", "12", "--clients", "1", "3", "--num-threads", "1", "--out", str(out)]
-    embodiment = ["--embodiment", whole_checkpoints.EMBODIMENT]
-    assert serve.main([str(whole_checkpoints.whole("nvidia")), *embodiment, *options]) == 0
-    rows = json.loads(out.read_text())["rows"]
-    assert [(row["clients"], row["requests"], row["lost"]) for row in rows] == [(1, 12, 0), (3, 12, 0)]
-    assert rows[0]["batch"] == 1
-    for row in rows:
+def test_every_request_is_counted_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serve, "COMPARED_SECONDS", 0.05)
+    monkeypatch.setattr(serve, "REST_SECONDS", 0.0)
+    arguments = ["--clients", "1", "3", "--requests", "12", "--rounds", "2", "--num-threads", "2"]
+    assert serve.main([*arguments, "--out", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "demo.json").read_text())
+    for row, clients in zip(result["rows"], (1, 3), strict=True):
+        assert (row["clients"], row["requests"], row["lost"]) == (clients, 12, 0)
+        for name in ("per_second", "in_process", "memory", "server_cpu", "client_cpu"):
+            assert len(row[name]) == 2
+            assert min(row[name]) >= 0
         assert 0 < row["p50"] <= row["p99"]
-        assert row["per_second"] > 0
-        assert row["in_process"] > 0
-        assert min(row["memory"]) > 10
-    assert "| 3 |" in capsys.readouterr().out
+        assert sum(int(size) * count for size, count in row["batches"].items()) == pytest.approx(12, abs=6)
+    assert result["machine"]["cpu"] in serve_report.document({"demo": result})
 
 
-def test_arguments_are_checked() -> None:
-    for arguments in ([], ["checkpoint", "--random", "out"], ["checkpoint", "--requests", "2"]):
-        with pytest.raises(SystemExit):
-            serve.parse(arguments)
+def row(clients: int, per_second: list[float], in_process: list[float]) -> dict[str, Any]:
+    return {
+        "clients": clients,
+        "requests": 100,
+        "lost": 1,
+        "per_second": per_second,
+        "in_process": in_process,
+        "memory": [50.0, 51.0],
+        "batches": {"1": 2, "4": 1},
+        "server_cpu": [9.0, 9.0],
+        "client_cpu": [0.1, 0.1],
+        "p50": 8.0,
+        "p99": 12.0,
+    }
+
+
+def test_ratios_are_those_of_the_same_round() -> None:
+    first = row(1, [100.0, 50.0], [100.0, 100.0])
+    cells = serve_report.cells(row(16, [200.0, 150.0], [100.0, 100.0]), first)
+    assert cells == [
+        "16",
+        "175 (162 to 188)",
+        "2.50",
+        "8.00",
+        "12.0",
+        "3.0",  # as a request sees it: 2 of 6 are alone, 4 of 6 in a batch of 4
+        "100",
+        "175% (162% to 188%)",
+        "1 of 100",
+        "9.00, 0.100",
+    ]
+
+
+def test_the_page_shows_what_is_committed() -> None:
+    committed = {
+        name: json.loads(path.read_text())
+        for name in serve_report.POLICIES
+        if (path := serve_report.COMMITTED / f"{name}.json").exists()
+    }
+    assert committed
+    assert serve_report.document(committed) in serve_report.PAGE.read_text()

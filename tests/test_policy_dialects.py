@@ -137,16 +137,37 @@ def test_several_observations_are_answered_as_if_alone(layout: str) -> None:
         made.sample(context, given)
 
 
+def test_what_was_read_stands_for_the_observation() -> None:
+    made = policy("nvidia")
+    given = [nested(made), flat(nested(made, batch=2)), lerobot(nested(made))]
+    readings = [made.read(one) for one in given]
+    expected = made.act(given, seed=3)
+    context = made.encode(readings)
+    for found in (
+        made.act(readings, seed=3),
+        made.act([given[0], readings[1], given[2]], seed=3),
+        made.sample(context, readings, seed=3),
+    ):
+        for one, other in zip(found, expected, strict=True):
+            assert len(one) == len(other)
+            for key in one if isinstance(one, dict) else (0,):
+                np.testing.assert_array_equal(one[key], other[key])
+    np.testing.assert_equal(made.act(readings[0], seed=4), made.act(given[0], seed=4))
+    made.read(given[1], most_rows=2)
+    with pytest.raises(InputError, match="expected at most 1 rows, got 2"):
+        made.read({"state": nested(made, batch=2)["state"]}, most_rows=1)  # before frames are looked at
+
+
 def test_one_string_a_row_of_a_batch_is_plain() -> None:
     made = policy("isaac")
     given = nested(made, batch=2)
-    reading = made._read(flat(given) | {"annotation.human.action.task_description": ["a", "b"]})[1][0]
+    reading = made.read(flat(given) | {"annotation.human.action.task_description": ["a", "b"]})
     assert (reading.instructions, reading.is_plain) == (("a", "b"), True)
     for texts in ([["a"], ["b"]], np.array([["a"], ["b"]]), (["a"], ("b",))):
-        reading = made._read(flat(given) | {"annotation.human.action.task_description": texts})[1][0]
+        reading = made.read(flat(given) | {"annotation.human.action.task_description": texts})
         assert (reading.instructions, reading.is_plain) == (("a", "b"), False)
     for text in ("a", ["a"], np.array(["a"])):
-        reading = made._read(row(flat(given), 0) | {"annotation.human.action.task_description": text})[1][0]
+        reading = made.read(row(flat(given), 0) | {"annotation.human.action.task_description": text})
         assert (reading.instructions, reading.is_plain) == (("a",), False)
 
 
@@ -167,9 +188,9 @@ def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() 
     isaac = policy("isaac")
     observation = flat(nested(isaac))
     del observation["annotation.human.action.task_description"]
-    assert isaac._read(observation)[1][0].instructions == (None,)
+    assert isaac.read(observation).instructions == (None,)
     observation["task"] = ["go"]
-    assert isaac._read(observation)[1][0].instructions == ("go",)
+    assert isaac.read(observation).instructions == ("go",)
 
 
 def test_float_frames_become_uint8_as_in_lerobot() -> None:
@@ -180,7 +201,7 @@ def test_float_frames_become_uint8_as_in_lerobot() -> None:
     frames[:, :, 20, :3] = [-0.2, 1.2, 0.5]
     given = lerobot(nested(made))
     for kind in (frames, torch.from_numpy(frames), torch.from_numpy(frames).double()):
-        reading = made._read(given | {"observation.images.front": kind})[1][0]
+        reading = made.read(given | {"observation.images.front": kind})
         found = reading.frames[0]["front"]
         assert np.array_equal(found[:16, :16], values[0])
         assert found[20, :3, 0].tolist() == [0, 255, 127]
@@ -194,7 +215,7 @@ def test_frames_along_time_come_before_cameras() -> None:
     video = np.random.default_rng(0).integers(0, 256, (2, 2, 8, 8, 3), np.uint8)
     given = nested(policy("n17"))
     given["video"] = {"a": video[:1], "b": video[1:]}
-    frames = made._read(given)[1][0].frames[0]
+    frames = made.read(given).frames[0]
     assert list(frames) == ["a[0]", "b[0]", "a[1]", "b[1]"]
     assert np.array_equal(frames["b[1]"], video[1, 1])
     given["video"] = {"a": video[:1, :1], "b": video[1:, :1]}
@@ -206,8 +227,8 @@ def test_unnamed_cameras_keep_their_order_or_are_sorted() -> None:
     made = policy("isaac", CameraSources())
     given = nested(policy("isaac"))
     given["video"] = dict.fromkeys(("z", "a"), given["video"]["wrist"])
-    assert list(made._read(given)[1][0].frames[0]) == ["z", "a"]
-    assert list(made._read(lerobot(given))[1][0].frames[0]) == ["a", "z"]
+    assert list(made.read(given).frames[0]) == ["z", "a"]
+    assert list(made.read(lerobot(given)).frames[0]) == ["a", "z"]
     assert list(made.example_observation()["video"]) == ["front"]
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import threading
 import time
+from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from serve_cases import HORIZON, MemoryPolicy, ask, get_action, observation, requester, serving, wait_until
 
+from saccade.dialects import DIALECTS, Reading, StateReading
 from saccade.errors import InputError
 from saccade.serve import Client, ServerError
 from saccade.serve.batching import Job, Queue
@@ -24,7 +26,9 @@ from saccade.serve.statistics import Statistics, line
 
 
 def job(client: Any = None, rows: int = 1, session: str | None = None) -> Job:
-    return Job(Call("get_action", options=Options(session=session)), rows, client or object(), 10)
+    nothing = StateReading(DIALECTS[0], True, False, np.zeros((rows, 1, 1), np.float32))
+    reading = Reading(**vars(nothing), frames=(), instructions=(), is_plain=False)
+    return Job(Call("get_action", options=Options(session=session)), reading, client or object(), 10)
 
 
 def rows(jobs: list[Job] | None) -> list[int]:
@@ -32,12 +36,20 @@ def rows(jobs: list[Job] | None) -> list[int]:
     return [one.rows for one in jobs]
 
 
+def computed(queue: Queue) -> list[int]:
+    """The rows of the requests of the next batch, which is done at once."""
+    jobs = queue.take()
+    assert jobs is not None
+    queue.done(jobs)
+    return rows(jobs)
+
+
 def test_a_batch_has_at_most_so_many_rows() -> None:
     queue = Queue(4, 0.0)
     for size in (1, 2, 3, 9, 1):
         queue.put(job(rows=size))
     assert queue.size == 50
-    assert [rows(queue.take()) for _ in range(4)] == [[1, 2], [3], [9], [1]]
+    assert [computed(queue) for _ in range(4)] == [[1, 2], [3], [9], [1]]
     assert (len(queue), queue.size) == (0, 0)
     queue.close()
     assert queue.take() is None
@@ -47,13 +59,13 @@ def test_a_client_alone_does_not_wait_and_others_wait_for_each_other(monkeypatch
     monkeypatch.setattr("saccade.serve.batching.ACTIVE_SECONDS", 0.3)
     queue = Queue(16, 30.0)
     queue.put(job("a"))
-    assert rows(queue.take()) == [1]
+    assert computed(queue) == [1]
     queue.put(job("b"))
     threading.Timer(0.05, lambda: queue.put(job("a"))).start()
-    assert rows(queue.take()) == [1, 1]
+    assert computed(queue) == [1, 1]
     queue.put(job("a"))
     start = time.monotonic()
-    assert rows(queue.take()) == [1]  # b is no longer expected after a while
+    assert computed(queue) == [1]  # b is no longer expected after a while
     assert 0.1 < time.monotonic() - start < 10
 
 
@@ -61,10 +73,10 @@ def test_the_oldest_request_waits_no_longer_than_asked() -> None:
     queue = Queue(16, 0.1)
     for client in ("a", "b"):
         queue.put(job(client))
-    assert rows(queue.take()) == [1, 1]
+    assert computed(queue) == [1, 1]
     queue.put(job("a"))
     start = time.monotonic()
-    assert rows(queue.take()) == [1]
+    assert computed(queue) == [1]
     assert 0.05 < time.monotonic() - start < 5
 
 
@@ -72,10 +84,10 @@ def test_a_closed_queue_does_not_wait() -> None:
     queue = Queue(16, 60.0)
     for client in ("a", "b"):
         queue.put(job(client))
-    assert rows(queue.take()) == [1, 1]
+    assert computed(queue) == [1, 1]
     queue.put(job("a"))
     queue.close()
-    assert rows(queue.take()) == [1]
+    assert computed(queue) == [1]
     assert queue.take() is None
 
 
@@ -84,9 +96,65 @@ def test_one_request_of_a_session_in_a_batch() -> None:
     jobs = [job(session="a"), job(session="a"), job(), job(session="b"), job(session="a")]
     for one in jobs:
         queue.put(one)
-    assert queue.take() == [jobs[0], jobs[2], jobs[3]]
-    assert queue.take() == [jobs[1]]
-    assert queue.take() == [jobs[4]]
+    for chosen in ([jobs[0], jobs[2], jobs[3]], [jobs[1]], [jobs[4]]):
+        assert queue.take() == chosen
+        queue.done(chosen)
+
+
+def test_a_session_is_computed_by_one_thread_at_a_time() -> None:
+    queue = Queue(16, 0.0, num_workers=2)
+    first, second, other = job(session="a"), job(session="a"), job(session="b")
+    queue.put(first)
+    assert queue.take() == [first]
+    queue.put(second)
+    queue.put(other)
+    assert queue.take() == [other]
+    with ThreadPoolExecutor(1) as threads:
+        taken = threads.submit(queue.take)
+        with pytest.raises(futures.TimeoutError):
+            taken.result(0.1)
+        queue.done([first])
+        assert taken.result(10) == [second]
+
+
+def test_threads_share_out_what_waits() -> None:
+    queue = Queue(8, 0.0, num_workers=2)
+    with ThreadPoolExecutor(2) as threads:
+        taken = [threads.submit(queue.take) for _ in range(2)]
+        wait_until(lambda: queue._num_idle == 2)
+        with queue._changed:  # all arrive at once
+            for _ in range(6):
+                queue.put(job())
+        assert [rows(one.result(10)) for one in taken] == [[1] * 3, [1] * 3]
+    for _ in range(9):
+        queue.put(job())
+    assert [rows(queue.take()) for _ in range(3)] == [[1] * 4, [1] * 4, [1]]
+    queue.close()
+    assert queue.take() is None
+
+
+def test_clients_that_are_computed_are_not_waited_for() -> None:
+    queue = Queue(16, 30.0, num_workers=2)
+    for client in ("a", "b"):
+        queue.put(job(client))
+    first = queue.take()
+    assert rows(first) == [1, 1]
+    queue.put(job("a"))
+    assert rows(queue.take()) == [1]
+
+
+def test_requests_that_wait_for_others_are_prepared() -> None:
+    prepared: list[Job] = []
+    queue = Queue(16, 0.2, prepared.append)
+    for client in ("a", "b"):
+        queue.put(job(client))
+    first = queue.take()
+    assert prepared == []  # nobody else was expected
+    assert first is not None
+    queue.done(first)
+    queue.put(job("a"))
+    second = queue.take()
+    assert prepared == second
 
 
 def test_requests_of_many_clients_are_one_batch_with_the_same_bits() -> None:
@@ -107,6 +175,26 @@ def test_requests_of_many_clients_are_one_batch_with_the_same_bits() -> None:
             together = [first.result(), *(other.result() for other in others)]
         assert policy.batches == [1, 14]
         for seed, chunk in enumerate(together):
+            alone = act(seed)
+            assert all(np.array_equal(chunk[key], alone[key]) for key in alone)
+
+
+def test_a_small_policy_computes_several_batches_at_a_time() -> None:
+    policy = MemoryPolicy(nbytes=1000)
+    policy.gate.clear()
+    with serving(policy) as running:
+
+        def act(seed: int) -> Any:
+            with Client(port=running.port) as client:
+                return client.get_action(observation(seed), {"seed": seed})[0]
+
+        with ThreadPoolExecutor(5) as threads:
+            several = [threads.submit(act, seed) for seed in range(5)]
+            wait_until(lambda: running.server._engine._running == 2)
+            policy.gate.set()
+            chunks = [one.result() for one in several]
+        assert sum(policy.batches) == 5
+        for seed, chunk in enumerate(chunks):
             alone = act(seed)
             assert all(np.array_equal(chunk[key], alone[key]) for key in alone)
 

@@ -92,6 +92,17 @@ def test_n17_gets_arrays_in_the_form_that_it_sends() -> None:
         np.testing.assert_array_equal(np.frombuffer(fields[b"data"], "<f4").reshape(expected.shape), expected)
 
 
+def test_requests_are_answered_that_come_with_the_greeting_and_before_garbage() -> None:
+    ping = b"".join(zmtp.message((b"",), packed({"endpoint": "ping"})))
+    with serving() as running, connect(running.port, NULL + READY + 2 * ping + b"\xff") as made:
+        received = b""
+        while piece := made.recv(1 << 16):
+            received += piece
+    answer = b"".join(zmtp.message((b"",), packed(PONG)))
+    assert received == NULL + b"\x04\x1c" + zmtp.READY + 2 * answer
+    assert "expected a frame, got flags 0xff" in running.log.warnings()[0]
+
+
 def test_a_seed_for_clients_that_bring_none() -> None:
     request = {"endpoint": "get_action", "data": flat_observation()}
     with serving(seed=3) as running, requester(running.port) as made:

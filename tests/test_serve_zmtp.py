@@ -16,12 +16,11 @@ PARTS = st.lists(st.binary(max_size=255), max_size=4)
 
 def feed(peer: Peer, data: bytes, sizes: Sequence[int]) -> list[Request]:
     """Gives a peer bytes in pieces of at most these sizes, in turn."""
-    found, position, turn = [], 0, 0
+    found: list[Request] = []
+    position = turn = 0
     while position < len(data):
-        with peer.space() as space:
-            count = min(len(space), sizes[turn % len(sizes)], len(data) - position)
-            space[:count] = data[position : position + count]
-        found += peer.filled(count)
+        count = sizes[turn % len(sizes)]
+        found += peer.receive(memoryview(data)[position : position + count])
         position += count
         turn += 1
     return found

@@ -28,9 +28,10 @@ from saccade.robots import Normalizer, padded
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-#: One observation in a form of `saccade.dialects`, with or without a batch axis, or several of them.
+#: One observation in a form of `saccade.dialects`, with or without a batch axis.
 Observation = Mapping[str, Any]
-Observations = Observation | Sequence[Observation]
+#: Or what was read of it, or several of them.
+Observations = Observation | Reading | Sequence[Observation | Reading]
 
 
 class Policy:
@@ -212,9 +213,28 @@ class Policy:
         Raises:
             InputError, ShapeError, DtypeError: As :meth:`encode` and :meth:`sample`.
         """
-        _, readings = self._read(observation)
+        readings = self._read(observation)
         context = self._encoded(readings, previous)
         return self._sampled(context.context, observation, readings, options)
+
+    def read(self, observation: Observation, *, most_rows: int | None = None) -> Reading:
+        """Reads and checks an observation.
+
+        Every method of this policy takes the result in place of the observation, and does not check it again.
+
+        Args:
+            observation: One observation in one of the forms of :meth:`encode`.
+            most_rows: An observation with more rows is refused.
+
+        Raises:
+            InputError, ShapeError, DtypeError: As :meth:`encode`.
+
+        Example:
+            >>> def chunks(policy: Policy, observation: dict) -> list:
+            ...     reading = policy.read(observation)
+            ...     return [policy.act(reading, seed=seed) for seed in range(3)]
+        """
+        return read(observation, self.requirements, most_rows)
 
     def encode(self, observation: Observations, *, previous: PolicyContext | None = None) -> PolicyContext:
         """Encodes what the robot sees and is told.
@@ -240,7 +260,7 @@ class Policy:
                 the robot needs. Or this policy has no backbone, or ``previous`` does not fit.
             MemoryError: There is not enough memory.
         """
-        return self._encoded(self._read(observation)[1], previous)
+        return self._encoded(self._read(observation), previous)
 
     def inputs(self, observation: Observations) -> list[BackboneInputs]:
         """The backbone's inputs for each observation: resized frames and token ids, a batch of one each.
@@ -251,7 +271,7 @@ class Policy:
         Raises:
             InputError, ShapeError, DtypeError: As :meth:`encode`.
         """
-        return self._inputs(self._read(observation)[1])
+        return self._inputs(self._read(observation))
 
     def features(
         self, inputs: Sequence[BackboneInputs], *, previous: PolicyContext | None = None
@@ -339,7 +359,8 @@ class Policy:
         if not _is_observation(observation_or_state):
             return self._of_state(held, observation_or_state, options)  # type: ignore[arg-type]
         observations = _listed(observation_or_state)  # type: ignore[arg-type]
-        readings = [read_state(one, self.requirements) for one in observations]
+        needs = self.requirements
+        readings = [one if isinstance(one, Reading) else read_state(one, needs) for one in observations]
         return self._sampled(held, observation_or_state, readings, options)  # type: ignore[arg-type]
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
@@ -354,10 +375,9 @@ class Policy:
         """
         return example_observation(self.requirements, self.normalizer, integer("seed", seed, least=0))
 
-    def _read(self, observation: Observations) -> tuple[list[Observation], list[Reading]]:
+    def _read(self, observation: Observations) -> list[Reading]:
         self._whole("act and encode", self.backbone)
-        observations = _listed(observation)
-        return observations, [read(one, self.requirements) for one in observations]
+        return [one if isinstance(one, Reading) else self.read(one) for one in _listed(observation)]
 
     def _inputs(self, readings: Sequence[Reading]) -> list[BackboneInputs]:
         processor = self._whole("inputs", self.processor)
@@ -386,7 +406,7 @@ class Policy:
             raise InputError(
                 f"observation: expected {context.batch}, as many as in context, got {len(state)}"
             )
-        is_single = isinstance(observation, Mapping)
+        is_single = isinstance(observation, Mapping | Reading)
         options = options.copy()
         previous, noise = options.get("previous_chunk"), options.get("noise")
         if previous is not None:
@@ -443,29 +463,27 @@ class Policy:
         return part
 
     def __repr__(self) -> str:
-        whole = ""
-        if self.backbone is not None:
-            whole = f" backbone={self.backbone!r} processor={self.processor!r}"
+        parts = f" backbone={self.backbone!r} processor={self.processor!r}"
         return (
             f"<saccade.Policy embodiment_id={self.embodiment_id} head={self.head!r} "
-            f"normalizer={self.normalizer!r}{whole}>"
+            f"normalizer={self.normalizer!r}{'' if self.backbone is None else parts}>"
         )
 
 
 def _is_observation(value: Any) -> bool:
     """Whether a value is an observation or a sequence of them, and not an array."""
     if isinstance(value, (list, tuple)):
-        return bool(value) and isinstance(value[0], Mapping)
-    return isinstance(value, Mapping)
+        return bool(value) and isinstance(value[0], Mapping | Reading)
+    return isinstance(value, Mapping | Reading)
 
 
-def _listed(observation: Observations) -> list[Observation]:
+def _listed(observation: Observations) -> list[Observation | Reading]:
     """Observations as a list.
 
     Raises:
         InputError: There is none.
     """
-    if isinstance(observation, Mapping):
+    if isinstance(observation, Mapping | Reading):
         return [observation]
     found = list(observation) if isinstance(observation, (list, tuple)) else []
     if not found:

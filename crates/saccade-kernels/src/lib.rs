@@ -44,7 +44,7 @@ pub use linear::{Epilogue, KernelError, LinearScratch, PackedLinear};
 pub use matrix::Matrix;
 pub use norm::layer::layer_norm;
 pub use norm::rms::{rms_norm, rms_norm_in_place};
-pub use pool::{Interrupted, interrupted, interruptible, parallel_for};
+pub use pool::{Interrupted, interrupted, interruptible, parallel_for, stay_on_this_thread};
 pub use rope::rotary_embedding;
 pub use rows::{Rows, RowsMut};
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};

@@ -38,7 +38,7 @@ mod _saccade {
     #[pymodule_export]
     use crate::machine::{
         available_isas, cpu_report, default_num_threads, dot_products, measure_peaks, selected_isa,
-        start_profile, take_profile,
+        start_profile, stay_on_this_thread, take_profile,
     };
     #[pymodule_export]
     use crate::processor::{Processor, ProcessorSource};

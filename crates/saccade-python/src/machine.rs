@@ -54,6 +54,12 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
     Ok(peaks)
 }
 
+/// Whether calls of this thread compute on it alone from now on, whatever number of threads a head or backbone has.
+#[pyfunction]
+pub(crate) fn stay_on_this_thread(stays: bool) {
+    saccade::stay_on_this_thread(stays);
+}
+
 /// The rate, or the exception for it: for memory that the system refused, or threads.
 fn peak_or_raise(measured: Result<f64, PeakError>) -> PyResult<f64> {
     measured.map_err(|error| match error {

@@ -62,6 +62,6 @@ pub use rewrite::resize::{
 };
 pub use rewrite::{RewriteOptions, Written};
 pub use saccade_checkpoint::{self as files, Checkpoint, Elements};
-pub use saccade_kernels::{Arithmetic, CpuReport, Isa, default_num_threads, peak};
+pub use saccade_kernels::{Arithmetic, CpuReport, Isa, default_num_threads, peak, stay_on_this_thread};
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;

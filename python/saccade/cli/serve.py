@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="text on standard error, live on a terminal; or JSON lines on standard output (default: text)",
     )
     batching = parser.add_argument_group("requests of several clients are computed together")
-    arguments.add_integer(batching, "--max-batch", default=16, help="observations in a batch at most")
+    arguments.add_integer(batching, "--max-batch", default=16, help="observations computed at a time")
     arguments.add_number(
         batching,
         "--max-wait-ms",

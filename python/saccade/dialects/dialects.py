@@ -10,19 +10,29 @@ from saccade.dialects.isaac_nested import IsaacNested
 from saccade.dialects.lerobot import Lerobot
 from saccade.dialects.reading import Dialect, Reading, StateReading
 from saccade.dialects.requirements import Requirements
+from saccade.errors import InputError
 
 #: All forms, in the order in which they are tried.
 DIALECTS: tuple[Dialect, ...] = (Lerobot(), IsaacFlat(), IsaacNested())
 
 
-def read(observation: Mapping[str, Any], needs: Requirements) -> Reading:
+def read(observation: Mapping[str, Any], needs: Requirements, most_rows: int | None = None) -> Reading:
     """Reads an observation of any form.
+
+    Args:
+        observation: The observation.
+        needs: What the robot needs.
+        most_rows: An observation with more rows is refused before its frames are looked at.
 
     Raises:
         InputError, ShapeError, DtypeError: It has no known form, or does not fit. The message lists what the
             robot needs.
     """
-    return _dialect(observation, needs).read(observation, needs)
+    dialect = _dialect(observation, needs)
+    state = dialect.read_state(observation, needs)
+    if most_rows is not None and len(state) > most_rows:
+        raise InputError(f"observation: expected at most {most_rows} rows, got {len(state)}")
+    return dialect.read(observation, state, needs)
 
 
 def read_state(observation: Mapping[str, Any], needs: Requirements) -> StateReading:

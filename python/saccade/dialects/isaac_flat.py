@@ -29,9 +29,8 @@ class IsaacFlat:
         """Whether a key has one of the prefixes."""
         return any(key.startswith(PREFIXES) for key in observation)
 
-    def read(self, observation: Mapping[str, Any], needs: Requirements) -> Reading:
+    def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
         """See :class:`saccade.dialects.Dialect`."""
-        state = self.read_state(observation, needs)
         frames = isaac.read_frames("video.", _below(observation, "video."), state.is_batched, needs)
         texts, is_plain = _language(observation, state, needs)
         check_batch({"state": len(state), "video": len(frames), "instructions": len(texts)}, needs)

@@ -26,9 +26,8 @@ class IsaacNested:
         """Whether one of the three modalities is a key."""
         return any(name in observation for name in MODALITIES)
 
-    def read(self, observation: Mapping[str, Any], needs: Requirements) -> Reading:
+    def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
         """See :class:`saccade.dialects.Dialect`."""
-        state = self.read_state(observation, needs)
         frames = isaac.read_frames("video.", _part(observation, "video", needs), state.is_batched, needs)
         texts, _ = _language(_part(observation, "language", needs), state.is_batched, needs)
         check_batch({"state": len(state), "video": len(frames), "language": len(texts)}, needs)

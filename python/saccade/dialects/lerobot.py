@@ -32,9 +32,8 @@ class Lerobot:
         """Whether a key begins with ``observation.``."""
         return any(key.startswith("observation.") for key in observation)
 
-    def read(self, observation: Mapping[str, Any], needs: Requirements) -> Reading:
+    def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
         """See :class:`saccade.dialects.Dialect`."""
-        state = self.read_state(observation, needs)
         frames = _frames(observation, state.is_batched, needs)
         texts = _texts(observation.get(TASK), state, needs)
         check_batch({STATE: len(state), f"{IMAGES}*": len(frames), TASK: len(texts)}, needs)

@@ -56,8 +56,13 @@ class Dialect(Protocol):
     def matches(self, observation: Mapping[str, Any]) -> bool:
         """Whether the keys are those of this form."""
 
-    def read(self, observation: Mapping[str, Any], needs: Requirements) -> Reading:
-        """Reads and checks an observation.
+    def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
+        """Reads and checks frames and instructions.
+
+        Args:
+            observation: The observation.
+            state: What `read_state` read of it.
+            needs: What the robot needs.
 
         Raises:
             InputError, ShapeError, DtypeError: Something is missing or does not fit. The message lists what
@@ -65,7 +70,7 @@ class Dialect(Protocol):
         """
 
     def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> StateReading:
-        """Reads and checks the state only; frames and instruction may be missing. Raises as `read`."""
+        """Reads and checks the state; frames and instruction may be missing. Raises as `read`."""
 
     def answer(self, parts: Mapping[str, Float32Array], reading: StateReading) -> Any:
         """The actions in this form.

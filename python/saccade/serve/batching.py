@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from saccade.dialects import Reading
 from saccade.serve.requests import Call
 
 #: A client that asked within these seconds is expected to ask again.
@@ -21,45 +22,65 @@ class Job:
 
     Attributes:
         call: What it asks for.
-        rows: Number of its observations.
+        reading: Its observations.
         client: Who asks.
         size: Bytes of its message.
         is_msgpack_numpy: In which form its arrays came, and those of the answer go.
+        inputs: What the backbone takes, or why there is none, once it is prepared.
+        is_claimed: Whether a thread prepares it while it waits.
         received: When it arrived, on the clock of `time.perf_counter`.
         reply: How it is answered; only the server reads it.
         milliseconds: How long each part took.
     """
 
     call: Call
-    rows: int
+    reading: Reading
     client: Hashable
     size: int
     is_msgpack_numpy: bool = False
+    inputs: Sequence[Any] | BaseException | None = None
+    is_claimed: bool = False
     received: float = field(default_factory=time.perf_counter)
     reply: Any = None
     milliseconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> int:
+        """Number of its observations."""
+        return len(self.reading)
 
 
 class Queue:
     """The requests that wait.
 
     A batch is taken when as many observations wait as a batch has, when every client that asked within the
-    last second is among them, or when the oldest request has waited long enough. A client alone never waits.
+    last second is waiting or being computed, or when the oldest request has waited long enough. A client
+    alone never waits.
 
     Args:
         max_batch: Observations in a batch. A request with more is a batch of its own.
         max_wait: Seconds that the oldest request waits for others at most.
+        prepare: Called with requests that wait for others, by a thread that would wait with them.
+        num_workers: Number of threads that take batches. They share out ``max_batch``.
         clock: Returns seconds.
     """
 
     def __init__(
-        self, max_batch: int, max_wait: float, clock: Callable[[], float] = time.perf_counter
+        self,
+        max_batch: int,
+        max_wait: float,
+        prepare: Callable[[Job], None] = lambda job: None,
+        num_workers: int = 1,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._max_batch, self._max_wait, self._clock = max_batch, max_wait, clock
+        self._max_batch = -(-max_batch // num_workers)
+        self._max_wait, self._prepare, self._clock = max_wait, prepare, clock
         self._jobs: deque[Job] = deque()
+        self._computed: set[Job] = set()
         self._active: OrderedDict[Hashable, float] = OrderedDict()
         self._changed = threading.Condition()
         self._is_closed = False
+        self._num_idle = 0
         self._size = 0
 
     def __len__(self) -> int:
@@ -83,53 +104,91 @@ class Queue:
         """What waits is still taken, without waiting for others; then :meth:`take` returns None."""
         with self._changed:
             self._is_closed = True
-            self._changed.notify()
+            self._changed.notify_all()
 
     def take(self) -> list[Job] | None:
         """The next batch, in the order of arrival; None once the queue is closed and empty.
 
-        Of each session it contains one request at most.
+        Of each session one request is computed at a time. Say with :meth:`done` when the batch is computed.
         """
         with self._changed:
-            while not self._jobs and not self._is_closed:
-                self._changed.wait()
-            if not self._jobs:
-                return None
-            deadline = self._jobs[0].received + self._max_wait
-            while (until := min(deadline, self._expected_until())) > (now := self._clock()):
-                self._changed.wait(until - now)
-            return self._chosen()
+            self._num_idle += 1
+            while True:
+                ready = self._ready()
+                if ready:
+                    until = min(ready[0].received + self._max_wait, self._expected_until(ready))
+                    missing = until - self._clock()
+                    if missing <= 0:
+                        break
+                    self._prepare_or_wait(ready, missing)
+                elif self._is_closed and not self._jobs:
+                    self._num_idle -= 1
+                    return None
+                else:
+                    self._changed.wait()
+            chosen = self._chosen(ready)
+            self._num_idle -= 1
+            if self._jobs:
+                self._changed.notify()  # another thread that waits for requests
+            return chosen
 
-    def _expected_until(self) -> float:
-        """Until when a client is expected that is not among those that wait; 0 if a batch need not wait."""
-        if self._is_closed or sum(job.rows for job in self._jobs) >= self._max_batch:
+    def done(self, jobs: Sequence[Job]) -> None:
+        """The batch was computed, and other requests of its sessions can be."""
+        with self._changed:
+            self._computed.difference_update(jobs)
+            if self._is_closed:
+                self._changed.notify_all()
+            elif self._jobs:
+                self._changed.notify()
+
+    def _ready(self) -> list[Job]:
+        """The requests that can be computed now."""
+        sessions = {job.call.options.session for job in self._computed} - {None}
+        found = []
+        for job in self._jobs:
+            session = job.call.options.session
+            if session not in sessions:
+                found.append(job)
+                if session is not None:
+                    sessions.add(session)
+        return found
+
+    def _expected_until(self, ready: Sequence[Job]) -> float:
+        """Until when a client is expected that neither waits nor is computed; 0 if a batch need not wait."""
+        if self._is_closed or sum(job.rows for job in ready) >= self._max_batch * self._num_idle:
             return 0.0
         recent = self._clock() - ACTIVE_SECONDS
         while self._active and next(iter(self._active.values())) < recent:
             self._active.popitem(last=False)
-        waiting = {job.client for job in self._jobs}
-        latest = max((seen for client, seen in self._active.items() if client not in waiting), default=None)
+        here = {job.client for job in self._jobs} | {job.client for job in self._computed}
+        latest = max((seen for client, seen in self._active.items() if client not in here), default=None)
         return 0.0 if latest is None else latest + ACTIVE_SECONDS
 
-    def _chosen(self) -> list[Job]:
+    def _prepare_or_wait(self, ready: Sequence[Job], seconds: float) -> None:
+        """Uses the time until others arrive."""
+        job = next((job for job in ready if not job.is_claimed), None)
+        if job is None:
+            self._changed.wait(seconds)
+            return
+        job.is_claimed = True
+        self._changed.release()
+        try:
+            self._prepare(job)
+        finally:
+            self._changed.acquire()
+
+    def _chosen(self, ready: Sequence[Job]) -> list[Job]:
+        """This thread's share of the requests that can be computed."""
+        share = -(-sum(job.rows for job in ready) // self._num_idle)
+        most = min(share, self._max_batch)
         chosen: list[Job] = []
-        later: deque[Job] = deque()
-        sessions: set[str | int] = set()
         rows = 0
-        while self._jobs:
-            job = self._jobs.popleft()
-            session = job.call.options.session
-            if session in sessions:
-                later.append(job)
-                continue
-            if chosen and rows + job.rows > self._max_batch:
-                self._jobs.appendleft(job)
+        for job in ready:
+            if chosen and rows + job.rows > most:
                 break
             chosen.append(job)
             rows += job.rows
             self._size -= job.size
-            if session is not None:
-                sessions.add(session)
-        later.extend(self._jobs)
-        self._jobs = later
+        self._computed.update(chosen)
+        self._jobs = deque(job for job in self._jobs if job not in self._computed)
         return chosen

@@ -19,8 +19,10 @@ from saccade.serve.limits import Limits
 MOST_UNREAD = 8_000_000
 #: Time that a program of another protocol gets to read why it is refused.
 FAREWELL_SECONDS = 2.0
-#: Seconds between two looks at connections that may have stalled.
-TICK = 0.5
+#: Seconds between two checks for connections that have stalled.
+CHECK_SECONDS = 0.5
+#: Bytes that are received by one call at most.
+RECEIVED_BYTES = 1 << 18
 OUT_OF_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 HTTP = """\
@@ -48,6 +50,7 @@ class Connection:
         self.unsent: deque[memoryview] = deque()
         self.num_unsent = 0
         self.progress = time.monotonic()
+        self.writes = False  # whether the selector waits until more can be sent
         self.farewell: float | None = None  # when it is closed at the latest, once it was refused
 
     @property
@@ -85,7 +88,8 @@ class Connections:
         self._selector = selectors.DefaultSelector()
         self._listener: socket.socket | None = listener
         self._clients: set[Connection] = set()
-        self._paused_until = self._looked = 0.0
+        self._paused_until = self._checked = 0.0
+        self._received = memoryview(bytearray(RECEIVED_BYTES))
         self._waker, self._woken = socket.socketpair()
         for end in (self._waker, self._woken):
             end.setblocking(False)
@@ -136,9 +140,9 @@ class Connections:
                 if events & selectors.EVENT_READ and connection in self._clients:
                     self._read(connection)
         now = time.monotonic()
-        if now - self._looked >= TICK:
-            self._looked = now
-            self._look_after(now)
+        if now - self._checked >= CHECK_SECONDS:
+            self._checked = now
+            self._check_connections(now)
 
     def send(self, connection: Connection, address: tuple[bytes, ...], payload: bytes) -> None:
         """Answers a request; nothing happens if its client is gone.
@@ -213,28 +217,33 @@ class Connections:
                 if not connection.socket.recv(1 << 16):
                     self._forget(connection)
                 return
-            with connection.peer.space() as space:
-                count = connection.socket.recv_into(space)
-            connection.progress = time.monotonic()
-            if not count:
-                self._lost(connection)
-                return
-            found = connection.peer.filled(count)
+            count = connection.socket.recv_into(self._received)
         except BlockingIOError:
             return
         except OSError:  # reset, timed out: the client died
             self._lost(connection)
             return
+        connection.progress = time.monotonic()
+        if not count:
+            self._lost(connection)
+            return
+        try:
+            for request in connection.peer.receive(self._received[:count]):
+                self._send_output(connection)
+                if connection not in self._clients:
+                    return
+                connection.waiting += 1
+                self._on_request(connection, request)
+            self._send_output(connection)
         except zmtp.ProtocolError as error:
             self._refuse(connection, error)
-            return
-        if connection.peer.output:
+
+    def _send_output(self, connection: Connection) -> None:
+        """Sends what the protocol answers by itself, which comes before the answer to a request."""
+        if connection.peer.output and connection in self._clients:
             self._append(connection, bytes(connection.peer.output))
             connection.peer.output.clear()
             self._write(connection)
-        for request in found:
-            connection.waiting += 1
-            self._on_request(connection, request)
 
     def _write(self, connection: Connection) -> None:
         try:
@@ -255,8 +264,10 @@ class Connections:
         if connection.farewell is not None and not connection.unsent:
             with contextlib.suppress(OSError):
                 connection.socket.shutdown(socket.SHUT_WR)
-        writes = selectors.EVENT_WRITE if connection.unsent else 0
-        self._selector.modify(connection.socket, selectors.EVENT_READ | writes, connection)
+        if connection.writes != bool(connection.unsent):
+            connection.writes = bool(connection.unsent)
+            writes = selectors.EVENT_WRITE if connection.writes else 0
+            self._selector.modify(connection.socket, selectors.EVENT_READ | writes, connection)
 
     def _append(self, connection: Connection, piece: bytes) -> None:
         connection.unsent.append(memoryview(piece))
@@ -271,7 +282,7 @@ class Connections:
             self._append(connection, HTTP.encode())
         self._write(connection)
 
-    def _look_after(self, now: float) -> None:
+    def _check_connections(self, now: float) -> None:
         if self._paused_until and now >= self._paused_until and self._listener is not None:
             self._paused_until = 0.0
             self._selector.register(self._listener, selectors.EVENT_READ)

@@ -6,6 +6,7 @@ server. Lines that cannot be written are counted.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import threading
@@ -19,6 +20,9 @@ from saccade.serve.statistics import line
 
 #: Lines that wait to be written; more are lost, and counted.
 MOST_LINES = 10_000
+#: Lines that are written by one call at most, and the seconds in which they gather.
+LINES_AT_ONCE = 512
+GATHERING_SECONDS = 0.02
 #: Warnings a second that are written; more are counted.
 MOST_WARNINGS = 20
 #: Back to the start of the line of a terminal, and erases it.
@@ -58,7 +62,7 @@ class Writer:
         self._descriptor = descriptor
         self._lines: deque[bytes] = deque()
         self._changed = threading.Condition()
-        self._is_closed = False
+        self._closing = threading.Event()
         self.lost = 0
         self._thread = threading.Thread(target=self._run, name="saccade-serve-log", daemon=True)
         self._thread.start()
@@ -70,28 +74,35 @@ class Writer:
                 self.lost += 1
                 return
             self._lines.append(text.encode("utf-8", "backslashreplace"))
-            self._changed.notify()
+            self._changed.notify()  # which costs nothing while lines gather
 
     def close(self, seconds: float = 2.0) -> None:
         """Writes the waiting lines, for at most the given number of seconds."""
         with self._changed:
-            self._is_closed = True
+            self._closing.set()
             self._changed.notify()
         self._thread.join(seconds)
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                while not self._lines and not self._is_closed:
+                while not self._lines and not self._closing.is_set():
                     self._changed.wait()
                 if not self._lines:
                     return
-                data = self._lines.popleft()
-            try:
-                while data:
-                    data = data[os.write(self._descriptor, data) :]
-            except OSError:  # a full disk, a closed pipe
-                self.lost += 1
+            self._closing.wait(GATHERING_SECONDS)
+            with self._changed:
+                count = min(len(self._lines), LINES_AT_ONCE)
+                lines = [self._lines.popleft() for _ in range(count)]
+            self._write(lines)
+
+    def _write(self, lines: list[bytes]) -> None:
+        data, written = b"".join(lines), 0
+        try:
+            while written < len(data):
+                written += os.write(self._descriptor, data[written:])
+        except OSError:  # a full disk, a closed pipe
+            self.lost += sum(end > written for end in itertools.accumulate(map(len, lines)))
 
 
 class _Limited:

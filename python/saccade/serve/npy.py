@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -65,12 +67,17 @@ def from_npy(data: Any, most_elements: int) -> npt.NDArray[Any]:
     length = int.from_bytes(view[8:start], "little")
     if length > min(LONGEST_HEADER, len(view) - start):
         raise InputError(f"array: header of {length} bytes, expected at most {LONGEST_HEADER}")
-    header = bytes(view[start : start + length])
+    layout = _header(bytes(view[start : start + length]))
+    return _array(view[start + length :], layout, most_elements)
+
+
+@functools.lru_cache(maxsize=256)  # a client's arrays have the same headers in every request
+def _header(header: bytes) -> _Layout:
     found = HEADER.fullmatch(header)
     if found is None:
         raise DtypeError("array: expected a header of numbers, booleans or text, without fields")
     shape = tuple(int(size) for size in found[3].decode().replace(" ", "").split(",") if size)
-    return _array(view[start + length :], found[1].decode(), shape, found[2] == b"True", most_elements)
+    return _layout(found[1].decode(), shape, found[2] == b"True")
 
 
 def to_msgpack_numpy(array: npt.NDArray[Any]) -> dict[bytes, Any]:
@@ -108,13 +115,21 @@ def from_msgpack_numpy(fields: Mapping[Any, Any], most_elements: int) -> Any:
         raise DtypeError("array: expected numbers, booleans or text, got another msgpack-numpy value")
     if not isinstance(shape, list) or not all(type(size) is int for size in shape):
         raise ShapeError(f"array: shape: expected a list of integers, got {shape!r:.100}")
-    array = _array(memoryview(data), name, tuple(shape), False, most_elements)
+    array = _array(memoryview(data), _layout(name, tuple(shape), False), most_elements)
     return array if field("nd") else array[()]
 
 
-def _array(
-    data: memoryview, dtype_name: str, shape: tuple[int, ...], is_fortran: bool, most_elements: int
-) -> npt.NDArray[Any]:
+@dataclass(frozen=True)
+class _Layout:
+    """An array without its values, which is small however large the shape is."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    is_fortran: bool
+    elements: int
+
+
+def _layout(dtype_name: str, shape: tuple[int, ...], is_fortran: bool) -> _Layout:
     if dtype_name in ("O", "|O"):
         raise DtypeError(f"array: expected numbers, booleans or text, got objects: {PICKLES}")
     try:
@@ -127,7 +142,11 @@ def _array(
         raise ShapeError(
             f"array: expected at most {MOST_AXES} axes of sizes of at least 0, got shape {shape!r:.100}"
         )
-    elements = math.prod(shape)
+    return _Layout(dtype, shape, is_fortran, math.prod(shape))
+
+
+def _array(data: memoryview, layout: _Layout, most_elements: int) -> npt.NDArray[Any]:
+    dtype, shape, elements = layout.dtype, layout.shape, layout.elements
     if elements > most_elements:
         raise InputError(f"array: expected at most {most_elements} elements, got {elements} (shape {shape})")
     if elements * dtype.itemsize != len(data):
@@ -136,7 +155,7 @@ def _array(
         )
     try:
         array = np.frombuffer(data, dtype) if elements else np.empty(shape, dtype)
-        array = array.reshape(shape, order="F" if is_fortran else "C")
+        array = array.reshape(shape, order="F" if layout.is_fortran else "C")
     except ValueError as error:  # sizes beside a zero that NumPy cannot multiply
         raise ShapeError(f"array: shape {shape!r:.100}: {error}") from None
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))

@@ -13,12 +13,36 @@ from saccade.errors import InputError, SaccadeError
 from saccade.serve.limits import Limits
 from saccade.serve.npy import Bytes, from_msgpack_numpy, from_npy, to_msgpack_numpy, to_npy
 
-#: Bytes of a number, or of the length that follows, by the first byte.
+#: Bytes of a number, or of the length that follows, by the first byte of a value.
 NUMBERS = {0xCA: 4, 0xCB: 8, 0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}
 BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}
 LISTS = {0xDC: 2, 0xDD: 4}
 MAPS = {0xDE: 2, 0xDF: 4}
 CONSTANTS = (0xC0, 0xC2, 0xC3)
+
+
+def _kind(first: int) -> tuple[int, int, int | None]:
+    """What the first byte of a value says.
+
+    Returns:
+        The bytes until the value's contents or end, 0 for a type that is refused; how many of them are a
+        length; and the items of a container, those of each unit of the length if there is one, else None.
+    """
+    if first <= 0x7F or first >= 0xE0 or first in CONSTANTS:
+        return 1, 0, None
+    if first <= 0x8F:
+        return 1, 0, 2 * (first & 0x0F)
+    if first <= 0x9F:
+        return 1, 0, first & 0x0F
+    if first <= 0xBF:
+        return 1 + (first & 0x1F), 0, None
+    if first in NUMBERS:
+        return 1 + NUMBERS[first], 0, None
+    width = BYTES.get(first) or LISTS.get(first) or MAPS.get(first) or 0
+    return (1 + width if width else 0), width, None if first in BYTES or not width else 1 + (first in MAPS)
+
+
+LENGTHS, WIDTHS, ITEMS = zip(*map(_kind, range(256)), strict=True)
 
 NDARRAY = "__ndarray_class__"
 
@@ -91,58 +115,50 @@ def check(data: memoryview, limits: Limits) -> None:
         InputError: The message is empty, cut off, longer than its value, nested too deeply, has too many
             values, or contains a type that no request contains.
     """
-    if not len(data):
+    size = len(data)
+    if not size:
         raise InputError("message: empty, expected a msgpack map")
-    remaining = [1]  # the values that are still to come, by depth
-    position = objects = 0
-    while remaining:
-        if not remaining[-1]:
-            remaining.pop()
-            continue
-        remaining[-1] -= 1
-        objects += 1
-        if objects > limits.objects:
-            raise InputError(f"message: expected at most {limits.objects} values")
-        position, items = _value(data, position)
-        if items is not None:
-            if len(remaining) > limits.depth:
-                raise InputError(f"message: expected a nesting of at most {limits.depth}")
-            remaining.append(items)
-    if position != len(data):
-        raise InputError(f"message: expected one msgpack value, got {len(data) - position} bytes after it")
-
-
-def _value(data: memoryview, position: int) -> tuple[int, int | None]:
-    """Where a value ends, or its first item begins, and the number of its items if it is a container."""
-    if position >= len(data):
-        raise InputError(f"message: cut off after {len(data)} bytes")
-    first = data[position]
-    position += 1
-    items = None
-    if first <= 0x7F or first >= 0xE0 or first in CONSTANTS:
-        return position, None
-    if first <= 0x8F:
-        items = 2 * (first & 0x0F)
-    elif first <= 0x9F:
-        items = first & 0x0F
-    elif first <= 0xBF:
-        position += first & 0x1F
-    elif first in NUMBERS:
-        position += NUMBERS[first]
-    else:
-        width = BYTES.get(first) or LISTS.get(first) or MAPS.get(first)
-        if width is None:
+    outer: list[int] = []  # the values that are still to come, by depth, of the containers around this one
+    remaining, objects, position = 1, 1, 0
+    while True:
+        while not remaining:
+            if not outer:
+                if position != size:
+                    raise InputError(
+                        f"message: expected one msgpack value, got {size - position} bytes after it"
+                    )
+                return
+            remaining = outer.pop()
+        remaining -= 1
+        if position >= size:
+            raise _cut_off(size)
+        first = data[position]
+        position += LENGTHS[first]
+        items = ITEMS[first]
+        width = WIDTHS[first]
+        if width:
+            length = int.from_bytes(data[position - width : position], "big")
+            if items is None:
+                position += length
+            else:
+                items *= length
+        elif not LENGTHS[first]:
             raise InputError(f"message: expected no msgpack extension, got type {first:#x}")
-        length = int.from_bytes(data[position : position + width], "big")
-        position += width
-        if first in BYTES:
-            position += length
-        else:
-            items = length if first in LISTS else 2 * length
-    # Each item has a byte at least, so a list that claims more is cut off.
-    if position + (items or 0) > len(data):
-        raise InputError(f"message: cut off after {len(data)} bytes")
-    return position, items
+        # Each item has a byte at least, so a list that claims more is cut off.
+        if position + (items or 0) > size:
+            raise _cut_off(size)
+        if items is not None:
+            objects += items
+            if objects > limits.objects:
+                raise InputError(f"message: expected at most {limits.objects} values")
+            if len(outer) >= limits.depth:
+                raise InputError(f"message: expected a nesting of at most {limits.depth}")
+            outer.append(remaining)
+            remaining = items
+
+
+def _cut_off(size: int) -> InputError:
+    return InputError(f"message: cut off after {size} bytes")
 
 
 def _plain(value: Any, as_msgpack_numpy: bool) -> Any:

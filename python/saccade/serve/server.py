@@ -8,13 +8,13 @@ import signal
 import socket
 import threading
 import time
-from collections import OrderedDict, deque
+import weakref
+from collections import deque
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from saccade import hub
-from saccade.dialects import read_state
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import engine, modalities, pickles
 from saccade.serve.batching import Job, Queue
@@ -30,11 +30,9 @@ from saccade.serve.zmtp import Request
 if TYPE_CHECKING:
     from saccade.policy import Policy
 
-#: Connections whose release is remembered, for `get_modality_config`.
-MOST_KNOWN = 4096
 #: Characters of an error that are sent.
 LONGEST_ERROR = 4000
-#: Seconds between two looks at the files of the checkpoint.
+#: Seconds between two checks of the files of the checkpoint.
 WATCH_SECONDS = 5.0
 #: Time to send the last answers, once all are computed.
 FLUSH_SECONDS = 5.0
@@ -48,7 +46,8 @@ class Server:
         listener: The socket that clients will connect to, from :func:`saccade.serve.connections.bind`.
         log: Where it says what happens.
         limits: What it takes at most.
-        max_batch: Observations that are computed together.
+        max_batch: Observations that are computed at a time: together, or with a small policy in a batch for
+            each thread.
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
         seed: Seed of the noise of requests that bring none, or None for noise that is different each time.
         api_token: A secret that every request must contain, or None.
@@ -83,10 +82,10 @@ class Server:
         self._seed = seed
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
-        self._forms: OrderedDict[Connection, str] = OrderedDict()
+        self._forms: weakref.WeakKeyDictionary[Connection, str] = weakref.WeakKeyDictionary()
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
         self._engine = engine.Engine(policy, self._sessions)
-        self._queue = Queue(max_batch, max_wait_ms / 1e3)
+        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self._engine.num_workers)
         self._statistics = Statistics()
         self.address = address_of(listener)
         self._connections = Connections(
@@ -97,7 +96,10 @@ class Server:
         self._stopping: str | None = None
         self._is_draining = False
         self._watched = _stamps(policy.head.source)
-        self._worker = threading.Thread(target=self._compute, name="saccade-serve", daemon=True)
+        self._workers = [
+            threading.Thread(target=self._compute, name=f"saccade-serve-{number}", daemon=True)
+            for number in range(self._engine.num_workers)
+        ]
 
     def stop(self, why: str) -> None:
         """Ends :meth:`run` once all requests that were accepted are answered.
@@ -129,7 +131,8 @@ class Server:
         """
         self._connections.listen()
         self._log.event("listening", address=self.address, policy=repr(self._policy), pid=os.getpid())
-        self._worker.start()
+        for worker in self._workers:
+            worker.start()
         spoken = watched = time.monotonic()
         try:
             while not self._is_done():
@@ -145,7 +148,6 @@ class Server:
         finally:
             self._queue.close()
             self._connections.close()
-            self._engine.close()
         self._log.statistics(self._statistics.summary())
         assert self._stopping is not None
         self._log.event("stopped", requests=self._statistics.requests.total(), errors=self._statistics.errors)
@@ -216,22 +218,18 @@ class Server:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
-        # Only the state, which is small. The rest is checked before it is computed.
-        rows = len(read_state(call.observation, self._policy.requirements))
-        if rows > self._limits.rows:
-            raise InputError(f"observation: expected at most {self._limits.rows} rows, got {rows}")
+        reading = self._policy.read(call.observation, most_rows=self._limits.rows)
         self._forms[connection] = "text" if call.is_bare else "map"
-        self._forms.move_to_end(connection)
-        while len(self._forms) > MOST_KNOWN:
-            self._forms.popitem(last=False)
         self._unanswered += 1
         reply = (connection, request.address)
-        self._queue.put(Job(call, rows, connection, request.size, is_msgpack_numpy, reply=reply))
+        self._queue.put(Job(call, reading, connection, request.size, is_msgpack_numpy, reply=reply))
 
     def _compute(self) -> None:
-        """The thread that computes."""
+        """What a thread does that computes."""
         while (jobs := self._queue.take()) is not None:
-            for outcome in self._engine.run(jobs):
+            outcomes = self._engine.run(jobs)
+            self._queue.done(jobs)
+            for outcome in outcomes:
                 payload = None
                 if outcome.error is None:
                     try:

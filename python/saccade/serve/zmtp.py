@@ -8,7 +8,7 @@ specification is 23/ZMTP of the ZeroMQ RFCs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 #: A connection begins with a signature (10 bytes), version (2), mechanism (20), role and filler (32).
@@ -23,8 +23,8 @@ LONGEST_ADDRESS = 255
 MOST_ADDRESSES = 8
 #: A larger request is not skipped to its end; the connection is closed.
 LONGEST_SKIPPED = 1 << 32
-#: A request is received into memory that grows with what has arrived, from this size on.
-FIRST_BYTES = 1 << 16
+#: An answer up to this size is joined with its frame, so that it is sent by one call.
+SHORT_ANSWER = 1 << 16
 SOCKET_TYPES = (b"REQ", b"DEALER")
 
 
@@ -60,8 +60,7 @@ class Request:
 class Peer:
     """What is known of the other side of a connection.
 
-    Write received bytes into :meth:`space`, and say with :meth:`filled` how many. What is to be sent is
-    appended to ``output``.
+    Give received bytes to :meth:`receive`. What is to be sent is appended to ``output``.
 
     Args:
         accepts: Whether a request of a size may be held now; if not, it is skipped.
@@ -73,9 +72,6 @@ class Peer:
         self._address: list[bytes] = []
         self._flags = 0
         self._is_ready = False
-        self._skipped = 0
-        self._buffer = bytearray()
-        self._filled = 0
         self._expect(len(SIGNATURE), self._signature)
 
     @property
@@ -86,40 +82,36 @@ class Peer:
     @property
     def is_between_requests(self) -> bool:
         """Whether the next byte begins a request."""
-        return self._is_ready and self._next == self._frame and not self._filled and not self._address
+        return self._is_ready and self._next == self._frame and not self._buffer and not self._address
 
-    def space(self) -> memoryview:
-        """Memory for the bytes that come next; never empty."""
-        if self._filled == len(self._buffer):
-            self._buffer.extend(bytes(min(self._size - self._filled, max(FIRST_BYTES, self._filled))))
-        return memoryview(self._buffer)[self._filled :]
+    def receive(self, data: memoryview) -> Iterator[Request]:
+        """Takes received bytes, and yields the requests that they complete.
 
-    def filled(self, count: int) -> list[Request]:
-        """Takes notice of received bytes.
+        Memory for a request grows with what has arrived of it.
 
         Args:
-            count: How many bytes were written into the last :meth:`space`.
+            data: The bytes, which may end anywhere. They are copied.
 
         Raises:
-            ProtocolError: See there.
+            ProtocolError: See there. The requests before it have been yielded.
         """
-        self._filled += count
-        if self._next == self._signature and self._buffer[:1] != SIGNATURE[:1]:
-            raise ProtocolError("no ZeroMQ client", bytes(self._buffer[: self._filled]))
-        if self._skips:
-            self._size -= self._filled
-            self._filled = 0
-            if self._size < len(self._buffer):
-                self._buffer = bytearray(max(self._size, 1))
-        if self._filled < self._size:
-            return []
-        found = self._next(self._buffer)
-        return [] if found is None else [found]
+        position = 0
+        while position < len(data):
+            piece = data[position : position + self._missing]
+            position += len(piece)
+            self._missing -= len(piece)
+            if not self._skips:
+                self._buffer += piece
+            if self._next == self._signature and self._buffer[:1] != SIGNATURE[:1]:
+                raise ProtocolError("no ZeroMQ client", bytes(self._buffer))
+            if not self._missing:
+                found = self._next(self._buffer)
+                if found is not None:
+                    yield found
 
     def _expect(self, size: int, then: Callable[[bytearray], Request | None], *, skips: bool = False) -> None:
-        self._size, self._next, self._skips = size, then, skips
-        self._buffer = bytearray(min(size, FIRST_BYTES))
-        self._filled = 0
+        self._missing, self._next, self._skips = size, then, skips
+        self._buffer = bytearray()
 
     def _signature(self, data: bytearray) -> None:
         if data[9] & 1 == 0:
@@ -157,7 +149,7 @@ class Peer:
             if size > LONGEST_ADDRESS or len(self._address) == MOST_ADDRESSES:
                 raise ProtocolError(f"expected a request in one frame, got a first frame of {size} bytes")
             return self._body(size, self._part)
-        if self._accepts(size):
+        if not size or self._accepts(size):
             return self._body(size, self._request)
         if size > LONGEST_SKIPPED:
             raise ProtocolError(f"expected a request of at most {LONGEST_SKIPPED} bytes, got {size}")
@@ -205,8 +197,8 @@ def message(address: Sequence[bytes], payload: bytes) -> list[bytes]:
         address: The address of the request.
         payload: The answer.
     """
-    start = b"".join(_frame(part, MORE) for part in address)
-    return [start + _header(len(payload), 0), payload]
+    start = b"".join(_frame(part, MORE) for part in address) + _header(len(payload), 0)
+    return [start + payload] if len(payload) <= SHORT_ANSWER else [start, payload]
 
 
 def _frame(body: bytes, flags: int) -> bytes:

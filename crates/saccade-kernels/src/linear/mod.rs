@@ -18,7 +18,7 @@ use crate::cpu::Cpu;
 use crate::gemm::outliers::{MultiplyOutliers, Outliers};
 use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, Tiles};
 use crate::isa::Isa;
-use crate::pool::parallel_for;
+use crate::pool::{parallel_for, usable};
 use crate::rows::{Rows, RowsMut};
 use crate::weights::{Arithmetic, Element, WeightRef};
 pub use epilogue::Epilogue;
@@ -273,7 +273,7 @@ impl PackedLinear {
         let threads = if macs < MACS_FOR_THREADS {
             1
         } else {
-            threads.min(macs / MACS_OF_THREAD)
+            usable(threads).min(macs / MACS_OF_THREAD)
         };
         let shape = self.gemm.shape();
         let columns = shape.columns;

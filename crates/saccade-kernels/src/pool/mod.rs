@@ -201,6 +201,8 @@ impl Pool {
 thread_local! {
     /// Whether this thread is running a task: a loop inside runs on this thread alone.
     static INSIDE: Cell<bool> = const { Cell::new(false) };
+    /// What the caller asked for with [`stay_on_this_thread`].
+    static STAYS: Cell<bool> = const { Cell::new(false) };
 }
 
 /// The pool of this process, or of the one that it was forked from; null before anyone needed one. Never freed.
@@ -230,8 +232,8 @@ fn pool() -> &'static Pool {
 
 /// Runs `f(task)` for every `task` in `0..tasks`, on up to `threads` threads of which the caller is one.
 ///
-/// Tasks are dealt one by one to threads that are free. With one thread, one task, or within a task of another loop, everything runs on the
-/// calling thread and nothing is started. The pool belongs to the process and may be used from many threads at once, after `fork`, and
+/// Tasks are dealt one by one to threads that are free. With one thread, one task, within a task of another loop, or after
+/// [`stay_on_this_thread`], everything runs on the calling thread and nothing is started. The pool belongs to the process and may be used from many threads at once, after `fork`, and
 /// with more threads than there are cores. Once its threads run, a call allocates nothing.
 ///
 /// Within [`interruptible`], once it is to stop, the remaining tasks do not run.
@@ -248,7 +250,7 @@ fn pool() -> &'static Pool {
 /// assert_eq!(sum.into_inner(), 10);
 /// ```
 pub fn parallel_for(threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
-    if threads <= 1 || tasks <= 1 || INSIDE.get() {
+    if usable(threads) <= 1 || tasks <= 1 {
         match Scope::current() {
             None => (0..tasks).for_each(f),
             Some(scope) => (0..tasks).take_while(|_| !scope.asks_to_stop()).for_each(f),
@@ -258,6 +260,27 @@ pub fn parallel_for(threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
         pool.start_workers(threads.min(tasks).min(MAX_THREADS) - 1);
         pool.run(threads, tasks, f);
     }
+}
+
+/// Whether the loops that the calling thread starts run on this thread alone from now on, as within a task.
+///
+/// For a caller that computes several things at the same time, one on each of its threads. Where every loop is short this is faster than all
+/// threads in every loop: nothing waits for the last task of a loop.
+///
+/// ```
+/// use saccade_kernels::{parallel_for, stay_on_this_thread};
+/// stay_on_this_thread(true);
+/// let here = std::thread::current().id();
+/// parallel_for(2, 8, &|_| assert_eq!(std::thread::current().id(), here));
+/// stay_on_this_thread(false);
+/// ```
+pub fn stay_on_this_thread(stays: bool) {
+    STAYS.set(stays);
+}
+
+/// How many of `threads` threads a loop of the calling thread can have.
+pub(crate) fn usable(threads: usize) -> usize {
+    if INSIDE.get() || STAYS.get() { 1 } else { threads }
 }
 
 #[cfg(test)]

@@ -1,0 +1,112 @@
+"""The tables of docs/serve.md, from the JSON of the measurements."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from benches.peers.results import rounded
+from benches.peers.text import table
+from saccade._files import write_json
+from saccade.bench.timing import quartiles
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "serve.md"
+#: What was measured here, and what is committed: a file for each policy.
+MEASURED_HERE = Path("out/serve")
+COMMITTED = Path(__file__).with_name("serve_results")
+#: The part of the page that `report --write` replaces.
+MEASURED = re.compile(r"(?<=<!-- measured -->\n).*(?=<!-- end of measured -->)", re.DOTALL)
+
+POLICIES = {"demo": "The bundled policy", "full": "N1.5 at its published size, random weights"}
+
+Results = dict[str, Any]
+Row = dict[str, Any]
+
+
+def command(*, write: bool) -> int:
+    """Prints the tables, or writes them to the page and keeps the measurements next to the program."""
+    results = {}
+    for name in POLICIES:
+        found = [folder / f"{name}.json" for folder in (MEASURED_HERE, COMMITTED)]
+        path = next((path for path in found if path.exists()), None)
+        if path is not None:
+            results[name] = rounded(json.loads(path.read_text()))
+    if not results:
+        raise SystemExit("benches.serve: nothing measured yet; run python -m benches.serve")
+    if not write:
+        print(document(results))
+        return 0
+    COMMITTED.mkdir(exist_ok=True)
+    for name, result in results.items():
+        write_json(COMMITTED / f"{name}.json", result)
+    page = PAGE.read_text()
+    PAGE.write_text(MEASURED.sub(lambda found: f"\n{document(results)}\n", page))
+    print(PAGE)
+    return 0
+
+
+def document(results: dict[str, Results]) -> str:
+    """The measured part of the page."""
+    parts = [
+        "Written by `python -m benches.serve report --write` from `benches/serve_results`, which "
+        "`python -m benches.serve` measured."
+    ]
+    for name, result in results.items():
+        parts += [f"### {POLICIES[name]}, {result['precision']}", *section(result)]
+    return "\n\n".join(parts) + "\n"
+
+
+def section(result: Results) -> Iterator[str]:
+    """What was measured of one policy."""
+    held, rows = result["machine"], result["rows"]
+    yield (
+        f"{held['cpu']} ({held['name']}, {held['isa']}), {held['cores']} cores, {held['memory_gb']} GB; "
+        f"{result['num_threads']} threads; saccade {held['versions']['saccade']}, commit {held['commit']}."
+    )
+    head = ["clients", "a second (quartiles)", "x one", "p50 ms", "p99 ms", "batch", "in process"]
+    head += ["of in process (quartiles)", "lost", "ms of processor: server, clients"]
+    yield table(head, [cells(row, rows[0]) for row in rows])
+    memory = rows[-1]["memory"]
+    requests = sum(row["requests"] for row in rows)
+    yield (
+        f"Requests: {requests}; rounds: {len(memory)}. Memory of the server: {memory[0]:.0f} MB after the "
+        f"first round, {memory[-1]:.0f} MB after the last."
+    )
+
+
+def cells(row: Row, first: Row) -> list[str]:
+    """A line of the table."""
+    sizes = {int(size): count for size, count in row["batches"].items()}
+    mean = sum(size * size * count for size, count in sizes.items()) / sum(
+        size * count for size, count in sizes.items()
+    )
+    shares = [mine / act for mine, act in zip(row["per_second"], row["in_process"], strict=True)]
+    times = [mine / one for mine, one in zip(row["per_second"], first["per_second"], strict=True)]
+    return [
+        str(row["clients"]),
+        spread(row["per_second"], number),
+        f"{quartiles(times)[1]:.2f}",
+        number(row["p50"]),
+        number(row["p99"]),
+        f"{mean:.1f}",
+        number(quartiles(row["in_process"])[1]),
+        spread(shares, "{:.0%}".format),
+        f"{row['lost']} of {row['requests']}",
+        f"{number(quartiles(row['server_cpu'])[1])}, {number(quartiles(row['client_cpu'])[1])}",
+    ]
+
+
+def spread(values: list[float], shown: Callable[[float], str]) -> str:
+    """The median, with the quartiles if there are several rounds."""
+    low, middle, high = map(shown, quartiles(values))
+    return f"{middle} ({low} to {high})" if len(values) > 1 else middle
+
+
+def number(value: float) -> str:
+    """Three digits or more."""
+    digits = 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3
+    return f"{value:.{digits}f}"
