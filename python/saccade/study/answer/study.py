@@ -189,13 +189,13 @@ class Answer(Study):
 
     def record(self, name: str) -> dict[str, Any]:
         """Records what is missing of a recording, and describes it."""
-        from saccade.sim import demos, opened
+        from saccade.sim import demos, environment_cache
         from saccade.sim.dataset import describe
 
         recording = next(one for one in self.plan.recordings if one.name == name)
         start = time.perf_counter()
         demos.record_tasks(recording.counts, self.demos[name], recording.settings, lambda task: None)
-        opened.close()
+        environment_cache.close()
         found = describe(self.demos[name], demos.recorded_tasks(self.demos[name]))
         return {
             "recording": name,
