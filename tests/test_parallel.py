@@ -13,10 +13,43 @@ import pytest
 from parallel_cases import Square
 
 from saccade._arrays import UInt8Array
+from saccade._files import path_text
 from saccade.errors import InputError
 from saccade.parallel import ALONE, Lost, Workers, each, files
 
 TWO = Workers(jobs=2)
+
+
+def test_linked_directories_travel_and_circles_end(tmp_path: Path) -> None:
+    (tmp_path / "policy" / ".cache").mkdir(parents=True)
+    (tmp_path / "shared").mkdir()
+    for name in ("policy/config.json", "policy/.cache/refs", "shared/metadata.json"):
+        (tmp_path / name).write_text("{}")
+    (tmp_path / "policy" / "experiment_cfg").symlink_to("../shared")
+    (tmp_path / "shared" / "again").symlink_to("../shared")
+    found = files.files_of(tmp_path / "policy")
+    assert sorted(found) == ["policy/config.json", "policy/experiment_cfg/metadata.json"]
+
+
+class Unreadable:
+    """Cannot be unpickled in another process."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (missing_file, ())
+
+    def __call__(self, piece: int) -> int:
+        return piece
+
+
+def missing_file() -> None:
+    """What `Unreadable` calls there."""
+    raise FileNotFoundError("statistics are not on this machine")
+
+
+def test_work_that_cannot_be_unpickled_is_no_death() -> None:
+    with pytest.raises(Exception, match="un-serialize") as raised:
+        list(each(Unreadable(), range(2), TWO))
+    assert "statistics are not on this machine" in str(raised.value.__cause__)
 
 
 def test_alone_is_in_this_process_and_in_order(tmp_path: Path) -> None:
@@ -192,9 +225,11 @@ def test_a_path_may_be_written_in_any_way(tmp_path: Path, monkeypatch: pytest.Mo
         sources, found = files.located(value, [file, "owner/name", "./policy"])
         assert sources == {policy: Path(policy)}
         assert found == Outer(Inner(policy), {"one": Path(policy)}, (policy,) * 4, "policies")
-    # A word that could be a path is one only if it was given in this way.
-    assert files.located(Inner("reach"), ["./reach"])[1] == Inner("reach")
-    assert files.located(Inner("reach"), ["reach"])[1] == Inner(str(tmp_path / "here" / "reach"))
+    # A word, such as the name of a task, is not a path, even if there is a file of that name.
+    for file in ("reach", "./reach"):
+        assert files.located(Inner("reach"), [file])[1] == Inner("reach")
+        found = files.located(Inner(path_text(Path("reach"))), [file])[1]
+        assert found == Inner(str(tmp_path / "here" / "reach"))
     assert files.located(Inner("a/b\0"), ["policy"])[1] == Inner("a/b\0")
     assert files.located(Inner("/" * 5000 + "a" * 300), ["policy"])[1].checkpoint.endswith("aaa")
 

@@ -40,6 +40,16 @@ def write_json(path: Path, value: Any) -> None:
         temporary.write_text(dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
+def path_text(path: Path) -> str:
+    """A path as text that contains a separator, which tells it from a word.
+
+    Example:
+        >>> path_text(Path("reach")), path_text(Path("out/reach"))
+        ('./reach', 'out/reach')
+    """
+    return str(path) if os.sep in str(path) else f"{os.curdir}{os.sep}{path}"
+
+
 def writable_directory(path: Path) -> Path:
     """Creates the directory if it does not exist, and checks that files can be written to it.
 

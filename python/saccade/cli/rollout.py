@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade import _arguments as arguments
-from saccade._files import writable_directory, write_atomically, write_json
+from saccade._files import path_text, writable_directory, write_atomically, write_json
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
 from saccade.errors import SaccadeError
 from saccade.parallel import Lost, Workers, each
@@ -172,7 +172,7 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
 
     graphics.check()
     num_threads = args.num_threads if workers.alone else workers.num_threads
-    checkpoint = str(args.checkpoint or DEMO_CHECKPOINT)
+    checkpoint = path_text(args.checkpoint or DEMO_CHECKPOINT)
     episodes = Episodes(checkpoint, args.engine, num_threads, args.instruction_from, args.video)
     tasks = list(args.tasks or episodes.policy.config.tasks)
     check_trained_on(episodes.policy, tasks)

@@ -43,15 +43,23 @@ def files_of(path: Path) -> dict[str, Path]:
     Hidden files are left out. A `.safetensors` file takes `config.json` with it, if that is next to it.
     """
     if path.is_dir():
-        below = {file: file.relative_to(path) for file in sorted(path.rglob("*"))}
-        return {
-            f"{path.resolve().name}/{name.as_posix()}": file
-            for file, name in below.items()
-            if file.is_file() and not any(part.startswith(".") for part in name.parts)
-        }
+        return {f"{path.resolve().name}/{file.relative_to(path).as_posix()}": file for file in walked(path)}
     config = path.with_name("config.json")
     companions = [config] if path.suffix == ".safetensors" and config.is_file() else []
     return {file.name: file for file in (path, *companions)}
+
+
+def walked(directory: Path) -> list[Path]:
+    """All files below a directory, except hidden ones; links to directories are followed, circles are not."""
+    found: list[Path] = []
+    for folder, inner, names in os.walk(directory, followlinks=True):
+        here = Path(folder)
+        above = {here.resolve(), *here.resolve().parents}
+        inner[:] = [
+            name for name in inner if not name.startswith(".") and (here / name).resolve() not in above
+        ]
+        found += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
+    return sorted(found)
 
 
 def pack(path: Path, put: Callable[[UInt8Array], Any]) -> Shipment:
@@ -143,15 +151,13 @@ def located(work: Any, files: Iterable[str | Path]) -> tuple[dict[str, Path], An
     exist, for example because they are names of published checkpoints, are left as they are.
 
     Args:
-        work: As `relocated` takes values. A string is a path if it is one of `files` or contains a separator.
+        work: As `relocated` takes values. A string is a path if it contains a separator (see
+            `saccade._files.path_text`); a word may be equal to the name of a file.
         files: Files and directories, each named in any way.
     """
-    given = {str(file): _absolute(file) for file in files if Path(file).exists()}
-    sources = {str(path): path for path in given.values()}
+    sources = {str(path): path for path in (_absolute(file) for file in files if Path(file).exists())}
 
     def absolute(text: str, is_path: bool) -> str:
-        if text in given:
-            return str(given[text])
         path = str(_absolute(text)) if is_path or os.sep in text else text
         return path if path in sources else text
 

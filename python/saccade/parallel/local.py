@@ -1,4 +1,4 @@
-"""Pieces in processes of this machine, by joblib's loky. A process that dies costs its piece a retry."""
+"""Pieces in processes of this machine, by joblib's loky. When a process dies, its pieces are repeated."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ def _spread(
 ) -> Iterator[tuple[int, Result | Lost]]:
     """Index and result of chosen pieces. If a process dies, those that were given out are `LOST`: the end."""
     from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     threads = {name: os.environ.get(name, str(_threads(processes))) for name in THREADS}
     pool = get_reusable_executor(max_workers=processes, timeout=IDLE, env=threads)
@@ -63,7 +64,10 @@ def _spread(
             for done in wait(running, return_when=FIRST_COMPLETED).done:
                 result = done.result()
                 yield running.pop(done), result
-    except BrokenProcessPool:
+    except BrokenProcessPool as error:
+        # loky also raises this for a piece that a process cannot unpickle, or a result that it cannot pickle.
+        if not isinstance(error, TerminatedWorkerError):
+            raise
         for index in running.values():
             yield index, LOST
         running.clear()

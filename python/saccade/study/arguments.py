@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from saccade._arguments import check_frames, check_tasks
+from saccade._files import path_text
 from saccade.errors import InputError
 from saccade.hub import resolve
 from saccade.parallel.arguments import workers_of
@@ -70,8 +71,8 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
         )
     found = Recording(
         checkpoint=checkpoint_of(args),
-        file=str(args.features),
-        config_file=None if args.config is None else str(args.config),
+        file=path_text(args.features),
+        config_file=None if args.config is None else path_text(args.config),
         seed=args.seed,
         # The bits do not depend on it. One process may use all cores; several share them.
         num_threads=None if workers_of(args).alone else 1,
@@ -85,15 +86,15 @@ def moments_of(args: argparse.Namespace) -> Moments:
     """Creates a source of pictures from parsed arguments, and looks at them; errors as `source_of`."""
     found = Moments(
         checkpoint=str(resolve(checkpoint_of(args))),
-        frames=str(args.frames),
+        frames=path_text(args.frames),
         instruction=args.instruction,
-        state=None if args.state is None else str(args.state),
-        other_frames=None if getattr(args, "other_frames", None) is None else str(args.other_frames),
+        state=None if args.state is None else path_text(args.state),
+        other_frames=None if getattr(args, "other_frames", None) is None else path_text(args.other_frames),
         other_instruction=getattr(args, "other_instruction", None),
         embodiment=args.embodiment,
         precision=args.precision or "float32",
         preprocessing=args.preprocessing,
-        tokenizer=None if args.tokenizer is None else str(args.tokenizer),
+        tokenizer=None if args.tokenizer is None else path_text(args.tokenizer),
         seed=args.seed,
         num_threads=None if workers_of(args).alone else 1,
     )
@@ -107,4 +108,4 @@ def checkpoint_of(args: argparse.Namespace) -> str:
         from saccade.sim.policy import DEMO_CHECKPOINT
 
         return str(DEMO_CHECKPOINT)
-    return str(args.checkpoint)
+    return path_text(args.checkpoint)

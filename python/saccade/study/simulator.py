@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._arrays import ArrayLike, Float32Array
+from saccade._files import path_text
 from saccade.config import HeadConfig
 from saccade.errors import CheckpointError
 from saccade.head import ActionHead
@@ -156,7 +157,7 @@ def simulator(
     Raises:
         FileNotFoundError, CheckpointError: there is no policy, or it was not trained on a task.
     """
-    path = str(checkpoint or DEMO_CHECKPOINT)
+    path = path_text(checkpoint or DEMO_CHECKPOINT)
     try:
         policy = policy_of(path)
     except (CheckpointError, FileNotFoundError) as error:

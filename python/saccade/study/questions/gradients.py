@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from saccade._arguments import add_frames, add_integer, add_rollout_arguments
+from saccade._files import path_text
 from saccade.errors import InputError
 from saccade.intervention import ROW_GROUPS
 from saccade.observation import MASKS, Observation
@@ -104,7 +105,7 @@ class Gradients(Study):
         source = source_of(args, "num_observations", "demos")
         if not source.closed_loop:
             return cls(source, args.projections)
-        demonstrations = None if args.demos is None else str(args.demos)
+        demonstrations = None if args.demos is None else path_text(args.demos)
         study = cls(source, args.projections, args.num_observations or NUM_OBSERVATIONS, demonstrations)
         if demonstrations is not None:
             check_demonstrations(Path(demonstrations), study.simulator)

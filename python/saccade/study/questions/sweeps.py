@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import pandas as pd
 
 from saccade._arguments import add_episodes, add_integer, add_list, add_seed, add_tasks, check_tasks
+from saccade._files import path_text
 from saccade.errors import InputError
 from saccade.intervention import Intervention
 from saccade.study.cell import Cell, Rows
@@ -184,7 +185,7 @@ class Sweep(Study):
                 parts.insert(1, f"alignment-{alignment:g}")
             if len(args.demos) > 1:
                 parts.insert(0, directory.resolve().name)
-            planned.append(Planned("-".join(parts), str(directory), TrainingSettings(**changes)))
+            planned.append(Planned("-".join(parts), path_text(directory), TrainingSettings(**changes)))
         return planned
 
     @classmethod
