@@ -13,6 +13,7 @@ import pandas as pd
 
 from saccade.errors import InputError
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, Contrast
+from saccade.study.answer.plan import PILOT
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.sign_flip import SignFlip, sign_flip
 from saccade.study.statistics import CONFIDENCE, holm
@@ -100,7 +101,7 @@ class ContrastResult:
 
 
 def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm: str = PLAIN) -> Judged:
-    """The success rates of policies, each task weighted alike.
+    """The success rates of policies, each task weighted alike; pilots are left out.
 
     Args:
         table: Table of the study.
@@ -111,7 +112,7 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
         InputError: an episode is in the table twice, or is not one of those.
     """
     expected = len(tasks) * len(seeds)
-    trained = table[table["kind"] == "training"]
+    trained = table[(table["kind"] == "training") & (table["stage"] != PILOT)]
     episodes = table[(table["kind"] == "episodes") & (table["arm"] == arm)] if "arm" in table else trained[:0]
     rates: dict[str, dict[int, float]] = {}
     missing = []
@@ -129,6 +130,36 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
         by_task = rows.assign(success=truths(rows["success"])).groupby("task")["success"].mean()
         rates.setdefault(str(row["recipe"]), {})[int(row["training_seed"])] = float(by_task.mean())
     return Judged(rates, missing)
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A pilot policy, which is no result.
+
+    Attributes:
+        policy: Its name.
+        loss: Its held-out loss.
+        rates: Its success rate by task, as far as it was judged.
+    """
+
+    policy: str
+    loss: float
+    rates: Mapping[str, float]
+
+
+def pilots(table: pd.DataFrame) -> list[Pilot]:
+    """The pilots, by name."""
+    if "stage" not in table:
+        return []
+    of_stage = table[table["stage"] == PILOT]
+    found = []
+    for policy, rows in of_stage.groupby("policy"):
+        episodes = rows[rows["kind"] == "episodes"]
+        by_task = episodes.assign(success=truths(episodes["success"])).groupby("task")["success"].mean()
+        rates = {str(task): float(rate) for task, rate in by_task.items()}
+        trained = rows[rows["kind"] == "training"]
+        found.append(Pilot(str(policy), float(trained["validation_loss"].iloc[0]), rates))
+    return found
 
 
 def over_seeds(found: Judged, contrast: Contrast) -> ContrastResult:
