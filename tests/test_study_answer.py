@@ -24,7 +24,7 @@ from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import Policy, num_vl_tokens
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.training_settings import TrainingSettings
-from saccade.study.answer import arms, costs
+from saccade.study.answer import arms, costs, measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
 from saccade.study.answer.plan import Backbone, Plan, Recipe, Recording
@@ -298,6 +298,24 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     section = Answer.summarise(table, read_provenance(out / "answer.json"))
     assert section.grids[-1].columns == ("recipe", "future-unread", "steps of 1")
     assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
+
+
+def test_measures_of_the_core(core: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    for name in ("n-4-seed-1", "n-32-seed-1", "n-32-seed-0"):  # one policy is enough here
+        shutil.rmtree(out / "answer" / "policies" / name)
+    assert main(["study", "answer", "--stages", "measures", "--out", str(out)]) != 0
+    provenance = read_provenance(out / "answer.json")
+    assert (provenance.done, provenance.total) == (14 + 1, 14 + 4)
+    table: Any = read_table(out / "answer.csv")
+    (row,) = table[table["kind"] == "measures"].to_dict("records")
+    assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
+    directory = str(out / "answer" / "policies" / "n-4-seed-0")
+    found = measures.measure(directory, PLAN.tasks, PLAN.seeds)
+    assert found["probe_r2"] is None
+    for name in ("chunk_change", "attention_mass", "gradient_share"):
+        assert row[name] == pytest.approx(found[name], rel=1e-6), name
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:

@@ -12,17 +12,20 @@ from matplotlib.figure import Figure as Picture
 from saccade.study import figures
 from saccade.study.answer.arms import ARMS
 from saccade.study.answer.contrasts import ALL, MARGIN
+from saccade.study.answer.measures import CUT, NAMES
 from saccade.study.answer.plan import PILOT
 from saccade.study.answer.results import (
     Change,
     ContrastResult,
     Judged,
     Pilot,
+    Relation,
     changes,
     confirmed,
     explored,
     judged,
     pilots,
+    relations,
 )
 from saccade.study.section import Figure, Grid, Prose, Section, number, points
 from saccade.study.sign_flip import sign_flip
@@ -66,6 +69,9 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         of_stage = [one for one in changes(table, found, tasks, seeds) if one.arm in names]
         if of_stage:
             grids.append(change_grid(prose.line("caption_changes", len(grids) + 1, stage), of_stage, names))
+    related = relations(table, found, tasks, seeds)
+    if related:
+        grids.append(relation_grid(prose.line("caption_relations", len(grids) + 1, CUT), related))
     shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
     pictures = [Figure("success", prose.line("caption_success"), success_picture(shown))] if shown else []
     return prose.section(pictures, grids + of_pilots)
@@ -152,6 +158,12 @@ def change_grid(caption: str, changed: Sequence[Change], arms: Sequence[str]) ->
         by_arm = {one.arm: points(one.test.difference) for one in changed if one.recipe == recipe}
         lines.append([recipe, *(by_arm.get(arm, "") for arm in arms)])
     return Grid(caption, ("recipe", *arms), lines)
+
+
+def relation_grid(caption: str, related: Sequence[Relation]) -> Grid:
+    """What the measures predict: a row for each."""
+    lines = [[NAMES[one.measure], str(one.policies), number(one.correlation, digits=2)] for one in related]
+    return Grid(caption, ("measure", "policies", "rank correlation (95 % interval)"), lines)
 
 
 def pilot_grid(found: Sequence[Pilot], tasks: Sequence[str]) -> Grid:
