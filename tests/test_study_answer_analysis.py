@@ -230,6 +230,11 @@ def test_measures_are_related_to_what_a_cut_costs() -> None:
 def test_nothing_trained() -> None:
     table = pd.DataFrame([{"kind": "recording", "recording": "tiny"}])
     assert Answer.summarise(table, provenance_of()).concluded == ["Not measured: no policy is trained."]
+    pilot = {"stage": "pilot", "recipe": "n-4-pilot", "policy": "n-4-pilot-seed-100", "training_seed": 100}
+    table = pd.DataFrame([{"kind": "training", **pilot, "num_future_tokens": 4, "validation_loss": 0.25}])
+    section = Answer.summarise(table, provenance_of())
+    assert section.concluded == ["Not measured: no policy is trained."]
+    assert [list(grid.rows) for grid in section.grids] == [[["n-4-pilot-seed-100", "0.2500", "", ""]]]
 
 
 def test_tasks_have_equal_weight() -> None:

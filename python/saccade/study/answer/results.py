@@ -157,8 +157,9 @@ def pilots(table: pd.DataFrame) -> list[Pilot]:
     found = []
     for policy, rows in of_stage.groupby("policy"):
         episodes = rows[rows["kind"] == "episodes"]
-        by_task = episodes.assign(success=truths(episodes["success"])).groupby("task")["success"].mean()
-        rates = {str(task): float(rate) for task, rate in by_task.items()}
+        rates = {}
+        for task, of_task in episodes.groupby("task") if len(episodes) else ():
+            rates[str(task)] = float(truths(of_task["success"]).mean())
         trained = rows[rows["kind"] == "training"]
         found.append(Pilot(str(policy), float(trained["validation_loss"].iloc[0]), rates))
     return found
