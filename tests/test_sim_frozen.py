@@ -22,6 +22,7 @@ from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.dataset import load_samples
 from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
 from saccade.sim.policy import Policy
+from saccade.sim.tasks import find_task
 from saccade.sim.training_settings import TrainingSettings
 
 RECORDING = demos.RecordingSettings(image_size=16, frame_stride=6, cameras=DEFAULT_CAMERAS[:2])
@@ -82,8 +83,9 @@ def test_the_backbone_alone_learns_positions_and_leaves_the_head(recording: Path
 
 
 def test_the_head_alone_leaves_the_backbone(recording: Path, pretrained: Path, tmp_path: Path) -> None:
-    train.train(recording, tmp_path / "one", HEAD, ignore, start=pretrained)
-    before, after = (load_file(one / "model.safetensors") for one in (pretrained, tmp_path / "one"))
+    out = tmp_path / "heads" / "one"  # neither of which exists
+    train.train(recording, out, HEAD, ignore, start=pretrained)
+    before, after = (load_file(one / "model.safetensors") for one in (pretrained, out))
     config = train.policy_config(HEAD, RECORDING, TASKS)
     start = train.new_run(HEAD, config, {}).average
     for name, tensor in after.items():
@@ -91,7 +93,7 @@ def test_the_head_alone_leaves_the_backbone(recording: Path, pretrained: Path, t
             assert torch.equal(tensor, before[name]), name
     changed = [name for name in start if not torch.equal(start[name].to(torch.bfloat16), after[name])]
     assert any(name.startswith("action_head.future_tokens") for name in changed)
-    assert Policy.load(tmp_path / "one").head.config.num_layers == 3
+    assert Policy.load(out).head.config.num_layers == 3
 
 
 def test_features_are_those_of_the_backbone_and_are_shared(
@@ -151,3 +153,39 @@ def test_what_cannot_be_is_refused(recording: Path, pretrained: Path, tmp_path: 
     with pytest.raises(InputError, match="other sizes, tasks or cameras"):
         train.train(recording, tmp_path / "out", deeper, ignore, start=pretrained)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_head_of_another_width(recording: Path, pretrained: Path, tmp_path: Path) -> None:
+    """Its VL self-attention stays as wide as the features; the engine computes what the reference does."""
+    wider = dataclasses.replace(HEAD, width=24, language_width=16)
+    train.train(recording, tmp_path / "wide", wider, ignore, start=pretrained)
+    config = Policy.load(tmp_path / "wide").head.config
+    assert (config.width, config.context_dim) == (24, 16)
+    seen = {}
+    for engine in ("rust", "torch"):
+        policy = Policy.load(tmp_path / "wide", engine=engine)
+        noise = policy.noise(np.random.default_rng(0))
+        seen[engine] = policy.act(policy.blank("reach"), noise=noise).actions
+    np.testing.assert_allclose(seen["rust"], seen["torch"], atol=1e-4)
+    with pytest.raises(InputError, match="other sizes, tasks or cameras"):
+        train.train(
+            recording, tmp_path / "out", dataclasses.replace(HEAD, width=24), ignore, start=pretrained
+        )
+    with pytest.raises(InputError, match="language_width: given 15, expected a multiple of 4"):
+        dataclasses.replace(HEAD, language_width=15)
+    with pytest.raises(InputError, match="language_width: given -4, expected at least 0"):
+        dataclasses.replace(HEAD, language_width=-4)
+
+
+def test_a_blind_head_sees_black(recording: Path, pretrained: Path, tmp_path: Path) -> None:
+    train.train(recording, tmp_path / "one", HEAD, ignore, start=pretrained)
+    train.train(recording, tmp_path / "two", dataclasses.replace(HEAD, blind=True), ignore, start=pretrained)
+    files = sorted(tmp_path.glob("features-*training*.npy"))
+    assert [path.stem.split("-", 3)[3] for path in files] == ["training-blind", "training"]
+    blind, seeing = (np.load(path) for path in files)
+    # All frames of a task that have the same wording have the same features, which is what a policy sees of
+    # cameras that are blanked.
+    assert len(np.unique(blind, axis=0)) <= 10 < len(np.unique(seeing, axis=0))
+    policy = Policy.load(tmp_path / "two")
+    black = policy.features(policy.blank(find_task("reach").instructions[0]))[0]
+    assert any(np.allclose(row[-len(black) :], black, rtol=1e-3, atol=5e-3) for row in blind)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from saccade._files import sha256_of
 from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import main
 from saccade.errors import InputError
@@ -23,17 +24,20 @@ from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.policy import Policy, num_vl_tokens
 from saccade.sim.rollout import environment_for, run_episode
 from saccade.sim.training_settings import TrainingSettings
-from saccade.study.answer import arms, costs
+from saccade.study.answer import arms, costs, measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
-from saccade.study.answer.plan import Plan, Recipe, Recording
+from saccade.study.answer.plan import Backbone, Plan, Recipe, Recording
 from saccade.study.answer.study import Answer
 from saccade.study.run import StudyError, run
+from saccade.study.simulator import policy_of
 from saccade.study.table import read_provenance, read_table
 
 WHOLE_PLAN = plans.PLAN
 TASK = "fork"  # its episodes are short
 TINY = TrainingSettings(
+    only="head",
+    absent_share=0.0,
     steps=2,
     batch_size=2,
     width=8,
@@ -52,18 +56,25 @@ RECORDING = Recording(
 )
 
 
-def recipe(stage: str, name: str, **changes: Any) -> Recipe:
-    return Recipe(stage, name, replace(TINY, **changes), "tiny", (0, 1))
+BACKBONE = Backbone("backbone", replace(TINY, only="backbone", num_future_tokens=0), "tiny")
+
+
+def recipe(stage: str, name: str, seeds: tuple[int, ...] = (0, 1), **changes: Any) -> Recipe:
+    return Recipe(stage, name, replace(TINY, **changes), "backbone", seeds)
 
 
 PLAN = Plan(
     recordings=(RECORDING,),
+    backbones=(BACKBONE,),
     recipes=(
+        recipe("pilot", "n-4-pilot", (100,), num_future_tokens=4),
+        recipe("pilot", "n-4-pilot-blind", (100,), num_future_tokens=4, blind=True),
         *(recipe("core", f"n-{count}", num_future_tokens=count) for count in (0, 4, 32)),
         recipe("alignment", "n-4-aligned", num_future_tokens=4, alignment_weight=0.2),
     ),
     tasks=(TASK,),
     seeds=range(2),
+    pilot_seeds=range(500, 502),
 )
 
 
@@ -91,11 +102,16 @@ def test_the_first_stage(core: Path) -> None:
     table: Any = read_table(core / "answer.csv")
     provenance = read_provenance(core / "answer.json")
     assert provenance.complete
-    assert provenance.total == 1 + 6 + 6
+    assert provenance.total == 1 + 1 + 6 + 6
     trained = table[table["kind"] == "training"].set_index("policy")
     assert sorted(trained.index) == sorted(f"n-{n}-seed-{seed}" for n in (0, 4, 32) for seed in (0, 1))
     policies = core / "answer" / "policies"
+    backbones = table[table["kind"] == "backbone"].set_index("policy")
+    assert list(backbones.index) == ["backbone"]
+    assert (core / "answer" / "backbones" / "backbone" / "model.safetensors").is_file()
+    assert backbones.loc["backbone", "steps"] == 2
     row = trained.loc["n-4-seed-1"]
+    assert row["start_sha256"] == sha256_of(core / "answer" / "backbones" / "backbone" / "model.safetensors")
     assert row["checkpoint_sha256"] == Policy.load(policies / "n-4-seed-1").checkpoint_sha256()
     history = json.loads((policies / "n-4-seed-1" / "history.json").read_text())
     assert row["validation_loss"] == history[-1]["validation_loss"]
@@ -194,40 +210,46 @@ def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.Cap
     assert main(arguments) != 0
     assert "n-32-seed-1: no such policy; it was trained, with the hash" in capsys.readouterr().err
     provenance = read_provenance(out / "answer.json")
-    assert (provenance.done, provenance.total) == (12, 13)
+    assert (provenance.done, provenance.total) == (13, 14)
     section = Answer.summarise(read_table(out / "answer.csv"), provenance)
     assert "n-32-seed-1: left out, 0 of 2 episodes are done." in section.concluded
     assert any("n-32 minus n-0: the training seed 1 lacks" in line for line in section.concluded)
 
 
 def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
-    study = Answer(PLAN, ("core",)).begin(tmp_path)
+    whole: Any = read_table(core / "answer.csv")
+    study = Answer(PLAN, ("core",)).begin(tmp_path).with_trained(whole)
     policy = study.planned("n-4-seed-0")
+    backbone = study.trainings["backbone"]
     shutil.copytree(core / "answer" / "demos", tmp_path / "answer" / "demos")
+    shutil.copytree(core / "answer" / "backbones", tmp_path / "answer" / "backbones")
 
     def stop(progress: train.Progress) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train.train(study.demos["tiny"], study.policies[policy.name], policy.training, stop)
+        train.train(study.demos["tiny"], study.trainings[policy.name], policy.training, stop, start=backbone)
     row = study.train(policy)
     assert (row["trained_from_step"], row["steps"]) == (1, 2)
-    whole: Any = read_table(core / "answer.csv")
     trained = whole[whole["kind"] == "training"].set_index("policy")
     assert row["checkpoint_sha256"] == trained.loc["n-4-seed-0", "checkpoint_sha256"]
 
     other = Answer(replace(PLAN, recipes=(recipe("core", "n-4", learning_rate=0.5),)), ("core",))
     with pytest.raises(InputError, match=r"n-4-seed-0: was trained with other settings \(learning_rate"):
-        other.begin(tmp_path).train(other.planned("n-4-seed-0"))
+        other.begin(tmp_path).with_trained(whole).train(other.planned("n-4-seed-0"))
     changed = replace(PLAN, recordings=(replace(RECORDING, counts={TASK: 3}),))
     with pytest.raises(InputError, match="was trained on other demonstrations"):
-        Answer(changed, ("core",)).begin(tmp_path).train(policy)
-    (study.policies[policy.name] / "config.json").write_text(
-        (study.policies[policy.name] / "config.json").read_text() + " "
+        Answer(changed, ("core",)).begin(tmp_path).with_trained(whole).train(policy)
+    (study.trainings[policy.name] / "config.json").write_text(
+        (study.trainings[policy.name] / "config.json").read_text() + " "
     )
     judge = replace(study, trained={policy.name: row["checkpoint_sha256"]})
     with pytest.raises(InputError, match=r"has the hash .* expected"):
         judge.judge(policy, "plain", TASK)
+    tensors = backbone / "model.safetensors"
+    tensors.write_bytes(tensors.read_bytes()[:-1] + b"\0")
+    with pytest.raises(InputError, match=r"backbone: has the hash .* expected"):
+        study.train(study.planned("n-32-seed-0"))
 
 
 def test_a_later_stage_pairs_with_the_first(core: Path, tmp_path: Path) -> None:
@@ -235,8 +257,11 @@ def test_a_later_stage_pairs_with_the_first(core: Path, tmp_path: Path) -> None:
     shutil.copytree(core, out)
     table: Any = run(Answer(PLAN, ("core", "alignment")), out)
     assert set(table[table["kind"] == "episodes"]["recipe"]) == {"n-0", "n-4", "n-32", "n-4-aligned"}
-    assert read_provenance(out / "answer.json").total == 1 + 8 + 8
-    assert len(times(out)) == 8
+    assert read_provenance(out / "answer.json").total == 1 + 1 + 8 + 8
+    assert len(times(out)) == 1 + 8
+    # The core alone leaves the features, which the next stage of the plan needs. Now nobody does.
+    assert len(list((core / "answer" / "policies").glob("features-*.npy"))) == 2
+    assert not list((out / "answer" / "policies").glob("features-*.npy"))
 
 
 def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,7 +274,7 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     shutil.copytree(core, out)
     assert main(["study", "answer", "--stages", "instrument", "--out", str(out)]) == 0
     table: Any = read_table(out / "answer.csv")
-    assert read_provenance(out / "answer.json").total == 13 + 4
+    assert read_provenance(out / "answer.json").total == 14 + 4
     found = table[table["kind"] == "episodes"].set_index(["policy", "arm", "seed"])
     policies = core / "answer" / "policies"
 
@@ -273,6 +298,73 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     section = Answer.summarise(table, read_provenance(out / "answer.json"))
     assert section.grids[-1].columns == ("recipe", "future-unread", "steps of 1")
     assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
+
+
+def test_measures_of_the_core(core: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    for name in ("n-4-seed-1", "n-32-seed-1", "n-32-seed-0"):  # one policy is enough here
+        shutil.rmtree(out / "answer" / "policies" / name)
+    assert main(["study", "answer", "--stages", "measures", "--out", str(out)]) != 0
+    provenance = read_provenance(out / "answer.json")
+    assert (provenance.done, provenance.total) == (14 + 1, 14 + 4)
+    table: Any = read_table(out / "answer.csv")
+    (row,) = table[table["kind"] == "measures"].to_dict("records")
+    assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
+    directory = str(out / "answer" / "policies" / "n-4-seed-0")
+    found = measures.measure(directory, PLAN.tasks, PLAN.seeds)
+    assert found["probe_r2"] is None
+    for name in ("chunk_change", "attention_mass", "gradient_share"):
+        assert row[name] == pytest.approx(found[name], rel=1e-6), name
+
+
+def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:
+    """They are run if they are named, on episodes of their own; a blind one is judged without pictures."""
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    assert main(["study", "answer", "--stages", "pilot", "--out", str(out)]) == 0
+    table: Any = read_table(out / "answer.csv")
+    assert read_provenance(out / "answer.json").total == 14 + 2 + 2
+    pilots = table[(table["kind"] == "episodes") & (table["stage"] == "pilot")]
+    assert set(pilots["seed"]) == {500, 501}
+    name = "n-4-pilot-blind-seed-100"
+    policy = Policy.load(out / "answer" / "policies" / name, num_threads=1)
+    environment = environment_for(policy, TASK, blanked=[camera.name for camera in policy.config.cameras])
+    for seed in (500, 501):
+        episode = run_episode(environment, policy, seed)
+        row = pilots.set_index(["policy", "seed"]).loc[(name, seed)]
+        assert (row["success"], row["control_steps"]) == (episode.success, episode.steps)
+    environment.close()
+    section = Answer.summarise(table, read_provenance(out / "answer.json"))
+    *results, shown = section.grids
+    assert shown.caption.startswith("Pilots, which are no results")
+    assert shown.columns == ("policy", "held-out loss", TASK)
+    assert [row[0] for row in shown.rows] == [name, "n-4-pilot-seed-100"]
+    assert results == list(
+        Answer.summarise(read_table(core / "answer.csv"), read_provenance(core / "answer.json")).grids
+    )
+    # Stages that train nothing, and those that are run by default, have no pilots.
+    study = Answer(PLAN, ("instrument",)).begin(out)
+    assert not [policy for policy, _ in study.judged("instrument") if "pilot" in policy.name]
+
+
+def test_a_blind_policy_sees_nothing(core: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    directory = str(core / "answer" / "policies" / "n-4-seed-0")
+    policy = policy_of(directory)
+    act = policy.act
+
+    def watched(observation: Any, **more: Any) -> Any:
+        seen.append(max(image.max() for image in observation["images"].values()))
+        return act(observation, **more)
+
+    monkeypatch.setattr(policy, "act", watched)
+    arms.judge(directory, TASK, 3, None, blind=True)
+    assert seen
+    assert not any(seen)
+    seen.clear()
+    arms.judge(directory, TASK, 3, None)
+    assert all(seen)
 
 
 def test_a_step_count_reaches_the_head(core: Path) -> None:
@@ -307,7 +399,7 @@ def test_the_arms_of_the_stages_that_train_nothing() -> None:
 
 
 def test_costs_by_hand() -> None:
-    settings = replace(TINY, num_future_tokens=5, vl_num_layers=1)
+    settings = replace(TINY, only="", num_future_tokens=5, vl_num_layers=1)
     config = train.policy_config(settings, RECORDING.settings, [TASK])
     sizes, head = config.backbone_sizes, config.head_config
     vision, text = sizes.vision, sizes.text
@@ -330,6 +422,14 @@ def test_costs_by_hand() -> None:
     assert aligned.chunk == found.chunk
     assert aligned.sample > found.sample + backbone
 
+    # Alone, the head costs what is left: the features are given.
+    head_alone = costs.cost(replace(settings, only="head"), RECORDING)
+    assert head_alone.chunk == found.chunk
+    assert 2 * backbone < found.sample - head_alone.sample < 3.5 * backbone
+    backbone_alone = costs.cost(replace(settings, only="backbone"), RECORDING)
+    assert backbone_alone.chunk == backbone
+    assert 2.5 * backbone < backbone_alone.sample < 3.5 * backbone
+
 
 def test_costs_that_are_matched() -> None:
     settings = replace(TINY, num_future_tokens=64, width=16, num_heads=2)
@@ -340,7 +440,10 @@ def test_costs_that_are_matched() -> None:
 
     width = costs.matched_width(settings, RECORDING)
     assert width > 16
-    errors = [abs(without(width=one).chunk - wanted.chunk) for one in (width - 4, width, width + 4)]
+    errors = [
+        abs(without(width=one, language_width=16).chunk - wanted.chunk)
+        for one in (width - 4, width, width + 4)
+    ]
     assert errors[1] == min(errors)
     steps = costs.matched_steps(settings, RECORDING)
     assert abs(steps * without().sample - settings.steps * wanted.sample) <= without().sample / 2
@@ -356,21 +459,43 @@ def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
 def test_every_contrast_is_of_recipes_of_the_plan() -> None:
     """And every recipe of the plan is in a contrast of its stage, or in the core."""
     contrasts = [*CONFIRMATORY, *itertools.chain.from_iterable(EXPLORATORY.values())]
-    assert set().union(*(one.recipes for one in contrasts)) == {one.name for one in WHOLE_PLAN.recipes}
-    assert WHOLE_PLAN.stages == ("core", *EXPLORATORY)
+    names = {one.name for one in WHOLE_PLAN.recipes if one.stage != plans.PILOT}
+    assert set().union(*(one.recipes for one in contrasts)) == names
+    assert WHOLE_PLAN.stages == (plans.PILOT, "core", *EXPLORATORY)
+
+
+def test_every_recipe_of_the_plan_fits_its_backbone() -> None:
+    """What `saccade train` compares before it starts from a backbone."""
+    for recipe in WHOLE_PLAN.recipes:
+        backbone = WHOLE_PLAN.backbone(recipe)
+        recording = WHOLE_PLAN.recording(backbone.recording)
+        head, alone = (
+            train.policy_config(one.training, recording.settings, list(recording.counts)).to_dict()
+            for one in (recipe, backbone)
+        )
+        assert head["backbone_cfg"] == alone["backbone_cfg"]
+        assert head["simulation_cfg"] == alone["simulation_cfg"]
 
 
 def test_plans_that_cannot_be(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="recipes: two have the same name in n-0, n-4, n-32, n-4-aligned, n"):
+    with pytest.raises(
+        InputError, match="recipes: two have the same name in n-4-pilot, n-4-pilot-blind, n-0"
+    ):
         replace(PLAN, recipes=(*PLAN.recipes, PLAN.recipes[0]))
-    with pytest.raises(InputError, match="recordings: n-0 has tiny, which is not one of them"):
+    with pytest.raises(InputError, match="backbones: n-4-pilot has backbone, which is not one of them"):
+        replace(PLAN, backbones=())
+    with pytest.raises(InputError, match="n-0: given only '', expected 'head'"):
+        replace(PLAN, recipes=(recipe("core", "n-0", only=""),))
+    with pytest.raises(InputError, match="pilot_seeds: given range"):
+        replace(PLAN, pilot_seeds=range(1, 4))
+    with pytest.raises(InputError, match="recordings: tiny is not one of them"):
         replace(PLAN, recordings=())
     with pytest.raises(InputError, match="recordings: tiny does not have all of reach"):
         replace(PLAN, tasks=("reach",))
     with pytest.raises(InputError, match="expected evaluation seeds"):
         replace(PLAN, seeds=range(2_000_000, 2_000_025))
     assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
-    assert "stages: unknown name cor, expected some of core, alignment" in capsys.readouterr().err
+    assert "stages: unknown name cor, expected some of pilot, core, alignment" in capsys.readouterr().err
 
 
 def test_failing_cells_do_not_stop_the_others(core: Path, tmp_path: Path) -> None:

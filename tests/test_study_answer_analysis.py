@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import spearmanr
 
 from saccade.errors import InputError
 from saccade.study.answer.contrasts import CONFIRMATORY, slope
 from saccade.study.answer.power import power
-from saccade.study.answer.results import changes, confirmed, judged, over_seeds
+from saccade.study.answer.results import changes, confirmed, judged, over_seeds, relations
 from saccade.study.answer.study import Answer
 from saccade.study.section import Section
 from saccade.study.sign_flip import sign_flip
@@ -182,9 +183,58 @@ def test_changes_of_arms_are_those_of_the_same_policies() -> None:
     assert found[1].test.difference.value == pytest.approx(expected.difference.value)
 
 
+def test_measures_are_related_to_what_a_cut_costs() -> None:
+    plain, cut = (
+        {"n-4": FEWER, "n-32": MORE},
+        {"n-4": FEWER, "n-32": [0.0, 0.3, 0.1, 0.2, 0.4, 0.5, 0.6, 0.8]},
+    )
+    table = rows_of(plain)
+    changed = rows_of(cut)
+    changed = changed[changed["kind"] == "episodes"].assign(arm="future-unread")
+    lost = {
+        (recipe, seed): round(plain[recipe][seed] - cut[recipe][seed], 6)
+        for recipe in plain
+        for seed in range(8)
+    }
+    rng = np.random.default_rng(0)
+    trained = table[table["kind"] == "training"]
+    measured = trained.assign(
+        kind="measures",
+        chunk_change=[
+            3 * lost[row["recipe"], row["training_seed"]] + 1 for row in trained.to_dict("records")
+        ],
+        attention_mass=rng.random(len(trained)),
+        gradient_share=0.5,
+        probe_r2=np.nan,
+    )
+    table = pd.concat([table, changed, measured[measured["policy"] != "n-4-seed-7"]])
+    found = relations(table, judged(table, ("a", "b"), range(10)), ("a", "b"), range(10))
+    assert [(one.measure, one.policies) for one in found] == [
+        ("chunk_change", 15),
+        ("attention_mass", 15),
+        ("gradient_share", 15),
+    ]
+    assert found[0].correlation.value == pytest.approx(1)
+    masses = dict(zip(measured["policy"], measured["attention_mass"], strict=True))
+    pairs = [(masses[f"{recipe}-seed-{seed}"], lost[recipe, seed]) for recipe in plain for seed in range(8)]
+    del pairs[7]
+    expected = spearmanr(*zip(*np.round(pairs, 12), strict=True)).statistic
+    assert found[1].correlation.value == pytest.approx(expected)
+    assert found[1].correlation.low < expected < found[1].correlation.high
+    assert math.isnan(found[2].correlation.value)  # the same for all
+    section = Answer.summarise(table.assign(validation_loss=0.5), provenance_of())
+    assert section.grids[-1].columns[0] == "measure"
+    assert [row[1] for row in section.grids[-1].rows] == ["15"] * 3
+
+
 def test_nothing_trained() -> None:
     table = pd.DataFrame([{"kind": "recording", "recording": "tiny"}])
     assert Answer.summarise(table, provenance_of()).concluded == ["Not measured: no policy is trained."]
+    pilot = {"stage": "pilot", "recipe": "n-4-pilot", "policy": "n-4-pilot-seed-100", "training_seed": 100}
+    table = pd.DataFrame([{"kind": "training", **pilot, "num_future_tokens": 4, "validation_loss": 0.25}])
+    section = Answer.summarise(table, provenance_of())
+    assert section.concluded == ["Not measured: no policy is trained."]
+    assert [list(grid.rows) for grid in section.grids] == [[["n-4-pilot-seed-100", "0.2500", "", ""]]]
 
 
 def test_tasks_have_equal_weight() -> None:

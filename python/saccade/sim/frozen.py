@@ -85,6 +85,7 @@ class FrozenFeatures:
     @torch.no_grad()
     def _write(self, path: Path) -> None:
         shape = (len(self._images), self._length, self._backbone.sizes.features_width)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary:
             array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
             for first in range(0, len(array), FRAMES_AT_ONCE):

@@ -211,6 +211,7 @@ def statistics_of(values: npt.NDArray[np.floating[Any]]) -> dict[str, dict[str, 
 def head_config(
     *,
     width: int,
+    features_width: int,
     num_layers: int,
     num_heads: int,
     vl_num_layers: int,
@@ -220,14 +221,14 @@ def head_config(
     state_dim: int,
     action_dim: int,
 ) -> dict[str, Any]:
-    """A head config with the published keys, all widths equal and one embodiment."""
-    attention = {"num_attention_heads": num_heads, "attention_head_dim": width // num_heads}
+    """A head config with the published keys, one embodiment, and one width except for the features."""
+    heads = {"num_attention_heads": num_heads}
     common = {"dropout": 0.0, "final_dropout": False, "positional_embeddings": None}
     return {
         "action_dim": action_dim,
         "action_horizon": horizon,
         "add_pos_embed": True,
-        "backbone_embedding_dim": width,
+        "backbone_embedding_dim": features_width,
         "hidden_size": width,
         "input_embedding_dim": width,
         "max_action_dim": action_dim,
@@ -244,14 +245,20 @@ def head_config(
         "use_vlln": True,
         "diffusion_model_cfg": {
             "num_layers": num_layers,
-            **attention,
-            "cross_attention_dim": width,
+            **heads,
+            "attention_head_dim": width // num_heads,
+            "cross_attention_dim": features_width,
             "output_dim": width,
             "interleave_self_attention": True,
             "norm_type": "ada_norm",
             **common,
         },
-        "vl_self_attention_cfg": {"num_layers": vl_num_layers, **attention, **common},
+        "vl_self_attention_cfg": {
+            "num_layers": vl_num_layers,
+            **heads,
+            "attention_head_dim": features_width // num_heads,
+            **common,
+        },
     }
 
 

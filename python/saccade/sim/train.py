@@ -51,7 +51,7 @@ from saccade.sim.settings import (
 )
 from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
 from saccade.sim.training_settings import STATE_FILE as STATE_FILE
-from saccade.sim.training_settings import TrainingSettings
+from saccade.sim.training_settings import TrainingSettings, features_name
 
 CHECKPOINT_SECONDS = 60.0
 VALIDATION_FRAMES = 256
@@ -95,6 +95,7 @@ def policy_config(
     return PolicyConfig(
         head=head_config(
             width=settings.width,
+            features_width=settings.features_width,
             num_layers=settings.num_layers,
             num_heads=settings.num_heads,
             vl_num_layers=settings.vl_num_layers,
@@ -105,7 +106,7 @@ def policy_config(
             action_dim=ACTION_DIM,
         ),
         backbone=backbone_config(
-            width=settings.width,
+            width=settings.features_width,
             num_layers=settings.language_layers,
             num_heads=settings.num_heads,
             vision_width=settings.vision_width,
@@ -391,6 +392,10 @@ def train(
     config = policy_config(settings, recording, tasks)
     processor = config.processor()
     training, validation = load_samples(demonstrations, tasks, settings.horizon, processor)
+    if settings.blind:
+        training, validation = (
+            replace(samples, images=np.zeros_like(samples.images)) for samples in (training, validation)
+        )
     config = (
         with_statistics(config, training) if start is None else config_of_start(config, start, settings.only)
     )
@@ -406,8 +411,8 @@ def train(
     def batches_of(samples: Samples, name: str, size: int, absent_share: float) -> Batches:
         frozen = None
         if settings.only == "head":
-            known = f"{settings.start_sha256[:16]}-{run.demonstrations['sha256'][:16]}"
-            path = out.parent / f"features-{known}-{name}.npy"
+            shown = f"{name}-blind" if settings.blind else name
+            path = out.parent / features_name(settings.start_sha256, run.demonstrations["sha256"], shown)
             frozen = FrozenFeatures(samples, prompts_of(config, processor), run.learner.backbone, path)
         return Batches(
             samples,

@@ -12,6 +12,17 @@ from saccade.errors import InputError
 STATE_FILE = "training.pt"
 
 
+def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str:
+    """The name of a file with the features of a frozen backbone, which stands beside the runs that share it.
+
+    Args:
+        start_sha256: Hash of the backbone's tensors.
+        recording_sha256: Hash of the demonstrations.
+        samples: Which of their frames, and how they are shown.
+    """
+    return f"features-{start_sha256[:16]}-{recording_sha256[:16]}-{samples}.npy"
+
+
 @dataclass(frozen=True)
 class TrainingSettings:
     """The settings of a training run. The defaults are those of the bundled policy.
@@ -35,7 +46,10 @@ class TrainingSettings:
             the words.
         start_sha256: Hash of the tensors that the run starts from; empty for random ones. `train` sets it.
         seed: Seed of initial weights, order and noise.
-        width, num_layers, num_heads: Sizes of the head; the language model has the same width and heads.
+        blind: Whether all pictures are black, for a policy that shows what can be done without them.
+        width, num_layers, num_heads: Sizes of the head; the language model has as many heads.
+        language_width: Width of the language model, and of the head's VL self-attention on its features; 0
+            for that of the head.
         language_layers: Layers of the language model.
         vision_width, vision_layers, vision_heads: Sizes of the vision tower.
         vl_num_layers: Blocks of the head's VL self-attention.
@@ -57,9 +71,11 @@ class TrainingSettings:
     absent_share: float = 0.1
     start_sha256: str = ""
     seed: int = 0
+    blind: bool = False
     width: int = 128
     num_layers: int = 4
     num_heads: int = 4
+    language_width: int = 0
     language_layers: int = 2
     vision_width: int = 96
     vision_layers: int = 3
@@ -79,11 +95,14 @@ class TrainingSettings:
                 f"absent_share: given {self.absent_share}, expected 0 where only the head is trained: the "
                 "features of a frame are computed once, with an instruction of its own task"
             )
-        if self.width % (2 * self.num_heads):
-            raise InputError(
-                f"width: given {self.width}, expected a multiple of {2 * self.num_heads}, an even number for "
-                f"each of num_heads {self.num_heads}"
-            )
+        for name, width in (("width", self.width), ("language_width", self.language_width)):
+            if width % (2 * self.num_heads):
+                raise InputError(
+                    f"{name}: given {width}, expected a multiple of {2 * self.num_heads}, an even number for "
+                    f"each of num_heads {self.num_heads}"
+                )
+        if self.language_width < 0:
+            raise InputError(f"language_width: given {self.language_width}, expected at least 0")
         if self.num_heads > 1 and self.num_heads % 2:
             raise InputError(f"num_heads: given {self.num_heads}, expected 1 or an even number")
         if self.vision_width % self.vision_heads:
@@ -104,6 +123,11 @@ class TrainingSettings:
             raise InputError(
                 f"alignment_block: given {self.alignment_block}, expected 0 to {self.num_layers - 1}"
             )
+
+    @property
+    def features_width(self) -> int:
+        """The width of the language model, whose features the head reads."""
+        return self.language_width or self.width
 
     @property
     def aligned_block(self) -> int | None:

@@ -48,9 +48,13 @@ class Part:
     provenance: Provenance | None = None
 
 
-def to_markdown(title: str, parts: Sequence[Part]) -> str:
-    """The whole report."""
-    text = templates().get_template("report.md.jinja").render(title=title, parts=parts, anchor=anchor)
+def to_markdown(title: str, opening: Sequence[str], parts: Sequence[Part]) -> str:
+    """The whole report; `opening` has its first paragraphs."""
+    text = (
+        templates()
+        .get_template("report.md.jinja")
+        .render(title=title, opening=opening, parts=parts, anchor=anchor)
+    )
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 

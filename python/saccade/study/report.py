@@ -43,12 +43,13 @@ def write_report(directory: Path) -> tuple[Path, Path]:
             "written by `saccade study`"
         )
     separate = len(measured) == 1 and measured[0] in SEPARATE
-    title = Prose("words").line("report_title", measured[0] if separate else "")
+    words, about = Prose("words"), measured[0] if separate else ""
+    title, opening = words.line("report_title", about), words.paragraphs("report_opening", about)
     parts = [make_part(directory, name) for name in (measured if separate else STUDIES)]
     if (directory / ATTENTION).is_dir():
         parts.append(attention_part(directory))
     pictures = {picture.file: picture.data for part in parts for picture in part.pictures}
-    text = to_markdown(title, parts)
+    text = to_markdown(title, opening, parts)
     page, markdown = directory / "report.html", directory / "report.md"
     for path, content in ((page, to_html(text, pictures)), (markdown, text)):
         with write_atomically(path) as temporary:

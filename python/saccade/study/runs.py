@@ -42,18 +42,19 @@ class Planned:
             "demonstrations": describe(directory, demos.recorded_tasks(directory)),
         }
 
-    def train(self, out: Path) -> None:
+    def train(self, out: Path, start: Path | None = None) -> None:
         """Trains the run on one thread, or continues the one in `out`.
 
         Args:
             out: The run's directory.
+            start: The policy to start from; None for random weights.
         """
         import torch
 
         from saccade.sim.train import train
 
         torch.set_num_threads(1)  # runs are spread over processes
-        train(Path(self.demonstrations), out, self.training, lambda progress: None)
+        train(Path(self.demonstrations), out, self.training, lambda progress: None, start=start)
 
 
 @dataclass(frozen=True)

@@ -274,16 +274,18 @@ def head_of(checkpoint: str, precision: str = "float32") -> ActionHead:
     return ActionHead.load(Path(checkpoint), precision=precision, num_threads=1)
 
 
-_open: dict[tuple[str, str], TaskEnvironment] = {}
+_open: dict[tuple[str, str, bool], TaskEnvironment] = {}
 
 
-def environment_of(checkpoint: str, task: str) -> TaskEnvironment:
-    """The task as the policy in that directory sees it. The two used last stay open."""
-    key = (checkpoint, task)
+def environment_of(checkpoint: str, task: str, *, blind: bool = False) -> TaskEnvironment:
+    """The task as the policy in that directory sees it, or with black images. The two used last stay open."""
+    key = (checkpoint, task, blind)
     if key in _open:
         _open[key] = _open.pop(key)  # now the last one
     else:
         if len(_open) == 2:
             _open.pop(next(iter(_open))).close()
-        _open[key] = environment_for(policy_of(checkpoint), task)
+        policy = policy_of(checkpoint)
+        blanked = [camera.name for camera in policy.config.cameras] if blind else []
+        _open[key] = environment_for(policy, task, blanked=blanked)
     return _open[key]

@@ -104,13 +104,14 @@ class SteppedHead:
         return self._head.sample(context, state, embodiment_id, **{**options, "num_steps": self._num_steps})
 
 
-def judge(checkpoint: str, task: str, seed: int, arm: PolicyArm | None) -> Episode:
+def judge(checkpoint: str, task: str, seed: int, arm: PolicyArm | None, *, blind: bool = False) -> Episode:
     """An episode of a policy under an arm; layout, wording and noise are the same under all arms.
 
     Args:
         checkpoint: Directory of the policy.
         task, seed: The episode.
         arm: None for the unchanged policy.
+        blind: Whether all pictures are black.
     """
     from saccade.sim.rollout import run_episode
     from saccade.study.simulator import environment_of, head_of, policy_of
@@ -120,4 +121,5 @@ def judge(checkpoint: str, task: str, seed: int, arm: PolicyArm | None) -> Episo
         change = arm.arm.intervention(head_of(checkpoint).future_tokens, episode_rng(task, seed))
         if arm.num_steps is not None:
             policy = policy.with_head(SteppedHead(policy.head, arm.num_steps))
-    return run_episode(environment_of(checkpoint, task), policy, seed, intervention=change)
+    environment = environment_of(checkpoint, task, blind=blind)
+    return run_episode(environment, policy, seed, intervention=change)

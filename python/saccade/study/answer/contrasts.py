@@ -109,7 +109,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
     ),
     "vision": tuple(
         contrast
-        for suffix in ("-one-camera", "-patch-32", "-patch-8")
+        for suffix in ("-two-cameras", "-patch-32", "-patch-8")
         for contrast in (difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix))
     ),
     "vlsa": tuple(

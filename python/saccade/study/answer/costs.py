@@ -1,4 +1,9 @@
-"""What a policy of the plan costs in multiply-adds, and what else the cost of its future tokens would buy."""
+"""What a policy of the plan costs in multiply-adds, and what else the cost of its future tokens would buy.
+
+Where only the head is trained, a training step counts the head's forward and backward alone. That leaves out
+the training of the backbone and its features of the recording, which are computed once for all heads and do
+not depend on N, and the optimiser.
+"""
 
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
@@ -21,8 +26,9 @@ class Cost:
     """Multiply-adds of a policy.
 
     Attributes:
-        chunk: Of one chunk of actions: backbone, encode and all Euler steps.
-        sample: Of one sample of a training step: forward and backward.
+        chunk: Of one chunk of actions: backbone, encode and all Euler steps. Of a backbone without a head,
+            its part.
+        sample: Of one sample of a training step: forward and backward of what is trained.
     """
 
     chunk: int
@@ -51,15 +57,18 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
     texts = [text for name in recording.counts for text in find_task(name).instructions]
     processor = config.processor()
     inputs = max((processor(frames, text) for text in texts), key=lambda one: one.input_ids.shape[1])
-    learner = Learner(config.backbone_sizes, head, training.aligned_block)
+    learner = Learner(config.backbone_sizes, head, training.aligned_block, training.only)
+    with torch.no_grad():
+        of_backbone = counted(lambda: learner.backbone(inputs))
+        seen = learner.backbone(inputs) if training.only == "head" else inputs
     horizon = head.action_horizon
     batch = Batch(
-        inputs,
+        seen,
         state=torch.zeros(1, head.state_dim),
         actions=torch.zeros(1, horizon, head.action_dim),
         mask=torch.ones(1, horizon, 1),
         targets=torch.zeros(1, NUM_TARGETS),
-        later=None if training.aligned_block is None else inputs,
+        later=None if training.aligned_block is None else seen,
     )
 
     def train() -> None:
@@ -67,9 +76,9 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
         sum(losses.values(), torch.zeros(())).backward()
 
     call = Call.of(head, inputs.input_ids.shape[1])
-    of_head = total(encode_work(head, call)).multiply_adds + total(sample_work(head, call)).multiply_adds
-    with torch.no_grad():
-        of_backbone = counted(lambda: learner.backbone(inputs))
+    of_head = 0
+    if training.only != "backbone":
+        of_head = total(encode_work(head, call)).multiply_adds + total(sample_work(head, call)).multiply_adds
     return Cost(of_head + of_backbone, counted(train))
 
 
@@ -85,7 +94,8 @@ def counted(work: Callable[[], Any]) -> int:
 
 
 def matched_width(training: TrainingSettings, recording: Recording) -> int:
-    """The width at which a policy without future tokens has the most similar cost of a chunk.
+    """The width at which a head without future tokens, on the same backbone, has the most similar cost of a
+    chunk.
 
     Args:
         training: Settings of a policy with future tokens.
@@ -93,7 +103,9 @@ def matched_width(training: TrainingSettings, recording: Recording) -> int:
     """
     wanted = cost(training, recording).chunk
     step = 2 * training.num_heads  # of widths that the heads can have
-    without = replace(training, num_future_tokens=0, alignment_weight=0.0)
+    without = replace(
+        training, num_future_tokens=0, alignment_weight=0.0, language_width=training.features_width
+    )
 
     def chunk(width: int) -> int:
         return cost(replace(without, width=width), recording).chunk

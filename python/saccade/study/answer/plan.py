@@ -33,21 +33,41 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class Backbone:
+    """A backbone, trained without a head. Policies are heads that are trained on its frozen features.
+
+    Attributes:
+        name: Its name in the table, which is that of its directory.
+        training: The settings, with ``only="backbone"``.
+        recording: Name of the recording, of its own training and of that of all heads on it.
+    """
+
+    name: str
+    training: TrainingSettings
+    recording: str
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The columns that identify it."""
+        return {"policy": self.name, "training_seed": self.training.seed}
+
+
+@dataclass(frozen=True)
 class Recipe:
     """How policies are trained that differ in their training seed only.
 
     Attributes:
         stage: The stage of the study that it belongs to.
         name: Its name in the table.
-        training: The settings; their seed is not used.
-        recording: Name of the recording.
+        training: The settings, with ``only="head"``; their seed is not used.
+        backbone: Name of the backbone.
         seeds: The training seeds.
     """
 
     stage: str
     name: str
     training: TrainingSettings
-    recording: str
+    backbone: str
     seeds: tuple[int, ...]
 
 
@@ -57,10 +77,12 @@ class PlannedPolicy:
 
     Attributes:
         recipe: How.
+        backbone: On what.
         seed: Its training seed.
     """
 
     recipe: Recipe
+    backbone: Backbone
     seed: int
 
     @property
@@ -73,6 +95,22 @@ class PlannedPolicy:
         """The settings, with the seed."""
         return replace(self.recipe.training, seed=self.seed)
 
+    @property
+    def recording(self) -> str:
+        """Name of the recording."""
+        return self.backbone.recording
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The columns that identify it."""
+        return {
+            "stage": self.recipe.stage,
+            "recipe": self.recipe.name,
+            "policy": self.name,
+            "training_seed": self.seed,
+            "num_future_tokens": self.recipe.training.num_future_tokens,
+        }
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -80,29 +118,44 @@ class Plan:
 
     Attributes:
         recordings: The demonstrations.
+        backbones: What the policies are trained on.
         recipes: In the order of their stages.
         tasks, seeds: The episodes of every policy: each seed in each task.
+        pilot_seeds: The seeds for the policies of the stage `PILOT`, which are different ones.
 
     Raises:
-        InputError: two recipes or recordings have the same name, a recipe's recording is unknown, or a task
-            is not in every recording, or a seed is not for evaluation.
+        InputError: two recipes, backbones or recordings have the same name, a recipe's backbone or a
+            backbone's recording is unknown, settings are not those of a head or a backbone alone, a task is
+            not in every recording, a seed is not for evaluation, or the pilots share one with the others.
     """
 
     recordings: tuple[Recording, ...]
+    backbones: tuple[Backbone, ...]
     recipes: tuple[Recipe, ...]
     tasks: tuple[str, ...]
     seeds: range
+    pilot_seeds: range
 
     def __post_init__(self) -> None:
-        check_evaluation_seeds(self.seeds.start, len(self.seeds))
+        for seeds in (self.seeds, self.pilot_seeds):
+            check_evaluation_seeds(seeds.start, len(seeds))
+        if set(self.seeds) & set(self.pilot_seeds):
+            raise InputError(f"pilot_seeds: given {self.pilot_seeds}, expected none of {self.seeds}")
         for what, names in (
             ("recordings", [recording.name for recording in self.recordings]),
+            ("backbones", [backbone.name for backbone in self.backbones]),
             ("recipes", [recipe.name for recipe in self.recipes]),
         ):
             if len(set(names)) != len(names):
                 raise InputError(f"{what}: two have the same name in {', '.join(names)}")
+        for backbone in self.backbones:
+            self.recording(backbone.recording)
         for recipe in self.recipes:
-            self.recording(recipe)
+            self.backbone(recipe)
+        for only, trained in (("backbone", self.backbones), ("head", self.recipes)):
+            for one in trained:
+                if one.training.only != only:
+                    raise InputError(f"{one.name}: given only {one.training.only!r}, expected {only!r}")
         for recording in self.recordings:
             if not set(self.tasks) <= set(recording.counts):
                 raise InputError(f"recordings: {recording.name} does not have all of {', '.join(self.tasks)}")
@@ -112,34 +165,65 @@ class Plan:
         """The stages in which policies are trained, in their order."""
         return tuple(dict.fromkeys(recipe.stage for recipe in self.recipes))
 
-    def recording(self, recipe: Recipe) -> Recording:
-        """The demonstrations of a recipe; raises `InputError` if there are none of that name."""
+    def recording(self, name: str) -> Recording:
+        """The demonstrations of that name; raises `InputError` if there are none."""
         for recording in self.recordings:
-            if recording.name == recipe.recording:
+            if recording.name == name:
                 return recording
-        raise InputError(f"recordings: {recipe.name} has {recipe.recording}, which is not one of them")
+        raise InputError(f"recordings: {name} is not one of them")
+
+    def backbone(self, recipe: Recipe) -> Backbone:
+        """The backbone of a recipe; raises `InputError` if there is none of that name."""
+        for backbone in self.backbones:
+            if backbone.name == recipe.backbone:
+                return backbone
+        raise InputError(f"backbones: {recipe.name} has {recipe.backbone}, which is not one of them")
+
+    def episodes(self, stage: str) -> range:
+        """The seeds of the episodes that judge the policies of a stage."""
+        return self.pilot_seeds if stage == PILOT else self.seeds
 
     def policies(self, stage: str) -> Iterator[PlannedPolicy]:
         """The policies of a stage, seed by seed: a run that is interrupted leaves whole pairs."""
         recipes = [recipe for recipe in self.recipes if recipe.stage == stage]
         for seed in sorted({seed for recipe in recipes for seed in recipe.seeds}):
-            yield from (PlannedPolicy(recipe, seed) for recipe in recipes if seed in recipe.seeds)
+            for recipe in recipes:
+                if seed in recipe.seeds:
+                    yield PlannedPolicy(recipe, self.backbone(recipe), seed)
 
-    def all_policies(self) -> Iterator[PlannedPolicy]:
-        """The policies of all stages."""
+    def all_policies(self, *, pilots: bool) -> Iterator[PlannedPolicy]:
+        """The policies of all stages, with or without those of `PILOT`."""
         for stage in self.stages:
-            yield from self.policies(stage)
+            if pilots or stage != PILOT:
+                yield from self.policies(stage)
 
 
-TASKS = ("reach", "two-goals", "stereo-reach", "two-stage")
+#: The stage whose policies only help to plan. It is run if it is named, and is no result.
+PILOT = "pilot"
+
+TASKS = ("reach", "stereo-reach")
 COUNTS = dict.fromkeys(TASKS, 200)  # demonstrations of each task
-EPISODES = range(25)  # seeds of the episodes of each task
+EPISODES = range(50)  # seeds of the episodes of each task
+PILOT_EPISODES = range(500_000, 500_050)
 SEEDS = tuple(range(8))  # of training
-BASE = TrainingSettings(steps=3200, width=64, learning_rate=2e-3, ema_decay=0.995)
+PILOT_SEEDS = (100, 101)
+BASE = TrainingSettings(
+    only="head",
+    absent_share=0.0,
+    steps=3000,
+    learning_rate=2e-3,
+    ema_decay=0.995,
+    width=64,
+    vision_width=48,
+    vision_layers=2,
+    execute_steps=8,
+)
+# No future tokens, so that a backbone has nothing of any N.
+BACKBONE = replace(BASE, only="backbone", steps=4000, learning_rate=1e-3, seed=0, num_future_tokens=0)
 ALIGNMENT = 0.2  # the weight of the loss in FLARE
 # What makes a policy without future tokens as costly as `BASE`: `costs.matched_width` for a chunk,
 # `costs.matched_steps` for the training. A test computes them again.
-WIDTH, STEPS = 88, 3511
+WIDTH, STEPS = 104, 4884
 
 
 def recipes(
@@ -147,7 +231,7 @@ def recipes(
     suffix: str,
     counts: Sequence[int],
     *,
-    recording: str = "plain",
+    backbone: str = "backbone",
     seeds: tuple[int, ...] = SEEDS,
     **changes: Any,
 ) -> Iterator[Recipe]:
@@ -157,32 +241,41 @@ def recipes(
         stage: Their stage.
         suffix: What follows `n-N` in their names.
         counts: Each N.
-        recording: Name of their recording.
+        backbone: Name of their backbone.
         seeds: Their training seeds.
         changes: Training settings and their values.
     """
     for count in counts:
         training = replace(BASE, num_future_tokens=count, **changes)
-        yield Recipe(stage, f"n-{count}{suffix}", training, recording, seeds)
+        yield Recipe(stage, f"n-{count}{suffix}", training, backbone, seeds)
 
 
 PLAN = Plan(
     recordings=(
         Recording("plain", COUNTS, RecordingSettings()),
-        Recording("one-camera", COUNTS, RecordingSettings(cameras=DEFAULT_CAMERAS[:1])),
+        Recording("two-cameras", COUNTS, RecordingSettings(cameras=DEFAULT_CAMERAS[:2])),
+    ),
+    backbones=(
+        Backbone("backbone", BACKBONE, "plain"),
+        Backbone("backbone-two-cameras", BACKBONE, "two-cameras"),
+        Backbone("backbone-patch-32", replace(BACKBONE, patch_size=32), "plain"),
+        Backbone("backbone-patch-8", replace(BACKBONE, patch_size=8), "plain"),
     ),
     recipes=(
+        *recipes(PILOT, "-pilot", (0, 32), seeds=PILOT_SEEDS),
+        *recipes(PILOT, "-pilot-blind", (32,), seeds=PILOT_SEEDS, blind=True),
         *recipes("core", "", (0, 4, 32)),
         *recipes("alignment", "-aligned", (4, 32), alignment_weight=ALIGNMENT),
         *recipes("numbers", "", (1, 16, 64)),
-        *recipes("compute", "-wide", (0,), width=WIDTH),
+        *recipes("compute", "-wide", (0,), width=WIDTH, language_width=BASE.width),
         *recipes("compute", "-long", (0,), steps=STEPS),
-        *recipes("vision", "-one-camera", (4, 32), recording="one-camera"),
-        *recipes("vision", "-patch-32", (4, 32), patch_size=32),
-        *recipes("vision", "-patch-8", (4, 32), patch_size=8),
+        *recipes("vision", "-two-cameras", (4, 32), backbone="backbone-two-cameras"),
+        *recipes("vision", "-patch-32", (4, 32), backbone="backbone-patch-32", patch_size=32),
+        *recipes("vision", "-patch-8", (4, 32), backbone="backbone-patch-8", patch_size=8),
         *recipes("vlsa", "-vlsa-0", (4, 32), vl_num_layers=0),
         *recipes("vlsa", "-vlsa-4", (4, 32), vl_num_layers=4),
     ),
     tasks=TASKS,
     seeds=EPISODES,
+    pilot_seeds=PILOT_EPISODES,
 )

@@ -10,12 +10,15 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+from scipy.stats import rankdata
 
 from saccade.errors import InputError
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, Contrast
+from saccade.study.answer.measures import CUT, MEASURES, NAMES
+from saccade.study.answer.plan import PILOT
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.sign_flip import SignFlip, sign_flip
-from saccade.study.statistics import CONFIDENCE, holm
+from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, holm
 from saccade.study.table import truths
 
 Float64Array = npt.NDArray[np.float64]
@@ -100,7 +103,7 @@ class ContrastResult:
 
 
 def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm: str = PLAIN) -> Judged:
-    """The success rates of policies, each task weighted alike.
+    """The success rates of policies, each task weighted alike; pilots are left out.
 
     Args:
         table: Table of the study.
@@ -111,7 +114,7 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
         InputError: an episode is in the table twice, or is not one of those.
     """
     expected = len(tasks) * len(seeds)
-    trained = table[table["kind"] == "training"]
+    trained = table[(table["kind"] == "training") & (table["stage"] != PILOT)]
     episodes = table[(table["kind"] == "episodes") & (table["arm"] == arm)] if "arm" in table else trained[:0]
     rates: dict[str, dict[int, float]] = {}
     missing = []
@@ -129,6 +132,92 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
         by_task = rows.assign(success=truths(rows["success"])).groupby("task")["success"].mean()
         rates.setdefault(str(row["recipe"]), {})[int(row["training_seed"])] = float(by_task.mean())
     return Judged(rates, missing)
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A pilot policy, which is no result.
+
+    Attributes:
+        policy: Its name.
+        loss: Its held-out loss.
+        rates: Its success rate by task, as far as it was judged.
+    """
+
+    policy: str
+    loss: float
+    rates: Mapping[str, float]
+
+
+def pilots(table: pd.DataFrame) -> list[Pilot]:
+    """The pilots, by name."""
+    if "stage" not in table:
+        return []
+    of_stage = table[table["stage"] == PILOT]
+    found = []
+    for policy, rows in of_stage.groupby("policy"):
+        episodes = rows[rows["kind"] == "episodes"]
+        rates = {}
+        for task, of_task in episodes.groupby("task") if len(episodes) else ():
+            rates[str(task)] = float(truths(of_task["success"]).mean())
+        trained = rows[rows["kind"] == "training"]
+        found.append(Pilot(str(policy), float(trained["validation_loss"].iloc[0]), rates))
+    return found
+
+
+@dataclass(frozen=True)
+class Relation:
+    """How well a measure of policies predicts what a cut does to their success.
+
+    Attributes:
+        measure: Its name in `measures.NAMES`.
+        policies: Number of policies.
+        correlation: Spearman's rank correlation with the success that the cut costs; NaN where one of the two
+            is the same for all policies.
+    """
+
+    measure: str
+    policies: int
+    correlation: Estimate
+
+
+def relations(
+    table: pd.DataFrame, found: Judged, tasks: Sequence[str], seeds: Sequence[int]
+) -> list[Relation]:
+    """The relations of all measures, over the policies that are measured and judged with and without the cut.
+
+    Args:
+        table, tasks, seeds: As of `judged`.
+        found: The unchanged policies.
+    """
+    rows = table[table["kind"] == MEASURES]
+    if rows.empty:
+        return []
+    cut = judged(table, tasks, seeds, CUT).rates
+    results = []
+    for name in NAMES:
+        pairs = []
+        for _, row in rows[rows[name].notna()].iterrows():
+            recipe, seed = str(row["recipe"]), int(row["training_seed"])
+            if seed in cut.get(recipe, {}) and seed in found.rates.get(recipe, {}):
+                lost = round(found.rates[recipe][seed] - cut[recipe][seed], 12)
+                pairs.append((float(row[name]), lost))
+        if pairs:
+            results.append(Relation(name, len(pairs), bootstrap(pairs, range(len(pairs)), rank_correlation)))
+    return results
+
+
+def rank_correlation(pairs: Float64Array) -> float:
+    """Spearman's correlation of `(pairs, 2)`; NaN where a column is constant.
+
+    Example:
+        >>> rank_correlation(np.array([[1.0, 10.0], [2.0, 40.0], [9.0, 30.0]]))
+        0.5
+    """
+    ranks = rankdata(pairs, axis=0)
+    centred = ranks - ranks.mean(axis=0)
+    squares = (centred**2).sum(axis=0)
+    return float(centred.prod(axis=1).sum() / math.sqrt(squares.prod())) if squares.all() else math.nan
 
 
 def over_seeds(found: Judged, contrast: Contrast) -> ContrastResult:

@@ -12,7 +12,21 @@ from matplotlib.figure import Figure as Picture
 from saccade.study import figures
 from saccade.study.answer.arms import ARMS
 from saccade.study.answer.contrasts import ALL, MARGIN
-from saccade.study.answer.results import Change, ContrastResult, Judged, changes, confirmed, explored, judged
+from saccade.study.answer.measures import CUT, NAMES
+from saccade.study.answer.plan import PILOT
+from saccade.study.answer.results import (
+    Change,
+    ContrastResult,
+    Judged,
+    Pilot,
+    Relation,
+    changes,
+    confirmed,
+    explored,
+    judged,
+    pilots,
+    relations,
+)
 from saccade.study.section import Figure, Grid, Prose, Section, number, points
 from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import Estimate, scaled
@@ -27,11 +41,14 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         provenance: Its provenance, whose settings say which episodes every policy runs.
     """
     tasks, seeds = provenance.settings["tasks"], provenance.settings["episodes"]
-    if not (table["kind"] == "training").any():
-        return Prose("answer", **EMPTY).section()
+    of_pilots = [pilot_grid(found, tasks) for found in [pilots(table)] if found]
+    trained = table[table["kind"] == "training"]
+    trained = trained[trained["stage"] != PILOT] if len(trained) else trained
+    if trained.empty:
+        return Prose("answer", **EMPTY).section(grids=of_pilots)
     found = judged(table, tasks, seeds)
     tests, others = confirmed(found), explored(found)
-    by_recipe = table[table["kind"] == "training"].groupby("recipe")["validation_loss"].mean()
+    by_recipe = trained.groupby("recipe")["validation_loss"].mean()
     losses = {str(recipe): float(loss) for recipe, loss in by_recipe.items()}
     prose = Prose(
         "answer",
@@ -52,9 +69,12 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         of_stage = [one for one in changes(table, found, tasks, seeds) if one.arm in names]
         if of_stage:
             grids.append(change_grid(prose.line("caption_changes", len(grids) + 1, stage), of_stage, names))
+    related = relations(table, found, tasks, seeds)
+    if related:
+        grids.append(relation_grid(prose.line("caption_relations", len(grids) + 1, CUT), related))
     shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
     pictures = [Figure("success", prose.line("caption_success"), success_picture(shown))] if shown else []
-    return prose.section(pictures, grids)
+    return prose.section(pictures, grids + of_pilots)
 
 
 #: The values of the template where nothing is trained.
@@ -138,6 +158,21 @@ def change_grid(caption: str, changed: Sequence[Change], arms: Sequence[str]) ->
         by_arm = {one.arm: points(one.test.difference) for one in changed if one.recipe == recipe}
         lines.append([recipe, *(by_arm.get(arm, "") for arm in arms)])
     return Grid(caption, ("recipe", *arms), lines)
+
+
+def relation_grid(caption: str, related: Sequence[Relation]) -> Grid:
+    """What the measures predict: a row for each."""
+    lines = [[NAMES[one.measure], str(one.policies), number(one.correlation, digits=2)] for one in related]
+    return Grid(caption, ("measure", "policies", "rank correlation (95 % interval)"), lines)
+
+
+def pilot_grid(found: Sequence[Pilot], tasks: Sequence[str]) -> Grid:
+    """The pilots: a row for each policy, a column for each task."""
+    lines = []
+    for one in found:
+        rates = [f"{100 * one.rates[task]:.0f}" if task in one.rates else "" for task in tasks]
+        lines.append([one.policy, f"{one.loss:.4f}", *rates])
+    return Grid(Prose("answer").line("caption_pilots"), ("policy", "held-out loss", *tasks), lines)
 
 
 def percent(result: ContrastResult) -> str:

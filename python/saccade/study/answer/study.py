@@ -13,13 +13,14 @@ from typing import Any, ClassVar
 import pandas as pd
 
 from saccade._arguments import add_list
-from saccade._files import checkpoint_identity
+from saccade._files import checkpoint_identity, sha256_of
 from saccade.errors import InputError
-from saccade.sim.training_settings import STATE_FILE
+from saccade.sim.training_settings import STATE_FILE, features_name
+from saccade.study.answer import measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
-from saccade.study.answer.plan import Plan, PlannedPolicy, Recording
+from saccade.study.answer.plan import PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.sweeps_results import PLAIN
@@ -29,15 +30,19 @@ from saccade.study.study import Study
 from saccade.study.table import Provenance, read_table, table_path
 
 EPILOG = """\
-Records demonstrations, trains the policies of the plan and judges them on the same episodes, stage after
-stage. DIR/answer/policies has the policies; one that is there and finished is not trained again, on any
-machine. DIR/answer/demos has the demonstrations, which only training needs; missing ones are recorded again.
+Records demonstrations, trains backbones, then the policies of the plan as heads on the frozen backbones, and
+judges the policies on the same episodes, stage after stage. DIR/answer/backbones and DIR/answer/policies have
+what was trained; what is there and finished is not trained again, on any machine. DIR/answer/demos has the
+demonstrations, which only training needs; missing ones are recorded again. The stage pilot is run only if it
+is named, and is no result.
 
 examples:
+  saccade study answer --stages pilot --out out/answer
   saccade study answer --stages core --jobs 2 --out out/answer
   saccade study answer --out out/answer
 """
-RECORDING, TRAINING, EPISODES = "recording", "training", "episodes"
+RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
+CORE_STAGE = "core"
 #: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
 NOT_KEPT = (STATE_FILE, "loss.png")
 
@@ -50,16 +55,16 @@ class Answer(Study):
         plan: What is trained, and how it is judged.
         stages: The stages that are run, in the order of the plan.
         phase: How many of `phases` are over.
-        demos: Directory of each recording, by name; set by `begin`, as are `policies`.
-        policies: Directory of each policy, by name.
-        trained: Hash of each finished policy, by name.
+        demos: Directory of each recording, by name; set by `begin`, as are `trainings`.
+        trainings: Directory of each backbone and each policy, by name.
+        trained: Hash of each one that is finished, by name.
     """
 
     plan: Plan
     stages: tuple[str, ...]
     phase: int = 0
     demos: Mapping[str, Path] = field(default_factory=dict)
-    policies: Mapping[str, Path] = field(default_factory=dict)
+    trainings: Mapping[str, Path] = field(default_factory=dict)
     trained: Mapping[str, str] = field(default_factory=dict)
     name: ClassVar[str] = "answer"
 
@@ -67,16 +72,16 @@ class Answer(Study):
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """See `Study`."""
         parser.epilog = EPILOG
-        stages = ", ".join((*plans.PLAN.stages, *ARMS))
-        add_list(parser, "--stages", help=f"stages to run (default: all: {stages})")
+        stages = ", ".join((*plans.PLAN.stages, *ARMS, measures.MEASURES))
+        add_list(parser, "--stages", help=f"stages to run, of {stages} (default: all but {PILOT})")
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Answer:
         """See `Study`."""
         from saccade.sim import graphics
 
-        known = (*plans.PLAN.stages, *ARMS)
-        asked = known if args.stages is None else args.stages
+        known = (*plans.PLAN.stages, *ARMS, measures.MEASURES)
+        asked = [stage for stage in known if stage != PILOT] if args.stages is None else args.stages
         unknown = [stage for stage in asked if stage not in known]
         if unknown:
             raise InputError(
@@ -89,23 +94,28 @@ class Answer(Study):
         """See `Study`."""
         own = out / self.name
         demos = {recording.name: own / "demos" / recording.name for recording in self.plan.recordings}
-        policies = {policy.name: own / "policies" / policy.name for policy in self.plan.all_policies()}
-        found = replace(self, demos=demos, policies=policies)
+        trainings = {one.name: own / "backbones" / one.name for one in self.plan.backbones}
+        for policy in self.plan.all_policies(pilots=True):
+            trainings[policy.name] = own / "policies" / policy.name
+        found = replace(self, demos=demos, trainings=trainings)
         path = table_path(out, self.name)  # of an earlier run, which may have had other stages
         return found.with_trained(read_table(path)) if path.exists() else found
 
     def settings(self) -> Mapping[str, Any]:
         """See `Study`."""
-        return {"engine": "rust", "tasks": list(self.plan.tasks), "episodes": list(self.plan.seeds)}
+        return {
+            "engine": "rust",
+            "tasks": list(self.plan.tasks),
+            "episodes": list(self.plan.seeds),
+            "pilot_episodes": list(self.plan.pilot_seeds),
+        }
 
     @property
     def phases(self) -> list[tuple[str, str]]:
         """Stage and kind of each phase. A stage is finished before the next one begins."""
-        return [
-            (stage, kind)
-            for stage in self.stages
-            for kind in ((EPISODES,) if stage in ARMS else (RECORDING, TRAINING, EPISODES))
-        ]
+        without_training = {measures.MEASURES: (measures.MEASURES,), **dict.fromkeys(ARMS, (EPISODES,))}
+        training = (RECORDING, BACKBONE, TRAINING, EPISODES)
+        return [(stage, kind) for stage in self.stages for kind in without_training.get(stage, training)]
 
     def cells(self) -> Sequence[Cell]:
         """See `Study`: those of the phases so far."""
@@ -113,17 +123,26 @@ class Answer(Study):
         return list({cell.key: cell for cell in itertools.chain.from_iterable(so_far)}.values())
 
     def cells_of(self, stage: str, kind: str) -> Iterator[Cell]:
-        """The cells of one phase. Stages may share a recording."""
+        """The cells of one phase. Stages may share recordings and backbones."""
         if kind == EPISODES:
             yield from self.episode_cells(stage)
             return
+        if kind == measures.MEASURES:
+            for policy in self.measured():
+                if policy.name in self.trained:
+                    settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.first_seeds)}
+                    yield Cell((kind, policy.name), settings)
+            return
         for policy in self.plan.policies(stage):
-            recording = described(self.plan.recording(policy.recipe))
+            backbone = policy.backbone
+            recording = described(self.plan.recording(policy.recording))
             if kind == RECORDING:
-                yield Cell((RECORDING, policy.recipe.recording), recording)
-            else:
+                yield Cell((RECORDING, policy.recording), recording)
+            elif kind == BACKBONE:
+                yield Cell((BACKBONE, backbone.name), {**asdict(backbone), "recording": recording})
+            elif backbone.name in self.trained:
                 planned = {"training": asdict(policy.training), "recording": recording}
-                yield Cell((TRAINING, policy.name), planned)
+                yield Cell((TRAINING, policy.name), {**planned, "backbone": self.trained[backbone.name]})
 
     def episode_cells(self, stage: str) -> Iterator[Cell]:
         """A cell for each task of each trained policy and arm: its own policies, or the arms of a stage that
@@ -131,17 +150,27 @@ class Answer(Study):
         """
         for policy, arm in self.judged(stage):
             if policy.name in self.trained:
-                settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.plan.seeds)}
+                episodes = list(self.plan.episodes(policy.recipe.stage))
+                settings = {"checkpoint": self.trained[policy.name], "episodes": episodes}
                 yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
 
     def judged(self, stage: str) -> Iterator[tuple[PlannedPolicy, str]]:
         """The policies and arms of a stage, trained or not."""
-        if stage not in ARMS:
+        if stage not in ARMS:  # `measures` has no policies of its own
             yield from ((policy, PLAIN) for policy in self.plan.policies(stage))
             return
-        for policy in self.plan.all_policies():
+        for policy in self.plan.all_policies(pilots=False):
             count = policy.training.num_future_tokens
             yield from ((policy, arm.name) for arm in ARMS[stage] if arm.applies(count))
+
+    def measured(self) -> Iterator[PlannedPolicy]:
+        """The policies of the stage `measures`, trained or not: those of the core that have tokens."""
+        yield from (one for one in self.plan.policies(CORE_STAGE) if one.training.num_future_tokens)
+
+    @property
+    def first_seeds(self) -> range:
+        """The episodes of the stage `measures`."""
+        return self.plan.seeds[: measures.EPISODES]
 
     @property
     def num_cells(self) -> int:
@@ -149,50 +178,77 @@ class Answer(Study):
         planned = [policy for stage in self.stages for policy in self.plan.policies(stage)]
         known = {policy.name for policy in planned} | set(self.trained)
         runs = [policy for stage in self.stages for policy, _ in self.judged(stage) if policy.name in known]
-        recordings = {policy.recipe.recording for policy in planned}
-        return len(recordings) + len(planned) + len(runs) * len(self.plan.tasks)
+        recordings = {policy.recording for policy in planned}
+        backbones = {policy.backbone.name for policy in planned}
+        measured = [one for one in self.measured() if measures.MEASURES in self.stages and one.name in known]
+        trained = len(recordings) + len(backbones) + len(planned)
+        return trained + len(runs) * len(self.plan.tasks) + len(measured)
 
     def then(self, table: pd.DataFrame) -> Answer | None:
         """See `Study`."""
         if self.phase + 1 == len(self.phases):
             return None
-        return replace(self.with_trained(table), phase=self.phase + 1)
+        found = replace(self.with_trained(table), phase=self.phase + 1)
+        found.delete_features()
+        return found
 
     def with_trained(self, table: pd.DataFrame) -> Answer:
-        """The study with the hashes of the policies that the table describes."""
-        rows = [] if table.empty else table[table["kind"] == TRAINING].to_dict("records")
+        """The study with the hashes of the backbones and policies that the table describes."""
+        rows = [] if table.empty else table[table["kind"].isin((BACKBONE, TRAINING))].to_dict("records")
         return replace(self, trained={row["policy"]: row["checkpoint_sha256"] for row in rows})
+
+    def delete_features(self) -> None:
+        """Deletes the features of every backbone on which no policy of the plan remains to be trained. Pilots
+        count only if their stage is run.
+        """
+        from saccade.sim.settings import TENSOR_FILE
+
+        planned = list(self.plan.all_policies(pilots=PILOT in self.stages))
+        wanted = {policy.backbone.name for policy in planned if policy.name not in self.trained}
+        beside = {policy.backbone.name: self.trainings[policy.name].parent for policy in planned}
+        for name, policies in beside.items():
+            tensors = self.trainings[name] / TENSOR_FILE
+            if name not in wanted and tensors.is_file():
+                # The star in front is for what a run that was killed left.
+                for path in policies.glob("*" + features_name(sha256_of(tensors), "*", "*")):
+                    path.unlink()
 
     @property
     def files(self) -> tuple[str | Path, ...]:
         """See `Study`: the finished policies. Demonstrations, and policies in training, stay in the output
         directory, which other machines must share.
         """
-        if self.phases[self.phase][1] != EPISODES:
+        if self.phases[self.phase][1] not in (EPISODES, measures.MEASURES):
             return ()
-        return tuple(path for name, path in self.policies.items() if name in self.trained and path.is_dir())
+        trained = [one.name for one in self.plan.all_policies(pilots=True) if one.name in self.trained]
+        return tuple(self.trainings[name] for name in trained if self.trainings[name].is_dir())
 
     def measure(self, cell: Cell) -> Rows:
         """See `Study`; the first word of the key says what is measured."""
         kind, name = str(cell.key[0]), str(cell.key[1])
         if kind == RECORDING:
             rows = [self.record(name)]
+        elif kind == BACKBONE:
+            rows = [self.train(next(one for one in self.plan.backbones if one.name == name))]
         elif kind == TRAINING:
             rows = [self.train(self.planned(name))]
+        elif kind == measures.MEASURES:
+            found = measures.measure(str(self.finished(name)), self.plan.tasks, self.first_seeds)
+            rows = [{**self.planned(name).columns, **found}]
         else:
             rows = self.judge(self.planned(name), str(cell.key[2]), str(cell.key[3]))
         return [{"kind": kind, **row} for row in rows]
 
     def planned(self, name: str) -> PlannedPolicy:
         """A policy of the plan by its name."""
-        return next(policy for policy in self.plan.all_policies() if policy.name == name)
+        return next(policy for policy in self.plan.all_policies(pilots=True) if policy.name == name)
 
     def record(self, name: str) -> dict[str, Any]:
         """Records what is missing of a recording, and describes it."""
         from saccade.sim import demos, environment_cache
         from saccade.sim.dataset import describe
 
-        recording = next(one for one in self.plan.recordings if one.name == name)
+        recording = self.plan.recording(name)
         start = time.perf_counter()
         demos.record_tasks(recording.counts, self.demos[name], recording.settings, lambda task: None)
         environment_cache.close()
@@ -204,26 +260,28 @@ class Answer(Study):
             "seconds": time.perf_counter() - start,
         }
 
-    def train(self, policy: PlannedPolicy) -> dict[str, Any]:
-        """Trains a policy unless that is done, and describes it.
+    def train(self, planned: Backbone | PlannedPolicy) -> dict[str, Any]:
+        """Trains a backbone or a policy unless that is done, and describes it.
 
         A column `trained_from_step` says how many steps were done when this process began: with another
         number than 0, `seconds` and `cpu` are those of the last part of the training only.
         """
-        directory, recording = self.policies[policy.name], policy.recipe.recording
-        start, first = time.perf_counter(), self.steps_done(policy)
-        if first < policy.training.steps:
+        directory, recording = self.trainings[planned.name], planned.recording
+        settings = planned.training
+        backbone = self.finished(planned.backbone.name) if isinstance(planned, PlannedPolicy) else None
+        start, first = time.perf_counter(), self.steps_done(planned, backbone)
+        if first < settings.steps:
             self.record(recording)
-            Planned(policy.name, str(self.demos[recording]), policy.training).train(directory)
+            Planned(planned.name, str(self.demos[recording]), settings).train(directory, backbone)
         seconds = time.perf_counter() - start
         for name in NOT_KEPT:
             (directory / name).unlink(missing_ok=True)
         run = read_run(directory, ("image_size", "num_cameras", "num_vl_tokens"))
-        found = cost(policy.training, self.plan.recording(policy.recipe))
-        known = {name: value for name, value in asdict(policy.training).items() if name != "seed"}
+        found = cost(settings, self.plan.recording(recording))
+        known = {name: run.settings[name] for name in asdict(settings) if name != "seed"}
         losses = {name: loss for name, loss in run.history[-1].items() if name != "step"}
         return {
-            **identity(policy),
+            **planned.columns,
             **known,
             **run.point,
             "recording": recording,
@@ -234,24 +292,32 @@ class Answer(Study):
             "trained_from_step": first,
             "seconds": seconds,
             "chunk_multiply_adds": found.chunk,
-            "training_multiply_adds": found.sample * policy.training.batch_size * policy.training.steps,
+            "training_multiply_adds": found.sample * settings.batch_size * settings.steps,
         }
 
-    def steps_done(self, policy: PlannedPolicy) -> int:
-        """The steps that a policy in its directory was trained for.
+    def steps_done(self, planned: Backbone | PlannedPolicy, backbone: Path | None) -> int:
+        """The steps that what is in its directory was trained for.
+
+        Args:
+            planned: What is to be trained.
+            backbone: The backbone of a policy.
 
         Raises:
-            InputError: it was trained with other settings.
+            InputError: it was trained with other settings, demonstrations or another backbone.
         """
-        directory = self.policies[policy.name]
+        from saccade.sim.settings import TENSOR_FILE
+
+        directory = self.trainings[planned.name]
         if not (directory / "settings.json").is_file():
             return 0
         run = read_run(directory, ())
-        wanted = asdict(policy.training)
+        wanted = asdict(planned.training)
+        if backbone is not None:
+            wanted["start_sha256"] = sha256_of(backbone / TENSOR_FILE)
         other = [name for name, value in wanted.items() if run.settings.get(name) != value]
         if other:
             raise InputError(f"{directory}: was trained with other settings ({', '.join(other)})")
-        counts = dict(self.plan.recording(policy.recipe).counts)
+        counts = dict(self.plan.recording(planned.recording).counts)
         if run.settings["demonstrations"]["tasks"] != counts:
             raise InputError(f"{directory}: was trained on other demonstrations, expected {counts}")
         if run.finished:
@@ -260,13 +326,23 @@ class Answer(Study):
         return saved_step(directory / STATE_FILE)
 
     def judge(self, policy: PlannedPolicy, arm: str, task: str) -> Rows:
-        """All episodes of a task, a row each.
+        """All episodes of a task, a row each; raises as `finished`."""
+        directory, blind = self.finished(policy.name), policy.training.blind
+        rows = []
+        for seed in self.plan.episodes(policy.recipe.stage):
+            episode = judge(str(directory), task, seed, find_arm(arm), blind=blind)
+            result = {"success": episode.success, "control_steps": episode.steps, "chunks": episode.chunks}
+            rows.append({**policy.columns, "arm": arm, "task": task, "seed": seed, **result})
+        return rows
+
+    def finished(self, name: str) -> Path:
+        """The directory of a backbone or a policy that is trained.
 
         Raises:
-            FileNotFoundError: the policy is not there.
+            FileNotFoundError: it is not there.
             InputError: it is not the one that the table describes.
         """
-        directory, expected = self.policies[policy.name], self.trained[policy.name]
+        directory, expected = self.trainings[name], self.trained[name]
         if not directory.is_dir():
             raise FileNotFoundError(
                 f"{directory}: no such policy; it was trained, with the hash {expected}. Put it back, or "
@@ -275,29 +351,12 @@ class Answer(Study):
         found = checkpoint_identity(directory)["sha256"]
         if found != expected:
             raise InputError(f"{directory}: has the hash {found}, expected {expected}, which was trained")
-        rows = []
-        for seed in self.plan.seeds:
-            episode = judge(str(directory), task, seed, find_arm(arm))
-            result = {"success": episode.success, "control_steps": episode.steps, "chunks": episode.chunks}
-            rows.append({**identity(policy), "arm": arm, "task": task, "seed": seed, **result})
-        return rows
+        return directory
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
         return section(table, provenance)
-
-
-def identity(policy: PlannedPolicy) -> dict[str, Any]:
-    """The columns that identify a policy."""
-    recipe = policy.recipe
-    return {
-        "stage": recipe.stage,
-        "recipe": recipe.name,
-        "policy": policy.name,
-        "training_seed": policy.seed,
-        "num_future_tokens": recipe.training.num_future_tokens,
-    }
 
 
 def described(recording: Recording) -> dict[str, Any]:

@@ -1,0 +1,113 @@
+"""What can be measured of a policy without judging it: cheap numbers that might predict a cut's effect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from saccade.study.linear_probes import FOLDS, PROPRIO, VL, Frames, join, probe
+from saccade.study.paths import DIRECT
+from saccade.study.questions.cuts import ARMS as CUTS
+from saccade.study.source import episode_rng
+
+if TYPE_CHECKING:
+    from saccade.head import ActionHead
+    from saccade.study.simulator import Recorded, Simulator
+
+#: The stage that measures them, for the policies of the core that have tokens.
+MEASURES = "measures"
+#: The arm whose effect on success they may predict.
+CUT = "future-unread"
+#: What is measured, and its label.
+NAMES = {
+    "chunk_change": "change of the chunk by the cut",
+    "attention_mass": "attention of action rows to future rows",
+    "gradient_share": "share of the gradient through future rows",
+    "probe_r2": "R2 of probes of future rows",
+}
+EPISODES = 10  # of each task
+OBSERVATIONS = 3  # of each episode, for gradients
+PROJECTIONS = 8  # of the actions, for gradients
+DIMENSIONS = 64  # that a probe reads
+
+
+def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Mapping[str, float | None]:
+    """The measures of a policy with future tokens, each a mean over episodes of the unchanged policy.
+
+    Args:
+        checkpoint: Directory of the policy.
+        tasks, seeds: The episodes.
+
+    Returns:
+        By name of `NAMES`. `chunk_change` is the mean absolute change of an action when state and action rows
+        do not see the future rows. `attention_mass` is the probability of the future rows for the action
+        rows, over blocks with self-attention, their heads and the Euler steps. `gradient_share` is the share
+        of the derivative of the actions by the vision-language tokens that passes future rows. `probe_r2` is
+        the share of the variance within a task, of the positions of object and goal, that a linear probe
+        finds in the mean of the future rows, over blocks; None with fewer episodes than folds.
+    """
+    from saccade.study.simulator import Simulator
+
+    source = Simulator(checkpoint, tuple(tasks), seeds)
+    head = source.head()
+    changes, masses, through, frames, numbers = [], [], [], list[Frames](), []
+    for number, task in enumerate(tasks):
+        for seed in seeds:
+            recorded = source.recorded(task, seed)
+            change = CUTS[CUT].intervention(head.future_tokens, episode_rng(task, seed))
+            plain, cut = (source.actions(recorded.observation, one) for one in (None, change))
+            changes.append(float(np.abs(cut - plain).mean()))
+            masses.append(attention_mass(head, recorded))
+            through.append(gradient_share(source, task, seed))
+            frames.append(future_frames(head, recorded))
+            numbers.append(number)
+    means = [float(np.mean(values)) for values in (changes, masses, through)]
+    found: list[float | None] = [*means, probed(frames, numbers) if len(frames) >= FOLDS else None]
+    return dict(zip(NAMES, found, strict=True))
+
+
+def attention_mass(head: ActionHead, recorded: Recorded) -> float:
+    """The probability that action rows give to future rows in an episode."""
+    masses = []
+    for observation in recorded.observation.rows():
+        trace = observation.trace(head, observation.encode(head), record=("attention",))
+        future, action = trace.rows["future"], trace.rows["action"]
+        for (_, block), probabilities in trace.attention.items():
+            if head.config.interleave_self_attention and block % 2 == 1:
+                masses.append(float(np.asarray(probabilities)[0, :, action, future].sum(axis=-1).mean()))
+    return float(np.mean(masses))
+
+
+def gradient_share(source: Simulator, task: str, seed: int) -> float:
+    """The share of the gradient that passes future rows in an episode."""
+    from saccade.study.questions.gradients import Gradients
+
+    rows = Gradients(source, PROJECTIONS, OBSERVATIONS).of_actions(task, seed)
+    (direct,) = [float(row["share"]) for row in rows if row.get("path") == DIRECT and "share" in row]
+    return 1.0 - direct
+
+
+def future_frames(head: ActionHead, recorded: Recorded) -> Frames:
+    """What probes of an episode read: the mean future row after each block; and what `probe` asks for."""
+    from saccade.study.questions.probes import frames_of
+
+    frames = frames_of(head, recorded, 0)
+    inputs = {
+        source: values
+        for source, values in frames.inputs.items()
+        if source in (PROPRIO, VL) or source[0::2] == ("future", "mean")
+    }
+    return replace(frames, inputs=inputs)
+
+
+def probed(frames: Sequence[Frames], numbers: Sequence[int]) -> float | None:
+    """The mean R2 over blocks and positions; None if nothing moves."""
+    import threadpoolctl  # type: ignore[import-untyped]
+
+    with threadpoolctl.threadpool_limits(1):
+        rows = probe(join(frames, numbers), DIMENSIONS)
+    found = [row["r2"] for row in rows if row["rows"] == "future" and row["target"] in ("object", "goal")]
+    return float(np.mean(found)) if found else None
