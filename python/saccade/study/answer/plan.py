@@ -201,11 +201,11 @@ class Plan:
 #: The stage whose policies only help to plan. It is run if it is named, and is no result.
 PILOT = "pilot"
 
-TASKS = ("reach", "stereo-reach")
-COUNTS = dict.fromkeys(TASKS, 200)  # demonstrations of each task
+TASKS = ("reach", "stereo-reach", "two-goals")
+COUNTS = dict.fromkeys(TASKS, 500)  # demonstrations of each task
 EPISODES = range(50)  # seeds of the episodes of each task
 PILOT_EPISODES = range(500_000, 500_050)
-SEEDS = tuple(range(8))  # of training
+SEEDS = tuple(range(12))  # of training
 PILOT_SEEDS = (100, 101)
 BASE = TrainingSettings(
     only="head",
@@ -214,8 +214,9 @@ BASE = TrainingSettings(
     learning_rate=2e-3,
     ema_decay=0.995,
     width=64,
-    vision_width=48,
-    vision_layers=2,
+    vision_width=64,
+    vision_layers=3,
+    vision_heads=4,
     execute_steps=8,
 )
 # No future tokens, so that a backbone has nothing of any N.
