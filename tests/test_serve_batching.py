@@ -28,7 +28,7 @@ from saccade.serve.statistics import Statistics, line
 def job(client: Any = None, rows: int = 1, session: str | None = None) -> Job:
     nothing = StateReading(DIALECTS[0], True, False, np.zeros((rows, 1, 1), np.float32))
     reading = Reading(**vars(nothing), frames=(), instructions=(), is_plain=False)
-    return Job(Call("get_action", options=Options(session=session)), reading, client or object(), 10)
+    return Job(Call("get_action", options=Options(session=session)), reading, client or object())
 
 
 def rows(jobs: list[Job] | None) -> list[int]:
@@ -48,9 +48,8 @@ def test_a_batch_has_at_most_so_many_rows() -> None:
     queue = Queue(4, 0.0)
     for size in (1, 2, 3, 9, 1):
         queue.put(job(rows=size))
-    assert queue.size == 50
     assert [computed(queue) for _ in range(4)] == [[1, 2], [3], [9], [1]]
-    assert (len(queue), queue.size) == (0, 0)
+    assert len(queue) == 0
     queue.close()
     assert queue.take() is None
 

@@ -24,19 +24,17 @@ class Job:
         call: What it asks for.
         reading: Its observations.
         client: Who asks.
-        size: Bytes of its message.
         is_msgpack_numpy: In which form its arrays came, and those of the answer go.
         inputs: What the backbone takes, or why there is none, once it is prepared.
         is_claimed: Whether a thread prepares it while it waits.
         received: When it arrived, on the clock of `time.perf_counter`.
-        reply: How it is answered; only the server reads it.
+        reply: What is answered; only the server reads it.
         milliseconds: How long each part took.
     """
 
     call: Call
     reading: Reading
     client: Hashable
-    size: int
     is_msgpack_numpy: bool = False
     inputs: Sequence[Any] | BaseException | None = None
     is_claimed: bool = False
@@ -81,21 +79,14 @@ class Queue:
         self._changed = threading.Condition()
         self._is_closed = False
         self._num_idle = 0
-        self._size = 0
 
     def __len__(self) -> int:
         return len(self._jobs)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the messages that wait."""
-        return self._size
 
     def put(self, job: Job) -> None:
         """Appends a request."""
         with self._changed:
             self._jobs.append(job)
-            self._size += job.size
             self._active.pop(job.client, None)
             self._active[job.client] = self._clock()
             self._changed.notify()
@@ -188,7 +179,6 @@ class Queue:
                 break
             chosen.append(job)
             rows += job.rows
-            self._size -= job.size
         self._computed.update(chosen)
         self._jobs = deque(job for job in self._jobs if job not in self._computed)
         return chosen
