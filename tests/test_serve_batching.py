@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from serve_cases import HORIZON, MemoryPolicy, ask, get_action, observation, requester, serving, wait_until
 
-from saccade.dialects import DIALECTS, Reading, StateReading
+from saccade.dialects import DIALECTS, Reading, Requirements, StateReading
 from saccade.errors import InputError
 from saccade.serve import Client, ServerError
 from saccade.serve.batching import Job, Queue
@@ -26,7 +26,9 @@ from saccade.serve.statistics import Statistics, line
 
 
 def job(client: Any = None, rows: int = 1, session: str | None = None) -> Job:
-    nothing = StateReading(DIALECTS[0], True, False, np.zeros((rows, 1, 1), np.float32))
+    nothing = StateReading(
+        DIALECTS[0], Requirements(None, None, ()), True, False, np.zeros((rows, 1, 1), np.float32)
+    )
     reading = Reading(**vars(nothing), frames=(), instructions=(), is_plain=False)
     return Job(Call("get_action", options=Options(session=session)), reading, client or object())
 

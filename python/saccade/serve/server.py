@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from saccade import hub
+from saccade import dialects, hub
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import engine, modalities, pickles
 from saccade.serve.batching import Job, Queue
@@ -219,7 +219,7 @@ class Server:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
-        reading = self._policy.read(call.observation, most_rows=self._limits.rows)
+        reading = dialects.read(call.observation, self._policy.requirements, self._limits.rows)
         self._forms[connection] = "text" if call.is_bare else "map"
         self._unanswered += 1
         reply = (connection, replace(request, payload=bytearray()))  # the payload was unpacked
