@@ -86,7 +86,8 @@ class Server:
         self._forms: weakref.WeakKeyDictionary[Connection, str] = weakref.WeakKeyDictionary()
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
         self._engine = engine.Engine(policy, self._sessions)
-        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self._engine.num_workers)
+        workers = min(self._engine.num_workers, max_batch)
+        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, workers)
         self._statistics = Statistics()
         self.address = address_of(listener)
         self._connections = Connections(listener, limits, self._on_request, self._on_problem)
@@ -97,7 +98,7 @@ class Server:
         self._watched = _stamps(policy.head.source)
         self._workers = [
             threading.Thread(target=self._compute, name=f"saccade-serve-{number}", daemon=True)
-            for number in range(self._engine.num_workers)
+            for number in range(workers)
         ]
 
     def stop(self, why: str) -> None:
