@@ -153,7 +153,8 @@ def test_threads_never_compute_more_than_a_batch_at_a_time() -> None:
         assert [len(queue.take() or []) for _ in expected] == expected
     for most, expected_workers in ((1, 1), (2, 2), (16, 2)):
         listener = bind("127.0.0.1", 0)
-        server = Server(MemoryPolicy(nbytes=1000), listener, MemoryLog(), max_batch=most)
+        policy: Any = MemoryPolicy(nbytes=1000)
+        server = Server(policy, listener, MemoryLog(), max_batch=most)
         assert len(server._workers) == expected_workers
         server._connections.close()
 
