@@ -124,11 +124,21 @@ def test_nothing_is_read_of_a_connection_that_its_request_closed() -> None:
 
     driven.connections._on_request = close
     with driven.client() as (made, _):
-        made.sendall(b"\x00\x00" * 100 + request(1000, sent=10))
+        made.sendall(b"\x00\x00" + request(1000, sent=10))
         driven.received(lambda: not len(driven.connections))
     assert len(driven.requests) == 1
     assert driven.connections.held == 0
     driven.connections.close()
+
+
+def test_a_request_is_not_counted_whose_client_was_lost_before_it_was_answered(
+    driven: Driven, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with driven.client() as (made, _):
+        monkeypatch.setattr(driven.connections, "_send_output", driven.connections._forget)  # as if it fails
+        made.sendall(request(1000))
+        driven.received(lambda: not len(driven.connections))
+    assert (driven.requests, driven.connections.held) == ([], 0)
 
 
 def test_heartbeats_of_a_client_that_does_not_read(driven: Driven, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,8 +151,7 @@ class Connections:
             request: The request, which need not have its payload any more.
             payload: The answer.
         """
-        if request.is_complete:
-            self._room.held -= request.size
+        self._release(request)
         if connection not in self._clients or not connection.is_open:
             return
         if not connection.num_unsent:
@@ -227,6 +226,7 @@ class Connections:
             for request in connection.peer.receive(self._received[:count]):
                 self._send_output(connection)
                 if connection not in self._clients:
+                    self._release(request)
                     return
                 self._on_request(connection, request)
                 if connection not in self._clients:
@@ -234,6 +234,11 @@ class Connections:
             self._send_output(connection)
         except zmtp.ProtocolError as error:
             self._refuse(connection, error)
+
+    def _release(self, request: zmtp.Request) -> None:
+        """Counts a request no more."""
+        if request.is_complete:
+            self._room.held -= request.size
 
     def _send_output(self, connection: Connection) -> None:
         """Sends what the protocol answers by itself, which comes before the answer to a request."""
