@@ -40,7 +40,7 @@ import numpy as np
 import zmq
 
 import saccade
-from benches import serve_report
+from benches import checkpoints, pages, serve_report
 from benches.peers import machine
 from saccade._files import write_json
 from saccade.serve.packing import pack
@@ -51,6 +51,8 @@ OBSERVATIONS = 8
 #: Seconds of batches that are computed in process in each round.
 COMPARED_SECONDS = 2.0
 START_SECONDS = 900.0
+#: The log has a line of each request within so many seconds, unless lines were lost.
+LOG_SECONDS = 10.0
 #: A client is not expected any more after a second without a request.
 REST_SECONDS = 1.2
 
@@ -87,26 +89,37 @@ class Row:
 def main(arguments: list[str] | None = None) -> int:
     """The exit status: 1 if an answer was lost."""
     args = parse(arguments)
+    path: Path = args.out / "results.json"
     if args.command == "report":
-        return serve_report.command(write=args.write)
-    checkpoint = DEMO if args.random is None else written(args.random)
+        return pages.report(
+            path,
+            serve_report.COMMITTED,
+            serve_report.PAGE,
+            serve_report.document,
+            program="benches.serve",
+            write=args.write,
+        )
+    checkpoint = DEMO if args.random is None else checkpoints.written(args.random)
     options = {"precision": args.precision, "num_threads": args.num_threads}
     policy = saccade.Policy.load(checkpoint, **options)
     observations = [policy.example_observation(seed) for seed in range(OBSERVATIONS)]
     rows = {clients: Row(clients) for clients in args.clients}
     latencies: dict[int, list[float]] = {clients: [] for clients in args.clients}
-    out = args.out / f"{'demo' if args.random is None else 'full'}.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
+    name = "demo" if args.random is None else "full"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # What was measured of the other policy is kept.
+    before = next((one for one in (path, serve_report.COMMITTED) if one.exists()), None)
+    results = {} if before is None else json.loads(before.read_text())
     here = machine.describe()
-    with server(checkpoint, args, out.with_suffix(".jsonl")) as running:
+    with server(checkpoint, args, path.with_name(f"{name}.jsonl")) as running:
         load(running, observations, 1, 2)  # the first request allocates memory
+        running.batches(2)
         for number in range(args.rounds):
             for clients, row in rows.items():
                 time.sleep(REST_SECONDS)
                 requests = args.requests * (number + 1) // args.rounds - args.requests * number // args.rounds
-                running.new_batches()
                 found = load(running, observations, clients, requests)
-                batches = running.new_batches()
+                batches = running.batches(requests)
                 latencies[clients] += found.latencies
                 row.requests += requests
                 row.lost += requests - len(found.latencies)
@@ -119,14 +132,14 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"round {number + 1}: {line(row)}", flush=True)
             for clients, row in rows.items():
                 row.p50, row.p99 = (1e3 * float(at) for at in np.percentile(latencies[clients], (50, 99)))
-            result = {
+            results[name] = {
                 "precision": args.precision,
                 "num_threads": policy.head.num_threads,
                 "machine": here,
                 "rows": [asdict(row) for row in rows.values()],
             }
-            write_json(out, result)
-    print(f"wrote {out}")
+            write_json(path, results)
+    print(f"wrote {path}")
     return int(any(row.lost for row in rows.values()))
 
 
@@ -147,20 +160,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--rounds", type=int, default=10, metavar="N")
     parser.add_argument("--precision", default="float32")
     parser.add_argument("--num-threads", type=int, metavar="N")
-    parser.add_argument("--serve-args", default="", metavar="TEXT", help="further arguments of saccade serve")
-    parser.add_argument("--out", type=Path, default=serve_report.MEASURED_HERE, metavar="DIR")
+    parser.add_argument("--out", type=Path, default=Path("out/serve"), metavar="DIR")
     args = parser.parse_args(arguments)
     if min(args.clients) < 1 or args.requests < args.rounds * max(args.clients):
         parser.error("expected at least one request for each client and round")
     return args
-
-
-def written(folder: Path) -> Path:
-    """A random checkpoint of full size, which is written if there is none."""
-    if not (folder / "config.json").is_file():
-        command = [sys.executable, "-m", "saccade.checkpoints.random_checkpoint", str(folder)]
-        subprocess.run(command, check=True)
-    return folder
 
 
 class Running:
@@ -182,11 +186,24 @@ class Running:
             time.sleep(0.05)
         self.port = int(json.loads(first)["address"].rpartition(":")[2])
 
-    def new_batches(self) -> Counter[int]:
-        """Number of batches by their size since the last call: of n observations, n requests say so."""
-        time.sleep(0.2)  # until the log is written
-        lines = [json.loads(text) for text in self._log.read().splitlines()]
-        sizes = Counter(one["batch"] for one in lines if one["event"] == "request" and one.get("batch"))
+    def batches(self, requests: int) -> Counter[int]:
+        """Number of batches by their size: of n observations, n requests say so.
+
+        Args:
+            requests: Number of requests since the last call; waits until the log has so many.
+        """
+        sizes: Counter[int] = Counter()
+        text, end = "", time.monotonic() + LOG_SECONDS
+        while requests and time.monotonic() < end:
+            text += self._log.readline()
+            if not text.endswith("\n"):
+                time.sleep(0.01)
+                continue
+            one, text = json.loads(text), ""
+            if one["event"] == "request":
+                requests -= 1
+                if one.get("batch"):
+                    sizes[one["batch"]] += 1
         return Counter({size: max(1, round(count / size)) for size, count in sizes.items()})
 
     def memory(self) -> float:
@@ -209,7 +226,7 @@ def server(checkpoint: Path, args: argparse.Namespace, log: Path) -> Iterator[Ru
         RuntimeError: It does not start, or does not end with status 0.
     """
     command = [sys.executable, "-m", "saccade", "serve", str(checkpoint), "--port", "0", "--log", "json"]
-    command += ["--precision", args.precision, *args.serve_args.split()]
+    command += ["--precision", args.precision]
     if args.num_threads is not None:
         command += ["--num-threads", str(args.num_threads)]
     with log.open("wb") as output, subprocess.Popen(command, stdout=output) as process:

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from benches.peers.results import rounded
 from benches.peers.text import table
-from saccade._files import write_json
 from saccade.bench.timing import quartiles
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "serve.md"
-#: What was measured here, and what is committed: a file for each policy.
-MEASURED_HERE = Path("out/serve")
-COMMITTED = Path(__file__).with_name("serve_results")
-#: The part of the page that `report --write` replaces.
-MEASURED = re.compile(r"(?<=<!-- measured -->\n).*(?=<!-- end of measured -->)", re.DOTALL)
+#: The committed measurements, by policy.
+COMMITTED = Path(__file__).with_name("serve_results.json")
 
 POLICIES = {"demo": "The bundled policy", "full": "N1.5 at its published size, random weights"}
 
@@ -27,36 +20,15 @@ Results = dict[str, Any]
 Row = dict[str, Any]
 
 
-def command(*, write: bool) -> int:
-    """Prints the tables, or writes them to the page and keeps the measurements next to the program."""
-    results = {}
-    for name in POLICIES:
-        found = [folder / f"{name}.json" for folder in (MEASURED_HERE, COMMITTED)]
-        path = next((path for path in found if path.exists()), None)
-        if path is not None:
-            results[name] = rounded(json.loads(path.read_text()))
-    if not results:
-        raise SystemExit("benches.serve: nothing measured yet; run python -m benches.serve")
-    if not write:
-        print(document(results))
-        return 0
-    COMMITTED.mkdir(exist_ok=True)
-    for name, result in results.items():
-        write_json(COMMITTED / f"{name}.json", result)
-    page = PAGE.read_text()
-    PAGE.write_text(MEASURED.sub(lambda found: f"\n{document(results)}\n", page))
-    print(PAGE)
-    return 0
-
-
 def document(results: dict[str, Results]) -> str:
     """The measured part of the page."""
     parts = [
-        "Written by `python -m benches.serve report --write` from `benches/serve_results`, which "
+        "Written by `python -m benches.serve report --write` from `benches/serve_results.json`, which "
         "`python -m benches.serve` measured."
     ]
-    for name, result in results.items():
-        parts += [f"### {POLICIES[name]}, {result['precision']}", *section(result)]
+    for name, title in POLICIES.items():
+        if name in results:
+            parts += [f"### {title}, {results[name]['precision']}", *section(results[name])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -72,10 +44,13 @@ def section(result: Results) -> Iterator[str]:
     yield table(head, [cells(row, rows[0]) for row in rows])
     memory = rows[-1]["memory"]
     requests = sum(row["requests"] for row in rows)
-    yield (
-        f"Requests: {requests}; rounds: {len(memory)}. Memory of the server: {memory[0]:.0f} MB after the "
-        f"first round, {memory[-1]:.0f} MB after the last."
-    )
+    text = f"Requests: {requests}; rounds: {len(memory)}."
+    if len(memory) > 1:
+        text += (
+            f" Memory of the server: {memory[0]:.0f} MB after the first round, {memory[-1]:.0f} MB after the "
+        )
+        text += "last."
+    yield text
 
 
 def cells(row: Row, first: Row) -> list[str]:

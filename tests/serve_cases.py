@@ -11,7 +11,7 @@ import io
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +20,7 @@ import msgpack
 import numpy as np
 import zmq
 
-from saccade.dialects import Camera, Reading, Requirements, read
+from saccade.dialects import Camera, Reading, Requirements
 from saccade.serve import Limits, Server
 from saccade.serve.connections import bind
 
@@ -54,9 +54,6 @@ class MemoryPolicy:
         self.requirements = Requirements(
             "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_key="annotation.task"
         )
-
-    def read(self, observation: Mapping[str, Any], *, most_rows: int | None = None) -> Reading:
-        return read(observation, self.requirements, most_rows)
 
     def inputs(self, reading: Reading) -> list[Any]:
         if "explode" in str(reading.instructions[0]):

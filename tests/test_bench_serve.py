@@ -11,20 +11,33 @@ import pytest
 from benches import serve, serve_report
 
 
-def test_every_request_is_counted_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_request_is_counted_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(serve, "COMPARED_SECONDS", 0.05)
     monkeypatch.setattr(serve, "REST_SECONDS", 0.0)
     arguments = ["--clients", "1", "3", "--requests", "12", "--rounds", "2", "--num-threads", "2"]
     assert serve.main([*arguments, "--out", str(tmp_path)]) == 0
-    result = json.loads((tmp_path / "demo.json").read_text())
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert set(results) == {"demo", "full"}  # that of the other policy is the committed one
+    result = results["demo"]
     for row, clients in zip(result["rows"], (1, 3), strict=True):
         assert (row["clients"], row["requests"], row["lost"]) == (clients, 12, 0)
         for name in ("per_second", "in_process", "memory", "server_cpu", "client_cpu"):
             assert len(row[name]) == 2
             assert min(row[name]) >= 0
         assert 0 < row["p50"] <= row["p99"]
-        assert sum(int(size) * count for size, count in row["batches"].items()) == pytest.approx(12, abs=6)
-    assert result["machine"]["cpu"] in serve_report.document({"demo": result})
+        assert sum(int(size) * count for size, count in row["batches"].items()) == 12
+    text = serve_report.document({"demo": result})
+    assert result["machine"]["cpu"] in text
+    assert "Requests: 24; rounds: 2. Memory of the server: " in text
+    for one in result["rows"]:
+        one.update({key: value[:1] for key, value in one.items() if isinstance(value, list)})
+    text = serve_report.document({"demo": result})
+    assert "Requests: 24; rounds: 1." in text
+    assert "Memory" not in text  # there is nothing to compare it with
+    assert serve.main(["report", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("### ") == 2
 
 
 def row(clients: int, per_second: list[float], in_process: list[float]) -> dict[str, Any]:
@@ -61,10 +74,6 @@ def test_ratios_are_those_of_the_same_round() -> None:
 
 
 def test_the_page_shows_what_is_committed() -> None:
-    committed = {
-        name: json.loads(path.read_text())
-        for name in serve_report.POLICIES
-        if (path := serve_report.COMMITTED / f"{name}.json").exists()
-    }
-    assert committed
+    committed = json.loads(serve_report.COMMITTED.read_text())
+    assert set(committed) == set(serve_report.POLICIES)
     assert serve_report.document(committed) in serve_report.PAGE.read_text()

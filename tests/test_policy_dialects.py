@@ -14,7 +14,7 @@ from policy_cases import policy
 
 import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
-from saccade.dialects import CameraSources
+from saccade.dialects import CameraSources, read
 
 Observation = dict[str, Any]
 
@@ -140,7 +140,7 @@ def test_several_observations_are_answered_as_if_alone(layout: str) -> None:
 def test_what_was_read_stands_for_the_observation() -> None:
     made = policy("nvidia")
     given = [nested(made), flat(nested(made, batch=2)), lerobot(nested(made))]
-    readings = [made.read(one) for one in given]
+    readings = [read(one, made.requirements) for one in given]
     expected = made.act(given, seed=3)
     context = made.encode(readings)
     for found in (
@@ -153,21 +153,40 @@ def test_what_was_read_stands_for_the_observation() -> None:
             for key in one if isinstance(one, dict) else (0,):
                 np.testing.assert_array_equal(one[key], other[key])
     np.testing.assert_equal(made.act(readings[0], seed=4), made.act(given[0], seed=4))
-    made.read(given[1], most_rows=2)
+    read(given[1], made.requirements, 2)
     with pytest.raises(InputError, match="expected at most 1 rows, got 2"):
-        made.read({"state": nested(made, batch=2)["state"]}, most_rows=1)  # before frames are looked at
+        read({"state": nested(made, batch=2)["state"]}, made.requirements, 1)  # before frames are looked at
+
+
+def test_what_was_read_for_another_policy_is_refused() -> None:
+    made, other = policy("nvidia"), policy("nvidia", CameraSources())
+    given = nested(made)
+    reading = read(given, made.requirements)
+    context = made.encode(given)
+    assert made.sample(context, reading, seed=0).keys() == made.sample(context, given, seed=0).keys()
+    for call in (other.inputs, other.act, lambda one: other.sample(context, one)):
+        with pytest.raises(
+            InputError, match=r"expected what was read for this policy, got what was read for another"
+        ):
+            call(reading)
+        with pytest.raises(
+            InputError, match=r"expected what was read for this policy, got what was read for another"
+        ):
+            call([reading])
 
 
 def test_one_string_a_row_of_a_batch_is_plain() -> None:
     made = policy("isaac")
     given = nested(made, batch=2)
-    reading = made.read(flat(given) | {"annotation.human.action.task_description": ["a", "b"]})
+    reading = read(flat(given) | {"annotation.human.action.task_description": ["a", "b"]}, made.requirements)
     assert (reading.instructions, reading.is_plain) == (("a", "b"), True)
     for texts in ([["a"], ["b"]], np.array([["a"], ["b"]]), (["a"], ("b",))):
-        reading = made.read(flat(given) | {"annotation.human.action.task_description": texts})
+        reading = read(flat(given) | {"annotation.human.action.task_description": texts}, made.requirements)
         assert (reading.instructions, reading.is_plain) == (("a", "b"), False)
     for text in ("a", ["a"], np.array(["a"])):
-        reading = made.read(row(flat(given), 0) | {"annotation.human.action.task_description": text})
+        reading = read(
+            row(flat(given), 0) | {"annotation.human.action.task_description": text}, made.requirements
+        )
         assert (reading.instructions, reading.is_plain) == (("a",), False)
 
 
@@ -188,9 +207,9 @@ def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() 
     isaac = policy("isaac")
     observation = flat(nested(isaac))
     del observation["annotation.human.action.task_description"]
-    assert isaac.read(observation).instructions == (None,)
+    assert read(observation, isaac.requirements).instructions == (None,)
     observation["task"] = ["go"]
-    assert isaac.read(observation).instructions == ("go",)
+    assert read(observation, isaac.requirements).instructions == ("go",)
 
 
 def test_float_frames_become_uint8_as_in_lerobot() -> None:
@@ -201,7 +220,7 @@ def test_float_frames_become_uint8_as_in_lerobot() -> None:
     frames[:, :, 20, :3] = [-0.2, 1.2, 0.5]
     given = lerobot(nested(made))
     for kind in (frames, torch.from_numpy(frames), torch.from_numpy(frames).double()):
-        reading = made.read(given | {"observation.images.front": kind})
+        reading = read(given | {"observation.images.front": kind}, made.requirements)
         found = reading.frames[0]["front"]
         assert np.array_equal(found[:16, :16], values[0])
         assert found[20, :3, 0].tolist() == [0, 255, 127]
@@ -215,7 +234,7 @@ def test_frames_along_time_come_before_cameras() -> None:
     video = np.random.default_rng(0).integers(0, 256, (2, 2, 8, 8, 3), np.uint8)
     given = nested(policy("n17"))
     given["video"] = {"a": video[:1], "b": video[1:]}
-    frames = made.read(given).frames[0]
+    frames = read(given, made.requirements).frames[0]
     assert list(frames) == ["a[0]", "b[0]", "a[1]", "b[1]"]
     assert np.array_equal(frames["b[1]"], video[1, 1])
     given["video"] = {"a": video[:1, :1], "b": video[1:, :1]}
@@ -227,8 +246,8 @@ def test_unnamed_cameras_keep_their_order_or_are_sorted() -> None:
     made = policy("isaac", CameraSources())
     given = nested(policy("isaac"))
     given["video"] = dict.fromkeys(("z", "a"), given["video"]["wrist"])
-    assert list(made.read(given).frames[0]) == ["z", "a"]
-    assert list(made.read(lerobot(given)).frames[0]) == ["a", "z"]
+    assert list(read(given, made.requirements).frames[0]) == ["z", "a"]
+    assert list(read(lerobot(given), made.requirements).frames[0]) == ["a", "z"]
     assert list(made.example_observation()["video"]) == ["front"]
 
 

@@ -13,12 +13,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from serve_cases import HORIZON, MemoryPolicy, ask, get_action, observation, requester, serving, wait_until
+from serve_cases import (
+    HORIZON,
+    MemoryLog,
+    MemoryPolicy,
+    ask,
+    get_action,
+    observation,
+    requester,
+    serving,
+    wait_until,
+)
 
-from saccade.dialects import DIALECTS, Reading, StateReading
+from saccade.dialects import DIALECTS, Reading, Requirements, StateReading
 from saccade.errors import InputError
-from saccade.serve import Client, ServerError
+from saccade.serve import Client, Server, ServerError
 from saccade.serve.batching import Job, Queue
+from saccade.serve.connections import bind
 from saccade.serve.logs import MOST_LINES, MOST_WARNINGS, JsonLog, LiveLog, TextLog, Writer
 from saccade.serve.requests import Call, Options
 from saccade.serve.sessions import Chunk, Sessions
@@ -26,9 +37,11 @@ from saccade.serve.statistics import Statistics, line
 
 
 def job(client: Any = None, rows: int = 1, session: str | None = None) -> Job:
-    nothing = StateReading(DIALECTS[0], True, False, np.zeros((rows, 1, 1), np.float32))
+    nothing = StateReading(
+        DIALECTS[0], Requirements(None, None, ()), True, False, np.zeros((rows, 1, 1), np.float32)
+    )
     reading = Reading(**vars(nothing), frames=(), instructions=(), is_plain=False)
-    return Job(Call("get_action", options=Options(session=session)), reading, client or object(), 10)
+    return Job(Call("get_action", options=Options(session=session)), reading, client or object())
 
 
 def rows(jobs: list[Job] | None) -> list[int]:
@@ -48,9 +61,8 @@ def test_a_batch_has_at_most_so_many_rows() -> None:
     queue = Queue(4, 0.0)
     for size in (1, 2, 3, 9, 1):
         queue.put(job(rows=size))
-    assert queue.size == 50
     assert [computed(queue) for _ in range(4)] == [[1, 2], [3], [9], [1]]
-    assert (len(queue), queue.size) == (0, 0)
+    assert len(queue) == 0
     queue.close()
     assert queue.take() is None
 
@@ -131,6 +143,63 @@ def test_threads_share_out_what_waits() -> None:
     assert [rows(queue.take()) for _ in range(3)] == [[1] * 4, [1] * 4, [1]]
     queue.close()
     assert queue.take() is None
+
+
+def test_threads_never_compute_more_than_a_batch_at_a_time() -> None:
+    for most, workers, expected in ((1, 1, [1, 1]), (3, 2, [1, 1]), (7, 2, [3, 3]), (8, 3, [2, 2, 2])):
+        queue = Queue(most, 0.0, num_workers=workers)
+        for _ in range(20):
+            queue.put(job())
+        assert [len(queue.take() or []) for _ in expected] == expected
+    for most, expected_workers in ((1, 1), (2, 2), (16, 2)):
+        listener = bind("127.0.0.1", 0)
+        policy: Any = MemoryPolicy(nbytes=1000)
+        server = Server(policy, listener, MemoryLog(), max_batch=most)
+        assert len(server._workers) == expected_workers
+        server._connections.close()
+
+
+def test_clients_that_are_gone_are_forgotten_while_the_queue_is_full() -> None:
+    now = [0.0]
+    queue = Queue(1, 0.0, clock=lambda: now[0])
+    for number in range(100):
+        now[0] = 0.1 * number
+        queue.put(job(f"client {number}"))
+        queue.put(job("client that stays"))
+    assert len(queue._active) <= 12
+
+
+def test_what_a_thread_prepares_is_left_to_it() -> None:
+    prepared: list[Job] = []
+    begun, go_on = threading.Event(), threading.Event()
+
+    def prepare(job: Job) -> None:
+        prepared.append(job)
+        begun.set()
+        assert go_on.wait(60)
+
+    queue = Queue(16, 60.0, prepare, num_workers=2)
+    for client in ("a", "b"):
+        queue.put(job(client))
+    assert computed(queue) == [1, 1]
+    first, same, other = job("a", session="s"), job("a", session="s"), job("b")
+    with ThreadPoolExecutor(2) as threads:
+        try:
+            queue.put(first)
+            slow = threads.submit(queue.take)
+            assert begun.wait(60)
+            queue.put(same)
+            queue.put(other)
+            assert threads.submit(queue.take).result(30) == [other]
+            assert not slow.done()
+            go_on.set()
+            assert slow.result(30) == [first]
+            assert prepared == [first]
+            queue.done([first])
+            assert queue.take() == [same]
+        finally:
+            go_on.set()
+            queue.close()
 
 
 def test_clients_that_are_computed_are_not_waited_for() -> None:

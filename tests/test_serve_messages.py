@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import pickle
+import subprocess
+import sys
 import tracemalloc
 from typing import Any
 
@@ -116,6 +118,54 @@ def test_arrays_of_msgpack_numpy(array: Any) -> None:
 def test_hostile_arrays_are_refused(data: Any, error: type[Exception], match: str) -> None:
     with pytest.raises(error, match=match):
         unpack(msgpack.packb({"a": {"__ndarray_class__": True, "as_npy": data}}), LIMITS)
+
+
+def test_hostile_headers_are_refused_at_once() -> None:
+    start = b"{'descr': '<f4', 'fortran_order': False, 'shape': ("
+    headers = [
+        start + text
+        for text in (
+            b"1" * 60 + b"x",
+            b"1" + b" " * 9000 + b"x",
+            b"," * 9000,
+            b"1 , " * 2400 + b"x",
+            b"1 " * 4000,
+        )
+    ]
+    # In a process of its own, since a regular expression that does not end cannot be interrupted.
+    program = """
+import sys
+from saccade.errors import DtypeError
+from saccade.serve.npy import from_npy
+
+for data in map(bytes.fromhex, sys.argv[1:]):
+    try:
+        from_npy(data, 100)
+    except DtypeError as error:
+        assert "expected a header" in str(error), error
+        print("refused")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *(npy(header, b"\0" * 4).hex() for header in headers)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert done.stdout.split() == ["refused"] * len(headers)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (7,), (2, 3), (1, 0, 4), (1,) * 32], ids=str)
+@pytest.mark.parametrize("dtype", ["<f4", ">i8", "|u1", "|b1", "<U0", ">U3"])
+@pytest.mark.parametrize("version", [(1, 0), (2, 0)])
+def test_headers_that_numpy_writes(shape: tuple[int, ...], dtype: str, version: tuple[int, int]) -> None:
+    for order in ("C", "F"):
+        array = np.zeros(shape, dtype, order=order)
+        output = io.BytesIO()
+        np.lib.format.write_array(output, array, version)
+        found = from_npy(output.getvalue(), 100)
+        assert (found.shape, found.dtype) == (shape, array.dtype.newbyteorder("="))
+        assert found.flags.f_contiguous == array.flags.f_contiguous
 
 
 def test_arrays_of_objects_are_not_unpickled() -> None:

@@ -7,13 +7,14 @@ import functools
 import json
 import os
 import pty
+import re
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,11 @@ from serve_cases import ask, packed, requester, serving, wait_until
 
 import saccade
 from saccade import Policy
-from saccade.serve import Client, ServerError
+from saccade.dialects import read
+from saccade.serve import Client, ServerError, engine
+from saccade.serve.batching import Job
+from saccade.serve.requests import Call, Options
+from saccade.serve.sessions import Sessions
 
 #: One of each release, and lerobot's.
 LAYOUTS = ("nvidia", "n16", "n17", "lerobot")
@@ -61,7 +66,16 @@ def assert_same(found: Any, expected: Any) -> None:
         np.testing.assert_array_equal(found[key], expected[key])
 
 
+@pytest.fixture(params=["small", "large"])
+def size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Whether the server takes the policy for a small one, which several threads compute, each on its own."""
+    if request.param == "large":
+        monkeypatch.setattr(engine, "SMALL_BACKBONE", 0)
+    return str(request.param)
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.usefixtures("size")
 def test_answers_are_those_of_act(layout: str) -> None:
     whole, seen = policy(layout), nested(layout, 1)
     with serving(whole, seed=9) as running, Client(port=running.port) as client:
@@ -77,7 +91,7 @@ def test_answers_are_those_of_act(layout: str) -> None:
 
 
 @pytest.mark.parametrize("layout", ["nvidia", "n17"])
-def test_an_answer_has_the_same_bits_alone_and_among_others(layout: str) -> None:
+def test_an_answer_has_the_same_bits_alone_and_among_others(layout: str, size: str) -> None:
     whole = policy(layout)
 
     def act(seed: int) -> Any:
@@ -86,6 +100,7 @@ def test_an_answer_has_the_same_bits_alone_and_among_others(layout: str) -> None
             return client.get_action(flat(seen) if seed % 2 else seen, {"seed": seed})[0]
 
     with serving(whole, max_batch=8, max_wait_ms=2000.0) as running, ThreadPoolExecutor(6) as threads:
+        assert len(running.server._workers) == {"small": 2, "large": 1}[size]
         together = list(threads.map(act, range(6)))
     sizes = {line["batch"] for line in running.log.lines if line["event"] == "request"}
     assert max(sizes) > 1
@@ -109,6 +124,7 @@ def test_sessions_are_real_time_chunking(layout: str) -> None:
         assert_same(second, expected)
 
 
+@pytest.mark.usefixtures("size")
 def test_sessions_of_several_robots_in_one_batch() -> None:
     whole = policy("nvidia")
 
@@ -146,6 +162,48 @@ def test_what_does_not_fit_is_refused_with_what_is_needed() -> None:
             client.get_action(seen)
         with pytest.raises(ServerError, match="needs cameras"):
             client.get_action({})
+
+
+def time_of_pool() -> int:
+    """Nanoseconds that the engine's own threads have run, once they rest."""
+
+    def ran() -> int:
+        total = 0
+        for task in Path("/proc/self/task").iterdir():
+            with contextlib.suppress(FileNotFoundError):
+                if re.fullmatch(r"saccade-\d+", (task / "comm").read_text().strip()):
+                    total += int((task / "schedstat").read_text().split()[0])
+        return total
+
+    before = -1
+    while (now := ran()) != before:
+        before = now
+        time.sleep(0.05)
+    return now
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="needs Linux's times of threads")
+def test_a_thread_computes_alone_while_others_do_and_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, seen = policy("nvidia"), nested("nvidia", 1)
+
+    def uses_pool(call: Callable[[], Any]) -> bool:
+        before = time_of_pool()
+        call()
+        return time_of_pool() != before
+
+    def jobs() -> list[Job]:
+        reading = read(seen, whole.requirements)
+        return [Job(Call("get_action", options=Options(seed=seed)), reading, None) for seed in range(2)]
+
+    made = engine.Engine(whole, Sessions(1, 1.0))
+    assert made.num_workers == 2
+    wait_until(lambda: uses_pool(lambda: whole.act(seen, seed=0)))
+    assert not uses_pool(lambda: made.run(jobs()))
+    wait_until(lambda: uses_pool(lambda: whole.act(seen, seed=0)), 10)
+    monkeypatch.setattr(made, "_outcomes", lambda jobs: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        made.run(jobs())
+    wait_until(lambda: uses_pool(lambda: whole.act(seen, seed=0)), 10)
 
 
 @contextlib.contextmanager

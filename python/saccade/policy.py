@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
 
 #: One observation in a form of `saccade.dialects`, with or without a batch axis.
 Observation = Mapping[str, Any]
-#: Or what was read of it, or several of them.
+#: Or several of them. The server gives what it has read of them by `saccade.dialects`.
 Observations = Observation | Reading | Sequence[Observation | Reading]
+
+Kind = TypeVar("Kind", bound=StateReading)
 
 
 class Policy:
@@ -217,25 +219,6 @@ class Policy:
         context = self._encoded(readings, previous)
         return self._sampled(context.context, observation, readings, options)
 
-    def read(self, observation: Observation, *, most_rows: int | None = None) -> Reading:
-        """Reads and checks an observation.
-
-        Every method of this policy takes the result in place of the observation, and does not check it again.
-
-        Args:
-            observation: One observation in one of the forms of :meth:`encode`.
-            most_rows: An observation with more rows is refused.
-
-        Raises:
-            InputError, ShapeError, DtypeError: As :meth:`encode`.
-
-        Example:
-            >>> def chunks(policy: Policy, observation: dict) -> list:
-            ...     reading = policy.read(observation)
-            ...     return [policy.act(reading, seed=seed) for seed in range(3)]
-        """
-        return read(observation, self.requirements, most_rows)
-
     def encode(self, observation: Observations, *, previous: PolicyContext | None = None) -> PolicyContext:
         """Encodes what the robot sees and is told.
 
@@ -359,8 +342,7 @@ class Policy:
         if not _is_observation(observation_or_state):
             return self._of_state(held, observation_or_state, options)  # type: ignore[arg-type]
         observations = _listed(observation_or_state)  # type: ignore[arg-type]
-        needs = self.requirements
-        readings = [one if isinstance(one, Reading) else read_state(one, needs) for one in observations]
+        readings = [self._read_by(read_state, one) for one in observations]
         return self._sampled(held, observation_or_state, readings, options)  # type: ignore[arg-type]
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
@@ -377,7 +359,24 @@ class Policy:
 
     def _read(self, observation: Observations) -> list[Reading]:
         self._whole("act and encode", self.backbone)
-        return [one if isinstance(one, Reading) else self.read(one) for one in _listed(observation)]
+        return [self._read_by(read, one) for one in _listed(observation)]
+
+    def _read_by(
+        self, reader: Callable[[Observation, Requirements], Kind], observation: Observation | Reading
+    ) -> Kind | Reading:
+        """An observation read by a reader, or what was already read of it.
+
+        Raises:
+            InputError: It was read for another policy. Or as the reader.
+        """
+        if not isinstance(observation, Reading):
+            return reader(observation, self.requirements)
+        if observation.needs != self.requirements:
+            raise InputError(
+                f"observation: expected what was read for this policy, got what was read for "
+                f"another: {observation.needs}, but {self.requirements}"
+            )
+        return observation
 
     def _inputs(self, readings: Sequence[Reading]) -> list[BackboneInputs]:
         processor = self._whole("inputs", self.processor)

@@ -34,12 +34,12 @@ class IsaacFlat:
         frames = isaac.read_frames("video.", _below(observation, "video."), state.is_batched, needs)
         texts, is_plain = _language(observation, state, needs)
         check_batch({"state": len(state), "video": len(frames), "instructions": len(texts)}, needs)
-        return Reading(self, state.is_batched, False, state.state, frames, texts, is_plain)
+        return Reading(self, needs, state.is_batched, False, state.state, frames, texts, is_plain)
 
     def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> StateReading:
         """See :class:`saccade.dialects.Dialect`."""
         state, is_batched = isaac.read_state("state.", _below(observation, "state."), needs)
-        return StateReading(self, is_batched, False, state)
+        return StateReading(self, needs, is_batched, False, state)
 
     def answer(self, parts: Mapping[str, Float32Array], reading: StateReading) -> dict[str, Float32Array]:
         """See :class:`saccade.dialects.Dialect`."""

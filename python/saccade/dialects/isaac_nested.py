@@ -32,12 +32,12 @@ class IsaacNested:
         texts, _ = _language(_part(observation, "language", needs), state.is_batched, needs)
         check_batch({"state": len(state), "video": len(frames), "language": len(texts)}, needs)
         # Isaac-GR00T's nested form always wraps the instruction.
-        return Reading(self, state.is_batched, False, state.state, frames, texts, is_plain=False)
+        return Reading(self, needs, state.is_batched, False, state.state, frames, texts, is_plain=False)
 
     def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> StateReading:
         """See :class:`saccade.dialects.Dialect`."""
         state, is_batched = isaac.read_state("state.", _part(observation, "state", needs), needs)
-        return StateReading(self, is_batched, False, state)
+        return StateReading(self, needs, is_batched, False, state)
 
     def answer(self, parts: Mapping[str, Float32Array], reading: StateReading) -> dict[str, Float32Array]:
         """See :class:`saccade.dialects.Dialect`."""

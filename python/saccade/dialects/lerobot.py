@@ -37,7 +37,9 @@ class Lerobot:
         frames = _frames(observation, state.is_batched, needs)
         texts = _texts(observation.get(TASK), state, needs)
         check_batch({STATE: len(state), f"{IMAGES}*": len(frames), TASK: len(texts)}, needs)
-        return Reading(self, state.is_batched, state.use_torch, state.state, frames, texts, is_plain=False)
+        return Reading(
+            self, needs, state.is_batched, state.use_torch, state.state, frames, texts, is_plain=False
+        )
 
     def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> StateReading:
         """See :class:`saccade.dialects.Dialect`."""
@@ -51,7 +53,7 @@ class Lerobot:
         if shaped.shape[1] != needs.state_history:
             raise needs.shape_error(STATE, f"{needs.state_history} states a row", f"shape {state.shape}")
         use_torch = any(is_torch(value) for key, value in observation.items() if "observation." in key)
-        return StateReading(self, axes > 1, use_torch, shaped)
+        return StateReading(self, needs, axes > 1, use_torch, shaped)
 
     def answer(self, parts: Mapping[str, Float32Array], reading: StateReading) -> Any:
         """See :class:`saccade.dialects.Dialect`."""

@@ -16,12 +16,14 @@ class StateReading:
 
     Attributes:
         dialect: The form.
+        needs: What the observation was checked against.
         is_batched: Whether the observation had a batch axis.
         use_torch: Whether the answer consists of torch tensors.
         state: ``(batch, state_history, state_width)`` float32 in the robot's units.
     """
 
     dialect: Dialect
+    needs: Requirements
     is_batched: bool
     use_torch: bool
     state: Float32Array
@@ -32,7 +34,7 @@ class StateReading:
 
 @dataclass(frozen=True, eq=False)
 class Reading(StateReading):
-    """One or several observations, checked.
+    """One or several observations, checked. It shares the memory of the caller's arrays where it can.
 
     Attributes:
         frames: For each observation the frames ``(height, width, 3)`` by the name of the view, in the order

@@ -24,19 +24,17 @@ class Job:
         call: What it asks for.
         reading: Its observations.
         client: Who asks.
-        size: Bytes of its message.
         is_msgpack_numpy: In which form its arrays came, and those of the answer go.
         inputs: What the backbone takes, or why there is none, once it is prepared.
-        is_claimed: Whether a thread prepares it while it waits.
+        is_claimed: Whether a thread has begun to prepare it while it waits.
         received: When it arrived, on the clock of `time.perf_counter`.
-        reply: How it is answered; only the server reads it.
+        reply: What is answered; only the server reads it.
         milliseconds: How long each part took.
     """
 
     call: Call
     reading: Reading
     client: Hashable
-    size: int
     is_msgpack_numpy: bool = False
     inputs: Sequence[Any] | BaseException | None = None
     is_claimed: bool = False
@@ -58,10 +56,10 @@ class Queue:
     alone never waits.
 
     Args:
-        max_batch: Observations in a batch. A request with more is a batch of its own.
+        max_batch: Observations that are computed at a time. A request with more is a batch of its own.
         max_wait: Seconds that the oldest request waits for others at most.
         prepare: Called with requests that wait for others, by a thread that would wait with them.
-        num_workers: Number of threads that take batches. They share out ``max_batch``.
+        num_workers: Number of threads that take batches. They share out ``max_batch``, so it is at most that.
         clock: Returns seconds.
     """
 
@@ -73,31 +71,28 @@ class Queue:
         num_workers: int = 1,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._max_batch = -(-max_batch // num_workers)
+        self._max_batch = max(1, max_batch // num_workers)
         self._max_wait, self._prepare, self._clock = max_wait, prepare, clock
         self._jobs: deque[Job] = deque()
+        self._prepared: set[Job] = set()  # those that a thread prepares now
         self._computed: set[Job] = set()
         self._active: OrderedDict[Hashable, float] = OrderedDict()
         self._changed = threading.Condition()
         self._is_closed = False
         self._num_idle = 0
-        self._size = 0
 
     def __len__(self) -> int:
         return len(self._jobs)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the messages that wait."""
-        return self._size
 
     def put(self, job: Job) -> None:
         """Appends a request."""
         with self._changed:
             self._jobs.append(job)
-            self._size += job.size
+            now = self._clock()
             self._active.pop(job.client, None)
-            self._active[job.client] = self._clock()
+            self._active[job.client] = now
+            while next(iter(self._active.values())) < now - ACTIVE_SECONDS:
+                self._active.popitem(last=False)
             self._changed.notify()
 
     def close(self) -> None:
@@ -142,13 +137,14 @@ class Queue:
                 self._changed.notify()
 
     def _ready(self) -> list[Job]:
-        """The requests that can be computed now."""
+        """The requests that can be computed now; those that another thread prepares are left to it."""
         sessions = {job.call.options.session for job in self._computed} - {None}
         found = []
         for job in self._jobs:
             session = job.call.options.session
             if session not in sessions:
-                found.append(job)
+                if job not in self._prepared:
+                    found.append(job)
                 if session is not None:
                     sessions.add(session)
         return found
@@ -157,9 +153,6 @@ class Queue:
         """Until when a client is expected that neither waits nor is computed; 0 if a batch need not wait."""
         if self._is_closed or sum(job.rows for job in ready) >= self._max_batch * self._num_idle:
             return 0.0
-        recent = self._clock() - ACTIVE_SECONDS
-        while self._active and next(iter(self._active.values())) < recent:
-            self._active.popitem(last=False)
         here = {job.client for job in self._jobs} | {job.client for job in self._computed}
         latest = max((seen for client, seen in self._active.items() if client not in here), default=None)
         return 0.0 if latest is None else latest + ACTIVE_SECONDS
@@ -171,11 +164,13 @@ class Queue:
             self._changed.wait(seconds)
             return
         job.is_claimed = True
+        self._prepared.add(job)
         self._changed.release()
         try:
             self._prepare(job)
         finally:
             self._changed.acquire()
+            self._prepared.discard(job)
 
     def _chosen(self, ready: Sequence[Job]) -> list[Job]:
         """This thread's share of the requests that can be computed."""
@@ -188,7 +183,6 @@ class Queue:
                 break
             chosen.append(job)
             rows += job.rows
-            self._size -= job.size
         self._computed.update(chosen)
         self._jobs = deque(job for job in self._jobs if job not in self._computed)
         return chosen

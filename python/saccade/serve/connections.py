@@ -21,8 +21,10 @@ MOST_UNREAD = 8_000_000
 FAREWELL_SECONDS = 2.0
 #: Seconds between two checks for connections that have stalled.
 CHECK_SECONDS = 0.5
-#: Bytes that are received by one call at most.
+#: Bytes that are received by one call at most, and those that are received at least if they are there. Small
+#: requests are answered one by one, so a call receives few of them before others have their turn.
 RECEIVED_BYTES = 1 << 18
+RECEIVED_AT_LEAST = 1 << 10
 OUT_OF_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 HTTP = """\
@@ -39,14 +41,12 @@ class Connection:
 
     Attributes:
         name: Its address and port, for messages.
-        waiting: Number of its requests that have not been answered.
     """
 
-    def __init__(self, connected: socket.socket, name: str, accepts: Callable[[int], bool]) -> None:
+    def __init__(self, connected: socket.socket, name: str, room: zmtp.Room) -> None:
         self.socket = connected
         self.name = name
-        self.waiting = 0
-        self.peer = zmtp.Peer(accepts)
+        self.peer = zmtp.Peer(room)
         self.unsent: deque[memoryview] = deque()
         self.num_unsent = 0
         self.progress = time.monotonic()
@@ -70,9 +70,8 @@ class Connections:
     Args:
         listener: The socket that they connect to, from :func:`bind`.
         limits: See there.
-        on_request: Called with each request that has arrived.
+        on_request: Called with each request that has arrived. Every one is to be answered by :meth:`send`.
         on_problem: Called with a client and what is wrong with it.
-        held: The bytes of all requests that wait, besides those that are being received.
     """
 
     def __init__(
@@ -81,10 +80,10 @@ class Connections:
         limits: Limits,
         on_request: Callable[[Connection, zmtp.Request], None],
         on_problem: Callable[[str, str], None],
-        held: Callable[[], int],
     ) -> None:
         self._limits = limits
-        self._on_request, self._on_problem, self._held = on_request, on_problem, held
+        self._on_request, self._on_problem = on_request, on_problem
+        self._room = zmtp.Room(limits.message_bytes, limits.waiting_bytes)
         self._selector = selectors.DefaultSelector()
         self._listener: socket.socket | None = listener
         self._clients: set[Connection] = set()
@@ -144,24 +143,27 @@ class Connections:
             self._checked = now
             self._check_connections(now)
 
-    def send(self, connection: Connection, address: tuple[bytes, ...], payload: bytes) -> None:
-        """Answers a request; nothing happens if its client is gone.
+    def send(self, connection: Connection, request: zmtp.Request, payload: bytes) -> None:
+        """Answers a request; nothing is sent if its client is gone.
 
         Args:
             connection: The client.
-            address: The address of the request.
+            request: The request, which need not have its payload any more.
             payload: The answer.
         """
-        connection.waiting -= 1
+        self._release(request)
         if connection not in self._clients or not connection.is_open:
             return
         if not connection.num_unsent:
             connection.progress = time.monotonic()
-        for piece in zmtp.message(address, payload):
+        for piece in zmtp.message(request.address, payload):
             self._append(connection, piece)
         self._write(connection)
-        if connection.num_unsent > MOST_UNREAD:
-            self._drop(connection, "does not read its answers")
+
+    @property
+    def held(self) -> int:
+        """Bytes of all requests that are being received or not yet answered."""
+        return self._room.held
 
     @property
     def num_unsent(self) -> int:
@@ -176,14 +178,6 @@ class Connections:
         self._selector.close()
         self._waker.close()
         self._woken.close()
-
-    def _accepts(self, size: int) -> bool:
-        """Whether a request of this size may be received."""
-        being_received = sum(connection.peer.held for connection in self._clients)
-        return (
-            size <= self._limits.message_bytes
-            and size + being_received + self._held() <= self._limits.waiting_bytes
-        )
 
     def _accept(self) -> None:
         assert self._listener is not None
@@ -207,7 +201,7 @@ class Connections:
         with contextlib.suppress(OSError):
             connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        connection = Connection(connected, name, self._accepts)
+        connection = Connection(connected, name, self._room)
         self._clients.add(connection)
         self._selector.register(connected, selectors.EVENT_READ, connection)
 
@@ -217,7 +211,8 @@ class Connections:
                 if not connection.socket.recv(1 << 16):
                     self._forget(connection)
                 return
-            count = connection.socket.recv_into(self._received)
+            wanted = max(connection.peer.missing, RECEIVED_AT_LEAST)
+            count = connection.socket.recv_into(self._received[:wanted])
         except BlockingIOError:
             return
         except OSError:  # reset, timed out: the client died
@@ -231,12 +226,19 @@ class Connections:
             for request in connection.peer.receive(self._received[:count]):
                 self._send_output(connection)
                 if connection not in self._clients:
+                    self._release(request)
                     return
-                connection.waiting += 1
                 self._on_request(connection, request)
+                if connection not in self._clients:
+                    return
             self._send_output(connection)
         except zmtp.ProtocolError as error:
             self._refuse(connection, error)
+
+    def _release(self, request: zmtp.Request) -> None:
+        """Counts a request no more."""
+        if request.is_complete:
+            self._room.held -= request.size
 
     def _send_output(self, connection: Connection) -> None:
         """Sends what the protocol answers by itself, which comes before the answer to a request."""
@@ -257,7 +259,9 @@ class Connections:
                 else:
                     connection.unsent[0] = piece[count:]
         except BlockingIOError:
-            pass
+            if connection.num_unsent > MOST_UNREAD:
+                self._drop(connection, "does not read its answers")
+                return
         except OSError:
             self._lost(connection)
             return
@@ -309,6 +313,8 @@ class Connections:
             connection.socket.close()
             connection.unsent.clear()
             connection.num_unsent = 0
+            # A session may keep the connection, and a part of a request may be large.
+            connection.peer.close()
 
     def _close_listener(self) -> None:
         if self._listener is not None:

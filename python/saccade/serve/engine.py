@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 #: The parts of which the time is reported, in their order. "wait" is the time in the queue.
 PARTS = ("wait", "inputs", "backbone", "head")
 #: With a backbone of at most so many bytes, each thread computes a batch of its own. Loops are short there:
-#: threads that share them wait for each other. Larger weights would be read from memory by each thread.
-#: Measured on 2 cores (Zen 3), two batches of 4 at a time against batches of 8, float32, by the size of
-#: backbone and head: 1.17 x at 4 MB, 1.10 x at 27 MB, 1.05 x at 157 MB.
+#: threads that share them wait for each other. Measured once by hand, by a program that is not committed, on
+#: two cores of AMD Zen 3, float32: observations a second with two batches of 4 on a thread each, divided by
+#: those with one batch of 8 on two threads, by the size of backbone and head together: 1.17 at 4 MB, 1.10 at
+#: 27 MB, 1.05 at 157 MB. Weights beyond the last-level cache are read from memory by each thread on its own,
+#: and the gain was above 1.1 at 4 MB only. The limit lies between these sizes; nothing was measured at 16 MB.
 SMALL_BACKBONE = 16 << 20
 
 
@@ -68,7 +70,7 @@ class Engine:
         sessions: The sessions, whose chunks it continues.
 
     Attributes:
-        num_workers: Number of threads that may call :meth:`run` at the same time.
+        num_workers: Number of threads that are to call :meth:`run` at the same time, at most.
     """
 
     def __init__(self, policy: Policy, sessions: Sessions) -> None:
@@ -100,7 +102,10 @@ class Engine:
         with self._running_threads() as running:
             # A request that nothing else is computed beside has all threads.
             _saccade.stay_on_this_thread(self.num_workers > 1 and (running > 1 or len(jobs) > 1))
-            return self._outcomes(jobs)
+            try:
+                return self._outcomes(jobs)
+            finally:
+                _saccade.stay_on_this_thread(False)
 
     @contextmanager
     def _running_threads(self) -> Iterator[int]:

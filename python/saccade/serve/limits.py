@@ -16,7 +16,7 @@ class Limits:
         objects: Number of values in a message, keys included; the elements of arrays are not counted.
         rows: Number of observations in a request.
         waiting: Number of requests that wait to be computed.
-        waiting_bytes: Size of all requests that wait or are being received.
+        waiting_bytes: Size of all requests that are being received or not yet answered.
         clients: Number of connections.
         sessions: Number of sessions; beyond it the one that was used least recently is forgotten.
         session_seconds: Time after which an unused session is forgotten.

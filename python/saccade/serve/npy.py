@@ -15,10 +15,11 @@ import numpy.typing as npt
 
 from saccade.errors import DtypeError, InputError, ShapeError
 
-#: NumPy writes its header in this form only, for the dtypes that are accepted.
+#: NumPy writes its header in this form only, for the dtypes that are accepted. There is one way only to match
+#: a text, so that the time is linear in its length.
 HEADER = re.compile(
     rb"\{ *'descr': *'([<>|=]?[a-zA-Z]\d{0,9})', *'fortran_order': *(True|False), *"
-    rb"'shape': *\(((?:-?\d{1,18} *,? *)*)\) *,? *\} *\n?"
+    rb"'shape': *\(((?:-?\d{1,18} *, *)*(?:-?\d{1,18} *)?)\) *(?:, *)?\} *\n?"
 )
 MAGIC = b"\x93NUMPY"
 #: Bytes before the header, by version of the format.

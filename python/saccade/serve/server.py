@@ -10,11 +10,12 @@ import threading
 import time
 import weakref
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from saccade import hub
+from saccade import dialects, hub
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import engine, modalities, pickles
 from saccade.serve.batching import Job, Queue
@@ -85,12 +86,11 @@ class Server:
         self._forms: weakref.WeakKeyDictionary[Connection, str] = weakref.WeakKeyDictionary()
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
         self._engine = engine.Engine(policy, self._sessions)
-        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self._engine.num_workers)
+        workers = min(self._engine.num_workers, max_batch)
+        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, workers)
         self._statistics = Statistics()
         self.address = address_of(listener)
-        self._connections = Connections(
-            listener, limits, self._on_request, self._on_problem, lambda: self._queue.size
-        )
+        self._connections = Connections(listener, limits, self._on_request, self._on_problem)
         self._finished: deque[tuple[engine.Outcome, bytes]] = deque()
         self._unanswered = 0
         self._stopping: str | None = None
@@ -98,7 +98,7 @@ class Server:
         self._watched = _stamps(policy.head.source)
         self._workers = [
             threading.Thread(target=self._compute, name=f"saccade-serve-{number}", daemon=True)
-            for number in range(self._engine.num_workers)
+            for number in range(workers)
         ]
 
     def stop(self, why: str) -> None:
@@ -175,7 +175,7 @@ class Server:
             if not request.is_complete:
                 raise InputError(self._too_large(request.size))
             if pickles.is_pickle(request.payload):
-                self._reply(connection, request, pickles.refusal(request.payload))
+                self._connections.send(connection, request, pickles.refusal(request.payload))
                 error = pickles.REFUSAL
                 return
             message = unpack(request.payload, self._limits)
@@ -186,10 +186,10 @@ class Server:
             if endpoint == "get_action":
                 self._enqueue(connection, request, call, message.is_msgpack_numpy)
                 return
-            self._reply(connection, request, pack(self._answer(connection, call)))
+            self._connections.send(connection, request, pack(self._answer(connection, call)))
         except Exception as caught:
             error = describe(caught)
-            self._reply(connection, request, pack({"error": error}))
+            self._connections.send(connection, request, pack({"error": error}))
         finally:
             if error is not None or endpoint != "get_action":
                 self._note(connection, endpoint, error)
@@ -197,7 +197,9 @@ class Server:
     def _too_large(self, size: int) -> str:
         if size > self._limits.message_bytes:
             return f"message: expected at most {self._limits.message_bytes} bytes, got {size}"
-        return f"busy: {self._queue.size} bytes of requests wait, and {size} more are too many; try again"
+        return (
+            f"busy: {self._connections.held} bytes of requests wait, and {size} more are too many; try again"
+        )
 
     def _answer(self, connection: Connection, call: Call) -> Any:
         """The answer to everything but ``get_action``."""
@@ -218,11 +220,11 @@ class Server:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
-        reading = self._policy.read(call.observation, most_rows=self._limits.rows)
+        reading = dialects.read(call.observation, self._policy.requirements, self._limits.rows)
         self._forms[connection] = "text" if call.is_bare else "map"
         self._unanswered += 1
-        reply = (connection, request.address)
-        self._queue.put(Job(call, reading, connection, request.size, is_msgpack_numpy, reply=reply))
+        reply = (connection, replace(request, payload=bytearray()))  # the payload was unpacked
+        self._queue.put(Job(call, reading, connection, is_msgpack_numpy, reply=reply))
 
     def _compute(self) -> None:
         """What a thread does that computes."""
@@ -245,8 +247,8 @@ class Server:
     def _send_finished(self) -> None:
         while self._finished:
             outcome, payload = self._finished.popleft()
-            connection, address = outcome.job.reply
-            self._connections.send(connection, address, payload)
+            connection, request = outcome.job.reply
+            self._connections.send(connection, request, payload)
             self._unanswered -= 1
             error = None if outcome.error is None else describe(outcome.error)
             total = 1e3 * (time.perf_counter() - outcome.job.received)
@@ -260,9 +262,6 @@ class Server:
                 batch=outcome.batch,
                 milliseconds={part: round(value, 3) for part, value in milliseconds.items()},
             )
-
-    def _reply(self, connection: Connection, request: Request, payload: bytes) -> None:
-        self._connections.send(connection, request.address, payload)
 
     def _note(self, connection: Connection, endpoint: str, error: str | None, **fields: Any) -> None:
         self._statistics.count(endpoint, is_error=error is not None)

@@ -46,9 +46,9 @@ class Request:
 
     Attributes:
         address: The frames before it, to be sent back before the answer.
-        payload: The request; empty if it was too large.
+        payload: The request; empty if it was skipped.
         size: Its size in bytes.
-        is_complete: False if it was skipped, because it was too large.
+        is_complete: False if it was skipped, because there was no room for it.
     """
 
     address: tuple[bytes, ...]
@@ -57,27 +57,54 @@ class Request:
     is_complete: bool = True
 
 
+class Room:
+    """Memory for the requests of all connections, from the first byte that is received until the answer.
+
+    Args:
+        request: Bytes of one request at most.
+        total: Bytes of all requests at most.
+
+    Attributes:
+        held: Bytes of all requests now. Whoever answers a request subtracts its size.
+    """
+
+    def __init__(self, request: int, total: int) -> None:
+        self._request, self._total = request, total
+        self.held = 0
+
+    def accepts(self, size: int) -> bool:
+        """Whether a request of this size could be held now. Nothing is reserved for it."""
+        return size <= self._request and self.held + size <= self._total
+
+    def take(self, size: int) -> bool:
+        """Counts received bytes of a request; returns False, and counts nothing, if they are too many."""
+        if self.held + size > self._total:
+            return False
+        self.held += size
+        return True
+
+
 class Peer:
     """What is known of the other side of a connection.
 
     Give received bytes to :meth:`receive`. What is to be sent is appended to ``output``.
 
     Args:
-        accepts: Whether a request of a size may be held now; if not, it is skipped.
+        room: Memory for requests. A request for which there is none is skipped.
     """
 
-    def __init__(self, accepts: Callable[[int], bool]) -> None:
+    def __init__(self, room: Room) -> None:
         self.output = bytearray()
-        self._accepts = accepts
+        self._room = room
         self._address: list[bytes] = []
-        self._flags = 0
+        self._flags = self._size = 0
         self._is_ready = False
         self._expect(len(SIGNATURE), self._signature)
 
     @property
-    def held(self) -> int:
-        """Bytes of the request that is being received."""
-        return len(self._buffer)
+    def missing(self) -> int:
+        """Bytes until the end of the part of a frame that is being received."""
+        return self._missing
 
     @property
     def is_between_requests(self) -> bool:
@@ -100,7 +127,9 @@ class Peer:
             piece = data[position : position + self._missing]
             position += len(piece)
             self._missing -= len(piece)
-            if not self._skips:
+            if self._next == self._request and not self._room.take(len(piece)):
+                self._skip()
+            elif not self._skips:
                 self._buffer += piece
             if self._next == self._signature and self._buffer[:1] != SIGNATURE[:1]:
                 raise ProtocolError("no ZeroMQ client", bytes(self._buffer))
@@ -108,6 +137,19 @@ class Peer:
                 found = self._next(self._buffer)
                 if found is not None:
                     yield found
+
+    def close(self) -> None:
+        """Forgets what has arrived of a request."""
+        if self._next == self._request:
+            self._room.held -= len(self._buffer)
+        self._address = []
+        self.output.clear()
+        self._expect(1, self._frame)
+
+    def _skip(self) -> None:
+        """Forgets what has arrived of a request, and skips the rest of it."""
+        self._room.held -= len(self._buffer)
+        self._expect(self._missing, self._skipped_request, skips=True)
 
     def _expect(self, size: int, then: Callable[[bytearray], Request | None], *, skips: bool = False) -> None:
         self._missing, self._next, self._skips = size, then, skips
@@ -149,11 +191,11 @@ class Peer:
             if size > LONGEST_ADDRESS or len(self._address) == MOST_ADDRESSES:
                 raise ProtocolError(f"expected a request in one frame, got a first frame of {size} bytes")
             return self._body(size, self._part)
-        if not size or self._accepts(size):
+        self._size = size
+        if not size or self._room.accepts(size):
             return self._body(size, self._request)
         if size > LONGEST_SKIPPED:
             raise ProtocolError(f"expected a request of at most {LONGEST_SKIPPED} bytes, got {size}")
-        self._skipped = size
         self._expect(size, self._skipped_request, skips=True)
         return None
 
@@ -182,7 +224,7 @@ class Peer:
         return self._found(Request(tuple(self._address), data, len(data)))
 
     def _skipped_request(self, data: bytearray) -> Request:
-        return self._found(Request(tuple(self._address), bytearray(), self._skipped, is_complete=False))
+        return self._found(Request(tuple(self._address), bytearray(), self._size, is_complete=False))
 
     def _found(self, request: Request) -> Request:
         self._address = []

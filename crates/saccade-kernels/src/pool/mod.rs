@@ -233,8 +233,9 @@ fn pool() -> &'static Pool {
 /// Runs `f(task)` for every `task` in `0..tasks`, on up to `threads` threads of which the caller is one.
 ///
 /// Tasks are dealt one by one to threads that are free. With one thread, one task, within a task of another loop, or after
-/// [`stay_on_this_thread`], everything runs on the calling thread and nothing is started. The pool belongs to the process and may be used from many threads at once, after `fork`, and
-/// with more threads than there are cores. Once its threads run, a call allocates nothing.
+/// [`stay_on_this_thread`], everything runs on the calling thread and nothing is started. The pool belongs to the process
+/// and may be used from many threads at once, after `fork`, and with more threads than there are cores. Once its threads
+/// run, a call allocates nothing.
 ///
 /// Within [`interruptible`], once it is to stop, the remaining tasks do not run.
 ///
