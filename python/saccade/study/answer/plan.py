@@ -210,7 +210,7 @@ PILOT_SEEDS = (100, 101)
 BASE = TrainingSettings(
     only="head",
     absent_share=0.0,
-    steps=3000,
+    steps=1200,
     learning_rate=2e-3,
     ema_decay=0.995,
     width=64,
@@ -224,7 +224,7 @@ BACKBONE = replace(BASE, only="backbone", steps=4000, learning_rate=1e-3, seed=0
 ALIGNMENT = 0.2  # the weight of the loss in FLARE
 # What makes a policy without future tokens as costly as `BASE`: `costs.matched_width` for a chunk,
 # `costs.matched_steps` for the training. A test computes them again.
-WIDTH, STEPS = 104, 4884
+WIDTH, STEPS = 104, 1953
 
 
 def recipes(
