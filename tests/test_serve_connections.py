@@ -144,6 +144,7 @@ def test_a_request_is_not_counted_whose_client_was_lost_before_it_was_answered(
 def test_heartbeats_of_a_client_that_does_not_read(driven: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("saccade.serve.connections.MOST_UNREAD", 10_000)
     with driven.client() as (made, connection):
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         made.setblocking(False)
         most = 0
