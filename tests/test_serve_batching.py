@@ -279,7 +279,10 @@ def test_a_request_that_fails_does_not_harm_its_batch(text: str, message: str) -
                 return client.get_action(observation(text=text if number == 2 else "go"), {"seed": number})[0]
 
         with ThreadPoolExecutor(4) as threads:
-            futures = [threads.submit(act, number) for number in range(4)]
+            futures = [threads.submit(act, 0)]
+            # The one that fails must not come first, since it would be answered before the others are there.
+            wait_until(lambda: running.server._unanswered == 1 and not len(running.server._queue))
+            futures += [threads.submit(act, number) for number in range(1, 4)]
             wait_until(lambda: running.server._unanswered == 4)
             policy.gate.set()
             for number in (0, 1, 3):

@@ -111,7 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         minimum=0.001,
         below=1e6,
         default=limits.waiting_bytes / 1e6,
-        help="size of all requests that wait or arrive, in millions of bytes",
+        help="size of all requests that arrive or are not yet answered, in millions of bytes",
     )
     arguments.add_integer(most, "--max-clients", default=limits.clients, help="connections")
     arguments.add_number(
