@@ -219,9 +219,9 @@ test-ray:
 	@$(MAKE) -s $(RAY_VENV)/.ray
 	SACCADE_RAY=1 OMP_NUM_THREADS=1 $(RAY_VENV)/bin/python -m pytest tests/test_ray.py $(RAY_ARGS)
 
-RAY_PIP := MATURIN_PEP517_ARGS=--locked $(RAY_VENV)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt
+RAY_PIP := MATURIN_PEP517_ARGS=--locked $(RAY_VENV)/bin/python -m pip --disable-pip-version-check --no-input install --quiet --constraint constraints.txt --constraint .ci/ray-constraints.txt
 
-$(RAY_VENV)/.ray: pyproject.toml constraints.txt $(RUST_SOURCES)
+$(RAY_VENV)/.ray: pyproject.toml constraints.txt .ci/ray-constraints.txt $(RUST_SOURCES)
 	@test "$$($(RAY_VENV)/bin/python -c 'import sys; print(sys.prefix)' 2>/dev/null)" = "$(abspath $(RAY_VENV))" || $(PYTHON) -m venv --clear $(RAY_VENV)
 	@echo "setup: saccade with the extra ray (torch is large; takes minutes the first time)"
 	@$(RAY_PIP) maturin pytest hypothesis
