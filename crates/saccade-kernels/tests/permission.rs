@@ -11,8 +11,8 @@ use std::sync::mpsc;
 use common::{bits, numbers, rows, rows_mut};
 use saccade_kernels::{Arithmetic, CpuReport, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, WeightRef};
 
-/// The bits of a layer of int8: the same with AMX as in software.
-fn layer(isa: Isa) -> Vec<u32> {
+/// A layer of int8: the same bits with AMX as in software.
+fn layer(isa: Isa) -> Vec<f32> {
     let weight = numbers(1, 70 * 100, 0.5);
     let weight = WeightRef::F32(Matrix::new(&weight, 100));
     let layer = PackedLinear::pack(isa, Arithmetic::Int8, 1, &[(weight, None)]).unwrap();
@@ -20,12 +20,16 @@ fn layer(isa: Isa) -> Vec<u32> {
     let scratch = &mut LinearScratch::new();
     let (x, to) = (rows(&x, 100), rows_mut(&mut out, 70));
     layer.apply(1, x, Epilogue::Store, to, scratch).unwrap();
-    bits(&out)
+    out
 }
 
-/// That the best instruction set of this process computes.
+/// That the best instruction set of this process computes: the bits of software, or nearly its numbers where inputs have 7 bits.
 fn best_computes() -> bool {
-    layer(Isa::best()) == layer(Isa::SoftwareTiles)
+    let (found, expected) = (layer(Isa::best()), layer(Isa::SoftwareTiles));
+    match Isa::best() {
+        Isa::Avx2 | Isa::Avx512f => found.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 0.1),
+        _ => bits(&found) == bits(&expected),
+    }
 }
 
 /// Runs `body` in a child of this process, which has asked for nothing yet. Returns what it says of tiles.
