@@ -13,39 +13,19 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from training_cases import RECORDING, TASKS, TINY, ignore
 
 from saccade import InputError
 from saccade.backbone_inputs import BackboneInputs
 from saccade.reference import Backbone
 from saccade.sim import demos, train
-from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.dataset import load_samples
 from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
 from saccade.sim.policy import Policy
 from saccade.sim.tasks import find_task
-from saccade.sim.training_settings import TrainingSettings
 
-RECORDING = demos.RecordingSettings(image_size=16, frame_stride=6, cameras=DEFAULT_CAMERAS[:2])
-TASKS = ["reach", "button-press-topdown"]  # whose wordings have different lengths
-BACKBONE = TrainingSettings(
-    only="backbone",
-    steps=4,
-    batch_size=4,
-    width=16,
-    num_layers=2,
-    num_heads=2,
-    language_layers=1,
-    vision_width=16,
-    vision_layers=1,
-    vision_heads=2,
-    num_future_tokens=3,
-    patch_size=8,
-)
+BACKBONE = dataclasses.replace(TINY, only="backbone", steps=4, batch_size=4)
 HEAD = dataclasses.replace(BACKBONE, only="head", absent_share=0.0, num_layers=3, seed=1)
-
-
-def ignore(progress: train.Progress) -> None:
-    """Shows no progress."""
 
 
 @pytest.fixture(scope="module")

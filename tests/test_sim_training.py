@@ -16,35 +16,20 @@ import pytest
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
+from training_cases import RECORDING, TASKS, TINY, ignore
 
 from saccade import InputError
 from saccade.backbone_inputs import BackboneInputs
 from saccade.cli import main
 from saccade.processor import Processor
 from saccade.sim import demos, train
-from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.dataset import chunks, describe, later_frames, load_samples, prepared
 from saccade.sim.learner import Learner, new_learner, pool_tokens
 from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade.sim.tasks import DEMONSTRATION_SEEDS
 from saccade.sim.training_settings import TrainingSettings
 
-RECORDING = demos.RecordingSettings(image_size=16, frame_stride=6, cameras=DEFAULT_CAMERAS[:2])
-TINY = TrainingSettings(
-    steps=6,
-    batch_size=2,
-    width=16,
-    num_layers=2,
-    num_heads=2,
-    language_layers=1,
-    vision_width=16,
-    vision_layers=1,
-    vision_heads=2,
-    num_future_tokens=3,
-    patch_size=8,
-)
 ALIGNED = dataclasses.replace(TINY, alignment_weight=0.2)
-TASKS = ["reach", "button-press-topdown"]
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +44,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def processor_of(settings: TrainingSettings) -> Processor:
     """The processor of the policy that a run trains."""
     return train.policy_config(settings, RECORDING, TASKS).processor()
-
-
-def ignore(progress: train.Progress) -> None:
-    """Shows no progress."""
 
 
 def test_recording_holds_what_it_says(recording: Path) -> None:
@@ -326,7 +307,7 @@ def make_batches(
     batches = train.Batches(
         samples,
         config,
-        config.processor(),
+        train.prompts_of(config, config.processor()),
         targets,
         settings.batch_size,
         absent_share=settings.absent_share,

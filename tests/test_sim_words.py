@@ -40,7 +40,8 @@ def make_batches(tasks: list[str], absent_share: float) -> tuple[train.Batches, 
     config = train.with_statistics(train.policy_config(settings, recording, tasks), samples)
     processor = config.processor()
     targets = np.zeros(6, np.float32), np.ones(6, np.float32)
-    return train.Batches(samples, config, processor, targets, 64, absent_share=absent_share), processor
+    prompts = train.prompts_of(config, processor)
+    return train.Batches(samples, config, prompts, targets, 64, absent_share=absent_share), processor
 
 
 def tasks_told(inputs: BackboneInputs | BackboneFeatures, processor: Processor) -> list[str]:

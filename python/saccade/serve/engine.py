@@ -100,7 +100,7 @@ class Engine:
             waited = 1e3 * (time.perf_counter() - job.received)
             job.milliseconds["wait"] = waited - job.milliseconds.get("inputs", 0.0)
         with self._running_threads() as running:
-            # A request that nothing else is computed beside has all threads.
+            # A request that is computed alone has all threads.
             _saccade.stay_on_this_thread(self.num_workers > 1 and (running > 1 or len(jobs) > 1))
             try:
                 return self._outcomes(jobs)

@@ -160,7 +160,7 @@ class Batches:
     Args:
         samples: the samples to draw from.
         config: config of the policy.
-        processor: processor of the policy.
+        prompts: what `prompts_of` returns.
         targets: mean and standard deviation of the positions, `(6,)` each.
         batch_size: frames per batch.
         absent_share: see `TrainingSettings`.
@@ -172,7 +172,7 @@ class Batches:
         self,
         samples: Samples,
         config: PolicyConfig,
-        processor: Processor,
+        prompts: list[list[npt.NDArray[np.int64]]],
         targets: tuple[Float32Array, Float32Array],
         batch_size: int,
         *,
@@ -189,7 +189,7 @@ class Batches:
         self._state = np.asarray(normalizer.state(samples.state))
         self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
         self._targets = (samples.targets - targets[0]) / targets[1]
-        self._prompts = prompts_of(config, processor)
+        self._prompts = prompts
         known = [list(TASKS).index(name) for name in config.simulation.tasks]
         self._impossible = [
             [other for other in known if list(TASKS.values())[other].objects != task.objects]
@@ -408,16 +408,18 @@ def train(
         resume(run, out / STATE_FILE)
     targets = (training.targets.mean(axis=0), training.targets.std(axis=0) + SMALLEST_DEVIATION)
 
+    prompts = prompts_of(config, processor)
+
     def batches_of(samples: Samples, name: str, size: int, absent_share: float) -> Batches:
         frozen = None
         if settings.only == "head":
             shown = f"{name}-blind" if settings.blind else name
             path = out.parent / features_name(settings.start_sha256, run.demonstrations["sha256"], shown)
-            frozen = FrozenFeatures(samples, prompts_of(config, processor), run.learner.backbone, path)
+            frozen = FrozenFeatures(samples, prompts, run.learner.backbone, path)
         return Batches(
             samples,
             config,
-            processor,
+            prompts,
             targets,
             size,
             absent_share=absent_share,
