@@ -16,12 +16,14 @@ from safetensors.torch import load_file
 from training_cases import RECORDING, TASKS, TINY, ignore
 
 from saccade import InputError
+from saccade._files import sha256_of
 from saccade.backbone_inputs import BackboneInputs
 from saccade.reference import Backbone
-from saccade.sim import demos, train
+from saccade.sim import dataset, demos, train
 from saccade.sim.dataset import load_samples
 from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
 from saccade.sim.policy import Policy
+from saccade.sim.settings import TENSOR_FILE
 from saccade.sim.tasks import find_task
 
 BACKBONE = dataclasses.replace(TINY, only="backbone", steps=4, batch_size=4)
@@ -77,12 +79,16 @@ def test_the_head_alone_leaves_the_backbone(recording: Path, pretrained: Path, t
 
 
 def test_features_are_those_of_the_backbone_and_are_shared(
-    recording: Path, pretrained: Path, tmp_path: Path
+    recording: Path, pretrained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train.train(recording, tmp_path / "one", HEAD, ignore, start=pretrained)
     files = sorted(tmp_path.glob("features-*.npy"))
     assert len(files) == 2
+    # Frames are not read again: only their number counts now.
+    monkeypatch.setattr(dataset, "prepared", None)
     written = [path.stat().st_mtime_ns for path in files]
+    train.train(recording, tmp_path / "same", HEAD, ignore, start=pretrained)
+    assert sha256_of(tmp_path / "same" / TENSOR_FILE) == sha256_of(tmp_path / "one" / TENSOR_FILE)
     aligned = dataclasses.replace(HEAD, alignment_weight=0.2)
     train.train(recording, tmp_path / "two", aligned, ignore, start=pretrained)
     assert [path.stat().st_mtime_ns for path in files] == written

@@ -100,9 +100,16 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
 
 
 def load_samples(
-    directory: Path, tasks: list[str], horizon: int, processor: Processor
+    directory: Path, tasks: list[str], horizon: int, processor: Processor | None
 ) -> tuple[Samples, Samples]:
     """Training and validation samples, split by demonstration.
+
+    Args:
+        directory: the demonstrations.
+        tasks: their tasks.
+        horizon: actions in a chunk.
+        processor: processor of the policy, which prepares the frames. None: no frame is read, which saves
+            most of the time, and `images` is `(frames, 0, 3, 0, 0)`.
 
     Raises:
         InputError: a task has no demonstrations.
@@ -110,12 +117,14 @@ def load_samples(
     parts: tuple[list[Samples], list[Samples]] = ([], [])
     for task in tasks:
         found = 0
-        for number, (_, demonstration) in enumerate(demos.episodes(directory, task)):
+        episodes = demos.episodes(directory, task, images=processor is not None)
+        for number, (_, demonstration) in enumerate(episodes):
             found += 1
             actions, mask = chunks(demonstration, horizon)
             keep = mask[..., 0].sum(axis=1) >= MIN_VALID_ACTIONS
+            without = np.empty((len(demonstration.images), 0, 3, 0, 0), np.uint8)
             samples = Samples(
-                images=prepared(demonstration.images, processor),
+                images=without if processor is None else prepared(demonstration.images, processor),
                 now=np.flatnonzero(keep),
                 later=later_frames(demonstration, horizon)[keep],
                 state=demonstration.proprio[keep],

@@ -284,10 +284,12 @@ def claim_directory(path: Path, settings: RecordingSettings) -> None:
         raise InputError(f"{path.parent}: was recorded with other settings; use another directory")
 
 
-def load(path: Path) -> Demonstration:
-    """Reads one episode."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return Demonstration(**{name: arrays[name] for name in Demonstration.__dataclass_fields__})
+def load(path: Path, *, images: bool = True) -> Demonstration:
+    """Reads one episode, with or without its images. Without, `images` is `(frames, 0, 0, 0, 3)`."""
+    with np.load(path, allow_pickle=False) as arrays:  # reads an array when it is asked for
+        names = [name for name in Demonstration.__dataclass_fields__ if images or name != "images"]
+        found = {name: arrays[name] for name in names}
+    return Demonstration(**{"images": np.empty((len(found["proprio"]), 0, 0, 0, 3), np.uint8), **found})
 
 
 def recorded_tasks(directory: Path) -> list[str]:
@@ -314,7 +316,7 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
     return RecordingSettings.from_dict(found[0])
 
 
-def episodes(directory: Path, task: str) -> Iterator[tuple[int, Demonstration]]:
-    """Seeds and episodes of a task, in the order of their seeds."""
+def episodes(directory: Path, task: str, *, images: bool = True) -> Iterator[tuple[int, Demonstration]]:
+    """Seeds and episodes of a task, in the order of their seeds, with or without images as in `load`."""
     for path in sorted((directory / task).glob("[0-9]*.npz"), key=lambda path: int(path.stem)):
-        yield int(path.stem), load(path)
+        yield int(path.stem), load(path, images=images)

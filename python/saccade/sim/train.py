@@ -59,6 +59,7 @@ WARMUP_STEPS = 200
 MAX_GRADIENT_NORM = 1.0
 WEIGHT_DECAY = 0.01
 BETAS = (0.9, 0.95)
+TRAINING, VALIDATION = "training", "validation"  # names of the two parts of the samples
 SMALLEST_DEVIATION = 1e-3  # metres; added where a position never changes
 
 
@@ -360,6 +361,12 @@ def start_from(run: Run, policy: Path) -> None:
     run.average = {name: tensor.detach().clone() for name, tensor in run.learner.policy_tensors().items()}
 
 
+def features_of(samples: str, settings: TrainingSettings, recorded: dict[str, Any], out: Path) -> Path:
+    """The file with the features of the training or validation frames; see `FrozenFeatures`."""
+    shown = f"{samples}-blind" if settings.blind else samples
+    return out.parent / features_name(settings.start_sha256, recorded["sha256"], shown)
+
+
 def train(
     demonstrations: Path,
     out: Path,
@@ -391,7 +398,14 @@ def train(
     recording = demos.read_settings(demonstrations, tasks)
     config = policy_config(settings, recording, tasks)
     processor = config.processor()
-    training, validation = load_samples(demonstrations, tasks, settings.horizon, processor)
+    recorded = describe(demonstrations, tasks)
+    if start is not None:
+        settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
+    features = {name: features_of(name, settings, recorded, out) for name in (TRAINING, VALIDATION)}
+    computed = settings.only == "head" and all(path.exists() for path in features.values())
+    training, validation = load_samples(
+        demonstrations, tasks, settings.horizon, None if computed else processor
+    )
     if settings.blind:
         training, validation = (
             replace(samples, images=np.zeros_like(samples.images)) for samples in (training, validation)
@@ -399,9 +413,7 @@ def train(
     config = (
         with_statistics(config, training) if start is None else config_of_start(config, start, settings.only)
     )
-    if start is not None:
-        settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
-    run = new_run(settings, config, describe(demonstrations, tasks))
+    run = new_run(settings, config, recorded)
     if start is not None:
         start_from(run, start)
     if (out / STATE_FILE).exists():
@@ -413,9 +425,7 @@ def train(
     def batches_of(samples: Samples, name: str, size: int, absent_share: float) -> Batches:
         frozen = None
         if settings.only == "head":
-            shown = f"{name}-blind" if settings.blind else name
-            path = out.parent / features_name(settings.start_sha256, run.demonstrations["sha256"], shown)
-            frozen = FrozenFeatures(samples, prompts, run.learner.backbone, path)
+            frozen = FrozenFeatures(samples, prompts, run.learner.backbone, features[name])
         return Batches(
             samples,
             config,
@@ -427,8 +437,8 @@ def train(
             with_later=settings.aligned_block is not None,
         )
 
-    batches = batches_of(training, "training", settings.batch_size, settings.absent_share)
-    held_out = batches_of(validation, "validation", VALIDATION_FRAMES, 0.0)
+    batches = batches_of(training, TRAINING, settings.batch_size, settings.absent_share)
+    held_out = batches_of(validation, VALIDATION, VALIDATION_FRAMES, 0.0)
     try:
         loop(run, batches, held_out, out, on_step)
     finally:
