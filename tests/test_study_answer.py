@@ -312,7 +312,7 @@ def test_measures_of_the_core(core: Path, tmp_path: Path) -> None:
     (row,) = table[table["kind"] == "measures"].to_dict("records")
     assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
     directory = str(out / "answer" / "policies" / "n-4-seed-0")
-    found = measures.measure(directory, PLAN.tasks, PLAN.seeds)
+    (found,) = measures.measure(directory, PLAN.tasks, PLAN.seeds)
     assert found["probe_r2"] is None
     for name in ("chunk_change", "attention_mass", "gradient_share"):
         assert row[name] == pytest.approx(found[name], rel=1e-6), name

@@ -31,7 +31,7 @@ def untrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_measures_of_the_bundled_policy() -> None:
-    found = measures.measure(str(DEMO_CHECKPOINT), TASKS, range(5))
+    (found,) = measures.measure(str(DEMO_CHECKPOINT), TASKS, range(5))
     assert found.keys() == measures.NAMES.keys()
     assert found["chunk_change"] is not None
     assert 0 < found["chunk_change"] < 0.5
@@ -41,7 +41,8 @@ def test_measures_of_the_bundled_policy() -> None:
     assert abs(found["gradient_share"]) < 1
     assert found["probe_r2"] is not None
     assert found["probe_r2"] < 1
-    assert measures.measure(str(DEMO_CHECKPOINT), TASKS, range(1))["probe_r2"] is None
+    (found,) = measures.measure(str(DEMO_CHECKPOINT), TASKS, range(1))
+    assert found["probe_r2"] is None
 
 
 def test_attention_mass_is_that_of_the_trace() -> None:
@@ -58,7 +59,7 @@ def test_attention_mass_is_that_of_the_trace() -> None:
 
 def test_rows_that_nobody_sees_change_nothing(untrained: Path) -> None:
     """Without the output of self-attention no row reaches another one; all vision is read directly."""
-    found = measures.measure(str(untrained), TASKS, range(1))
+    (found,) = measures.measure(str(untrained), TASKS, range(1))
     assert found["chunk_change"] == pytest.approx(0, abs=1e-5)
     assert found["gradient_share"] == pytest.approx(0, abs=1e-4)
     assert found["attention_mass"] is not None
