@@ -43,11 +43,11 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
 
     Returns:
         One row, with the columns `NAMES`. `chunk_change` is the mean absolute change of an action when state
-        and action rows do not see the future rows. `attention_mass` is the probability of the future rows for the action
-        rows, over blocks with self-attention, their heads and the Euler steps. `gradient_share` is the share
-        of the derivative of the actions by the vision-language tokens that passes future rows. `probe_r2` is
-        the share of the variance within a task, of the positions of object and goal, that a linear probe
-        finds in the mean of the future rows, over blocks; None with fewer episodes than folds.
+        and action rows do not see the future rows. `attention_mass` is the probability of the future rows for
+        the action rows, over blocks with self-attention, their heads and the Euler steps. `gradient_share` is
+        the share of the derivative of the actions by the vision-language tokens that passes future rows.
+        `probe_r2` is the share of the variance within a task, of the positions of object and goal, that a
+        linear probe finds in the mean of the future rows, over blocks; None with fewer episodes than folds.
     """
     from saccade.study.simulator import Simulator
 

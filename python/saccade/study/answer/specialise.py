@@ -53,8 +53,8 @@ SIZES: Mapping[str, Callable[[int], int]] = {
     "half": lambda count: count // 2,
     "all": lambda count: count,
 }
-#: A mean change of an action that rounding alone may make. The order of the tokens, which must not matter,
-#: changed the actions of a pilot policy by 5e-8.
+#: A change of the chunk counts as zero if its mean absolute value is below this, which rounding alone may
+#: make. The order of the tokens, which must not matter, changed the actions of a pilot policy by 5e-8.
 ROUNDING = 1e-6
 
 
@@ -192,31 +192,32 @@ def removal(change: Change, order: Tokens, weight: str) -> Removal:
         weight: One of `WEIGHTS`.
     """
     count = len(order)
-    alone = np.stack([change(np.array([token]), weight) for token in range(count)])
+
+    def rounded(removed: Tokens, weight: str) -> Float64Array:
+        found = change(removed, weight)
+        return found if np.abs(found).mean() >= ROUNDING else np.zeros_like(found)
+
+    alone = np.stack([rounded(np.array([token]), weight) for token in range(count)])
     sets = {}
     for name, size_of in SIZES.items():
         size = size_of(count)
         if size >= 2 and (size < count or weight == LOST):
-            found, added = change(order[:size], weight), alone[order[:size]].sum(axis=0)
+            found, added = rounded(order[:size], weight), alone[order[:size]].sum(axis=0)
             squares = (float(np.square(one).mean()) for one in (found, added, found - added))
             sets[name] = MeanSquares(*squares)
     effects = np.abs(alone).reshape(count, -1).mean(axis=1)
-    return Removal(effects, float(np.abs(change(order, LOST)).mean()), sets)
+    return Removal(effects, float(np.abs(rounded(order, LOST)).mean()), sets)
 
 
 def effective_number(effects: npt.ArrayLike) -> float | None:
-    """(sum e)^2 / sum e^2: N for N equal effects, 1 if only one token has any.
-
-    None if the largest effect is below `ROUNDING`.
+    """(sum e)^2 / sum e^2: N for N equal effects, 1 if only one token has any, None if none has.
 
     Example:
         >>> effective_number([0.3, 0.3, 0.0]), effective_number([0.0, 0.0])
         (2.0, None)
     """
     found = np.asarray(effects, dtype=np.float64)
-    if found.max() < ROUNDING:
-        return None
-    return float(found.sum() ** 2 / np.square(found).sum())
+    return float(found.sum() ** 2 / np.square(found).sum()) if found.any() else None
 
 
 def summary(removals: Sequence[Removal]) -> dict[str, Any]:
@@ -233,7 +234,7 @@ def summary(removals: Sequence[Removal]) -> dict[str, Any]:
         weights in the softmax and the weight is `KEPT`, a set of k has the ratio (N - 1) / (N - k) and the
         share 1 - ((k - 1) / (N - 1))^2, because the weight of the others grows with k.
 
-        What is a quotient by no more than `ROUNDING`, or of a size that was not removed, is None.
+        A quotient by zero is None, and so are the numbers of a size that was not removed.
     """
     numbers = [effective_number(one.effects) for one in removals]
     defined = [number for number in numbers if number is not None]
@@ -242,7 +243,7 @@ def summary(removals: Sequence[Removal]) -> dict[str, Any]:
     found = {
         "mean_effect": float(np.mean([one.effects.mean() for one in removals])),
         "effective_tokens": float(np.mean(defined)) if defined else None,
-        "largest_share": largest / together if together > ROUNDING else None,
+        "largest_share": largest / together if together else None,
     }
     for size in SIZES:
         squares = [one.sets[size] for one in removals if size in one.sets]
@@ -250,6 +251,6 @@ def summary(removals: Sequence[Removal]) -> dict[str, Any]:
             float(np.mean([getattr(one, name) for one in squares])) if squares else 0.0
             for name in ("change", "sum", "difference")
         )
-        found[f"explained_{size}"] = 1 - difference / change if change > ROUNDING**2 else None
-        found[f"ratio_{size}"] = float(np.sqrt(change / added)) if added > ROUNDING**2 else None
+        found[f"explained_{size}"] = 1 - difference / change if change else None
+        found[f"ratio_{size}"] = float(np.sqrt(change / added)) if added else None
     return found
