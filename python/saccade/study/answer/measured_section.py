@@ -130,4 +130,4 @@ def patching_grid(caption: str, rows: pd.DataFrame) -> Grid:
     for recipe in recipes_of(together):
         of_recipe = together[together["recipe"] == recipe].groupby("group")["share"]
         lines.append([recipe, *(shown(mean(of_recipe.get_group(group))) for group in GROUPS)])
-    return Grid(caption, ("recipe", *(f"{group} rows" for group in GROUPS)), lines)
+    return Grid(caption, ("recipe", *GROUPS), lines)
