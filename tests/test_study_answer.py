@@ -27,6 +27,7 @@ from saccade.sim.training_settings import TrainingSettings
 from saccade.study.answer import arms, costs, measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
+from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.plan import Backbone, Plan, Recipe, Recording
 from saccade.study.answer.study import Answer
 from saccade.study.run import StudyError, run
@@ -300,22 +301,47 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
 
 
-def test_measures_of_the_core(core: Path, tmp_path: Path) -> None:
+def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(core, out)
     for name in ("n-4-seed-1", "n-32-seed-1", "n-32-seed-0"):  # one policy is enough here
         shutil.rmtree(out / "answer" / "policies" / name)
-    assert main(["study", "answer", "--stages", "measures", "--out", str(out)]) != 0
-    provenance = read_provenance(out / "answer.json")
-    assert (provenance.done, provenance.total) == (14 + 1, 14 + 4)
+    for done, stage in enumerate(MEASURED, start=1):  # one after the other: a stage with failures is the last
+        assert main(["study", "answer", "--stages", stage, "--out", str(out)]) != 0
+        provenance = read_provenance(out / "answer.json")
+        assert (provenance.done, provenance.total) == (14 + done, 14 + done - 1 + 4)
     table: Any = read_table(out / "answer.csv")
+    rows = table[table["kind"] == "specialise"]
+    assert set(rows["policy"]) == {"n-4-seed-0"}
+    assert sorted(zip(rows["tokens"], rows["weight"], strict=True)) == [
+        (tokens, weight) for tokens in ("learned", "random") for weight in ("kept", "lost")
+    ]
+    rows = table[(table["kind"] == "patching") & (table["block"] == "all")].set_index("group")
+    assert rows.loc["all rows", "share"] == pytest.approx(1, abs=1e-4)
+    assert set(rows["pairs"]) == {2}
+    section = Answer.summarise(table, provenance)
+    assert [grid.columns[0] for grid in section.grids[-4:]] == ["recipe"] * 4
     (row,) = table[table["kind"] == "measures"].to_dict("records")
     assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
     directory = str(out / "answer" / "policies" / "n-4-seed-0")
-    found = measures.measure(directory, PLAN.tasks, PLAN.seeds)
+    (found,) = measures.measure(directory, PLAN.tasks, PLAN.seeds)
     assert found["probe_r2"] is None
     for name in ("chunk_change", "attention_mass", "gradient_share"):
         assert row[name] == pytest.approx(found[name], rel=1e-6), name
+
+
+def test_policies_that_are_measured() -> None:
+    """Those of all stages but the pilots, as far as they have enough tokens."""
+    one = recipe("numbers", "n-1", (0,), num_future_tokens=1)
+    study = Answer(replace(PLAN, recipes=(*PLAN.recipes, one)), ())
+    several = {f"{name}-seed-{seed}" for name in ("n-4", "n-32", "n-4-aligned") for seed in (0, 1)}
+    assert {policy.name for policy in study.measured("specialise")} == several
+    for stage in ("measures", "patching"):
+        assert {policy.name for policy in study.measured(stage)} == {*several, "n-1-seed-0"}
+    known = replace(
+        study, stages=("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), "")
+    )
+    assert known.num_cells == 7 + 6
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:

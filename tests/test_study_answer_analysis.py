@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -15,6 +16,7 @@ from saccade.errors import InputError
 from saccade.study.answer.contrasts import CONFIRMATORY, slope
 from saccade.study.answer.power import power
 from saccade.study.answer.results import changes, confirmed, judged, over_seeds, relations
+from saccade.study.answer.section import relation_grid
 from saccade.study.answer.study import Answer
 from saccade.study.section import Section
 from saccade.study.sign_flip import sign_flip
@@ -224,7 +226,65 @@ def test_measures_are_related_to_what_a_cut_costs() -> None:
     assert math.isnan(found[2].correlation.value)  # the same for all
     section = Answer.summarise(table.assign(validation_loss=0.5), provenance_of())
     assert section.grids[-1].columns[0] == "measure"
-    assert [row[1] for row in section.grids[-1].rows] == ["15"] * 3
+    assert [row[1::2] for row in section.grids[-1].rows] == [["15", "15"]] * 3
+
+    # Policies of other stages count in the second number only.
+    of_core = table[(table["stage"] == "core") & (table["policy"] != "n-32-seed-3")]
+    other = table[table["policy"] == "n-32-seed-3"].assign(
+        stage="numbers", policy="n-16-seed-3", recipe="n-16"
+    )
+    table = pd.concat([of_core, other])
+    section = Answer.summarise(table.assign(validation_loss=0.5), provenance_of())
+    assert [row[1::2] for row in section.grids[-1].rows] == [["14", "15"]] * 3
+    assert section.grids[-1].rows[1][4].startswith(f"{expected:.2f} (")
+    alone = relation_grid("", [], found)
+    assert [row[1:4] for row in alone.rows] == [["0", "", "15"]] * 3
+
+
+def test_what_is_measured_has_its_tables() -> None:
+    """Means over training seeds by hand; what no policy has is left empty."""
+    rows = rows_of({name: [0.5] * 6 for name in ("n-4", "n-32")})
+    rows = pd.concat([rows, rows[rows["recipe"] == "n-4"].assign(recipe="n-4-aligned", stage="alignment")])
+    rows["policy"] = rows["recipe"] + "-seed-" + rows["training_seed"].astype(str)
+    trained = rows[rows["kind"] == "training"].sample(frac=1, random_state=0)
+    seeds, many = trained["training_seed"], trained["num_future_tokens"]
+    measured = []
+    for tokens, weight in itertools.product(("learned", "random"), ("kept", "lost")):
+        numbers = {"effective_tokens": 2.0 + seeds, "largest_share": 0.25, "overlap": 0.5}
+        if tokens == "learned":
+            numbers |= {"overlap": 0.75 + 0.01 * seeds, "effective_tokens": many / 2 + seeds}
+        for size in ("two", "half", "all"):
+            has_it = (weight == "lost") | ((size == "two") & (seeds > 0)) | ((size == "half") & (many > 4))
+            numbers[f"explained_{size}"] = np.where(has_it, 0.5, np.nan)
+            numbers[f"ratio_{size}"] = np.where(has_it, 1.5, np.nan)
+        measured.append(trained.assign(kind="specialise", tokens=tokens, weight=weight, **numbers))
+    for group, share in {"future": 0.1, "state": 0.2, "action": 1.0, "all rows": 1.0}.items():
+        for block in ("all", "0"):
+            found = share * (1 + 0.1 * seeds) if block == "all" else 9.0
+            measured.append(trained.assign(kind="patching", group=group, block=block, share=found))
+    table = pd.concat([rows, *measured]).assign(validation_loss=0.5)
+    section = Answer.summarise(table, provenance_of())
+    assert [figure.name for figure in section.figures] == ["success", "overlap"]
+    captions = [grid.caption.split(".")[0] for grid in section.grids]
+    assert captions == [f"Table {place}" for place in range(1, len(captions) + 1)]
+    maps, removed, sums, patched = section.grids[-4:]
+    assert [row[0] for row in maps.rows] == ["n-4", "n-32", "n-4-aligned"]
+    overlaps = sign_flip([0.75 + 0.01 * seed for seed in range(6)]).difference
+    shown = f"{overlaps.value:.3f} ({overlaps.low:.3f} to {overlaps.high:.3f})"
+    assert maps.rows[1] == ["n-32", shown, "0.500 (0.500 to 0.500)", maps.rows[1][3]]
+    assert maps.rows[1][3].startswith(f"{overlaps.value - 0.5:.3f} (")
+    assert [row[:2] for row in removed.rows[:3]] == [["n-4", "kept"], ["n-4", "lost"], ["n-32", "kept"]]
+    assert removed.rows[2][2] == "18.5 (16.0 to 21.0)"
+    assert removed.rows[2][4:] == ["14.0 (14.0 to 14.0)", "0.250 (0.250 to 0.250)"]
+    assert sums.columns[2:4] == ("two: share explained", "two: ratio")
+    assert sums.rows[0][2:] == ["0.50 (no interval)", "1.50 (no interval)", "", "", "", ""]
+    assert sums.rows[2][4:] == ["0.50 (0.50 to 0.50)", "1.50 (1.50 to 1.50)", "", ""]
+    assert "" not in sums.rows[1]
+    assert [cell.split()[0] for cell in patched.rows[0]] == ["n-4", "0.12", "0.25", "1.25", "1.25"]
+    assert patched.columns == ("recipe", "future", "state", "action", "all rows")
+    only = Answer.summarise(table[~table["kind"].isin(["specialise"])], provenance_of())
+    assert only.grids[-1].rows == patched.rows
+    assert only.grids[-1].caption.startswith(f"Table {len(only.grids)}. ")
 
 
 def test_nothing_trained() -> None:

@@ -22,6 +22,8 @@ from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, holm
 from saccade.study.table import truths
 
 Float64Array = npt.NDArray[np.float64]
+#: The stage of the policies of `CONFIRMATORY`.
+CORE_STAGE = "core"
 #: In words: `more` or `less` for a contrast that is not zero, `small` for one within its margin.
 Finding: TypeAlias = Literal["more", "less", "small", "undecided", "not measured"]
 
@@ -118,10 +120,7 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
     episodes = table[(table["kind"] == "episodes") & (table["arm"] == arm)] if "arm" in table else trained[:0]
     rates: dict[str, dict[int, float]] = {}
     missing = []
-    stages = ["core", *EXPLORATORY]
-    trained = trained.assign(order=trained["stage"].map(stages.index))
-    trained = trained.sort_values(["order", "num_future_tokens", "recipe", "training_seed"])
-    for policy, row in trained.set_index("policy").iterrows():
+    for policy, row in ordered(trained).set_index("policy").iterrows():
         rows = episodes[episodes["policy"] == policy]
         pairs = set(zip(rows["task"], rows["seed"], strict=True)) if len(rows) else set()
         if len(pairs) != len(rows) or not pairs <= {(task, seed) for task in tasks for seed in seeds}:
@@ -132,6 +131,13 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
         by_task = rows.assign(success=truths(rows["success"])).groupby("task")["success"].mean()
         rates.setdefault(str(row["recipe"]), {})[int(row["training_seed"])] = float(by_task.mean())
     return Judged(rates, missing)
+
+
+def ordered(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of policies in the order of stage, N, recipe and training seed."""
+    stages = [CORE_STAGE, *EXPLORATORY]
+    rows = rows.assign(order=rows["stage"].map(stages.index))
+    return rows.sort_values(["order", "num_future_tokens", "recipe", "training_seed"], kind="stable")
 
 
 @dataclass(frozen=True)
@@ -182,15 +188,21 @@ class Relation:
 
 
 def relations(
-    table: pd.DataFrame, found: Judged, tasks: Sequence[str], seeds: Sequence[int]
+    table: pd.DataFrame,
+    found: Judged,
+    tasks: Sequence[str],
+    seeds: Sequence[int],
+    stages: Sequence[str] = (CORE_STAGE, *EXPLORATORY),
 ) -> list[Relation]:
     """The relations of all measures, over the policies that are measured and judged with and without the cut.
 
     Args:
         table, tasks, seeds: As of `judged`.
         found: The unchanged policies.
+        stages: The stages whose policies are used.
     """
     rows = table[table["kind"] == MEASURES]
+    rows = rows[rows["stage"].isin(stages)] if len(rows) else rows
     if rows.empty:
         return []
     cut = judged(table, tasks, seeds, CUT).rates

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,9 +13,11 @@ from matplotlib.figure import Figure as Picture
 from saccade.study import figures
 from saccade.study.answer.arms import ARMS
 from saccade.study.answer.contrasts import ALL, MARGIN
+from saccade.study.answer.measured_section import of_measured
 from saccade.study.answer.measures import CUT, NAMES
 from saccade.study.answer.plan import PILOT
 from saccade.study.answer.results import (
+    CORE_STAGE,
     Change,
     ContrastResult,
     Judged,
@@ -71,10 +74,12 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
             grids.append(change_grid(prose.line("caption_changes", len(grids) + 1, stage), of_stage, names))
     related = relations(table, found, tasks, seeds)
     if related:
-        grids.append(relation_grid(prose.line("caption_relations", len(grids) + 1, CUT), related))
+        of_core = relations(table, found, tasks, seeds, [CORE_STAGE])
+        grids.append(relation_grid(prose.line("caption_relations", len(grids) + 1, CUT), of_core, related))
     shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
     pictures = [Figure("success", prose.line("caption_success"), success_picture(shown))] if shown else []
-    return prose.section(pictures, grids + of_pilots)
+    more_pictures, more_grids = of_measured(table, len(grids) + 1)
+    return prose.section(pictures + more_pictures, grids + more_grids + of_pilots)
 
 
 #: The values of the template where nothing is trained.
@@ -160,10 +165,18 @@ def change_grid(caption: str, changed: Sequence[Change], arms: Sequence[str]) ->
     return Grid(caption, ("recipe", *arms), lines)
 
 
-def relation_grid(caption: str, related: Sequence[Relation]) -> Grid:
-    """What the measures predict: a row for each."""
-    lines = [[NAMES[one.measure], str(one.policies), number(one.correlation, digits=2)] for one in related]
-    return Grid(caption, ("measure", "policies", "rank correlation (95 % interval)"), lines)
+def relation_grid(caption: str, of_core: Sequence[Relation], of_all: Sequence[Relation]) -> Grid:
+    """What the measures predict, over the policies of the core and over all: a row for each."""
+    core = {one.measure: one for one in of_core}
+    lines = []
+    for one in of_all:
+        shown = [
+            [str(found.policies), number(found.correlation, digits=2)] if found else ["0", ""]
+            for found in (core.get(one.measure), one)
+        ]
+        lines.append([NAMES[one.measure], *itertools.chain.from_iterable(shown)])
+    numbers = "rank correlation (95 % interval)"
+    return Grid(caption, ("measure", "of the core", numbers, "of all", numbers), lines)
 
 
 def pilot_grid(found: Sequence[Pilot], tasks: Sequence[str]) -> Grid:
