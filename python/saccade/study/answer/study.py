@@ -20,7 +20,7 @@ from saccade.study.answer import measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
-from saccade.study.answer.plan import PILOT, Backbone, Plan, PlannedPolicy, Recording
+from saccade.study.answer.plan import CORE_STAGE, PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.sweeps_results import PLAIN
@@ -42,7 +42,6 @@ examples:
   saccade study answer --out out/answer
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
-CORE_STAGE = "core"
 #: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
 NOT_KEPT = (STATE_FILE, "loss.png")
 
@@ -356,7 +355,7 @@ class Answer(Study):
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
-        return section(table, provenance)
+        return section(table, provenance, plans.PLAN)
 
 
 def described(recording: Recording) -> dict[str, Any]:
