@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import itertools
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -94,7 +97,12 @@ def quick() -> Iterator[None]:
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of the first stage."""
     out = tmp_path_factory.mktemp("core")
-    assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    assert re.search(
+        r"^- (In these policies|Whether) .* \(no interval; .*; table 1\)\.$", printed.getvalue(), re.M
+    )
     return out
 
 

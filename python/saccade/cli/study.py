@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,8 +119,8 @@ def show(name: str, out: Path, as_json: bool) -> None:
         _output.print_json({"provenance": vars(provenance), "rows": rows}, indent=2)
         return
     section = load_study(name).summarise(tables.read_table(tables.table_path(out, name)), provenance)
-    for line in section.concluded:
-        print(f"- {line}")
+    for line in (*section.answer, *section.concluded):
+        print("- " + re.sub(r"\[([^]]*)\]\(#[^)]*\)", r"\1", line))  # links are for the report
     print(f"table   {tables.table_path(out, name)}")
     print(f"report  saccade study report {out}")
 
