@@ -24,7 +24,7 @@ from saccade.study.report import write_report
 from saccade.study.section import Section
 from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import holm
-from saccade.study.table import Provenance, write_provenance, write_table
+from saccade.study.table import Provenance, write_provenance
 
 STAGES = {one.name: one.stage for one in plans.PLAN.recipes}
 
@@ -434,7 +434,7 @@ def test_the_report_begins_with_the_answer(tmp_path: Path) -> None:
     episodes = list(plan.seeds)
     rates = {name: [0.25, 0.5] * 6 for name in ("n-0", "n-4", "n-32")}
     rows = rows_of(rates, len(episodes)).assign(validation_loss=0.5)
-    write_table(rows.to_dict("records"), tmp_path / "answer.csv")
+    rows.to_csv(tmp_path / "answer.csv", index=False)
     known = Provenance("answer", {"tasks": ["a", "b"], "episodes": episodes}, 1, 1)
     write_provenance(known, tmp_path / "answer.json")
     page, markdown = (path.read_text(encoding="utf-8") for path in write_report(tmp_path))

@@ -94,7 +94,8 @@ def measure(args: argparse.Namespace) -> int:
     from saccade.study.run import run as run_study
 
     workers = workers_of(args)
-    with _output.progress_bar("loading", transient=True):
+    with _output.progress_bar("loading", transient=True) as loading:
+        args.on_moment = lambda done, total: loading(done, total, "looking at the pictures")
         study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
     with _output.progress_bar(args.study) as update:

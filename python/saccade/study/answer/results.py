@@ -145,9 +145,9 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
     stages = [CORE_STAGE, *EXPLORATORY]
     trained = trained.assign(order=trained["stage"].map(stages.index))
     trained = trained.sort_values(["order", "num_future_tokens", "recipe", "training_seed"])
-    by_policy = dict(list(episodes.groupby("policy"))) if len(episodes) else {}
+    by_policy = {str(name): rows for name, rows in episodes.groupby("policy")} if len(episodes) else {}
     for policy, row in trained.set_index("policy").iterrows():
-        rows = by_policy.get(policy, episodes[:0])
+        rows = by_policy.get(str(policy), episodes[:0])
         pairs = set(zip(rows["task"], rows["seed"], strict=True)) if len(rows) else set()
         if len(pairs) != len(rows) or not pairs <= {(task, seed) for task in tasks for seed in seeds}:
             raise InputError(f"episodes: those of {policy} are not distinct ones of the plan")
