@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import itertools
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -95,7 +98,12 @@ def quick() -> Iterator[None]:
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of the first stage."""
     out = tmp_path_factory.mktemp("core")
-    assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    assert re.search(
+        r"^- (In these policies|Whether) .* \(no interval; .*; table 1\)\.$", printed.getvalue(), re.M
+    )
     return out
 
 
@@ -213,8 +221,8 @@ def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.Cap
     provenance = read_provenance(out / "answer.json")
     assert (provenance.done, provenance.total) == (13, 14)
     section = Answer.summarise(read_table(out / "answer.csv"), provenance)
-    assert "n-32-seed-1: left out, 0 of 2 episodes are done." in section.concluded
-    assert any("n-32 minus n-0: the training seed 1 lacks" in line for line in section.concluded)
+    assert "n-32-seed-1 (0 of 2 episodes)." in section.summary[-1]
+    assert section.answer[0].startswith("No result yet: 5 of the 6 policies of the core are trained")
 
 
 def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
@@ -297,8 +305,9 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     row = found.loc[("n-0-seed-0", "steps of 1", 0)]
     assert (row["success"], row["control_steps"]) == expected(stepped, 0, None)
     section = Answer.summarise(table, read_provenance(out / "answer.json"))
-    assert section.grids[-1].columns == ("recipe", "future-unread", "steps of 1")
-    assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
+    assert section.grids[-2].columns == ("recipe", "future-unread", "steps of 1")
+    assert {row[0] for row in section.grids[-2].rows} == {"n-4", "n-0"}
+    assert list(section.grids[-1].rows[2]) == ["instrument", "4", "6"]
 
 
 def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
@@ -333,14 +342,12 @@ def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
 def test_policies_that_are_measured() -> None:
     """Those of all stages but the pilots, as far as they have enough tokens."""
     one = recipe("numbers", "n-1", (0,), num_future_tokens=1)
-    study = Answer(replace(PLAN, recipes=(*PLAN.recipes, one)), ())
+    plan = replace(PLAN, recipes=(*PLAN.recipes, one))
     several = {f"{name}-seed-{seed}" for name in ("n-4", "n-32", "n-4-aligned") for seed in (0, 1)}
-    assert {policy.name for policy in study.measured("specialise")} == several
+    assert {policy.name for policy in MEASURED["specialise"].policies(plan)} == several
     for stage in ("measures", "patching"):
-        assert {policy.name for policy in study.measured(stage)} == {*several, "n-1-seed-0"}
-    known = replace(
-        study, stages=("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), "")
-    )
+        assert {policy.name for policy in MEASURED[stage].policies(plan)} == {*several, "n-1-seed-0"}
+    known = Answer(plan, ("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), ""))
     assert known.num_cells == 7 + 6
 
 

@@ -79,6 +79,17 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     assert (settings["name"], settings["episodes"], settings["instruction"]) == ("table", 2, TOLD)
 
 
+def test_progress_is_by_moment(frames: Path) -> None:
+    told: list[tuple[int, int]] = []
+    encode.cache_clear()
+    given: dict[str, Any] = {"checkpoint": str(whole("isaac")), "embodiment": EMBODIMENT, "num_threads": 1}
+    watched = Moments(frames=str(frames), on_moment=lambda done, total: told.append((done, total)), **given)
+    assert len(watched.all) == 3
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert Moments(frames=str(frames), **given).all is watched.all  # the same source, and nothing is repeated
+    assert len(told) == 3
+
+
 def test_a_published_id(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from huggingface_hub import constants
 

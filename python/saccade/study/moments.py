@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -48,6 +48,7 @@ class Moments(Recorded):
         precision: How the backbone computes.
         seed: Seed of random tokens and of the noise.
         num_threads: Number of threads. Default: that of the engine.
+        on_moment: Called with the number of encoded moments and that of all, while the policy encodes them.
     """
 
     checkpoint: str
@@ -62,6 +63,7 @@ class Moments(Recorded):
     tokenizer: str | None = None
     seed: int = 0
     num_threads: int | None = None
+    on_moment: Callable[[int, int], None] | None = field(default=None, compare=False, repr=False)
     task: ClassVar[str] = "frames"
 
     @property
@@ -172,6 +174,8 @@ def encode(source: Moments) -> Encoded:
             other = others[place].observation
             (features,) = policy.features(policy.inputs(other), previous=context)
             compared.append(as_head_takes_it(policy, other, features))
+        if source.on_moment is not None:
+            source.on_moment(place + 1, len(moments))
     return Encoded(
         config=parts.head.config,
         identity=checkpoint_identity(Path(source.checkpoint)),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from saccade.study.answer import measures, patching, specialise
+from saccade.study.answer.plan import Plan, PlannedPolicy
 from saccade.study.cell import Rows
 
 
@@ -20,6 +21,12 @@ class MeasuredStage:
 
     measure: Callable[[str, Sequence[str], range], Rows]
     fewest_tokens: int = 1
+
+    def policies(self, plan: Plan) -> Iterator[PlannedPolicy]:
+        """The policies of a plan that are measured, trained or not."""
+        for policy in plan.all_policies(pilots=False):
+            if policy.training.num_future_tokens >= self.fewest_tokens:
+                yield policy
 
 
 #: By name of the stage.

@@ -128,7 +128,7 @@ class Answer(Study):
             yield from self.episode_cells(stage)
             return
         if kind in MEASURED:
-            for policy in self.measured(stage):
+            for policy in MEASURED[kind].policies(self.plan):
                 if policy.name in self.trained:
                     settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.first_seeds)}
                     yield Cell((kind, policy.name), settings)
@@ -155,19 +155,16 @@ class Answer(Study):
                 yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
 
     def judged(self, stage: str) -> Iterator[tuple[PlannedPolicy, str]]:
-        """The policies and arms of a stage, trained or not."""
+        """The policies and arms of a stage, trained or not. They run arm by arm, so that a run which is
+        stopped leaves whole arms.
+        """
         if stage not in ARMS:  # those of `MEASURED` have no policies of their own
             yield from ((policy, PLAIN) for policy in self.plan.policies(stage))
             return
-        for policy in self.plan.all_policies(pilots=False):
-            count = policy.training.num_future_tokens
-            yield from ((policy, arm.name) for arm in ARMS[stage] if arm.applies(count))
-
-    def measured(self, stage: str) -> Iterator[PlannedPolicy]:
-        """The policies of a stage of `MEASURED`, trained or not."""
-        for policy in self.plan.all_policies(pilots=False):
-            if policy.training.num_future_tokens >= MEASURED[stage].fewest_tokens:
-                yield policy
+        for arm in ARMS[stage]:
+            for policy in self.plan.all_policies(pilots=False):
+                if arm.applies(policy.training.num_future_tokens):
+                    yield policy, arm.name
 
     @property
     def first_seeds(self) -> range:
@@ -184,8 +181,8 @@ class Answer(Study):
         runs = [policy for stage in self.stages for policy, _ in self.judged(stage) if policy.name in known]
         recordings = {policy.recording for policy in planned}
         backbones = {policy.backbone.name for policy in planned}
-        of_policies = [stage for stage in self.stages if stage in MEASURED]
-        measured = [one for stage in of_policies for one in self.measured(stage) if one.name in known]
+        of_policies = [MEASURED[stage].policies(self.plan) for stage in self.stages if stage in MEASURED]
+        measured = [one for policies in of_policies for one in policies if one.name in known]
         trained = len(recordings) + len(backbones) + len(planned)
         return trained + len(runs) * len(self.plan.tasks) + len(measured)
 
@@ -361,7 +358,7 @@ class Answer(Study):
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
-        return section(table, provenance)
+        return section(table, provenance, plans.PLAN)
 
 
 def described(recording: Recording) -> dict[str, Any]:
