@@ -85,6 +85,7 @@ class Moments(Recorded):
                 "precision": self.precision,
                 "preprocessing": encoded.preprocessing,
                 "embodiment_id": int(encoded.observation.embodiment_id[0]),
+                "action_width": encoded.action_width,
                 "other": other,
             },
             "seed": self.seed,
@@ -101,6 +102,11 @@ class Moments(Recorded):
     def config(self) -> HeadConfig:
         """See `Source`."""
         return encode(self).config
+
+    @property
+    def action_width(self) -> int:
+        """Those of the robot: nothing was learned for the others."""
+        return encode(self).action_width
 
     @property
     def all(self) -> Observation:
@@ -125,6 +131,7 @@ class Encoded:
         config: Config of the head.
         identity: Name and hash of the checkpoint.
         preprocessing: How frames and words were prepared.
+        action_width: Number of the head's action dimensions that the robot uses.
         moments, others: The moments, and those to compare them with.
         observation, other_observation: The same as the head takes them; None without others.
         inputs: What the backbone was given for each of `moments`.
@@ -135,6 +142,7 @@ class Encoded:
     config: HeadConfig
     identity: dict[str, str]
     preprocessing: str
+    action_width: int
     moments: Sequence[Moment]
     others: Sequence[Moment]
     observation: Observation
@@ -180,6 +188,7 @@ def encode(source: Moments) -> Encoded:
         config=parts.head.config,
         identity=checkpoint_identity(Path(source.checkpoint)),
         preprocessing=parts.processor.preprocessing,
+        action_width=policy.normalizer.head_action_width,
         moments=moments,
         others=others,
         observation=joined(seen, moments),
