@@ -134,7 +134,7 @@ def test_tokens_of_the_bundled_policy() -> None:
         bias = np.full(count, weight, dtype=np.float32)
         bias[removed] = -np.inf
         change = Intervention(key_bias={"future": bias})
-        after = head.sample(context, seen.state, 0, noise=seen.noise, intervention=change)
+        after = head.sample(context, seen.state, 0, noise=np.asarray(seen.noise), intervention=change)
         return np.asarray(after - whole.actions, dtype=np.float64)
 
     together = np.abs(changed(list(range(count)), 0.0)).mean()
