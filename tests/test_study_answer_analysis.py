@@ -250,7 +250,7 @@ def test_what_is_measured_has_its_tables() -> None:
     seeds, many = trained["training_seed"], trained["num_future_tokens"]
     measured = []
     for tokens, weight in itertools.product(("learned", "random"), ("kept", "lost")):
-        numbers = {"effective_tokens": 2.0 + seeds, "largest_share": 0.25, "overlap": 0.5}
+        numbers: dict[str, Any] = {"effective_tokens": 2.0 + seeds, "largest_share": 0.25, "overlap": 0.5}
         if tokens == "learned":
             numbers |= {"overlap": 0.75 + 0.01 * seeds, "effective_tokens": many / 2 + seeds}
         for size in ("two", "half", "all"):
