@@ -151,4 +151,6 @@ def test_plans_that_cannot_be(
         replace(PLAN, seeds=range(2_000_000, 2_000_025))
     monkeypatch.setattr(graphics, "check", lambda: None)
     assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
-    assert "stages: unknown name cor, expected some of pilot, core, alignment" in capsys.readouterr().err
+    assert (
+        "stages: unknown name cor, expected some of pilot, core, longer, alignment" in capsys.readouterr().err
+    )

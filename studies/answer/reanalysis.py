@@ -348,8 +348,9 @@ def main() -> None:
     """Print everything."""
     with Path(__file__).with_name("answer.csv").open(newline="", encoding="utf-8") as file:
         rows: list[Row] = list(csv.DictReader(file))
-    trained = [row for row in rows if row["kind"] == "training"]
-    episodes = [row for row in rows if row["kind"] == "episodes"]
+    core_rows = [row for row in rows if row["stage"] == "core"]
+    trained = [row for row in core_rows if row["kind"] == "training"]
+    episodes = [row for row in core_rows if row["kind"] == "episodes" and row["arm"] == "plain"]
     check(rows, trained, episodes)
     core = Core(trained, episodes)
     describe(core)
