@@ -6,6 +6,7 @@
 #   .ci/aarch64/run.sh python     the Python tests that need NumPy alone, on each of $CPUS
 #   .ci/aarch64/run.sh loops      the inner loops of the kernels, judged by llvm-mca, as a table in Markdown
 #   .ci/aarch64/run.sh instructions   instructions a multiply-add of whole linear layers, counted by the emulator
+#   .ci/aarch64/run.sh lint       clippy of the Rust crates; a warning is an error
 #   .ci/aarch64/run.sh check      that it compiles for macOS (ARM) and Windows (x86-64), without their standard libraries
 #   .ci/aarch64/run.sh test       setup, rust and python
 #
@@ -205,15 +206,27 @@ instructions() (
     done
 )
 
+# Unpacks a package of Debian's Rust beside the compiler, unless what it brings is there.
+unpack() {
+    [ -e "$RUST/$2" ] && return
+    mkdir -p "$WORK/debs"
+    (cd "$WORK/debs" && apt-get download -qq "$1" 2>/dev/null) || fail "this Debian has no package $1"
+    dpkg-deb --extract "$WORK/debs/$1"*.deb "$WORK/rust"
+    rm -r "$WORK/debs"
+}
+
+# Clippy of the same version as the compiler. It finds the standard library by SYSROOT.
+lint() (
+    cross
+    unpack rust-web-clippy bin/cargo-clippy
+    SYSROOT=$RUST LD_LIBRARY_PATH=$RUST/lib/x86_64-linux-gnu "$RUST/bin/cargo-clippy" clippy --locked --quiet "${LEAST[@]}" \
+        --target $TARGET -p saccade-kernels -p saccade-checkpoint -p saccade-groot --all-targets -- --deny warnings
+)
+
 check() (
     cross
     # Debian has no standard library for them, but its sources, which are checked too.
-    if [ ! -e "$WORK/rust/usr/src/rustc-web" ]; then
-        mkdir -p "$WORK/debs"
-        (cd "$WORK/debs" && apt-get download -qq rust-web-src 2>/dev/null) || fail "this Debian has no package rust-web-src"
-        dpkg-deb --extract "$WORK"/debs/rust-web-src*.deb "$WORK/rust"
-        rm -r "$WORK/debs"
-    fi
+    unpack rust-web-src src/rustc-web
     export RUSTC_BOOTSTRAP=1
     for target in aarch64-apple-darwin x86_64-pc-windows-msvc; do
         echo "aarch64: checking for $target"
@@ -228,6 +241,7 @@ rust) rust ;;
 python) run_python ;;
 loops) loops ;;
 instructions) instructions ;;
+lint) lint ;;
 check) check ;;
 test) setup && rust && run_python ;;
 *)

@@ -39,8 +39,8 @@ pub(super) unsafe fn multiply_add<P: Pairwise, const NV: usize, const MR: usize>
         }
         for v in 0..NV {
             let columns = vld1q_u32(weights.add(v * 4));
-            for pair in 0..MR {
-                sums[pair][v] = P::multiply_add(sums[pair][v], rows[pair], columns);
+            for (sums, &rows) in sums.iter_mut().zip(&rows) {
+                sums[v] = P::multiply_add(sums[v], rows, columns);
             }
         }
     }

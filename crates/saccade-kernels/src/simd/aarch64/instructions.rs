@@ -92,6 +92,6 @@ pub(crate) unsafe fn bfcvtn(x: float32x4_t) -> uint16x4_t {
 /// Asks for the cache line at `at` in the second-level cache. A hint: any address is allowed.
 #[inline(always)]
 pub(crate) fn prefetch(at: *const u8) {
-    // SAFETY: prefetching never faults, whatever the address.
-    unsafe { asm!("prfm pldl2keep, [{0}]", in(reg) at, options(nomem, nostack, preserves_flags)) }
+    // SAFETY: prefetching never faults, whatever the address. It is a number here: nothing is read or written through it.
+    unsafe { asm!("prfm pldl2keep, [{0}]", in(reg) at.addr(), options(nomem, nostack, preserves_flags)) }
 }
