@@ -1,4 +1,4 @@
-"""Makes the pictures of the README from what the commands write.
+"""Makes the pictures of the README from what the commands write, and the diagram of docs/future-tokens.md.
 
     saccade rollout --episodes 1 --video --out out/gif python docs/make_pictures.py gif
     out/gif/videos/{reach,push,drawer-open,button-press-topdown,window-open}-0.mp4
@@ -6,9 +6,11 @@
     saccade attention --task push --seed 3 --out out/look
     python docs/make_pictures.py map out/look/sheet.png
 
+    python docs/make_pictures.py step
+
 `gif` joins videos into one looping GIF; frames are scaled down, thinned out and reduced to one palette, so
 that the file stays small. `map` cuts out the upper part of a sheet: images, occlusion and the first attention
-maps. Needs the extra `sim`.
+maps. `step` draws one denoising step of N1.5's action head. Needs the extra `sim`.
 """
 
 from __future__ import annotations
@@ -16,9 +18,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -60,8 +65,68 @@ def make_map(args: argparse.Namespace) -> None:
     print(f"{args.out}: {args.out.stat().st_size / 1e6:.2f} MB")
 
 
+def make_step(args: argparse.Namespace) -> None:
+    """Draws one denoising step, to be read in black and white."""
+    picture = Figure(figsize=(9, 5.6), layout="constrained")
+    axes = picture.subplots()
+    axes.set_xlim(0, 100)
+    axes.set_ylim(1, 59)
+    axes.axis("off")
+
+    def box(left: float, bottom: float, width: float, height: float, text: str, **style: Any) -> None:
+        frame = {"facecolor": "white", "edgecolor": "black", "linewidth": 1, **style}
+        axes.add_patch(Rectangle((left, bottom), width, height, **frame))
+        axes.text(left + width / 2, bottom + height / 2, text, ha="center", va="center", fontsize=9)
+
+    def arrow(start: tuple[float, float], end: tuple[float, float], **style: Any) -> None:
+        axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": "black", **style})
+
+    def rows(left: float, bottom: float, count: int, pitch: float, **style: Any) -> None:
+        frame = {"facecolor": "white", "edgecolor": "black", "linewidth": 0.6, **style}
+        for place in range(count):
+            axes.add_patch(Rectangle((left + pitch * place, bottom), 0.8 * pitch, 3, **frame))
+
+    for bottom, text in ((53, "camera 1"), (47, "camera 2"), (41, "instruction")):
+        box(0, bottom, 13, 5, text)
+        arrow((13, bottom + 2.5), (17, 49.5))
+    box(17, 43, 15, 13, "vision-language\nbackbone\n(runs once)")
+    arrow((32, 49.5), (36, 49.5))
+    rows(36, 48, 27, 1.05, facecolor="0.85")
+    axes.text(66.5, 49.5, "...", ha="center", va="center", fontsize=12)
+    rows(69, 48, 29, 1.05, facecolor="0.85")
+    axes.text(36, 52.5, "T_vl vision-language tokens: 256 for each camera, and the words", fontsize=9)
+
+    for left, count, style, text in (
+        (6, 1, {"facecolor": "0.55"}, "state"),
+        (11, 32, {"hatch": "////"}, "32 future tokens: learned, the same for every input"),
+        (72, 16, {}, "16 actions, noise at first"),
+    ):
+        rows(left, 30, count, 1.75, **style)
+        axes.text(left, 34, text, fontsize=9, va="bottom")
+        rows(left, 8, count, 1.75, **style)
+    box(6, 17, 94, 4.5, "odd blocks: the 49 rows read each other")
+    box(6, 22, 94, 4.5, "")
+    axes.text(
+        53,
+        24.2,
+        "even blocks: each of the 49 rows reads the vision-language tokens",
+        ha="center",
+        va="center",
+        fontsize=9,
+    )
+    arrow((69.5, 48), (69.5, 26.8), linestyle="--")
+    axes.text(2, 21.7, "16 blocks in turn", rotation=90, ha="center", va="center", fontsize=9)
+    axes.text(6, 6.2, "the results of state and future rows are not used", fontsize=9, va="top")
+    axes.text(72, 6.2, "action rows: how the\nactions must change", fontsize=9, va="top")
+    for place in (6.7, 39, 86):
+        arrow((place, 29.5), (place, 26.8))
+        arrow((place, 16.8), (place, 11.3))
+    picture.savefig(args.out, dpi=110, metadata={"Software": None})
+    print(f"{args.out}: {args.out.stat().st_size / 1e6:.2f} MB")
+
+
 def main() -> None:
-    """Runs one of the two."""
+    """Runs one of the three."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -80,6 +145,9 @@ def main() -> None:
     one.add_argument("--top", type=int, default=105, help="first row of pixels (default: 105)")
     one.add_argument("--bottom", type=int, default=670, help="last row of pixels (default: 670)")
     one.set_defaults(make=make_map)
+    step = kinds.add_parser("step", help="one denoising step")
+    step.add_argument("--out", type=Path, default=IMAGES / "step.png")
+    step.set_defaults(make=make_step)
     args = parser.parse_args()
     args.make(args)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from descendants import all_end, descendants
 
 from benches import checkpoints, farm, farm_processes, farm_report
 from benches.farm_processes import Robot, Setting
@@ -120,23 +121,6 @@ def test_a_run_goes_on_where_it_stopped(
     assert len(list(tmp_path.glob("results-*.json"))) == 1
 
 
-def descendants(pid: int) -> list[int]:
-    """The processes that a process started, and those that they started."""
-    try:
-        children = [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:
-        return []
-    return [*children, *(below for child in children for below in descendants(child))]
-
-
-def command_of(pid: int) -> str:
-    """What a process runs, empty if it is gone."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_text()
-    except OSError:
-        return ""
-
-
 @pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
 def test_an_interrupted_run_leaves_no_process(checkpoint: Path, tmp_path: Path, sign: signal.Signals) -> None:
     few = ["--policies", "full", "--engines", "saccade", "--cores", "2", "--full-batches", "1"]
@@ -152,10 +136,7 @@ def test_an_interrupted_run_leaves_no_process(checkpoint: Path, tmp_path: Path, 
     finally:
         program.kill()
         program.wait()
-    end = time.monotonic() + 60
-    while any(map(command_of, found)):
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    assert all_end(found, seconds=60)
 
 
 def test_a_mistyped_checkpoint_is_refused_and_stays_empty(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ PAGES = [
 #: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
 NEED_CHECKPOINTS = (
     *("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md"),
-    "frames.md",
+    *("frames.md", "protocol.md"),
 )
 MODULES = sorted(
     info.name
@@ -180,7 +180,7 @@ def test_pictures_of_the_readme_are_made_from_what_commands_write(tmp_path: Path
         "--bottom",
         "25",
     ]
-    for arguments in (gif, crop):
+    for arguments in (gif, crop, ["step", "--out", str(tmp_path / "step.png")]):
         subprocess.run([*script, *arguments], check=True, capture_output=True)
     with Image.open(tmp_path / "one.gif") as made:
         assert made.size == (48, 32)
@@ -188,6 +188,11 @@ def test_pictures_of_the_readme_are_made_from_what_commands_write(tmp_path: Path
         assert made.info["loop"] == 0
     with Image.open(tmp_path / "map.png") as made:
         assert made.size == (40, 20)
+    with (
+        Image.open(tmp_path / "step.png") as made,
+        Image.open(ROOT / "docs" / "images" / "step.png") as shown,
+    ):
+        assert made.size == shown.size
 
 
 def test_nothing_names_a_package_registry_or_a_path_of_one_machine() -> None:

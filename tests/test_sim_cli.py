@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +15,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from descendants import all_end, descendants
 from PIL import Image
 
 import saccade.sim.rollout
@@ -125,6 +130,23 @@ def test_ctrl_c_keeps_what_is_done(
         "reach-0.mp4",
     }
     assert "1/1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
+def test_a_command_that_is_ended_ends_its_processes(tmp_path: Path, sign: signal.Signals) -> None:
+    arguments = ["demos", "--tasks", "reach", "--episodes", "5000", "--jobs", "2", "--out", str(tmp_path)]
+    program = subprocess.Popen([sys.executable, "-m", "saccade", *arguments])
+    try:
+        # One of loky's own, and two that record.
+        while len(found := descendants(program.pid)) < 3 or not list(tmp_path.glob("reach/[0-9]*.npz")):
+            assert program.poll() is None
+            time.sleep(0.02)
+        program.send_signal(sign)
+        assert program.wait(60) == {signal.SIGTERM: 143, signal.SIGINT: 130}[sign]
+    finally:
+        program.kill()
+        program.wait()
+    assert all_end(found, seconds=60)
 
 
 def test_json_prints_the_result_file_and_nothing_else(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import itertools
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,6 +30,7 @@ from saccade.sim.training_settings import TrainingSettings
 from saccade.study.answer import arms, costs, measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
+from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.plan import Backbone, Plan, Recipe, Recording
 from saccade.study.answer.study import Answer
 from saccade.study.run import StudyError, run
@@ -94,7 +98,12 @@ def quick() -> Iterator[None]:
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of the first stage."""
     out = tmp_path_factory.mktemp("core")
-    assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
+    assert re.search(
+        r"^- (In these policies|Whether) .* \(no interval; .*; table 1\)\.$", printed.getvalue(), re.M
+    )
     return out
 
 
@@ -212,8 +221,8 @@ def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.Cap
     provenance = read_provenance(out / "answer.json")
     assert (provenance.done, provenance.total) == (13, 14)
     section = Answer.summarise(read_table(out / "answer.csv"), provenance)
-    assert "n-32-seed-1: left out, 0 of 2 episodes are done." in section.concluded
-    assert any("n-32 minus n-0: the training seed 1 lacks" in line for line in section.concluded)
+    assert "n-32-seed-1 (0 of 2 episodes)." in section.summary[-1]
+    assert section.answer[0].startswith("No result yet: 5 of the 6 policies of the core are trained")
 
 
 def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
@@ -296,26 +305,51 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     row = found.loc[("n-0-seed-0", "steps of 1", 0)]
     assert (row["success"], row["control_steps"]) == expected(stepped, 0, None)
     section = Answer.summarise(table, read_provenance(out / "answer.json"))
-    assert section.grids[-1].columns == ("recipe", "future-unread", "steps of 1")
-    assert {row[0] for row in section.grids[-1].rows} == {"n-4", "n-0"}
+    assert section.grids[-2].columns == ("recipe", "future-unread", "steps of 1")
+    assert {row[0] for row in section.grids[-2].rows} == {"n-4", "n-0"}
+    assert list(section.grids[-1].rows[2]) == ["instrument", "4", "6"]
 
 
-def test_measures_of_the_core(core: Path, tmp_path: Path) -> None:
+def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(core, out)
     for name in ("n-4-seed-1", "n-32-seed-1", "n-32-seed-0"):  # one policy is enough here
         shutil.rmtree(out / "answer" / "policies" / name)
-    assert main(["study", "answer", "--stages", "measures", "--out", str(out)]) != 0
-    provenance = read_provenance(out / "answer.json")
-    assert (provenance.done, provenance.total) == (14 + 1, 14 + 4)
+    for done, stage in enumerate(MEASURED, start=1):  # one after the other: a stage with failures is the last
+        assert main(["study", "answer", "--stages", stage, "--out", str(out)]) != 0
+        provenance = read_provenance(out / "answer.json")
+        assert (provenance.done, provenance.total) == (14 + done, 14 + done - 1 + 4)
     table: Any = read_table(out / "answer.csv")
+    rows = table[table["kind"] == "specialise"]
+    assert set(rows["policy"]) == {"n-4-seed-0"}
+    assert sorted(zip(rows["tokens"], rows["weight"], strict=True)) == [
+        (tokens, weight) for tokens in ("learned", "random") for weight in ("kept", "lost")
+    ]
+    rows = table[(table["kind"] == "patching") & (table["block"] == "all")].set_index("group")
+    assert set(rows["pairs"]) == {2}
+    assert rows["share"].isna().all()  # what is hardly trained acts alike in all layouts
+    section = Answer.summarise(table, provenance)
+    assert [grid.columns[0] for grid in section.grids[-4:]] == ["recipe"] * 4
+    assert section.grids[-1].rows == [["n-4", "", "", "", ""]]
     (row,) = table[table["kind"] == "measures"].to_dict("records")
     assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
     directory = str(out / "answer" / "policies" / "n-4-seed-0")
-    found = measures.measure(directory, PLAN.tasks, PLAN.seeds)
+    (found,) = measures.measure(directory, PLAN.tasks, PLAN.seeds)
     assert found["probe_r2"] is None
     for name in ("chunk_change", "attention_mass", "gradient_share"):
         assert row[name] == pytest.approx(found[name], rel=1e-6), name
+
+
+def test_policies_that_are_measured() -> None:
+    """Those of all stages but the pilots, as far as they have enough tokens."""
+    one = recipe("numbers", "n-1", (0,), num_future_tokens=1)
+    plan = replace(PLAN, recipes=(*PLAN.recipes, one))
+    several = {f"{name}-seed-{seed}" for name in ("n-4", "n-32", "n-4-aligned") for seed in (0, 1)}
+    assert {policy.name for policy in MEASURED["specialise"].policies(plan)} == several
+    for stage in ("measures", "patching"):
+        assert {policy.name for policy in MEASURED[stage].policies(plan)} == {*several, "n-1-seed-0"}
+    known = Answer(plan, ("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), ""))
+    assert known.num_cells == 7 + 6
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,13 @@ from saccade.cli import main
 from saccade.frames import read_frames
 from saccade.policy_parts import as_head_takes_it, parts_of
 from saccade.reference import ActionHead, Backbone
+from saccade.study import derivatives as head_derivatives
 from saccade.study import input_derivatives as derivatives
+from saccade.study.cell import Cell
 from saccade.study.moments import Moments, encode
+from saccade.study.questions.gradients import Gradients
+from saccade.study.questions.patching import Patching
+from saccade.study.questions.patching_section import FROM_FILE
 from saccade.study.table import read_provenance, read_table
 
 torch.set_num_threads(1)
@@ -50,8 +56,14 @@ def table_of(out: Path, name: str) -> pd.DataFrame:
 
 @pytest.mark.parametrize("layout", ["isaac", "n17"])
 def test_cuts_are_those_of_the_same_features_in_a_file(
-    layout: str, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    layout: str,
+    frames: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # A file does not say how many action dimensions the robot has.
+    monkeypatch.setattr(Moments, "action_width", property(lambda source: source.config.action_dim))
     arms = ["--arms", "future-unread,future-blind,action-blind", "--seed", "5"]
     assert study("cuts", frames, tmp_path / "frames", *arms, layout=layout) == 0
     printed = capsys.readouterr().out
@@ -77,6 +89,44 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     assert found["moment"].unique().tolist() == ["pour/1", "pour/2", "wipe/1"]
     settings = read_provenance(tmp_path / "frames" / "cuts.json").settings["frames"]
     assert (settings["name"], settings["episodes"], settings["instruction"]) == ("table", 2, TOLD)
+
+
+def test_only_the_dimensions_of_the_robot_count(frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Moments(str(whole("isaac")), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1)
+    head, width = source.head(), loaded("isaac").normalizer.head_action_width
+    assert 0 < width < head.config.action_dim
+    receiver, donor = source.observed("frames", 0), source.all.row(2)
+    chunks = receiver.sample(head)
+    np.testing.assert_array_equal(source.actions(receiver, None), chunks[..., :width])
+
+    rows = Patching(source, (0,), (0,)).measure(Cell((FROM_FILE, "frames", 0)))
+    before = receiver.with_draw(0).sample(head)[0, :, :width].astype(np.float64)
+    after = replace(donor, noise=receiver.with_draw(0).noise).sample(head)[0, :, :width]
+    assert rows[0]["squared_way"] == pytest.approx(float(np.square(after - before).sum()), rel=1e-5)
+
+    seen: list[torch.Tensor] = []
+    sensitivity = head_derivatives.action_sensitivity
+
+    def watched(*given: Any) -> Any:
+        seen.append(given[4])
+        return sensitivity(*given)
+
+    monkeypatch.setattr(head_derivatives, "action_sensitivity", watched)
+    Gradients(source, projections=1).measure(Cell(("actions", "frames", 0)))
+    (projection,) = seen
+    assert projection[..., :width].abs().min() > 0
+    assert not projection[..., width:].any()
+
+
+def test_progress_is_by_moment(frames: Path) -> None:
+    told: list[tuple[int, int]] = []
+    encode.cache_clear()
+    given: dict[str, Any] = {"checkpoint": str(whole("isaac")), "embodiment": EMBODIMENT, "num_threads": 1}
+    watched = Moments(frames=str(frames), on_moment=lambda done, total: told.append((done, total)), **given)
+    assert len(watched.all) == 3
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert Moments(frames=str(frames), **given).all is watched.all  # the same source, and nothing is repeated
+    assert len(told) == 3
 
 
 def test_a_published_id(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

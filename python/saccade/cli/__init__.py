@@ -1,8 +1,9 @@
 """The `saccade` command: one file per command, imported only when that command is chosen.
 
 Exit status: 0, or what the command returned (`parity` returns 1 for a difference); 2 with one line on
-standard error for bad input, missing packages, and paths or streams that cannot be used; 130 after Ctrl-C;
-141 if the reader of standard output went away, as a shell reports for a program that SIGPIPE ended.
+standard error for bad input, missing packages, and paths or streams that cannot be used; 130 after Ctrl-C and
+143 after SIGTERM, both of which also end the processes that a command started; 141 if the reader of standard
+output went away, as a shell reports for a program that SIGPIPE ended.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import contextlib
 import errno
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from typing import NoReturn, Protocol, runtime_checkable
 
 from saccade._arguments import UsageError
@@ -65,6 +68,7 @@ EXIT_OK = 0
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+EXIT_TERMINATED = 143  # 128 + SIGTERM
 
 
 EPILOG = """\
@@ -197,7 +201,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _output.prepare_streams()
         try:
-            return dispatch(argv)
+            with terminable():
+                return dispatch(argv)
         finally:
             _output.flush()  # finds a closed pipe or a full disk here, not while the interpreter ends
     except KeyboardInterrupt:
@@ -209,6 +214,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     except _output.OutputError as error:
         _output.discard_output()
         return refuse(str(error))
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """SIGTERM ends the block as an exception does, so that processes which it started end, too.
+
+    Its usual effect is to end this process alone. Nothing changes where SIGTERM has another effect already,
+    and in threads other than the main one, which cannot set it.
+    """
+
+    def stop(number: int, frame: object) -> NoReturn:
+        sys.exit(EXIT_TERMINATED)
+
+    usual = signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if not usual or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def dispatch(argv: list[str]) -> int:

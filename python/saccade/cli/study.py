@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +94,8 @@ def measure(args: argparse.Namespace) -> int:
     from saccade.study.run import run as run_study
 
     workers = workers_of(args)
-    with _output.progress_bar("loading", transient=True):
+    with _output.progress_bar("loading", transient=True) as loading:
+        args.on_moment = lambda done, total: loading(done, total, "looking at the pictures")
         study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
     with _output.progress_bar(args.study) as update:
@@ -118,8 +120,8 @@ def show(name: str, out: Path, as_json: bool) -> None:
         _output.print_json({"provenance": vars(provenance), "rows": rows}, indent=2)
         return
     section = load_study(name).summarise(tables.read_table(tables.table_path(out, name)), provenance)
-    for line in section.concluded:
-        print(f"- {line}")
+    for line in (*section.answer, *section.concluded):
+        print("- " + re.sub(r"\[([^]]*)\]\(#[^)]*\)", r"\1", line))  # links are for the report
     print(f"table   {tables.table_path(out, name)}")
     print(f"report  saccade study report {out}")
 

@@ -146,6 +146,11 @@ class Normalizer(Robot):
         values = self._head("state", state, self.state_groups)
         return like_features(_mapped(values, self.state_groups, Group.to_robot), is_torch(state))
 
+    @property
+    def head_action_width(self) -> int:
+        """Number of values of the head's action that the robot uses. They come first; the rest is padding."""
+        return sum(group.width for group in self.action_groups)
+
     def actions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
         """Converts a chunk of the head to the robot's actions.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from saccade._arguments import check_frames, check_tasks
@@ -23,7 +24,7 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
 
     Args:
         args: as `saccade._arguments.add_rollout_arguments` declares them, and for studies that take
-            pictures `add_frames`.
+            pictures `add_frames`. With `on_moment`, see `Moments`, that is called while pictures are encoded.
         refused: options of the study that cannot be used with recorded observations.
 
     Raises:
@@ -98,7 +99,8 @@ def moments_of(args: argparse.Namespace) -> Moments:
         seed=args.seed,
         num_threads=None if workers_of(args).alone else 1,
     )
-    _ = found.all
+    # The backbone takes seconds for a moment. Equal sources share what it found; a function stays here.
+    _ = replace(found, on_moment=getattr(args, "on_moment", None)).all
     return found
 
 

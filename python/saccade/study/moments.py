@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -48,6 +48,7 @@ class Moments(Recorded):
         precision: How the backbone computes.
         seed: Seed of random tokens and of the noise.
         num_threads: Number of threads. Default: that of the engine.
+        on_moment: Called with the number of encoded moments and that of all, while the policy encodes them.
     """
 
     checkpoint: str
@@ -62,6 +63,7 @@ class Moments(Recorded):
     tokenizer: str | None = None
     seed: int = 0
     num_threads: int | None = None
+    on_moment: Callable[[int, int], None] | None = field(default=None, compare=False, repr=False)
     task: ClassVar[str] = "frames"
 
     @property
@@ -83,6 +85,7 @@ class Moments(Recorded):
                 "precision": self.precision,
                 "preprocessing": encoded.preprocessing,
                 "embodiment_id": int(encoded.observation.embodiment_id[0]),
+                "action_width": encoded.action_width,
                 "other": other,
             },
             "seed": self.seed,
@@ -99,6 +102,11 @@ class Moments(Recorded):
     def config(self) -> HeadConfig:
         """See `Source`."""
         return encode(self).config
+
+    @property
+    def action_width(self) -> int:
+        """Those of the robot: nothing was learned for the others."""
+        return encode(self).action_width
 
     @property
     def all(self) -> Observation:
@@ -123,6 +131,7 @@ class Encoded:
         config: Config of the head.
         identity: Name and hash of the checkpoint.
         preprocessing: How frames and words were prepared.
+        action_width: Number of the head's action dimensions that the robot uses.
         moments, others: The moments, and those to compare them with.
         observation, other_observation: The same as the head takes them; None without others.
         inputs: What the backbone was given for each of `moments`.
@@ -133,6 +142,7 @@ class Encoded:
     config: HeadConfig
     identity: dict[str, str]
     preprocessing: str
+    action_width: int
     moments: Sequence[Moment]
     others: Sequence[Moment]
     observation: Observation
@@ -172,10 +182,13 @@ def encode(source: Moments) -> Encoded:
             other = others[place].observation
             (features,) = policy.features(policy.inputs(other), previous=context)
             compared.append(as_head_takes_it(policy, other, features))
+        if source.on_moment is not None:
+            source.on_moment(place + 1, len(moments))
     return Encoded(
         config=parts.head.config,
         identity=checkpoint_identity(Path(source.checkpoint)),
         preprocessing=parts.processor.preprocessing,
+        action_width=policy.normalizer.head_action_width,
         moments=moments,
         others=others,
         observation=joined(seen, moments),

@@ -73,7 +73,7 @@ def to_html(markdown: str, pictures: Mapping[str, str]) -> str:
     for token, following in itertools.pairwise(tokens):
         if token.type == "heading_open" and token.tag == "h1":
             title = following.content
-        if token.type == "heading_open" and token.tag == "h2":
+        if token.type == "heading_open" and token.tag in ("h2", "h4"):
             token.attrSet("id", anchor(following.content))
         for child in token.children or ():
             if child.type == "image":

@@ -74,8 +74,9 @@ class Recorded(Source):
     def actions(
         self, observation: Observation, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
-        """The head's own, normalised actions; see `Source`."""
+        """The head's own, normalised actions, those that count; see `Source`."""
         found = observation.sample(self.head(), context, intervention=intervention)
+        found = found[..., : self.action_width]
         return found if found.ndim == 4 else found[:, None]
 
     def comparable(self, chunk: Float32Array) -> Float32Array:

@@ -44,7 +44,8 @@ def write_report(directory: Path) -> tuple[Path, Path]:
         )
     separate = len(measured) == 1 and measured[0] in SEPARATE
     words, about = Prose("words"), measured[0] if separate else ""
-    title, opening = words.line("report_title", about), words.paragraphs("report_opening", about)
+    title = words.line("report_title", about)
+    opening = words.paragraphs("report_opening", about, (directory / "README.md").exists())
     parts = [make_part(directory, name) for name in (measured if separate else STUDIES)]
     if (directory / ATTENTION).is_dir():
         parts.append(attention_part(directory))

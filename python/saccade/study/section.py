@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -45,6 +46,12 @@ class Grid:
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
 
+    @property
+    def heading(self) -> str:
+        """What it is referred to by: "Table 3" if its caption begins with "Table 3. ", else nothing."""
+        found = re.match(r"(Table \d+)\. ", self.caption)
+        return found[1] if found else ""
+
 
 @dataclass(frozen=True)
 class Section:
@@ -56,6 +63,8 @@ class Section:
         figures, grids: The results.
         concluded: Sentences that say what the intervals show.
         not_shown: Sentences that say what the study cannot show.
+        answer: Sentences that the section begins with, before its figures; for a study with one question.
+        commands: Commands that compute the section again, for one with an answer.
     """
 
     title: str
@@ -64,6 +73,8 @@ class Section:
     grids: Sequence[Grid] = ()
     concluded: Sequence[str] = ()
     not_shown: Sequence[str] = ()
+    answer: Sequence[str] = ()
+    commands: Sequence[str] = ()
 
 
 def number(estimate: Estimate, digits: int) -> str:

@@ -70,6 +70,11 @@ class Source(ABC):
         """The head; loaded once in a process for each precision."""
 
     @property
+    def action_width(self) -> int:
+        """Number of the head's action dimensions that count; they come first. Default: all."""
+        return self.config.action_dim
+
+    @property
     def future_tokens(self) -> Float32Array:
         """The learned future tokens, `(N, width)`; N is 0 where the checkpoint has none."""
         return self.head().future_tokens

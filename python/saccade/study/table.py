@@ -65,7 +65,7 @@ def read_table(path: Path) -> pd.DataFrame:
         return pd.DataFrame()
     try:
         # Words like "none" or "NA" are names here, not missing values.
-        return pd.read_csv(path, keep_default_na=False, na_values=[""])
+        return pd.read_csv(path, keep_default_na=False, na_values=[""], low_memory=False)
     except (pd.errors.ParserError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a table: {error}") from None
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from saccade.study.cell import Rows
 from saccade.study.linear_probes import FOLDS, PROPRIO, VL, Frames, join, probe
 from saccade.study.paths import DIRECT
 from saccade.study.questions.cuts import ARMS as CUTS
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from saccade.head import ActionHead
     from saccade.study.simulator import Recorded, Simulator
 
-#: The stage that measures them, for the policies of the core that have tokens.
+#: The stage that measures them, for trained policies with tokens.
 MEASURES = "measures"
 #: The arm whose effect on success they may predict.
 CUT = "future-unread"
@@ -28,13 +29,12 @@ NAMES = {
     "gradient_share": "share of the gradient through future rows",
     "probe_r2": "R2 of probes of future rows",
 }
-EPISODES = 10  # of each task
 OBSERVATIONS = 3  # of each episode, for gradients
 PROJECTIONS = 8  # of the actions, for gradients
 DIMENSIONS = 64  # that a probe reads
 
 
-def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Mapping[str, float | None]:
+def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
     """The measures of a policy with future tokens, each a mean over episodes of the unchanged policy.
 
     Args:
@@ -42,12 +42,12 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Mapping[str,
         tasks, seeds: The episodes.
 
     Returns:
-        By name of `NAMES`. `chunk_change` is the mean absolute change of an action when state and action rows
-        do not see the future rows. `attention_mass` is the probability of the future rows for the action
-        rows, over blocks with self-attention, their heads and the Euler steps. `gradient_share` is the share
-        of the derivative of the actions by the vision-language tokens that passes future rows. `probe_r2` is
-        the share of the variance within a task, of the positions of object and goal, that a linear probe
-        finds in the mean of the future rows, over blocks; None with fewer episodes than folds.
+        One row, with the columns `NAMES`. `chunk_change` is the mean absolute change of an action when state
+        and action rows do not see the future rows. `attention_mass` is the probability of the future rows for
+        the action rows, over blocks with self-attention, their heads and the Euler steps. `gradient_share` is
+        the share of the derivative of the actions by the vision-language tokens that passes future rows.
+        `probe_r2` is the share of the variance within a task, of the positions of object and goal, that a
+        linear probe finds in the mean of the future rows, over blocks; None with fewer episodes than folds.
     """
     from saccade.study.simulator import Simulator
 
@@ -66,7 +66,7 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Mapping[str,
             numbers.append(number)
     means = [float(np.mean(values)) for values in (changes, masses, through)]
     found: list[float | None] = [*means, probed(frames, numbers) if len(frames) >= FOLDS else None]
-    return dict(zip(NAMES, found, strict=True))
+    return [dict(zip(NAMES, found, strict=True))]
 
 
 def attention_mass(head: ActionHead, recorded: Recorded) -> float:

@@ -200,6 +200,8 @@ class Plan:
 
 #: The stage whose policies only help to plan. It is run if it is named, and is no result.
 PILOT = "pilot"
+#: The stage of the confirmatory tests. Nothing is judged before all its policies are there.
+CORE_STAGE = "core"
 
 TASKS = ("stereo-reach", "two-goals")
 # Demonstrations of each task. reach is learned, too, and not judged: a blindfolded policy succeeds too often.
@@ -266,7 +268,7 @@ PLAN = Plan(
     recipes=(
         *recipes(PILOT, "-pilot", (0, 32), seeds=PILOT_SEEDS),
         *recipes(PILOT, "-pilot-blind", (32,), seeds=PILOT_SEEDS, blind=True),
-        *recipes("core", "", (0, 4, 32)),
+        *recipes(CORE_STAGE, "", (0, 4, 32)),
         *recipes("alignment", "-aligned", (4, 32), alignment_weight=ALIGNMENT),
         *recipes("numbers", "", (1, 16, 64)),
         *recipes("compute", "-wide", (0,), width=WIDTH, language_width=BASE.width),

@@ -13,9 +13,11 @@ import pandas as pd
 from scipy.stats import rankdata
 
 from saccade.errors import InputError
-from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, Contrast
+from saccade.study.answer.arms import ARMS
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, MARGIN, Contrast
+from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.measures import CUT, MEASURES, NAMES
-from saccade.study.answer.plan import PILOT
+from saccade.study.answer.plan import CORE_STAGE, PILOT, Plan
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.sign_flip import SignFlip, sign_flip
 from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, holm
@@ -92,14 +94,35 @@ class ContrastResult:
         """
         if self.test is None:
             return "not measured"
-        found = self.test.difference
-        rejected = found.low > 0 or found.high < 0
-        if self.corrected is not None:
-            rejected = self.corrected <= 1 - CONFIDENCE
-        if rejected:
+        found, margin = self.test.difference, self.contrast.margin
+        if self.corrected is None:
+            return finding(found, margin)
+        if self.corrected <= 1 - CONFIDENCE:
             return "more" if found.value > 0 else "less"
-        inside = not math.isnan(found.low) and max(-found.low, found.high) < self.contrast.margin
-        return "small" if inside else "undecided"
+        return "small" if inside(found, margin) else "undecided"
+
+    @property
+    def inside(self) -> bool:
+        """Whether the interval is inside the margin on both sides, whatever the finding."""
+        return self.test is not None and inside(self.test.difference, self.contrast.margin)
+
+
+def inside(found: Estimate, margin: float) -> bool:
+    """Whether an interval excludes the margin on both sides; False without an interval."""
+    return not math.isnan(found.low) and max(-found.low, found.high) < margin
+
+
+def finding(found: Estimate, margin: float = MARGIN) -> Finding:
+    """What an exploratory estimate shows, by the rules of `ContrastResult.finding`.
+
+    Example:
+        >>> [finding(Estimate((low + high) / 2, low, high))
+        ...  for low, high in ((0.02, 0.2), (-0.2, -0.02), (-0.05, 0.05), (-0.05, 0.15))]
+        ['more', 'less', 'small', 'undecided']
+    """
+    if found.low > 0 or found.high < 0:
+        return "more" if found.value > 0 else "less"
+    return "small" if inside(found, margin) else "undecided"
 
 
 def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm: str = PLAIN) -> Judged:
@@ -113,16 +136,16 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
     Raises:
         InputError: an episode is in the table twice, or is not one of those.
     """
+    if "stage" not in table:  # no policy is trained
+        return Judged({}, [])
     expected = len(tasks) * len(seeds)
     trained = table[(table["kind"] == "training") & (table["stage"] != PILOT)]
     episodes = table[(table["kind"] == "episodes") & (table["arm"] == arm)] if "arm" in table else trained[:0]
     rates: dict[str, dict[int, float]] = {}
     missing = []
-    stages = ["core", *EXPLORATORY]
-    trained = trained.assign(order=trained["stage"].map(stages.index))
-    trained = trained.sort_values(["order", "num_future_tokens", "recipe", "training_seed"])
-    for policy, row in trained.set_index("policy").iterrows():
-        rows = episodes[episodes["policy"] == policy]
+    by_policy = {str(name): rows for name, rows in episodes.groupby("policy")} if len(episodes) else {}
+    for policy, row in ordered(trained).set_index("policy").iterrows():
+        rows = by_policy.get(str(policy), episodes[:0])
         pairs = set(zip(rows["task"], rows["seed"], strict=True)) if len(rows) else set()
         if len(pairs) != len(rows) or not pairs <= {(task, seed) for task in tasks for seed in seeds}:
             raise InputError(f"episodes: those of {policy} are not distinct ones of the plan")
@@ -132,6 +155,56 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
         by_task = rows.assign(success=truths(rows["success"])).groupby("task")["success"].mean()
         rates.setdefault(str(row["recipe"]), {})[int(row["training_seed"])] = float(by_task.mean())
     return Judged(rates, missing)
+
+
+def ordered(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of policies in the order of stage, N, recipe and training seed."""
+    stages = [CORE_STAGE, *EXPLORATORY]
+    rows = rows.assign(order=rows["stage"].map(stages.index))
+    return rows.sort_values(["order", "num_future_tokens", "recipe", "training_seed"], kind="stable")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How much of a stage is there.
+
+    Attributes:
+        stage: Its name.
+        done: Number of its policies that are trained and have all their episodes; in a stage that trains
+            none, of pairs of a policy and an arm, or of measured policies.
+        planned: Their number in the plan.
+    """
+
+    stage: str
+    done: int
+    planned: int
+
+
+def progress(
+    table: pd.DataFrame, found: Judged, plan: Plan, tasks: Sequence[str], seeds: Sequence[int]
+) -> list[Progress]:
+    """How much of every stage is there, without the pilots.
+
+    Args:
+        table, tasks, seeds: As of `judged`.
+        found: The unchanged policies.
+        plan: The plan of the study.
+    """
+    results = []
+    for stage in plan.stages:
+        if stage != PILOT:
+            planned = list(plan.policies(stage))
+            there = [one for one in planned if one.seed in found.rates.get(one.recipe.name, {})]
+            results.append(Progress(stage, len(there), len(planned)))
+    for stage, arms in ARMS.items():
+        done = [sum(map(len, judged(table, tasks, seeds, arm.name).rates.values())) for arm in arms]
+        counts = [policy.training.num_future_tokens for policy in plan.all_policies(pilots=False)]
+        results.append(Progress(stage, sum(done), sum(arm.applies(n) for arm in arms for n in counts)))
+    for stage, measured in MEASURED.items():
+        of_stage = table[table["kind"] == stage]
+        policies = of_stage["policy"].nunique() if len(of_stage) else 0
+        results.append(Progress(stage, policies, len(list(measured.policies(plan)))))
+    return results
 
 
 @dataclass(frozen=True)
@@ -182,15 +255,21 @@ class Relation:
 
 
 def relations(
-    table: pd.DataFrame, found: Judged, tasks: Sequence[str], seeds: Sequence[int]
+    table: pd.DataFrame,
+    found: Judged,
+    tasks: Sequence[str],
+    seeds: Sequence[int],
+    stages: Sequence[str] = (CORE_STAGE, *EXPLORATORY),
 ) -> list[Relation]:
     """The relations of all measures, over the policies that are measured and judged with and without the cut.
 
     Args:
         table, tasks, seeds: As of `judged`.
         found: The unchanged policies.
+        stages: The stages whose policies are used.
     """
     rows = table[table["kind"] == MEASURES]
+    rows = rows[rows["stage"].isin(stages)] if len(rows) else rows
     if rows.empty:
         return []
     cut = judged(table, tasks, seeds, CUT).rates
@@ -251,6 +330,11 @@ class Change:
     recipe: str
     arm: str
     test: SignFlip
+
+    @property
+    def finding(self) -> Finding:
+        """What it shows, as an exploratory contrast with the margin `MARGIN`."""
+        return finding(self.test.difference)
 
 
 def changes(table: pd.DataFrame, found: Judged, tasks: Sequence[str], seeds: Sequence[int]) -> list[Change]:

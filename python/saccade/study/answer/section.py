@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,83 +12,136 @@ from matplotlib.figure import Figure as Picture
 
 from saccade.study import figures
 from saccade.study.answer.arms import ARMS
-from saccade.study.answer.contrasts import ALL, MARGIN
-from saccade.study.answer.measures import CUT, NAMES
-from saccade.study.answer.plan import PILOT
+from saccade.study.answer.contrasts import ALL, CORE, MARGIN
+from saccade.study.answer.measured_section import of_measured
+from saccade.study.answer.measures import CUT, MEASURES, NAMES
+from saccade.study.answer.plan import CORE_STAGE, Plan
 from saccade.study.answer.results import (
     Change,
     ContrastResult,
     Judged,
     Pilot,
+    Progress,
     Relation,
     changes,
     confirmed,
     explored,
     judged,
     pilots,
+    progress,
     relations,
 )
-from saccade.study.section import Figure, Grid, Prose, Section, number, points
+from saccade.study.section import FEWEST, Figure, Grid, Prose, Section, number, points
 from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import Estimate, scaled
 from saccade.study.table import Provenance
 
 
-def section(table: pd.DataFrame, provenance: Provenance) -> Section:
-    """The study's part of the report.
+def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
+    """The study's part of the report. It has no result before the core is complete.
 
     Args:
         table: Table of the study.
         provenance: Its provenance, whose settings say which episodes every policy runs.
+        plan: The plan, which says which policies there should be.
     """
     tasks, seeds = provenance.settings["tasks"], provenance.settings["episodes"]
-    of_pilots = [pilot_grid(found, tasks) for found in [pilots(table)] if found]
-    trained = table[table["kind"] == "training"]
-    trained = trained[trained["stage"] != PILOT] if len(trained) else trained
-    if trained.empty:
-        return Prose("answer", **EMPTY).section(grids=of_pilots)
     found = judged(table, tasks, seeds)
-    tests, others = confirmed(found), explored(found)
-    by_recipe = trained.groupby("recipe")["validation_loss"].mean()
-    losses = {str(recipe): float(loss) for recipe, loss in by_recipe.items()}
-    prose = Prose(
-        "answer",
-        tests=tests,
-        explored=others,
-        missing=found.missing,
-        means={recipe: mean_of(rates) for recipe, rates in found.rates.items()},
-        counts={recipe: len(rates) for recipe, rates in found.rates.items()},
-        margin=f"{100 * MARGIN:.0f}",
-        tasks=tasks,
-        episodes=len(tasks) * len(seeds),
+    stages = progress(table, found, plan, tasks, seeds)
+    core = next(one for one in stages if one.stage == CORE_STAGE)
+    results = found if core.done == core.planned else None
+    known = known_facts(plan, found, core, tasks, seeds)
+    pictures, grids = [], list[Grid]()
+    if results is None:
+        prose = Prose("answer", **known, places={})
+        answer = prose.points("not_judged")
+    else:
+        tests, others = confirmed(found), explored(found)
+        changed = changes(table, found, tasks, seeds)
+        arms = {stage: [arm.name for arm in of_stage] for stage, of_stage in ARMS.items()}
+        by_stage = {stage: [one for one in changed if one.arm in arms[stage]] for stage in arms}
+        by_stage = {stage: of_stage for stage, of_stage in by_stage.items() if of_stage}
+        everywhere = relations(table, found, tasks, seeds)
+        related = relations(table, found, tasks, seeds, [CORE_STAGE])
+        names = ["tests", "policies", *others, *by_stage, *([MEASURES] if everywhere else [])]
+        places = {name: place for place, name in enumerate(names, start=1)}
+        predictive = [one for one in related if predicts(one)]
+        prose = Prose(
+            "answer",
+            **known,
+            places=places,
+            tests=tests,
+            cuts={one.recipe: one for one in changed if one.arm == CUT},
+            contrasts={one.contrast.name: (one, stage) for stage, of in others.items() for one in of},
+            related=related,
+            predictive=predictive,
+            others=[one for one in related if one not in predictive],
+        )
+        answer = prose.points("answer")
+        shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
+        pictures.append(Figure("success", prose.line("caption_success"), success_picture(shown)))
+        grids += [test_grid(prose, tests), policy_grid(prose, found, mean_losses(table))]
+        for stage, contrasts in others.items():
+            grids.append(contrast_grid(prose.line("caption_contrasts", places[stage], stage), contrasts))
+        for stage, of_stage in by_stage.items():
+            caption = prose.line("caption_changes", places[stage], stage)
+            grids.append(change_grid(caption, of_stage, arms[stage]))
+        if everywhere:
+            caption = prose.line("caption_relations", places[MEASURES], CUT)
+            grids.append(relation_grid(caption, related, everywhere))
+        more_pictures, more_grids = of_measured(table, len(grids) + 1)
+        pictures += more_pictures
+        grids += more_grids
+    grids.append(progress_grid(prose.line("caption_progress", len(grids) + 1), stages))
+    of_pilots = pilots(table)
+    if of_pilots:
+        grids.append(pilot_grid(of_pilots, tasks))
+    return Section(
+        title=prose.line("title"),
+        summary=prose.paragraphs("summary"),
+        figures=pictures,
+        grids=grids,
+        not_shown=prose.points("not_shown"),
+        answer=answer,
+        commands=COMMANDS,
     )
-    grids = [test_grid(prose, tests), policy_grid(prose, found, losses)]
-    for place, (stage, results) in enumerate(others.items(), start=3):
-        grids.append(contrast_grid(prose.line("caption_contrasts", place, stage), results))
-    for stage, arms in ARMS.items():
-        names = [arm.name for arm in arms]
-        of_stage = [one for one in changes(table, found, tasks, seeds) if one.arm in names]
-        if of_stage:
-            grids.append(change_grid(prose.line("caption_changes", len(grids) + 1, stage), of_stage, names))
-    related = relations(table, found, tasks, seeds)
-    if related:
-        grids.append(relation_grid(prose.line("caption_relations", len(grids) + 1, CUT), related))
-    shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
-    pictures = [Figure("success", prose.line("caption_success"), success_picture(shown))] if shown else []
-    return prose.section(pictures, grids + of_pilots)
 
 
-#: The values of the template where nothing is trained.
-EMPTY = {
-    "tests": [],
-    "explored": {},
-    "missing": [],
-    "means": {},
-    "counts": {},
-    "margin": f"{100 * MARGIN:.0f}",
-    "tasks": [],
-    "episodes": 0,
-}
+COMMANDS = ("saccade study answer --out DIR", "saccade study report DIR")
+
+
+def known_facts(
+    plan: Plan, found: Judged, core: Progress, tasks: Sequence[str], seeds: Sequence[int]
+) -> dict[str, Any]:
+    """The values of the template that are no results."""
+    policies = list(plan.policies(CORE_STAGE))
+    return {
+        "tasks": tasks,
+        "episodes": len(tasks) * len(seeds),
+        "margin": f"{100 * MARGIN:.0f}",
+        "labels": NAMES,
+        "done": core.done,
+        "planned": core.planned,
+        "core": sorted({one.training.num_future_tokens for one in policies}),
+        "num_seeds": len({one.seed for one in policies}),
+        "head": policies[0].training,
+        "backbone": policies[0].backbone.training,
+        "missing": found.missing,
+    }
+
+
+def predicts(related: Relation) -> bool:
+    """Whether a measure is correlated with what the cut costs: its interval excludes zero, over enough
+    policies.
+    """
+    found = related.correlation
+    return related.policies >= FEWEST and (found.low > 0 or found.high < 0)
+
+
+def mean_losses(table: pd.DataFrame) -> dict[str, float]:
+    """The mean held-out loss of each recipe."""
+    by_recipe = table[table["kind"] == "training"].groupby("recipe")["validation_loss"].mean()
+    return {str(recipe): float(loss) for recipe, loss in by_recipe.items()}
 
 
 def mean_of(rates: Mapping[int, float]) -> Estimate:
@@ -96,26 +150,27 @@ def mean_of(rates: Mapping[int, float]) -> Estimate:
 
 
 def success_picture(shown: Mapping[str, Mapping[int, float]]) -> Picture:
-    """Success over N: a line for each training seed, and the mean with its interval.
+    """Success over N: a line for each training seed, and the means with their intervals, filled in the core.
 
     Args:
         shown: Success by recipe of `ALL` and training seed.
     """
-    picture, (axes,) = figures.new_picture(height=3.6)
+    picture, (axes,) = figures.new_picture(height=4.0)
     places = {recipe: place for place, recipe in enumerate(shown)}
     for seed in sorted({seed for rates in shown.values() for seed in rates}):
         have = [recipe for recipe in shown if seed in shown[recipe]]
         values = [100 * shown[recipe][seed] for recipe in have]
         axes.plot([places[one] for one in have], values, color="0.6", linewidth=0.9, marker="o", markersize=3)
-    means = [scaled(mean_of(rates)) for rates in shown.values()]
-    middle = np.array([mean.value for mean in means])
-    bounds = np.array([[mean.low, mean.high] for mean in means]).T
-    reach = np.nan_to_num(np.abs(bounds - middle))
-    beside = np.arange(len(means)) + 0.08  # so that the bars do not cover the dots
-    style: dict[str, Any] = {"linewidth": 2, "marker": "s", "markersize": 6, "capsize": 4, "zorder": 3}
-    axes.errorbar(beside, middle, reach, color="black", **style)
+    style: dict[str, Any] = {"color": "black", "linewidth": 2, "markersize": 7, "capsize": 4, "zorder": 3}
+    for recipe, rates in shown.items():
+        mean = scaled(mean_of(rates))
+        reach = np.nan_to_num([[mean.value - mean.low], [mean.high - mean.value]])
+        inner = "black" if recipe in CORE else "white"
+        beside = places[recipe] + 0.1  # so that the bars do not cover the dots
+        axes.errorbar([beside], [mean.value], reach, marker="s", markerfacecolor=inner, **style)
     axes.set_xticks(list(places.values()), [str(ALL[recipe]) for recipe in shown])
     axes.set_xlabel("number of future tokens, N")
+    axes.set_ylim(0, 100)
     axes.set_ylabel("success, %")
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
@@ -130,7 +185,7 @@ def policy_grid(prose: Prose, found: Judged, losses: Mapping[str, float]) -> Gri
         shown = [f"{100 * rates[seed]:.1f}" if seed in rates else "" for seed in seeds]
         lines.append([recipe, points(mean_of(rates)), f"{losses[recipe]:.4f}", *shown])
     columns = ("recipe", "mean, %", "held-out loss", *(f"seed {seed}" for seed in seeds))
-    return Grid(prose.line("caption_policies"), columns, lines)
+    return Grid(prose.line("caption_policies", 2), columns, lines)
 
 
 def test_grid(prose: Prose, tests: Sequence[ContrastResult]) -> Grid:
@@ -142,7 +197,7 @@ def test_grid(prose: Prose, tests: Sequence[ContrastResult]) -> Grid:
             numbers = [percent(one), f"{one.test.p_value:.4f}", f"{one.corrected:.4f}"]
         lines.append([one.contrast.name, str(len(one.seeds)), *numbers, one.finding])
     columns = ("contrast", "pairs", "points (95 % interval)", "p", "p after Holm", "finding")
-    return Grid(prose.line("caption_tests"), columns, lines)
+    return Grid(prose.line("caption_tests", 1), columns, lines)
 
 
 def contrast_grid(caption: str, results: Sequence[ContrastResult]) -> Grid:
@@ -160,10 +215,24 @@ def change_grid(caption: str, changed: Sequence[Change], arms: Sequence[str]) ->
     return Grid(caption, ("recipe", *arms), lines)
 
 
-def relation_grid(caption: str, related: Sequence[Relation]) -> Grid:
-    """What the measures predict: a row for each."""
-    lines = [[NAMES[one.measure], str(one.policies), number(one.correlation, digits=2)] for one in related]
-    return Grid(caption, ("measure", "policies", "rank correlation (95 % interval)"), lines)
+def relation_grid(caption: str, of_core: Sequence[Relation], of_all: Sequence[Relation]) -> Grid:
+    """What the measures predict, over the policies of the core and over all: a row for each."""
+    core = {one.measure: one for one in of_core}
+    lines = []
+    for one in of_all:
+        shown = [
+            [str(found.policies), number(found.correlation, digits=2)] if found else ["0", ""]
+            for found in (core.get(one.measure), one)
+        ]
+        lines.append([NAMES[one.measure], *itertools.chain.from_iterable(shown)])
+    numbers = "rank correlation (95 % interval)"
+    return Grid(caption, ("measure", "of the core", numbers, "of all", numbers), lines)
+
+
+def progress_grid(caption: str, stages: Sequence[Progress]) -> Grid:
+    """How much is there: a row for each stage."""
+    lines = [[one.stage, str(one.done), str(one.planned)] for one in stages]
+    return Grid(caption, ("stage", "done", "planned"), lines)
 
 
 def pilot_grid(found: Sequence[Pilot], tasks: Sequence[str]) -> Grid:

@@ -16,10 +16,10 @@ from saccade._arguments import add_list
 from saccade._files import checkpoint_identity, sha256_of
 from saccade.errors import InputError
 from saccade.sim.training_settings import STATE_FILE, features_name
-from saccade.study.answer import measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
+from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.plan import PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
 from saccade.study.cell import Cell, Rows
@@ -42,7 +42,7 @@ examples:
   saccade study answer --out out/answer
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
-CORE_STAGE = "core"
+FIRST_EPISODES = 10  # of each task, for the stages of `MEASURED`
 #: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
 NOT_KEPT = (STATE_FILE, "loss.png")
 
@@ -72,7 +72,7 @@ class Answer(Study):
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """See `Study`."""
         parser.epilog = EPILOG
-        stages = ", ".join((*plans.PLAN.stages, *ARMS, measures.MEASURES))
+        stages = ", ".join((*plans.PLAN.stages, *ARMS, *MEASURED))
         add_list(parser, "--stages", help=f"stages to run, of {stages} (default: all but {PILOT})")
 
     @classmethod
@@ -80,7 +80,7 @@ class Answer(Study):
         """See `Study`."""
         from saccade.sim import graphics
 
-        known = (*plans.PLAN.stages, *ARMS, measures.MEASURES)
+        known = (*plans.PLAN.stages, *ARMS, *MEASURED)
         asked = [stage for stage in known if stage != PILOT] if args.stages is None else args.stages
         unknown = [stage for stage in asked if stage not in known]
         if unknown:
@@ -113,7 +113,7 @@ class Answer(Study):
     @property
     def phases(self) -> list[tuple[str, str]]:
         """Stage and kind of each phase. A stage is finished before the next one begins."""
-        without_training = {measures.MEASURES: (measures.MEASURES,), **dict.fromkeys(ARMS, (EPISODES,))}
+        without_training = {**{stage: (stage,) for stage in MEASURED}, **dict.fromkeys(ARMS, (EPISODES,))}
         training = (RECORDING, BACKBONE, TRAINING, EPISODES)
         return [(stage, kind) for stage in self.stages for kind in without_training.get(stage, training)]
 
@@ -127,8 +127,8 @@ class Answer(Study):
         if kind == EPISODES:
             yield from self.episode_cells(stage)
             return
-        if kind == measures.MEASURES:
-            for policy in self.measured():
+        if kind in MEASURED:
+            for policy in MEASURED[kind].policies(self.plan):
                 if policy.name in self.trained:
                     settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.first_seeds)}
                     yield Cell((kind, policy.name), settings)
@@ -155,32 +155,34 @@ class Answer(Study):
                 yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
 
     def judged(self, stage: str) -> Iterator[tuple[PlannedPolicy, str]]:
-        """The policies and arms of a stage, trained or not."""
-        if stage not in ARMS:  # `measures` has no policies of its own
+        """The policies and arms of a stage, trained or not. They run arm by arm, so that a run which is
+        stopped leaves whole arms.
+        """
+        if stage not in ARMS:  # those of `MEASURED` have no policies of their own
             yield from ((policy, PLAIN) for policy in self.plan.policies(stage))
             return
-        for policy in self.plan.all_policies(pilots=False):
-            count = policy.training.num_future_tokens
-            yield from ((policy, arm.name) for arm in ARMS[stage] if arm.applies(count))
-
-    def measured(self) -> Iterator[PlannedPolicy]:
-        """The policies of the stage `measures`, trained or not: those of the core that have tokens."""
-        yield from (one for one in self.plan.policies(CORE_STAGE) if one.training.num_future_tokens)
+        for arm in ARMS[stage]:
+            for policy in self.plan.all_policies(pilots=False):
+                if arm.applies(policy.training.num_future_tokens):
+                    yield policy, arm.name
 
     @property
     def first_seeds(self) -> range:
-        """The episodes of the stage `measures`."""
-        return self.plan.seeds[: measures.EPISODES]
+        """The episodes of the stages of `MEASURED`."""
+        return self.plan.seeds[:FIRST_EPISODES]
 
     @property
     def num_cells(self) -> int:
-        """See `Study`. Arms count for the policies that these stages train, or earlier ones have trained."""
+        """See `Study`. Stages without training count the policies that these stages train, or earlier ones
+        have trained.
+        """
         planned = [policy for stage in self.stages for policy in self.plan.policies(stage)]
         known = {policy.name for policy in planned} | set(self.trained)
         runs = [policy for stage in self.stages for policy, _ in self.judged(stage) if policy.name in known]
         recordings = {policy.recording for policy in planned}
         backbones = {policy.backbone.name for policy in planned}
-        measured = [one for one in self.measured() if measures.MEASURES in self.stages and one.name in known]
+        of_policies = [MEASURED[stage].policies(self.plan) for stage in self.stages if stage in MEASURED]
+        measured = [one for policies in of_policies for one in policies if one.name in known]
         trained = len(recordings) + len(backbones) + len(planned)
         return trained + len(runs) * len(self.plan.tasks) + len(measured)
 
@@ -218,7 +220,7 @@ class Answer(Study):
         """See `Study`: the finished policies. Demonstrations, and policies in training, stay in the output
         directory, which other machines must share.
         """
-        if self.phases[self.phase][1] not in (EPISODES, measures.MEASURES):
+        if self.phases[self.phase][1] not in (EPISODES, *MEASURED):
             return ()
         trained = [one.name for one in self.plan.all_policies(pilots=True) if one.name in self.trained]
         return tuple(self.trainings[name] for name in trained if self.trainings[name].is_dir())
@@ -232,9 +234,9 @@ class Answer(Study):
             rows = [self.train(next(one for one in self.plan.backbones if one.name == name))]
         elif kind == TRAINING:
             rows = [self.train(self.planned(name))]
-        elif kind == measures.MEASURES:
-            found = measures.measure(str(self.finished(name)), self.plan.tasks, self.first_seeds)
-            rows = [{**self.planned(name).columns, **found}]
+        elif kind in MEASURED:
+            found = MEASURED[kind].measure(str(self.finished(name)), self.plan.tasks, self.first_seeds)
+            rows = [{**self.planned(name).columns, **row} for row in found]
         else:
             rows = self.judge(self.planned(name), str(cell.key[2]), str(cell.key[3]))
         return [{"kind": kind, **row} for row in rows]
@@ -356,7 +358,7 @@ class Answer(Study):
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
-        return section(table, provenance)
+        return section(table, provenance, plans.PLAN)
 
 
 def described(recording: Recording) -> dict[str, Any]:

@@ -214,6 +214,7 @@ class Gradients(Study):
         )
         shape = (self.projections, head.config.action_horizon, head.config.action_dim)
         cotangents = torch.randn(shape, generator=generator)
+        cotangents[..., self.source.action_width :] = 0
         # In a head of full size, which a file may be for, the graph takes a gigabyte for each projection.
         size = self.projections if self.source.closed_loop else 1
         sensitivities, paths = [], []

@@ -140,7 +140,8 @@ class Patching(Study):
         pair = pair_of(self.source, kind, task, seed, cell.settings.get("donor_seed"))
         if isinstance(pair, str):
             return [{**row, "note": pair}]
-        return patched(self.source.head(), pair, self.blocks, self.steps, {**row, **pair.labels})
+        columns = {**row, **pair.labels}
+        return patched(self.source.head(), pair, self.blocks, self.steps, columns, self.source.action_width)
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
@@ -214,7 +215,12 @@ def recorded_pair(source: Recorded, kind: str, task: str, row: int) -> Pair | st
 
 
 def patched(
-    head: ActionHead, pair: Pair, blocks: Sequence[int], steps: Sequence[int], row: Mapping[str, Any]
+    head: ActionHead,
+    pair: Pair,
+    blocks: Sequence[int],
+    steps: Sequence[int],
+    row: Mapping[str, Any],
+    action_width: int,
 ) -> Rows:
     """A row for each group of rows and block: what the donor's rows do in the receiver's run.
 
@@ -224,20 +230,22 @@ def patched(
         blocks: after which rows are patched, one by one and all at once.
         steps: Euler steps in which they are patched.
         row: columns that all rows have.
+        action_width: number of action dimensions that count.
     """
     receiver = pair.receiver
     context = receiver.encode(head)
 
     def chunk(intervention: Intervention | None) -> npt.NDArray[np.float64]:
-        """The head's own, normalised actions, `(horizon, action_dim)`."""
-        return np.asarray(receiver.sample(head, context, intervention=intervention)[0], dtype=np.float64)
+        """The head's own, normalised actions, `(horizon, action_width)`."""
+        found = receiver.sample(head, context, intervention=intervention)[0, :, :action_width]
+        return np.asarray(found, dtype=np.float64)
 
     trace = replace(pair.donor, noise=receiver.noise).trace(
         head, record=("hidden",), blocks=blocks, steps=steps
     )
     hidden = {place: np.asarray(rows)[0] for place, rows in trace.hidden.items()}
     before = chunk(None)
-    way = np.asarray(trace.actions)[0] - before
+    way = np.asarray(trace.actions)[0, :, :action_width] - before
     found: Rows = []
     for group, members in GROUPS.items():
         if "future" in members and head.config.num_future_tokens == 0 and members != ROW_GROUPS:

@@ -1,0 +1,133 @@
+"""The report's part on trained policies that are measured and not judged: specialised tokens, patching.
+
+A number is a mean over the training seeds of a recipe, with the interval of `sign_flip`. A seed without the
+number is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import pandas as pd
+from matplotlib.figure import Figure as Picture
+
+from saccade.study import figures
+from saccade.study.answer.patching import PATCHING
+from saccade.study.answer.results import ordered
+from saccade.study.answer.specialise import KEPT, LEARNED, RANDOM, SIZES, SPECIALISE, WEIGHTS
+from saccade.study.questions.patching_section import ALL, GROUPS
+from saccade.study.section import Figure, Grid, Prose, number
+from saccade.study.sign_flip import sign_flip
+from saccade.study.statistics import Estimate
+
+#: By recipe: a number with learned tokens, with random ones, and the difference; None where no seed has it.
+Compared: TypeAlias = Mapping[str, tuple[Estimate | None, Estimate | None, Estimate | None]]
+COMPARED = ("learned", "random", "learned minus random")
+#: The two numbers of a set of tokens, and their labels.
+PARTS = {"explained": "share explained", "ratio": "ratio"}
+
+
+def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Grid]]:
+    """The figure and the tables, as far as something is measured.
+
+    Args:
+        table: Table of the study.
+        place: Number of the first table.
+    """
+    prose = Prose("answer_measured")
+    pictures: list[Figure] = []
+    grids: list[Grid] = []
+    rows = table[table["kind"] == SPECIALISE]
+    if len(rows):
+        rows = ordered(rows)
+        maps = compared(rows[rows["weight"] == KEPT], "overlap")
+        pictures.append(Figure("overlap", prose.line("caption_picture"), overlap_picture(maps)))
+        grids += [
+            overlap_grid(prose.line("caption_overlap", place), maps),
+            removal_grid(prose.line("caption_removal", place + 1), rows),
+            sum_grid(prose.line("caption_sums", place + 2), rows[rows["tokens"] == LEARNED]),
+        ]
+    rows = table[table["kind"] == PATCHING]
+    if len(rows):
+        grids.append(patching_grid(prose.line("caption_patching", place + len(grids)), ordered(rows)))
+    return pictures, grids
+
+
+def mean(values: pd.Series) -> Estimate | None:
+    """The mean over policies; None if none has a value."""
+    known = values.dropna()
+    return sign_flip(known.tolist()).difference if len(known) else None
+
+
+def shown(estimate: Estimate | None, digits: int = 2) -> str:
+    """An estimate for a table; nothing for None."""
+    return "" if estimate is None else number(estimate, digits=digits)
+
+
+def recipes_of(rows: pd.DataFrame) -> list[str]:
+    """The recipes of rows, in their order."""
+    return list(dict.fromkeys(rows["recipe"].astype(str)))
+
+
+def compared(rows: pd.DataFrame, column: str) -> Compared:
+    """A column of `SPECIALISE`, of one weight."""
+    found = {}
+    for recipe in recipes_of(rows):
+        by_kind = rows[rows["recipe"] == recipe].pivot(index="policy", columns="tokens", values=column)
+        learned, random = by_kind[LEARNED], by_kind[RANDOM]
+        found[recipe] = (mean(learned), mean(random), mean(learned - random))
+    return found
+
+
+def overlap_picture(maps: Compared) -> Picture:
+    """The difference between learned and random tokens for each recipe."""
+    differences = {recipe: of_recipe[-1] for recipe, of_recipe in maps.items()}
+    known = {recipe: one for recipe, one in differences.items() if one is not None}
+    label = "overlap of maps, learned minus random tokens"
+    return figures.estimates(list(known), list(known.values()), label, reference=0.0)
+
+
+def overlap_grid(caption: str, maps: Compared) -> Grid:
+    """The overlap of maps: a row for each recipe."""
+    lines = [[recipe, *(shown(one, 3) for one in found)] for recipe, found in maps.items()]
+    return Grid(caption, ("recipe", *COMPARED), lines)
+
+
+def removal_grid(caption: str, rows: pd.DataFrame) -> Grid:
+    """What a missing token changes: a row for each recipe and weight."""
+    of_weight = {weight: rows[rows["weight"] == weight] for weight in WEIGHTS}
+    numbers = {weight: compared(some, "effective_tokens") for weight, some in of_weight.items()}
+    largest = {weight: compared(some, "largest_share") for weight, some in of_weight.items()}
+    lines = [
+        [
+            recipe,
+            weight,
+            *(shown(one, 1) for one in numbers[weight][recipe]),
+            shown(largest[weight][recipe][0], 3),
+        ]
+        for recipe in recipes_of(rows)
+        for weight in WEIGHTS
+    ]
+    return Grid(caption, ("recipe", "weight", *COMPARED, "largest effect, of that of all"), lines)
+
+
+def sum_grid(caption: str, rows: pd.DataFrame) -> Grid:
+    """Whether the changes by learned tokens add up: a row for each recipe and weight."""
+    names = {f"{size}: {label}": f"{name}_{size}" for size in SIZES for name, label in PARTS.items()}
+    lines = []
+    for recipe in recipes_of(rows):
+        for weight in WEIGHTS:
+            some = rows[(rows["recipe"] == recipe) & (rows["weight"] == weight)]
+            lines.append([recipe, weight, *(shown(mean(some[name])) for name in names.values())])
+    return Grid(caption, ("recipe", "weight", *names), lines)
+
+
+def patching_grid(caption: str, rows: pd.DataFrame) -> Grid:
+    """How far the chunks move towards the donors': a row for each recipe, a column for each group of rows."""
+    together = rows[rows["block"] == ALL]
+    lines = []
+    for recipe in recipes_of(together):
+        of_recipe = together[together["recipe"] == recipe].groupby("group")["share"]
+        lines.append([recipe, *(shown(mean(of_recipe.get_group(group))) for group in GROUPS)])
+    return Grid(caption, ("recipe", *GROUPS), lines)
