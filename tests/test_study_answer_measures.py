@@ -119,9 +119,9 @@ def test_tokens_of_the_bundled_policy() -> None:
     head = ActionHead.load(DEMO_CHECKPOINT).requires_grad_(False)
     context = head.encode(seen.backbone_features)
     count = head.config.num_future_tokens
-    assert seen.noise is not None
-
-    whole = head.trace(context, seen.state, 0, noise=seen.noise, record=("attention",))
+    noise = seen.noise
+    assert noise is not None
+    whole = head.trace(context, seen.state, 0, noise=noise, record=("attention",))
     overlaps = []
     for (_, block), probabilities in whole.attention.items():
         if block in (0, 2):
@@ -134,7 +134,7 @@ def test_tokens_of_the_bundled_policy() -> None:
         bias = np.full(count, weight, dtype=np.float32)
         bias[removed] = -np.inf
         change = Intervention(key_bias={"future": bias})
-        after = head.sample(context, seen.state, 0, noise=np.asarray(seen.noise), intervention=change)
+        after = head.sample(context, seen.state, 0, noise=noise, intervention=change)
         return np.asarray(after - whole.actions, dtype=np.float64)
 
     together = np.abs(changed(list(range(count)), 0.0)).mean()

@@ -37,7 +37,9 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
         pair = simulated_pair(source, DONORS, task, seed, seed + len(seeds))
         assert isinstance(pair, Pair)  # every task has other layouts
         columns = {"task": task, "seed": seed, **pair.labels}
-        found += patched(head, pair, range(config.num_layers), range(config.num_steps), columns)
+        found += patched(
+            head, pair, range(config.num_layers), range(config.num_steps), columns, source.action_width
+        )
     rows: Rows = []
     for (group, block), of_place in measured_rows(pd.DataFrame(found)).groupby(
         ["group", "block"], sort=False
