@@ -211,7 +211,7 @@ def test_nothing_is_judged_before_the_core_is_complete() -> None:
     ]
     assert not partly.figures
     (stages,) = partly.grids
-    assert [list(row) for row in stages.rows[:2]] == [["core", "35", "36"], ["alignment", "12", "24"]]
+    assert [list(row) for row in stages.rows[:3:2]] == [["core", "35", "36"], ["alignment", "12", "24"]]
     assert "n-32-seed-11 (149 of 150 episodes)." in partly.summary[-1]
     assert "points (" not in " ".join([*partly.answer, *partly.summary])
     complete = section(table, known, plans.PLAN)
@@ -274,7 +274,8 @@ def test_the_sentence_about_the_cut() -> None:
 def test_the_exploratory_sentence() -> None:
     nothing = section_of(CORE).answer[3]
     assert nothing.startswith(
-        "Not measured: 32 tokens against a wider head without tokens at the same cost of"
+        "Not measured: 32 tokens against none, both trained for about twice as long; 32 tokens against a "
+        "wider head without tokens at the same cost of"
     )
     assert nothing.endswith("with patches of 32 against 16 pixels.")
     some = {
@@ -294,7 +295,8 @@ def test_the_exploratory_sentence() -> None:
         r"\(B; \[table 3\]\S*\); "
         r"32 against 4 tokens, with patches of 8 against 16 pixels: a change in favour of 4, -130.0 points "
         r"\(B; \[table 6\]\S*\); "
-        r"not measured: 32 against 4 tokens, with two cameras against one; 32 against 4 "
+        r"not measured: 32 tokens against none, both trained for about twice as long; "
+        r"32 against 4 tokens, with two cameras against one; 32 against 4 "
         r"tokens, with patches of "
         r"32 against 16 pixels\.".replace("B;", f"{BOUNDS};"),
         sentence,

@@ -52,10 +52,11 @@ def difference(second: str, first: str) -> Contrast:
     return Contrast(f"{second} minus {first}", {second: 1.0, first: -1.0})
 
 
-def interaction(suffix: str) -> Contrast:
-    """What 32 tokens instead of 4 change in policies of another kind, minus the same in plain ones."""
-    weights = {f"n-32{suffix}": 1.0, f"n-4{suffix}": -1.0, "n-32": -1.0, "n-4": 1.0}
-    return Contrast(f"(n-32{suffix} minus n-4{suffix}) minus (n-32 minus n-4)", weights)
+def interaction(suffix: str, fewer: int = 4) -> Contrast:
+    """What 32 tokens instead of fewer change in policies of another kind, minus the same in plain ones."""
+    few, many = f"n-{fewer}", "n-32"
+    weights = {f"{many}{suffix}": 1.0, f"{few}{suffix}": -1.0, many: -1.0, few: 1.0}
+    return Contrast(f"({many}{suffix} minus {few}{suffix}) minus ({many} minus {few})", weights)
 
 
 def slope(counts: Mapping[str, int]) -> Contrast:
@@ -88,6 +89,12 @@ CONFIRMATORY = (difference("n-32", "n-0"), difference("n-32", "n-4"), slope(CORE
 
 #: Everything else, by stage: intervals without a test.
 EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
+    "longer": (
+        difference("n-32-longer", "n-0-longer"),
+        difference("n-32-longer", "n-4-longer"),
+        difference("n-4-longer", "n-0-longer"),
+        interaction("-longer", fewer=0),
+    ),
     "alignment": (
         difference("n-4-aligned", "n-4"),
         difference("n-32-aligned", "n-32"),

@@ -225,6 +225,9 @@ BASE = TrainingSettings(
 # No future tokens, so that a backbone has nothing of any N.
 BACKBONE = replace(BASE, only="backbone", steps=4000, learning_rate=1e-3, seed=0, num_future_tokens=0)
 ALIGNMENT = 0.2  # the weight of the loss in FLARE
+# Twice the steps, and a little more: after `BASE.steps` half of the core's policies had not left the first
+# plateau of their loss. The pilot of 3,000 steps had.
+LONGER = 3000
 # What makes a policy without future tokens as costly as `BASE`: `costs.matched_width` for a chunk,
 # `costs.matched_steps` for the training. A test computes them again.
 WIDTH, STEPS = 104, 2279
@@ -269,6 +272,7 @@ PLAN = Plan(
         *recipes(PILOT, "-pilot", (0, 32), seeds=PILOT_SEEDS),
         *recipes(PILOT, "-pilot-blind", (32,), seeds=PILOT_SEEDS, blind=True),
         *recipes(CORE_STAGE, "", (0, 4, 32)),
+        *recipes("longer", "-longer", (0, 4, 32), steps=LONGER),
         *recipes("alignment", "-aligned", (4, 32), alignment_weight=ALIGNMENT),
         *recipes("numbers", "", (1, 16, 64)),
         *recipes("compute", "-wide", (0,), width=WIDTH, language_width=BASE.width),

@@ -1,0 +1,156 @@
+"""The plan of `saccade study answer`: what is refused, its arms and contrasts, what its policies cost."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from answer_cases import PLAN, RECORDING, TASK, TINY, recipe
+
+from saccade.bench.work import Call, encode_work, sample_work, total
+from saccade.cli import main
+from saccade.errors import InputError
+from saccade.sim import graphics, train
+from saccade.sim.policy import num_vl_tokens
+from saccade.study.answer import arms, costs
+from saccade.study.answer import plan as plans
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
+from saccade.study.answer.measured import MEASURED
+from saccade.study.answer.study import Answer
+
+
+def test_policies_that_are_measured() -> None:
+    """Those of all stages but the pilots, as far as they have enough tokens."""
+    one = recipe("numbers", "n-1", (0,), num_future_tokens=1)
+    plan = replace(PLAN, recipes=(*PLAN.recipes, one))
+    several = {f"{name}-seed-{seed}" for name in ("n-4", "n-32", "n-4-aligned") for seed in (0, 1)}
+    assert {policy.name for policy in MEASURED["specialise"].policies(plan)} == several
+    for stage in ("measures", "patching"):
+        assert {policy.name for policy in MEASURED[stage].policies(plan)} == {*several, "n-1-seed-0"}
+    known = Answer(plan, ("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), ""))
+    assert known.num_cells == 7 + 6
+
+
+def test_the_arms_of_the_stages_that_train_nothing() -> None:
+    names = [arm.name for of_stage in arms.ARMS.values() for arm in of_stage]
+    assert len(set(names)) == len(names)
+    for name in names:
+        found = arms.find_arm(name)
+        assert found is not None
+        rng, tokens = np.random.default_rng(0), np.random.default_rng(1).standard_normal((8, 4))
+        change = found.arm.intervention(tokens.astype(np.float32), rng)
+        assert (change is None) == (found.num_steps is not None)
+        assert found.applies(8)
+        assert found.applies(0) == (found.num_steps is not None)
+    assert arms.find_arm("plain") is None
+    assert [arms.mass_of(4).applies(count) for count in (0, 4, 32)] == [False, False, True]
+    assert [arms.merged_to(4).applies(count) for count in (0, 4, 32)] == [False, False, True]
+
+
+def test_costs_by_hand() -> None:
+    settings = replace(TINY, only="", num_future_tokens=5, vl_num_layers=1)
+    config = train.policy_config(settings, RECORDING.settings, [TASK])
+    sizes, head = config.backbone_sizes, config.head_config
+    vision, text = sizes.vision, sizes.text
+    patches, merged = vision.num_positions, vision.num_positions // 4
+    tower = patches * 3 * vision.patch_size**2 * vision.width + vision.num_layers * (
+        patches * vision.width * (4 * vision.width + 2 * vision.mlp_width) + 2 * patches**2 * vision.width
+    )
+    connector = merged * 4 * vision.width * text.width
+    (context,) = {num_vl_tokens(config.processor(), config.simulation)}
+    inner = text.num_heads * text.head_dim
+    layer = context * text.width * (2 * inner + 2 * text.num_key_heads * text.head_dim + 3 * text.mlp_width)
+    backbone = tower + connector + sizes.num_layers * (layer + 2 * context**2 * inner)
+    call = Call.of(head, context)
+    of_head = [total(work(head, call)).multiply_adds for work in (encode_work, sample_work)]
+    found = costs.cost(settings, RECORDING)
+    assert found.chunk == backbone + sum(of_head)
+    # Backward costs twice as much as forward, except where no gradient is needed: at the pixels.
+    assert 2.5 * backbone < found.sample < 3 * (backbone + sum(of_head))
+    aligned = costs.cost(replace(settings, alignment_weight=0.1), RECORDING)
+    assert aligned.chunk == found.chunk
+    assert aligned.sample > found.sample + backbone
+
+    # Alone, the head costs what is left: the features are given.
+    head_alone = costs.cost(replace(settings, only="head"), RECORDING)
+    assert head_alone.chunk == found.chunk
+    assert 2 * backbone < found.sample - head_alone.sample < 3.5 * backbone
+    backbone_alone = costs.cost(replace(settings, only="backbone"), RECORDING)
+    assert backbone_alone.chunk == backbone
+    assert 2.5 * backbone < backbone_alone.sample < 3.5 * backbone
+
+
+def test_costs_that_are_matched() -> None:
+    settings = replace(TINY, num_future_tokens=64, width=16, num_heads=2)
+    wanted = costs.cost(settings, RECORDING)
+
+    def without(**changes: Any) -> costs.Cost:
+        return costs.cost(replace(settings, num_future_tokens=0, **changes), RECORDING)
+
+    width = costs.matched_width(settings, RECORDING)
+    assert width > 16
+    errors = [
+        abs(without(width=one, language_width=16).chunk - wanted.chunk)
+        for one in (width - 4, width, width + 4)
+    ]
+    assert errors[1] == min(errors)
+    steps = costs.matched_steps(settings, RECORDING)
+    assert abs(steps * without().sample - settings.steps * wanted.sample) <= without().sample / 2
+
+
+def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
+    (plain,) = [one for one in plans.PLAN.recordings if one.name == "plain"]
+    assert plans.BASE.num_future_tokens == 32
+    assert costs.matched_width(plans.BASE, plain) == plans.WIDTH
+    assert costs.matched_steps(plans.BASE, plain) == plans.STEPS
+
+
+def test_every_contrast_is_of_recipes_of_the_plan() -> None:
+    """And every recipe of the plan is in a contrast of its stage, or in the core."""
+    contrasts = [*CONFIRMATORY, *itertools.chain.from_iterable(EXPLORATORY.values())]
+    names = {one.name for one in plans.PLAN.recipes if one.stage != plans.PILOT}
+    assert set().union(*(one.recipes for one in contrasts)) == names
+    assert plans.PLAN.stages == (plans.PILOT, "core", *EXPLORATORY)
+
+
+def test_every_recipe_of_the_plan_fits_its_backbone() -> None:
+    """What `saccade train` compares before it starts from a backbone."""
+    for one in plans.PLAN.recipes:
+        backbone = plans.PLAN.backbone(one)
+        recording = plans.PLAN.recording(backbone.recording)
+        head, alone = (
+            train.policy_config(each.training, recording.settings, list(recording.counts)).to_dict()
+            for each in (one, backbone)
+        )
+        assert head["backbone_cfg"] == alone["backbone_cfg"]
+        assert head["simulation_cfg"] == alone["simulation_cfg"]
+
+
+def test_plans_that_cannot_be(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(
+        InputError, match="recipes: two have the same name in n-4-pilot, n-4-pilot-blind, n-0"
+    ):
+        replace(PLAN, recipes=(*PLAN.recipes, PLAN.recipes[0]))
+    with pytest.raises(InputError, match="backbones: n-4-pilot has backbone, which is not one of them"):
+        replace(PLAN, backbones=())
+    with pytest.raises(InputError, match="n-0: given only '', expected 'head'"):
+        replace(PLAN, recipes=(recipe("core", "n-0", only=""),))
+    with pytest.raises(InputError, match="pilot_seeds: given range"):
+        replace(PLAN, pilot_seeds=range(1, 4))
+    with pytest.raises(InputError, match="recordings: tiny is not one of them"):
+        replace(PLAN, recordings=())
+    with pytest.raises(InputError, match="recordings: tiny does not have all of reach"):
+        replace(PLAN, tasks=("reach",))
+    with pytest.raises(InputError, match="expected evaluation seeds"):
+        replace(PLAN, seeds=range(2_000_000, 2_000_025))
+    monkeypatch.setattr(graphics, "check", lambda: None)
+    assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
+    assert (
+        "stages: unknown name cor, expected some of pilot, core, longer, alignment" in capsys.readouterr().err
+    )
