@@ -157,6 +157,43 @@ def judged(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int], arm:
     return Judged(rates, missing)
 
 
+def judged_by_task(table: pd.DataFrame, tasks: Sequence[str], seeds: Sequence[int]) -> dict[str, Judged]:
+    """The success rates of the unchanged policies in each task alone; see `judged`."""
+    other = {task: (table["kind"] == "episodes") & (table["task"] != task) for task in tasks}
+    return {task: judged(table[~other[task]], [task], seeds) for task in tasks}
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Held-out loss and success of the core's policies.
+
+    Attributes:
+        policies: By recipe, `(policies, 2)`: loss, and success rate.
+        correlation: Their rank correlation over all policies; NaN where one of the two is the same for all.
+    """
+
+    policies: Mapping[str, Float64Array]
+    correlation: Estimate
+
+
+def losses(table: pd.DataFrame, found: Judged) -> Losses:
+    """Held-out loss and success of the core's policies.
+
+    Args:
+        table: Table of the study.
+        found: The unchanged policies, with at least one of the core.
+    """
+    of_core = table[(table["kind"] == "training") & (table["stage"] == CORE_STAGE)]
+    policies: dict[str, list[tuple[float, float]]] = {}
+    for _, row in ordered(of_core).iterrows():
+        rate = found.rates.get(str(row["recipe"]), {}).get(int(row["training_seed"]))
+        if rate is not None:
+            policies.setdefault(str(row["recipe"]), []).append((float(row["validation_loss"]), rate))
+    arrays = {recipe: np.array(pairs) for recipe, pairs in policies.items()}
+    pairs = np.concatenate(list(arrays.values()))
+    return Losses(arrays, bootstrap(pairs, range(len(pairs)), rank_correlation))
+
+
 def ordered(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows of policies in the order of stage, N, recipe and training seed."""
     stages = [CORE_STAGE, *EXPLORATORY]

@@ -20,6 +20,7 @@ from saccade.study.answer.results import (
     Change,
     ContrastResult,
     Judged,
+    Losses,
     Pilot,
     Progress,
     Relation,
@@ -27,6 +28,9 @@ from saccade.study.answer.results import (
     confirmed,
     explored,
     judged,
+    judged_by_task,
+    losses,
+    over_seeds,
     pilots,
     progress,
     relations,
@@ -66,6 +70,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         names = ["tests", "policies", *others, *by_stage, *([MEASURES] if everywhere else [])]
         places = {name: place for place, name in enumerate(names, start=1)}
         predictive = [one for one in related if predicts(one)]
+        of_core, by_task = losses(table, found), judged_by_task(table, tasks, seeds)
         prose = Prose(
             "answer",
             **known,
@@ -76,11 +81,13 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
             related=related,
             predictive=predictive,
             others=[one for one in related if one not in predictive],
+            of_loss=of_core.correlation,
         )
         answer = prose.points("answer")
         shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
         pictures.append(Figure("success", prose.line("caption_success"), success_picture(shown)))
-        grids += [test_grid(prose, tests), policy_grid(prose, found, mean_losses(table))]
+        pictures.append(Figure("losses", prose.line("caption_losses"), loss_picture(of_core)))
+        grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, mean_losses(table))]
         for stage, contrasts in others.items():
             grids.append(contrast_grid(prose.line("caption_contrasts", places[stage], stage), contrasts))
         for stage, of_stage in by_stage.items():
@@ -177,26 +184,47 @@ def success_picture(shown: Mapping[str, Mapping[int, float]]) -> Picture:
     return picture
 
 
-def policy_grid(prose: Prose, found: Judged, losses: Mapping[str, float]) -> Grid:
-    """Success of every policy, recipe by recipe."""
+def loss_picture(of_core: Losses) -> Picture:
+    """Success of the core's policies over their held-out loss; N by the form of the dots."""
+    picture, (axes,) = figures.new_picture(height=3.6)
+    fills = ("white", "0.6", "black")
+    for (recipe, pairs), marker, fill in zip(of_core.policies.items(), "o^s", fills, strict=False):
+        style: dict[str, Any] = {"marker": marker, "facecolors": fill, "edgecolors": "black", "zorder": 3}
+        axes.scatter(pairs[:, 0], 100 * pairs[:, 1], s=36, label=f"N = {ALL[recipe]}", **style)
+    axes.set_xlabel("held-out loss")
+    axes.set_ylim(0, 100)
+    axes.set_ylabel("success, %")
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    axes.legend(frameon=False)
+    return picture
+
+
+def policy_grid(
+    prose: Prose, found: Judged, by_task: Mapping[str, Judged], losses: Mapping[str, float]
+) -> Grid:
+    """Success of every policy, recipe by recipe, and the means in each task."""
     seeds = sorted({seed for rates in found.rates.values() for seed in rates})
     lines = []
     for recipe, rates in found.rates.items():
         shown = [f"{100 * rates[seed]:.1f}" if seed in rates else "" for seed in seeds]
-        lines.append([recipe, points(mean_of(rates)), f"{losses[recipe]:.4f}", *shown])
-    columns = ("recipe", "mean, %", "held-out loss", *(f"seed {seed}" for seed in seeds))
+        means = [points(mean_of(one.rates[recipe])) for one in by_task.values()]
+        lines.append([recipe, points(mean_of(rates)), *means, f"{losses[recipe]:.4f}", *shown])
+    columns = ("recipe", "mean, %", *by_task, "held-out loss", *(f"seed {seed}" for seed in seeds))
     return Grid(prose.line("caption_policies", 2), columns, lines)
 
 
-def test_grid(prose: Prose, tests: Sequence[ContrastResult]) -> Grid:
-    """The confirmatory tests."""
+def test_grid(prose: Prose, tests: Sequence[ContrastResult], by_task: Mapping[str, Judged]) -> Grid:
+    """The confirmatory tests, and the same contrasts in each task alone."""
     lines = []
     for one in tests:
         numbers = ["", "", ""]
         if one.test is not None and one.corrected is not None:
             numbers = [percent(one), f"{one.test.p_value:.4f}", f"{one.corrected:.4f}"]
-        lines.append([one.contrast.name, str(len(one.seeds)), *numbers, one.finding])
-    columns = ("contrast", "pairs", "points (95 % interval)", "p", "p after Holm", "finding")
+        alone = [over_seeds(found, one.contrast) for found in by_task.values()]
+        of_tasks = [percent(each) if each.test is not None else "" for each in alone]
+        lines.append([one.contrast.name, str(len(one.seeds)), *numbers, one.finding, *of_tasks])
+    columns = ("contrast", "pairs", "points (95 % interval)", "p", "p after Holm", "finding", *by_task)
     return Grid(prose.line("caption_tests", 1), columns, lines)
 
 
