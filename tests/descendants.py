@@ -1,5 +1,6 @@
-"""The processes that a process started."""
+"""The processes that a process started, and how such a process is interrupted."""
 
+import signal
 import time
 from pathlib import Path
 
@@ -29,3 +30,8 @@ def all_end(pids: list[int], *, seconds: float) -> bool:
             return False
         time.sleep(0.02)
     return True
+
+
+def usual_interrupt() -> None:
+    """Gives SIGINT its usual effect, as `preexec_fn`: shells ignore it in what they run in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

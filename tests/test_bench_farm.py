@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from descendants import all_end, descendants
+from descendants import all_end, descendants, usual_interrupt
 
 from benches import checkpoints, farm, farm_processes, farm_report
 from benches.farm_processes import Robot, Setting
@@ -125,7 +125,8 @@ def test_a_run_goes_on_where_it_stopped(
 def test_an_interrupted_run_leaves_no_process(checkpoint: Path, tmp_path: Path, sign: signal.Signals) -> None:
     few = ["--policies", "full", "--engines", "saccade", "--cores", "2", "--full-batches", "1"]
     own = ["--checkpoint", str(checkpoint), "--seconds", "600", "--work", str(tmp_path)]
-    program = subprocess.Popen([sys.executable, "-m", "benches.farm", *few, *own], cwd=ROOT)
+    command = [sys.executable, "-m", "benches.farm", *few, *own]
+    program = subprocess.Popen(command, cwd=ROOT, preexec_fn=usual_interrupt)
     try:
         # The holder, its two forked processes, and multiprocessing's own.
         while len(found := descendants(program.pid)) < 4:

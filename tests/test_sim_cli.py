@@ -15,7 +15,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from descendants import all_end, descendants
+from descendants import all_end, descendants, usual_interrupt
 from PIL import Image
 
 import saccade.sim.rollout
@@ -135,7 +135,7 @@ def test_ctrl_c_keeps_what_is_done(
 @pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
 def test_a_command_that_is_ended_ends_its_processes(tmp_path: Path, sign: signal.Signals) -> None:
     arguments = ["demos", "--tasks", "reach", "--episodes", "5000", "--jobs", "2", "--out", str(tmp_path)]
-    program = subprocess.Popen([sys.executable, "-m", "saccade", *arguments])
+    program = subprocess.Popen([sys.executable, "-m", "saccade", *arguments], preexec_fn=usual_interrupt)
     try:
         # One of loky's own, and two that record.
         while len(found := descendants(program.pid)) < 3 or not list(tmp_path.glob("reach/[0-9]*.npz")):
