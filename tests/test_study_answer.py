@@ -281,7 +281,7 @@ def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
     assert rows["share"].isna().all()  # what is hardly trained acts alike in all layouts
     section = Answer.summarise(table, provenance)
     assert [grid.columns[0] for grid in section.grids].count("recipe") >= 4
-    assert section.grids[-1].rows == [["n-4", "", "", "", ""]]
+    assert section.grids[-2].rows == [["n-4", "", "", "", ""]]
     (row,) = table[table["kind"] == "measures"].to_dict("records")
     assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
     directory = str(out / "answer" / "policies" / "n-4-seed-0")
