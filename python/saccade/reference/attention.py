@@ -52,11 +52,8 @@ class Attention(nn.Module):
         q = self.split_heads(self.to_q(x))  # (B, heads, Q, head_dim)
         k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
         v = self.split_heads(self.to_v(context))  # (B, heads, S, head_dim)
-        if logit_bias is None and stop_gradient is None and not return_weights:
-            weights, values = (
-                None,
-                F.scaled_dot_product_attention(q, k, v),
-            )  # the same sums; faster in training
+        if stop_gradient is None and not return_weights:
+            weights, values = None, fused_attention(q, k, v, logit_bias)
         else:
             weights = attention_weights(q, k, logit_bias, stop_gradient)  # (B, heads, Q, S)
             values = attention_values(weights, v, stop_gradient)  # (B, heads, Q, head_dim)
@@ -87,10 +84,37 @@ def attention_weights(
     logits = logits / math.sqrt(q.shape[-1])
     if logit_bias is None:
         return torch.softmax(logits, dim=-1)
-    logits = logits + logit_bias.to(logits.dtype)
-    nothing_left = torch.isneginf(logits).all(dim=-1, keepdim=True)  # (B, heads, Q, 1)
-    # Filled before the softmax as well: NaN would reach the gradient even if the value is replaced.
-    return torch.softmax(logits.masked_fill(nothing_left, 0.0), dim=-1).masked_fill(nothing_left, 0.0)
+    bias, nothing_left = split_bias(logit_bias)
+    weights = torch.softmax(logits + bias.to(logits.dtype), dim=-1)
+    return weights.masked_fill(nothing_left, 0.0)
+
+
+def fused_attention(q: Tensor, k: Tensor, v: Tensor, logit_bias: Tensor | None) -> Tensor:
+    """The sums of `attention_weights` and `attention_values` by torch's own kernel, which is faster in training.
+
+    Args:
+        q: `(B, heads, Q, head_dim)`.
+        k, v: `(B, heads, S, head_dim)`.
+        logit_bias: broadcast to `(B, heads, Q, S)`, or None.
+
+    Returns:
+        `(B, heads, Q, head_dim)`.
+    """
+    if logit_bias is None:
+        return F.scaled_dot_product_attention(q, k, v)
+    bias, nothing_left = split_bias(logit_bias)
+    bias = bias.to(q.dtype).expand(*q.shape[:-1], k.shape[-2])
+    return F.scaled_dot_product_attention(q, k, v, attn_mask=bias).masked_fill(nothing_left, 0.0)
+
+
+def split_bias(logit_bias: Tensor) -> tuple[Tensor, Tensor]:
+    """The bias with zeros for queries that no key is left to, and which these are, `(..., 1)` bool.
+
+    Their softmax would be NaN, and so would be its gradient even if the value is replaced. Found in the bias,
+    which mostly is much smaller than the scores.
+    """
+    nothing_left = torch.isneginf(logit_bias).all(dim=-1, keepdim=True)
+    return logit_bias.masked_fill(nothing_left, 0.0), nothing_left
 
 
 def attention_values(weights: Tensor, v: Tensor, stop_gradient: Tensor | None) -> Tensor:
