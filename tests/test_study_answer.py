@@ -28,6 +28,7 @@ from saccade.study.answer import arms, costs, measures
 from saccade.study.answer import plan as plans
 from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.study import Answer
+from saccade.study.questions import sweeps_cost
 from saccade.study.run import StudyError, run
 from saccade.study.simulator import policy_of
 from saccade.study.table import read_provenance, read_table
@@ -289,6 +290,28 @@ def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
     assert found["probe_r2"] is None
     for name in ("chunk_change", "attention_mass", "gradient_share"):
         assert row[name] == pytest.approx(found[name], rel=1e-6), name
+
+
+def test_latencies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One cell with a policy of each recipe, after everything else; it is repeated where there are more."""
+    monkeypatch.setattr(sweeps_cost, "ROUNDS", 5)
+    out = tmp_path / "out"
+    shutil.copytree(core, out)
+    assert main(["study", "answer", "--stages", "times", "--out", str(out)]) == 0
+    provenance = read_provenance(out / "answer.json")
+    assert (provenance.done, provenance.total) == (15, 15)
+    table: Any = read_table(out / "answer.csv")
+    rows = table[table["kind"] == "times"]
+    assert list(rows["policy"]) == ["n-0-seed-0", "n-4-seed-0", "n-32-seed-0"]
+    assert rows["sample_ratio"].iloc[0] == 1
+    section = Answer.summarise(table, provenance)
+    assert [row[0] for row in section.grids[-2].rows] == ["n-0", "n-4", "n-32"]
+    assert section.grids[-2].rows[0][3] == "1.00 (1.00 to 1.00)"
+    assert list(section.grids[-1].rows[-1]) == ["times", "3", "4"]
+    assert main(["study", "answer", "--stages", "alignment,times", "--out", str(out)]) == 0
+    table = read_table(out / "answer.csv")
+    rows = table[table["kind"] == "times"]
+    assert list(rows["policy"]) == ["n-0-seed-0", "n-4-seed-0", "n-32-seed-0", "n-4-aligned-seed-0"]
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:

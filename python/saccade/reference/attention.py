@@ -90,7 +90,7 @@ def attention_weights(
 
 
 def fused_attention(q: Tensor, k: Tensor, v: Tensor, logit_bias: Tensor | None) -> Tensor:
-    """The sums of `attention_weights` and `attention_values` by torch's own kernel, which is faster in training.
+    """The sums of `attention_weights` and `attention_values` by torch's own kernel: faster in training.
 
     Args:
         q: `(B, heads, Q, head_dim)`.

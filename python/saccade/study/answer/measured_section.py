@@ -1,4 +1,4 @@
-"""The report's part on trained policies that are measured and not judged: specialised tokens, patching.
+"""The report's part on policies that are measured and not judged: specialised tokens, patching, latencies.
 
 A number is a mean over the training seeds of a recipe, with the interval of `sign_flip`. A seed without the
 number is left out.
@@ -16,6 +16,7 @@ from saccade.study import figures
 from saccade.study.answer.patching import PATCHING
 from saccade.study.answer.results import ordered
 from saccade.study.answer.specialise import KEPT, LEARNED, RANDOM, SIZES, SPECIALISE, WEIGHTS
+from saccade.study.answer.times import TIMES
 from saccade.study.questions.patching_section import ALL, GROUPS
 from saccade.study.section import Figure, Grid, Prose, number
 from saccade.study.sign_flip import sign_flip
@@ -51,6 +52,10 @@ def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Gri
     rows = table[table["kind"] == PATCHING]
     if len(rows):
         grids.append(patching_grid(prose.line("caption_patching", place + len(grids)), ordered(rows)))
+    rows = table[table["kind"] == TIMES]
+    if len(rows):
+        cpu = str(rows["cpu"].iloc[0])
+        grids.append(time_grid(prose.line("caption_times", place + len(grids), cpu), ordered(rows)))
     return pictures, grids
 
 
@@ -131,3 +136,16 @@ def patching_grid(caption: str, rows: pd.DataFrame) -> Grid:
         of_recipe = together[together["recipe"] == recipe].groupby("group")["share"]
         lines.append([recipe, *(shown(mean(of_recipe.get_group(group))) for group in GROUPS)])
     return Grid(caption, ("recipe", *GROUPS), lines)
+
+
+def time_grid(caption: str, rows: pd.DataFrame) -> Grid:
+    """What heads cost: a row for each recipe, milliseconds and ratios to the first."""
+    lines = []
+    for _, row in rows.iterrows():
+        numbers = [str(int(row["num_vl_tokens"]))]
+        for part in ("encode", "sample"):
+            ratio = Estimate(*(float(row[f"{part}_ratio{end}"]) for end in ("", "_low", "_high")))
+            numbers += [f"{row[f'{part}_ms']:.3f}", shown(ratio)]
+        lines.append([str(row["recipe"]), *numbers])
+    columns = ("recipe", "T_vl", "encode, ms", "ratio", "sample, ms", "ratio")
+    return Grid(caption, columns, lines)

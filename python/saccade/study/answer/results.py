@@ -18,6 +18,7 @@ from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, MARGIN, Co
 from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.measures import CUT, MEASURES, NAMES
 from saccade.study.answer.plan import CORE_STAGE, PILOT, Plan
+from saccade.study.answer.times import TIMES
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.sign_flip import SignFlip, sign_flip
 from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, holm
@@ -208,7 +209,7 @@ class Progress:
     Attributes:
         stage: Its name.
         done: Number of its policies that are trained and have all their episodes; in a stage that trains
-            none, of pairs of a policy and an arm, or of measured policies.
+            none, of pairs of a policy and an arm, of measured policies, or of timed recipes.
         planned: Their number in the plan.
     """
 
@@ -241,6 +242,8 @@ def progress(
         of_stage = table[table["kind"] == stage]
         policies = of_stage["policy"].nunique() if len(of_stage) else 0
         results.append(Progress(stage, policies, len(list(measured.policies(plan)))))
+    recipes = {recipe.name for recipe in plan.recipes if recipe.stage != PILOT}
+    results.append(Progress(TIMES, int((table["kind"] == TIMES).sum()), len(recipes)))
     return results
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +22,7 @@ from saccade.study.answer.costs import cost
 from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.plan import PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
+from saccade.study.answer.times import TIMES, latencies
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.runs import Planned, read_run, saved_step
@@ -72,7 +73,7 @@ class Answer(Study):
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """See `Study`."""
         parser.epilog = EPILOG
-        stages = ", ".join((*plans.PLAN.stages, *ARMS, *MEASURED))
+        stages = ", ".join(all_stages(plans.PLAN))
         add_list(parser, "--stages", help=f"stages to run, of {stages} (default: all but {PILOT})")
 
     @classmethod
@@ -80,7 +81,7 @@ class Answer(Study):
         """See `Study`."""
         from saccade.sim import graphics
 
-        known = (*plans.PLAN.stages, *ARMS, *MEASURED)
+        known = all_stages(plans.PLAN)
         asked = [stage for stage in known if stage != PILOT] if args.stages is None else args.stages
         unknown = [stage for stage in asked if stage not in known]
         if unknown:
@@ -113,7 +114,9 @@ class Answer(Study):
     @property
     def phases(self) -> list[tuple[str, str]]:
         """Stage and kind of each phase. A stage is finished before the next one begins."""
-        without_training = {**{stage: (stage,) for stage in MEASURED}, **dict.fromkeys(ARMS, (EPISODES,))}
+        without_training = {stage: (stage,) for stage in (*MEASURED, TIMES)} | dict.fromkeys(
+            ARMS, (EPISODES,)
+        )
         training = (RECORDING, BACKBONE, TRAINING, EPISODES)
         return [(stage, kind) for stage in self.stages for kind in without_training.get(stage, training)]
 
@@ -126,6 +129,12 @@ class Answer(Study):
         """The cells of one phase. Stages may share recordings and backbones."""
         if kind == EPISODES:
             yield from self.episode_cells(stage)
+            return
+        if kind == TIMES:  # one cell for all, which are timed alternately
+            timed = self.timed(self.trained)
+            if timed:
+                checkpoints = {name: self.trained[policy.name] for name, policy in timed.items()}
+                yield Cell((TIMES,), {"checkpoints": checkpoints})
             return
         if kind in MEASURED:
             for policy in MEASURED[kind].policies(self.plan):
@@ -166,6 +175,14 @@ class Answer(Study):
                 if arm.applies(policy.training.num_future_tokens):
                     yield policy, arm.name
 
+    def timed(self, known: Container[str]) -> dict[str, PlannedPolicy]:
+        """The policy of each recipe that is timed, by the recipe's name: the first one that is known."""
+        found: dict[str, PlannedPolicy] = {}
+        for policy in self.plan.all_policies(pilots=False):
+            if policy.name in known:
+                found.setdefault(policy.recipe.name, policy)
+        return found
+
     @property
     def first_seeds(self) -> range:
         """The episodes of the stages of `MEASURED`."""
@@ -184,7 +201,8 @@ class Answer(Study):
         of_policies = [MEASURED[stage].policies(self.plan) for stage in self.stages if stage in MEASURED]
         measured = [one for policies in of_policies for one in policies if one.name in known]
         trained = len(recordings) + len(backbones) + len(planned)
-        return trained + len(runs) * len(self.plan.tasks) + len(measured)
+        timed = TIMES in self.stages and bool(self.timed(known))
+        return trained + len(runs) * len(self.plan.tasks) + len(measured) + timed
 
     def then(self, table: pd.DataFrame) -> Answer | None:
         """See `Study`."""
@@ -220,26 +238,35 @@ class Answer(Study):
         """See `Study`: the finished policies. Demonstrations, and policies in training, stay in the output
         directory, which other machines must share.
         """
-        if self.phases[self.phase][1] not in (EPISODES, *MEASURED):
+        if self.phases[self.phase][1] not in (EPISODES, *MEASURED, TIMES):
             return ()
         trained = [one.name for one in self.plan.all_policies(pilots=True) if one.name in self.trained]
         return tuple(self.trainings[name] for name in trained if self.trainings[name].is_dir())
 
     def measure(self, cell: Cell) -> Rows:
         """See `Study`; the first word of the key says what is measured."""
-        kind, name = str(cell.key[0]), str(cell.key[1])
-        if kind == RECORDING:
-            rows = [self.record(name)]
-        elif kind == BACKBONE:
-            rows = [self.train(next(one for one in self.plan.backbones if one.name == name))]
-        elif kind == TRAINING:
-            rows = [self.train(self.planned(name))]
-        elif kind in MEASURED:
-            found = MEASURED[kind].measure(str(self.finished(name)), self.plan.tasks, self.first_seeds)
-            rows = [{**self.planned(name).columns, **row} for row in found]
-        else:
-            rows = self.judge(self.planned(name), str(cell.key[2]), str(cell.key[3]))
+        kind = str(cell.key[0])
+        rows = self.time() if kind == TIMES else self.measure_one(kind, *map(str, cell.key[1:]))
         return [{"kind": kind, **row} for row in rows]
+
+    def measure_one(self, kind: str, name: str, arm: str = "", task: str = "") -> Rows:
+        """Measures one recording, backbone or policy."""
+        if kind == RECORDING:
+            return [self.record(name)]
+        if kind == BACKBONE:
+            return [self.train(next(one for one in self.plan.backbones if one.name == name))]
+        if kind == TRAINING:
+            return [self.train(self.planned(name))]
+        if kind in MEASURED:
+            found = MEASURED[kind].measure(str(self.finished(name)), self.plan.tasks, self.first_seeds)
+            return [{**self.planned(name).columns, **row} for row in found]
+        return self.judge(self.planned(name), arm, task)
+
+    def time(self) -> Rows:
+        """Latencies of a policy of each recipe, timed alternately."""
+        timed = list(self.timed(self.trained).values())
+        found = latencies([self.finished(policy.name) for policy in timed])
+        return [{**policy.columns, **row} for policy, row in zip(timed, found, strict=True)]
 
     def planned(self, name: str) -> PlannedPolicy:
         """A policy of the plan by its name."""
@@ -359,6 +386,11 @@ class Answer(Study):
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
         return section(table, provenance, plans.PLAN)
+
+
+def all_stages(plan: Plan) -> tuple[str, ...]:
+    """The stages of a plan, those that train policies and those that do not, in the order they run in."""
+    return (*plan.stages, *ARMS, *MEASURED, TIMES)
 
 
 def described(recording: Recording) -> dict[str, Any]:
