@@ -15,12 +15,12 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 
-import saccade
 from saccade._files import sha256_of, writable_directory, write_json
 from saccade.environment import cpu_name
 from saccade.errors import InputError, SaccadeError
 from saccade.parallel import ALONE, Lost, Workers, each
 from saccade.study.cell import Cell, Rows, digest, plain, sortable
+from saccade.study.code_version import code_version
 from saccade.study.study import Study
 from saccade.study.table import (
     Provenance,
@@ -132,7 +132,7 @@ def run_cells(
     store = Store(study, out, settings, cells, expected)
     todo = [cell for cell in cells if cell.digest not in store.finished]
     store.write()
-    marks = {"settings_sha256": digest(settings), "saccade": saccade.__version__}
+    marks = {"settings_sha256": digest(settings), "saccade": code_version()}
     for cell, result in each(Guarded(work, marks), todo, workers, files):
         finished = Finished(cell, [], 0.0, result.reason) if isinstance(result, Lost) else result
         store.add(finished)
@@ -270,7 +270,7 @@ class Guarded:
 @functools.cache
 def packages() -> dict[str, str]:
     """Versions of saccade and of the installed packages that compute with it."""
-    found = {"saccade": saccade.__version__}
+    found = {"saccade": code_version()}
     for name in RECORDED_PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
