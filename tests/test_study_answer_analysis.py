@@ -276,12 +276,14 @@ def test_the_sentence_about_the_cut() -> None:
 def test_the_exploratory_sentence() -> None:
     nothing = section_of(CORE).answer[3]
     assert nothing.startswith(
-        "Not measured: 32 tokens against none, both trained for about twice as long; 32 tokens against a "
-        "wider head without tokens at the same cost of"
+        "Not measured: 32 tokens against none, with scaled first weights; 32 tokens against 4, with scaled "
+        "first weights; 32 tokens against a wider head without tokens at the same cost of"
     )
     assert nothing.endswith("with patches of 32 against 16 pixels.")
     some = {
         **CORE,
+        "n-32-scaled": MORE,
+        "n-4-scaled": FEWER,
         "n-32-aligned": MORE,
         "n-0-wide": FEWER,
         "n-0-long": [*MORE[:3], 0.1],
@@ -290,14 +292,16 @@ def test_the_exploratory_sentence() -> None:
     }
     sentence = section_of(some).answer[3]
     assert re.fullmatch(
-        r"Exploratory: 32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 5\]\S*\); "
+        r"Exploratory: 32 tokens against 4, with scaled first weights: more success, 65.0 points "
+        r"\(B; \[table 3\]\S*\); "
+        r"32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 6\]\S*\); "
         r"32 tokens against longer training .*: undecided, 15.0 points \(no interval; 4 "
         r"training seeds; .*\); "
         r"32 tokens with the alignment loss against without: no difference of 10 points or more, 0.0 points "
-        r"\(B; \[table 3\]\S*\); "
+        r"\(B; \[table 4\]\S*\); "
         r"32 against 4 tokens, with patches of 8 against 16 pixels: a change in favour of 4, -130.0 points "
-        r"\(B; \[table 6\]\S*\); "
-        r"not measured: 32 tokens against none, both trained for about twice as long; "
+        r"\(B; \[table 7\]\S*\); "
+        r"not measured: 32 tokens against none, with scaled first weights; "
         r"32 against 4 tokens, with two cameras against one; 32 against 4 "
         r"tokens, with patches of "
         r"32 against 16 pixels\.".replace("B;", f"{BOUNDS};"),
@@ -307,7 +311,7 @@ def test_the_exploratory_sentence() -> None:
     sentence = section_of(other).answer[3]
     assert "wider head without tokens at the same cost of a chunk: less success, -20.0 points" in sentence
     assert "8 against 16 pixels: no change of 10 points or more, 0.0 points" in sentence
-    other = {**other, "n-4": MORE, "n-32": FEWER}
+    other = {**other, "n-4-scaled": MORE, "n-32-scaled": FEWER}
     assert "8 against 16 pixels: a change in favour of 32, 130.0 points" in section_of(other).answer[3]
 
 
@@ -327,18 +331,20 @@ def test_later_stages_have_their_tables() -> None:
     whole = section_of(
         {
             **CORE,
+            "n-4-scaled": FEWER,
+            "n-32-scaled": MORE,
             "n-4-aligned": MORE,
             "n-0-wide": FEWER,
             "n-4-patch-8": FEWER,
             "n-32-patch-8": FEWER,
         }
     )
-    assert [grid.heading for grid in whole.grids] == [f"Table {place}" for place in range(1, 8)]
+    assert [grid.heading for grid in whole.grids] == [f"Table {place}" for place in range(1, 9)]
     assert whole.grids[-1].columns == ("stage", "done", "planned")
     by_name = {row[0]: row for grid in whole.grids[2:] for row in grid.rows}
-    assert by_name["n-4-aligned minus n-4"][-1] == "more"
+    assert by_name["n-4-aligned minus n-4-scaled"][-1] == "more"
     assert by_name["n-32-patch-8 minus n-4-patch-8"][-1] == "small"
-    assert by_name["(n-32-patch-8 minus n-4-patch-8) minus (n-32 minus n-4)"][-1] == "less"
+    assert by_name["(n-32-patch-8 minus n-4-patch-8) minus (n-32-scaled minus n-4-scaled)"][-1] == "less"
 
 
 def test_changes_of_arms_are_those_of_the_same_policies() -> None:

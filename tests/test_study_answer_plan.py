@@ -15,7 +15,9 @@ from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import main
 from saccade.errors import InputError
 from saccade.sim import graphics, train
+from saccade.sim.learner import new_learner
 from saccade.sim.policy import num_vl_tokens
+from saccade.sim.training_settings import TrainingSettings
 from saccade.study.answer import arms, costs
 from saccade.study.answer import plan as plans
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
@@ -104,9 +106,9 @@ def test_costs_that_are_matched() -> None:
 
 def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
     (plain,) = [one for one in plans.PLAN.recordings if one.name == "plain"]
-    assert plans.BASE.num_future_tokens == 32
-    assert costs.matched_width(plans.BASE, plain) == plans.WIDTH
-    assert costs.matched_steps(plans.BASE, plain) == plans.STEPS
+    assert plans.SCALED.num_future_tokens == 32
+    assert costs.matched_width(plans.SCALED, plain) == plans.WIDTH
+    assert costs.matched_steps(plans.SCALED, plain) == plans.STEPS
 
 
 def test_every_contrast_is_of_recipes_of_the_plan() -> None:
@@ -152,5 +154,23 @@ def test_plans_that_cannot_be(
     monkeypatch.setattr(graphics, "check", lambda: None)
     assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
     assert (
-        "stages: unknown name cor, expected some of pilot, core, longer, alignment" in capsys.readouterr().err
+        "stages: unknown name cor, expected some of pilot, core, scaled, alignment" in capsys.readouterr().err
     )
+
+
+def test_scaled_first_weights_are_the_same_numbers() -> None:
+    """Only category-specific weights are scaled; settings of before have no such entry."""
+    scaled = replace(TINY, category_std=0.1)
+    config = train.policy_config(TINY, RECORDING.settings, [TASK])
+    plain, larger = (new_learner(one, config).state_dict() for one in (TINY, scaled))
+    changed = {name for name, tensor in plain.items() if not tensor.equal(larger[name])}
+    assert changed == {name for name in plain if name.endswith(".W")}
+    assert len(changed) == 7  # two layers of the state's encoder, three of the actions', two of the decoder
+    for name in changed:
+        assert float((larger[name] - 5 * plain[name]).abs().max()) < 1e-6
+    assert "category_std" not in TINY.to_dict()
+    assert scaled.to_dict() == {**TINY.to_dict(), "category_std": 0.1}
+    assert TrainingSettings(**scaled.to_dict()) == scaled
+    for wrong in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(InputError, match="category_std: given"):
+            replace(TINY, category_std=wrong)

@@ -45,12 +45,14 @@ def main() -> None:
     parser.add_argument("--num-future-tokens", type=int, default=32)
     parser.add_argument("--seed", type=int, default=100)
     parser.add_argument("--steps", type=int, default=BASE.steps)
+    parser.add_argument("--category-std", type=float, default=BASE.category_std)
     parser.add_argument("--blind", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
     demos, backbone = args.out / "demos", args.out / "backbone"
-    settings = replace(BASE, num_future_tokens=args.num_future_tokens, seed=args.seed, steps=args.steps)
-    directory = args.out / f"n-{args.num_future_tokens}-seed-{args.seed}-steps-{args.steps}"
+    varied = {name: getattr(args, name) for name in ("num_future_tokens", "seed", "steps", "category_std")}
+    settings = replace(BASE, **varied)
+    directory = args.out / "-".join(f"{name}-{value}" for name, value in varied.items())
     if not (backbone / "model.safetensors").exists():
         train(demos, backbone, BACKBONE, lambda progress: None)
     train(demos, directory, settings, lambda progress: None, start=backbone)

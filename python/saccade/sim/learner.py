@@ -18,7 +18,7 @@ from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.config import HeadConfig
 from saccade.reference import ActionHead, Backbone
 from saccade.reference.backbone import BackboneFeatures
-from saccade.reference.layers import TABLE_STD
+from saccade.reference.layers import TABLE_STD, CategoryLinear
 from saccade.sim.settings import PolicyConfig
 from saccade.sim.training_settings import TrainingSettings
 
@@ -189,11 +189,13 @@ def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
     """The modules with their initial weights.
 
     Runs of one seed that differ in N start from the same weights of everything else, and the tokens of the
-    smaller N are the first ones of the larger N. So policies can be compared in pairs of one seed.
+    smaller N are the first ones of the larger N. So policies can be compared in pairs of one seed. With
+    another `category_std`, the category-specific weights are the same numbers on another scale.
     """
     sizes, head, block = config.backbone_sizes, config.head_config, settings.aligned_block
     torch.manual_seed(settings.seed)
     drawn = Learner(sizes, replace(head, num_future_tokens=SHARED_TOKENS), block, settings.only)
+    scale_categories(drawn, settings.category_std)
     if head.num_future_tokens == SHARED_TOKENS:
         return drawn
     more = max(0, head.num_future_tokens - SHARED_TOKENS)
@@ -207,6 +209,16 @@ def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
     learner = Learner(sizes, head, block, settings.only)
     learner.load_state_dict(state)
     return learner
+
+
+@torch.no_grad()
+def scale_categories(learner: Learner, std: float) -> None:
+    """Gives new category-specific weights another standard deviation than `TABLE_STD`."""
+    if std == TABLE_STD:
+        return
+    for module in learner.modules():
+        if isinstance(module, CategoryLinear):
+            module.W.mul_(std / TABLE_STD)
 
 
 class ImageTargets(nn.Module):

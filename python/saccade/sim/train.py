@@ -17,7 +17,7 @@ import math
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -292,7 +292,7 @@ def save(run: Run, out: Path) -> None:
     """Writes all files of the run."""
     out.mkdir(parents=True, exist_ok=True)
     state = {
-        "settings": asdict(run.settings),
+        "settings": run.settings.to_dict(),
         "config": described(run.config),
         "step": run.step,
         "history": run.history,
@@ -305,7 +305,7 @@ def save(run: Run, out: Path) -> None:
     with write_atomically(out / STATE_FILE) as temporary:
         temporary.write_bytes(serialized.getbuffer())
     export(run, out)
-    write_json(out / "settings.json", {**asdict(run.settings), "demonstrations": run.demonstrations})
+    write_json(out / "settings.json", {**run.settings.to_dict(), "demonstrations": run.demonstrations})
     write_json(out / "history.json", run.history)
     plot_history(run.history, out / "loss.png")
 
@@ -317,10 +317,10 @@ def resume(run: Run, path: Path) -> None:
         InputError: it was started with other settings or other demonstrations.
     """
     state = torch.load(path, weights_only=True)
-    if state["settings"] != asdict(run.settings):
-        changed = [
-            name for name, value in asdict(run.settings).items() if state["settings"].get(name) != value
-        ]
+    settings = run.settings.to_dict()
+    if state["settings"] != settings:
+        names = {**state["settings"], **settings}
+        changed = [name for name in names if state["settings"].get(name) != settings.get(name)]
         raise InputError(f"{path}: the run was started with other settings ({', '.join(changed)})")
     if state["config"] != described(run.config):
         raise InputError(f"{path}: the run was started with other demonstrations")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
 
 from saccade.errors import InputError
 
@@ -21,6 +21,23 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
         samples: Which of their frames, and how they are shown.
     """
     return f"features-{start_sha256[:16]}-{recording_sha256[:16]}-{samples}.npy"
+
+
+CATEGORY_STD, RELEASED_WIDTH = 0.02, 1536  # of the released code and of GR00T N1.5
+
+
+def released_std(width: int) -> float:
+    """The `category_std` with which layers of this width begin as those of GR00T N1.5 do.
+
+    What a linear layer returns grows with the square root of its width. With the released 0.02, a head of
+    width 64 begins with encoded actions that are 25 times smaller than those of GR00T N1.5, beside positions
+    that are as large (`studies/answer/initial_scale.py`).
+
+    Example:
+        >>> released_std(1536), round(released_std(64), 3)
+        (0.02, 0.098)
+    """
+    return CATEGORY_STD * math.sqrt(RELEASED_WIDTH / width)
 
 
 @dataclass(frozen=True)
@@ -46,6 +63,9 @@ class TrainingSettings:
             the words.
         start_sha256: Hash of the tensors that the run starts from; empty for random ones. `train` sets it.
         seed: Seed of initial weights, order and noise.
+        category_std: Standard deviation of the initial category-specific weights, those of the state encoder
+            and of the encoder and the decoder of the actions. 0.02 is that of the released code, which is
+            made for a width of 1536; see `released_std`.
         blind: Whether all pictures are black, for a policy that shows what can be done without them.
         width, num_layers, num_heads: Sizes of the head; the language model has as many heads.
         language_width: Width of the language model, and of the head's VL self-attention on its features; 0
@@ -71,6 +91,7 @@ class TrainingSettings:
     absent_share: float = 0.1
     start_sha256: str = ""
     seed: int = 0
+    category_std: float = CATEGORY_STD
     blind: bool = False
     width: int = 128
     num_layers: int = 4
@@ -105,6 +126,8 @@ class TrainingSettings:
             raise InputError(f"language_width: given {self.language_width}, expected at least 0")
         if self.num_heads > 1 and self.num_heads % 2:
             raise InputError(f"num_heads: given {self.num_heads}, expected 1 or an even number")
+        if not 0 < self.category_std < math.inf:
+            raise InputError(f"category_std: given {self.category_std}, expected a positive number")
         if self.vision_width % self.vision_heads:
             raise InputError(
                 f"vision_width: given {self.vision_width}, expected a multiple of vision_heads "
@@ -123,6 +146,16 @@ class TrainingSettings:
             raise InputError(
                 f"alignment_block: given {self.alignment_block}, expected 0 to {self.num_layers - 1}"
             )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON values.
+
+        Without settings that were added after the first runs, where they have their defaults: so these runs
+        can be continued and compared with later ones.
+        """
+        added = {"category_std"}
+        defaults = {one.name: one.default for one in fields(self) if one.name in added}
+        return {name: value for name, value in asdict(self).items() if defaults.get(name, self) != value}
 
     @property
     def features_width(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,7 @@ class Planned:
 
         directory = Path(self.demonstrations)
         return {
-            **asdict(self.training),
+            **self.training.to_dict(),
             "demonstrations": describe(directory, demos.recorded_tasks(directory)),
         }
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 #: A difference of success rates that would matter. Smaller ones count as none.
 MARGIN = 0.10
 CORE = {"n-0": 0, "n-4": 4, "n-32": 32}  # N of the recipes of the confirmatory tests
-ALL = {"n-0": 0, "n-1": 1, "n-4": 4, "n-16": 16, "n-32": 32, "n-64": 64}
+#: N of the recipes that the later stages are compared with, and of those with other numbers.
+SCALED = {f"n-{count}-scaled": count for count in (0, 1, 4, 16, 32, 64)}
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,11 @@ def difference(second: str, first: str) -> Contrast:
     return Contrast(f"{second} minus {first}", {second: 1.0, first: -1.0})
 
 
-def interaction(suffix: str, fewer: int = 4) -> Contrast:
-    """What 32 tokens instead of fewer change in policies of another kind, minus the same in plain ones."""
-    few, many = f"n-{fewer}", "n-32"
-    weights = {f"{many}{suffix}": 1.0, f"{few}{suffix}": -1.0, many: -1.0, few: 1.0}
-    return Contrast(f"({many}{suffix} minus {few}{suffix}) minus ({many} minus {few})", weights)
+def interaction(suffix: str) -> Contrast:
+    """What 32 tokens instead of 4 change in policies of another kind, minus the same in those of `SCALED`."""
+    weights = {f"n-32{suffix}": 1.0, f"n-4{suffix}": -1.0, "n-32-scaled": -1.0, "n-4-scaled": 1.0}
+    name = f"(n-32{suffix} minus n-4{suffix}) minus (n-32-scaled minus n-4-scaled)"
+    return Contrast(name, weights)
 
 
 def slope(counts: Mapping[str, int]) -> Contrast:
@@ -89,30 +90,31 @@ CONFIRMATORY = (difference("n-32", "n-0"), difference("n-32", "n-4"), slope(CORE
 
 #: Everything else, by stage: intervals without a test.
 EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
-    "longer": (
-        difference("n-32-longer", "n-0-longer"),
-        difference("n-32-longer", "n-4-longer"),
-        difference("n-4-longer", "n-0-longer"),
-        interaction("-longer", fewer=0),
+    "scaled": (
+        difference("n-32-scaled", "n-0-scaled"),
+        difference("n-32-scaled", "n-4-scaled"),
+        difference("n-4-scaled", "n-0-scaled"),
+        difference("n-0-scaled", "n-0"),
+        difference("n-32-scaled", "n-32"),
     ),
     "alignment": (
-        difference("n-4-aligned", "n-4"),
-        difference("n-32-aligned", "n-32"),
+        difference("n-4-aligned", "n-4-scaled"),
+        difference("n-32-aligned", "n-32-scaled"),
         difference("n-32-aligned", "n-4-aligned"),
-        difference("n-32-aligned", "n-0"),
+        difference("n-32-aligned", "n-0-scaled"),
     ),
     "numbers": (
-        difference("n-1", "n-0"),
         difference("n-4", "n-0"),
-        difference("n-16", "n-4"),
-        difference("n-64", "n-32"),
-        slope(ALL),
+        difference("n-1-scaled", "n-0-scaled"),
+        difference("n-16-scaled", "n-4-scaled"),
+        difference("n-64-scaled", "n-32-scaled"),
+        slope(SCALED),
     ),
     "compute": (
-        difference("n-32", "n-0-wide"),
-        difference("n-32", "n-0-long"),
-        difference("n-0-wide", "n-0"),
-        difference("n-0-long", "n-0"),
+        difference("n-32-scaled", "n-0-wide"),
+        difference("n-32-scaled", "n-0-long"),
+        difference("n-0-wide", "n-0-scaled"),
+        difference("n-0-long", "n-0-scaled"),
     ),
     "vision": tuple(
         contrast

@@ -14,7 +14,7 @@ from saccade.errors import InputError
 from saccade.sim.cameras import DEFAULT_CAMERAS
 from saccade.sim.demos import RecordingSettings
 from saccade.sim.tasks import check_evaluation_seeds
-from saccade.sim.training_settings import TrainingSettings
+from saccade.sim.training_settings import TrainingSettings, released_std
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,10 @@ class Backbone:
     def columns(self) -> dict[str, Any]:
         """The columns that identify it."""
         return {"policy": self.name, "training_seed": self.training.seed}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The backbone as JSON values."""
+        return {"name": self.name, "training": self.training.to_dict(), "recording": self.recording}
 
 
 @dataclass(frozen=True)
@@ -225,12 +229,12 @@ BASE = TrainingSettings(
 # No future tokens, so that a backbone has nothing of any N.
 BACKBONE = replace(BASE, only="backbone", steps=4000, learning_rate=1e-3, seed=0, num_future_tokens=0)
 ALIGNMENT = 0.2  # the weight of the loss in FLARE
-# Twice the steps, and a little more: after `BASE.steps` half of the core's policies had not left the first
-# plateau of their loss. The pilot of 3,000 steps had.
-LONGER = 3000
-# What makes a policy without future tokens as costly as `BASE`: `costs.matched_width` for a chunk,
+# First weights on the scale that GR00T N1.5 has. With those of `BASE`, half of the core's policies had not
+# left the first plateau of their loss when the training ended; with these there is none (the page's pilots).
+SCALED = replace(BASE, steps=1000, category_std=round(released_std(BASE.width), 3))
+# What makes a policy without future tokens as costly as `SCALED`: `costs.matched_width` for a chunk,
 # `costs.matched_steps` for the training. A test computes them again.
-WIDTH, STEPS = 104, 2279
+WIDTH, STEPS = 104, 1628
 
 
 def recipes(
@@ -240,9 +244,10 @@ def recipes(
     *,
     backbone: str = "backbone",
     seeds: tuple[int, ...] = SEEDS,
+    base: TrainingSettings = SCALED,
     **changes: Any,
 ) -> Iterator[Recipe]:
-    """Recipes that differ from `BASE` in N and in `changes`.
+    """Recipes that differ from `base` in N and in `changes`.
 
     Args:
         stage: Their stage.
@@ -250,10 +255,11 @@ def recipes(
         counts: Each N.
         backbone: Name of their backbone.
         seeds: Their training seeds.
+        base: The other training settings.
         changes: Training settings and their values.
     """
     for count in counts:
-        training = replace(BASE, num_future_tokens=count, **changes)
+        training = replace(base, num_future_tokens=count, **changes)
         yield Recipe(stage, f"n-{count}{suffix}", training, backbone, seeds)
 
 
@@ -269,13 +275,20 @@ PLAN = Plan(
         Backbone("backbone-patch-8", replace(BACKBONE, patch_size=8), "plain"),
     ),
     recipes=(
-        *recipes(PILOT, "-pilot", (0, 32), seeds=PILOT_SEEDS),
-        *recipes(PILOT, "-pilot-blind", (32,), seeds=PILOT_SEEDS, blind=True),
-        *recipes(CORE_STAGE, "", (0, 4, 32)),
-        *recipes("longer", "-longer", (0, 4, 32), steps=LONGER),
+        *recipes(PILOT, "-pilot", (0, 32), seeds=PILOT_SEEDS, base=BASE),
+        *recipes(PILOT, "-pilot-blind", (32,), seeds=PILOT_SEEDS, base=BASE, blind=True),
+        *recipes(CORE_STAGE, "", (0, 4, 32), base=BASE),
+        *recipes("scaled", "-scaled", (0, 4, 32)),
         *recipes("alignment", "-aligned", (4, 32), alignment_weight=ALIGNMENT),
-        *recipes("numbers", "", (1, 16, 64)),
-        *recipes("compute", "-wide", (0,), width=WIDTH, language_width=BASE.width),
+        *recipes("numbers", "-scaled", (1, 16, 64)),
+        *recipes(
+            "compute",
+            "-wide",
+            (0,),
+            width=WIDTH,
+            language_width=BASE.width,
+            category_std=round(released_std(WIDTH), 3),
+        ),
         *recipes("compute", "-long", (0,), steps=STEPS),
         *recipes("vision", "-two-cameras", (4, 32), backbone="backbone-two-cameras"),
         *recipes("vision", "-patch-32", (4, 32), backbone="backbone-patch-32", patch_size=32),

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
 from saccade.study import figures
 from saccade.study.answer.arms import ARMS
-from saccade.study.answer.contrasts import ALL, CORE, MARGIN
+from saccade.study.answer.contrasts import CORE, MARGIN, SCALED
 from saccade.study.answer.measured_section import of_measured
 from saccade.study.answer.measures import CUT, MEASURES, NAMES
 from saccade.study.answer.plan import CORE_STAGE, Plan
@@ -84,8 +85,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
             of_loss=of_core.correlation,
         )
         answer = prose.points("answer")
-        shown = {recipe: found.rates[recipe] for recipe in ALL if recipe in found.rates}
-        pictures.append(Figure("success", prose.line("caption_success"), success_picture(shown)))
+        pictures.append(Figure("success", prose.line("caption_success"), success_picture(found)))
         pictures.append(Figure("losses", prose.line("caption_losses"), loss_picture(of_core)))
         grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, mean_losses(table))]
         for stage, contrasts in others.items():
@@ -132,6 +132,7 @@ def known_facts(
         "core": sorted({one.training.num_future_tokens for one in policies}),
         "num_seeds": len({one.seed for one in policies}),
         "head": policies[0].training,
+        "scaled": next((one.training for one in plan.recipes if one.stage == "scaled"), None),
         "backbone": policies[0].backbone.training,
         "missing": found.missing,
     }
@@ -156,13 +157,33 @@ def mean_of(rates: Mapping[int, float]) -> Estimate:
     return sign_flip(list(rates.values())).difference
 
 
-def success_picture(shown: Mapping[str, Mapping[int, float]]) -> Picture:
-    """Success over N: a line for each training seed, and the means with their intervals, filled in the core.
+def success_picture(found: Judged) -> Picture:
+    """Success over N, in the core and with the released scale of the first weights, as far as that is there.
+
+    A line for each training seed, and the means with their intervals, filled in the core.
+    """
+    plots = {"core": CORE, "scaled first weights (exploratory)": SCALED}
+    plots = {title: {one: n for one, n in of.items() if one in found.rates} for title, of in plots.items()}
+    plots = {title: counts for title, counts in plots.items() if counts}
+    picture, all_axes = figures.new_picture(height=4.0, columns=len(plots))
+    for axes, (title, counts) in zip(all_axes, plots.items(), strict=True):
+        in_core = counts.keys() <= CORE.keys()
+        show_success(axes, {recipe: found.rates[recipe] for recipe in counts}, filled=in_core)
+        axes.set_xticks(range(len(counts)), [str(count) for count in counts.values()])
+        axes.set_xlabel("number of future tokens, N")
+        axes.set_ylabel("success, %")
+        axes.set_title(title, fontsize="medium")
+    return picture
+
+
+def show_success(axes: Axes, shown: Mapping[str, Mapping[int, float]], *, filled: bool) -> None:
+    """Draws the success of recipes from left to right.
 
     Args:
-        shown: Success by recipe of `ALL` and training seed.
+        axes: Where.
+        shown: Success by recipe and training seed.
+        filled: Whether the squares of the means are filled.
     """
-    picture, (axes,) = figures.new_picture(height=4.0)
     places = {recipe: place for place, recipe in enumerate(shown)}
     for seed in sorted({seed for rates in shown.values() for seed in rates}):
         have = [recipe for recipe in shown if seed in shown[recipe]]
@@ -172,16 +193,12 @@ def success_picture(shown: Mapping[str, Mapping[int, float]]) -> Picture:
     for recipe, rates in shown.items():
         mean = scaled(mean_of(rates))
         reach = np.nan_to_num([[mean.value - mean.low], [mean.high - mean.value]])
-        inner = "black" if recipe in CORE else "white"
+        inner = "black" if filled else "white"
         beside = places[recipe] + 0.1  # so that the bars do not cover the dots
         axes.errorbar([beside], [mean.value], reach, marker="s", markerfacecolor=inner, **style)
-    axes.set_xticks(list(places.values()), [str(ALL[recipe]) for recipe in shown])
-    axes.set_xlabel("number of future tokens, N")
     axes.set_ylim(0, 100)
-    axes.set_ylabel("success, %")
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    return picture
 
 
 def loss_picture(of_core: Losses) -> Picture:
@@ -190,7 +207,7 @@ def loss_picture(of_core: Losses) -> Picture:
     fills = ("white", "0.6", "black")
     for (recipe, pairs), marker, fill in zip(of_core.policies.items(), "o^s", fills, strict=False):
         style: dict[str, Any] = {"marker": marker, "facecolors": fill, "edgecolors": "black", "zorder": 3}
-        axes.scatter(pairs[:, 0], 100 * pairs[:, 1], s=36, label=f"N = {ALL[recipe]}", **style)
+        axes.scatter(pairs[:, 0], 100 * pairs[:, 1], s=36, label=f"N = {CORE[recipe]}", **style)
     axes.set_xlabel("held-out loss")
     axes.set_ylim(0, 100)
     axes.set_ylabel("success, %")

@@ -6,7 +6,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -44,6 +44,7 @@ examples:
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
 FIRST_EPISODES = 10  # of each task, for the stages of `MEASURED`
+ALREADY = ("seed", "demonstrations")  # settings of a run that the table has under other names
 #: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
 NOT_KEPT = (STATE_FILE, "loss.png")
 
@@ -148,9 +149,9 @@ class Answer(Study):
             if kind == RECORDING:
                 yield Cell((RECORDING, policy.recording), recording)
             elif kind == BACKBONE:
-                yield Cell((BACKBONE, backbone.name), {**asdict(backbone), "recording": recording})
+                yield Cell((BACKBONE, backbone.name), {**backbone.to_dict(), "recording": recording})
             elif backbone.name in self.trained:
-                planned = {"training": asdict(policy.training), "recording": recording}
+                planned = {"training": policy.training.to_dict(), "recording": recording}
                 yield Cell((TRAINING, policy.name), {**planned, "backbone": self.trained[backbone.name]})
 
     def episode_cells(self, stage: str) -> Iterator[Cell]:
@@ -307,7 +308,7 @@ class Answer(Study):
             (directory / name).unlink(missing_ok=True)
         run = read_run(directory, ("image_size", "num_cameras", "num_vl_tokens"))
         found = cost(settings, self.plan.recording(recording))
-        known = {name: run.settings[name] for name in asdict(settings) if name != "seed"}
+        known = {name: value for name, value in run.settings.items() if name not in ALREADY}
         losses = {name: loss for name, loss in run.history[-1].items() if name != "step"}
         return {
             **planned.columns,
@@ -340,10 +341,11 @@ class Answer(Study):
         if not (directory / "settings.json").is_file():
             return 0
         run = read_run(directory, ())
-        wanted = asdict(planned.training)
+        wanted = planned.training.to_dict()
         if backbone is not None:
             wanted["start_sha256"] = sha256_of(backbone / TENSOR_FILE)
-        other = [name for name, value in wanted.items() if run.settings.get(name) != value]
+        found = {name: value for name, value in run.settings.items() if name != "demonstrations"}
+        other = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
         if other:
             raise InputError(f"{directory}: was trained with other settings ({', '.join(other)})")
         counts = dict(self.plan.recording(planned.recording).counts)
