@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -188,3 +189,14 @@ def test_detectable_between_runs_at_the_edges() -> None:
     assert statistics.detectable_between_runs(1.0, 100, 2, 0.0) == 0.0
     with pytest.raises(InputError, match="rate, episodes, runs, run_deviation: given"):
         statistics.detectable_between_runs(1.2, 100, 2, 0.0)
+
+
+def test_a_vectorized_bootstrap_is_the_same() -> None:
+    values = np.random.default_rng(3).normal(size=(12, 2))
+
+    def product(rows: Any) -> Any:
+        return rows.prod(axis=-1).mean(axis=-1)
+
+    assert statistics.bootstrap(values, range(12), product, vectorized=True) == statistics.bootstrap(
+        values, range(12), product
+    )

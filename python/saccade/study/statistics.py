@@ -18,7 +18,7 @@ from saccade.errors import InputError
 
 POWER = 0.8
 LOSS_THAT_MATTERS = 0.05  # of the success rate: 5 percentage points
-Statistic: TypeAlias = Callable[..., float]
+Statistic: TypeAlias = Callable[..., Any]  # a number, or an array if it is vectorized
 Verdict: TypeAlias = Literal["better", "worse", "no worse", "undecided"]
 
 
@@ -211,6 +211,7 @@ def bootstrap(
     *,
     draws: int = 2000,
     seed: int = 0,
+    vectorized: bool = False,
 ) -> Estimate:
     """A statistic with its percentile interval from a cluster bootstrap.
 
@@ -224,6 +225,8 @@ def bootstrap(
         clusters: The cluster of each observation, such as its episode: strings, numbers or tuples of them.
         statistic: A function of such rows that does not depend on their order.
         draws, seed: Number of bootstrap samples and seed of the random generator.
+        vectorized: Whether `statistic` also takes `(draws, observations, ...)` and returns `(draws,)`. Each
+            observation is then a cluster.
 
     Raises:
         InputError: `clusters` does not have one entry per observation, or there are no observations.
@@ -247,11 +250,12 @@ def bootstrap(
         return Estimate(value, math.nan, math.nan)
     number_of = np.array([numbers[name] for name in names])
     members = [np.flatnonzero(number_of == number) for number in range(len(numbers))]
-    rng = np.random.default_rng(seed)
-    drawn = []
-    for _ in range(draws):
-        chosen = rng.integers(len(members), size=len(members))
-        drawn.append(float(statistic(rows[np.concatenate([members[one] for one in chosen])])))
+    chosen = np.random.default_rng(seed).integers(len(members), size=(draws, len(members)))
+    if vectorized:
+        drawn = np.asarray(statistic(rows[chosen]))
+    else:
+        samples = (np.concatenate([members[one] for one in of_draw]) for of_draw in chosen)
+        drawn = np.array([float(statistic(rows[sample])) for sample in samples])
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high))
 

@@ -192,7 +192,7 @@ def losses(table: pd.DataFrame, found: Judged) -> Losses:
             policies.setdefault(str(row["recipe"]), []).append((float(row["validation_loss"]), rate))
     arrays = {recipe: np.array(pairs) for recipe, pairs in policies.items()}
     pairs = np.concatenate(list(arrays.values()))
-    return Losses(arrays, bootstrap(pairs, range(len(pairs)), rank_correlation))
+    return Losses(arrays, correlated(pairs))
 
 
 def ordered(rows: pd.DataFrame) -> pd.DataFrame:
@@ -322,21 +322,27 @@ def relations(
                 lost = round(found.rates[recipe][seed] - cut[recipe][seed], 12)
                 pairs.append((float(row[name]), lost))
         if pairs:
-            results.append(Relation(name, len(pairs), bootstrap(pairs, range(len(pairs)), rank_correlation)))
+            results.append(Relation(name, len(pairs), correlated(np.array(pairs))))
     return results
 
 
-def rank_correlation(pairs: Float64Array) -> float:
-    """Spearman's correlation of `(pairs, 2)`; NaN where a column is constant.
+def correlated(pairs: Float64Array) -> Estimate:
+    """The rank correlation of `(pairs, 2)` with its bootstrap interval."""
+    return bootstrap(pairs, range(len(pairs)), rank_correlation, vectorized=True)
+
+
+def rank_correlation(pairs: Float64Array) -> Float64Array:
+    """Spearman's correlation of `(..., pairs, 2)`; NaN where a column is constant.
 
     Example:
         >>> rank_correlation(np.array([[1.0, 10.0], [2.0, 40.0], [9.0, 30.0]]))
-        0.5
+        array(0.5)
     """
-    ranks = rankdata(pairs, axis=0)
-    centred = ranks - ranks.mean(axis=0)
-    squares = (centred**2).sum(axis=0)
-    return float(centred.prod(axis=1).sum() / math.sqrt(squares.prod())) if squares.all() else math.nan
+    ranks = rankdata(pairs, axis=-2)
+    centred = ranks - ranks.mean(axis=-2, keepdims=True)
+    squares = (centred**2).sum(axis=-2).prod(axis=-1)
+    products = centred.prod(axis=-1).sum(axis=-1)
+    return np.asarray(np.where(squares > 0, products / np.sqrt(np.where(squares > 0, squares, 1)), np.nan))
 
 
 def over_seeds(found: Judged, contrast: Contrast) -> ContrastResult:
