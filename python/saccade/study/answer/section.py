@@ -89,7 +89,8 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         pictures.append(Figure("losses", prose.line("caption_losses"), loss_picture(of_core)))
         grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, mean_losses(table))]
         for stage, contrasts in others.items():
-            grids.append(contrast_grid(prose.line("caption_contrasts", places[stage], stage), contrasts))
+            caption = prose.line("caption_contrasts", places[stage], stage)
+            grids.append(contrast_grid(caption, contrasts, by_task))
         for stage, of_stage in by_stage.items():
             caption = prose.line("caption_changes", places[stage], stage)
             grids.append(change_grid(caption, of_stage, arms[stage]))
@@ -238,17 +239,25 @@ def test_grid(prose: Prose, tests: Sequence[ContrastResult], by_task: Mapping[st
         numbers = ["", "", ""]
         if one.test is not None and one.corrected is not None:
             numbers = [percent(one), f"{one.test.p_value:.4f}", f"{one.corrected:.4f}"]
-        alone = [over_seeds(found, one.contrast) for found in by_task.values()]
-        of_tasks = [percent(each) if each.test is not None else "" for each in alone]
+        of_tasks = in_tasks(one, by_task)
         lines.append([one.contrast.name, str(len(one.seeds)), *numbers, one.finding, *of_tasks])
     columns = ("contrast", "pairs", "points (95 % interval)", "p", "p after Holm", "finding", *by_task)
     return Grid(prose.line("caption_tests", 1), columns, lines)
 
 
-def contrast_grid(caption: str, results: Sequence[ContrastResult]) -> Grid:
-    """The exploratory contrasts of a stage."""
-    lines = [[one.contrast.name, str(len(one.seeds)), percent(one), one.finding] for one in results]
-    return Grid(caption, ("contrast", "pairs", "points (95 % interval)", "finding"), lines)
+def contrast_grid(caption: str, results: Sequence[ContrastResult], by_task: Mapping[str, Judged]) -> Grid:
+    """The exploratory contrasts of a stage, together and in each task alone."""
+    lines = [
+        [one.contrast.name, str(len(one.seeds)), percent(one), one.finding, *in_tasks(one, by_task)]
+        for one in results
+    ]
+    return Grid(caption, ("contrast", "pairs", "points (95 % interval)", "finding", *by_task), lines)
+
+
+def in_tasks(result: ContrastResult, by_task: Mapping[str, Judged]) -> list[str]:
+    """The same contrast in each task alone."""
+    alone = [over_seeds(found, result.contrast) for found in by_task.values()]
+    return [percent(one) if one.test is not None else "" for one in alone]
 
 
 def change_grid(caption: str, changed: Sequence[Change], arms: Sequence[str]) -> Grid:

@@ -1,0 +1,428 @@
+"""The report on `saccade study answer`: its sentences, tables and figures."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from answer_tables import CORE, FEWER, MORE, plan_of, provenance_of, rows_of, section_of
+from scipy.stats import spearmanr
+
+from saccade.study.answer import plan as plans
+from saccade.study.answer.results import judged, relations
+from saccade.study.answer.section import predicts, relation_grid, section
+from saccade.study.answer.study import Answer
+from saccade.study.report import write_report
+from saccade.study.sign_flip import sign_flip
+from saccade.study.table import Provenance, write_provenance
+
+LINK = r"\[table 1\]\(#table-1\)"
+BOUNDS = r"95 % interval [-\d.]+ to [-\d.]+"
+
+
+@pytest.mark.parametrize(
+    ("zero", "four", "many", "found", "said"),
+    [
+        (
+            *(FEWER, FEWER, MORE, ("more", "more", "more")),
+            (
+                rf"In these policies, 32 future tokens help: success with them minus success without any is "
+                rf"65.0 points \({BOUNDS}; p = 0.0234 after Holm's correction; {LINK}\)\.",
+                rf"Compared with 4 tokens, 32 help: the difference is 65.0 points \({BOUNDS}; .*; {LINK}\); "
+                rf"with log2\(N \+ 1\), success rises over N = 0, 4, 32, with a slope of 13.\d\d points per "
+                rf"unit of log2\(N \+ 1\) \({BOUNDS}; .*; {LINK}\)\.",
+            ),
+        ),
+        (
+            *(MORE, MORE, FEWER, ("less", "less", "less")),
+            (
+                r"In these policies, 32 future tokens hurt: success with them .* is -65.0 points .*",
+                r"Compared with 4 tokens, 32 hurt: the difference is -65.0 points .*; with log2\(N \+ 1\), "
+                r"success falls over N = 0, 4, 32, with a slope of -13.*",
+            ),
+        ),
+        (
+            *(FEWER, FEWER, FEWER, ("small", "small", "small")),
+            (
+                r"In these policies, 32 future tokens make no difference of 10 points or more, "
+                r"the margin set beforehand; smaller ones are not excluded: .* "
+                r"is 0.0 points "
+                r"\(95 % interval 0.0 to 0.0; p = 1.0000 after .*",
+                r"Compared with 4 tokens, 32 make no difference of 10 points or more, the margin set "
+                r"beforehand; smaller ones are not excluded: .*; the slope over N = 0, 4, 32, which is "
+                r"nearly computed from the first difference, is 0.00 points per unit.*",
+            ),
+        ),
+        (
+            *(FEWER[:5], FEWER[:5], MORE[:5], ("undecided", "undecided", "undecided")),
+            (
+                r"Whether 32 future tokens help in these policies is undecided: .* is 66.0 points "
+                r"\(no interval; "
+                r"p = 0.1875 after .*",
+                r"Whether 32 tokens help compared with 4 is undecided: .*\(no interval; .*; "
+                r"the slope over N = 0, 4, 32, which is nearly computed from the first difference, is "
+                r"13.40 points per .*\(no interval; .*",
+            ),
+        ),
+        (
+            *([0.1, 0.9] * 4, [0.5] * 8, [0.8, 0.2] * 4, ("undecided", "undecided", "undecided")),
+            (
+                r"Whether 32 future tokens help in these policies is undecided: .* is 0.0 points "
+                r"\(95 % interval -70.0 to 70.0; .*",
+                r"Whether 32 tokens help compared with 4 is undecided: .*",
+            ),
+        ),
+    ],
+)
+def test_the_first_two_sentences(
+    zero: list[float], four: list[float], many: list[float], found: tuple[str, ...], said: tuple[str, ...]
+) -> None:
+    whole = section_of({"n-0": zero, "n-4": four, "n-32": many})
+    tests = next(grid for grid in whole.grids if grid.caption.startswith("Table 1."))
+    assert tuple(row[5] for row in tests.rows) == found
+    assert len(whole.answer) == 5
+    for sentence, expected in zip(whole.answer, said, strict=False):
+        assert re.fullmatch(expected, sentence), sentence
+    assert [figure.name for figure in whole.figures] == ["success", "losses"]
+
+
+def test_a_small_effect_that_is_certain_is_called_small() -> None:
+    """Rejected, and inside the margin."""
+    rates = {"n-0": [0.50] * 10, "n-4": [0.50] * 10, "n-32": [0.54, 0.56] * 5}
+    table = rows_of(rates, 50).assign(validation_loss=0.5)
+    whole = section(table, provenance_of(50), plan_of(10))
+    assert [row[5] for row in whole.grids[0].rows] == ["more"] * 3
+    assert whole.answer[0].startswith("In these policies, 32 future tokens help, by less than 10 points: ")
+    assert whole.answer[1].startswith("Compared with 4 tokens, 32 help, by less than 10 points: ")
+    assert (
+        "success rises over N = 0, 4, 32, by less than 10 points in all, with a slope of" in whole.answer[1]
+    )
+
+
+def test_nothing_is_judged_before_the_core_is_complete() -> None:
+    """Neither in sentences nor in tables or figures, and not the later stages either."""
+    episodes = len(plans.PLAN.seeds)
+    known = Provenance("answer", {"tasks": ["a", "b"], "episodes": list(range(episodes))}, 1, 1)
+    rates = {name: [0.25] * 12 for name in ("n-0", "n-4", "n-32", "n-4-aligned")}
+    table = rows_of(rates, episodes).assign(validation_loss=0.5)
+    last = table[(table["policy"] == "n-32-seed-11") & (table["kind"] == "episodes")].index[-1:]
+    partly = section(table.drop(last), known, plans.PLAN)
+    assert partly.answer == [
+        "No result yet: 35 of the 36 policies of the core are trained and have run all "
+        "their episodes. By the "
+        "plan, nothing is judged before all of them are there."
+    ]
+    assert not partly.figures
+    (stages,) = partly.grids
+    assert [list(row) for row in stages.rows[:3:2]] == [["core", "35", "36"], ["alignment", "12", "24"]]
+    assert "n-32-seed-11 (149 of 150 episodes)." in partly.summary[-1]
+    assert "points (" not in " ".join([*partly.answer, *partly.summary])
+    complete = section(table, known, plans.PLAN)
+    assert len(complete.answer) == 5
+    assert [row[1] for row in complete.grids[0].rows] == ["12"] * 3
+    # Policies of other stages do not count.
+    assert (
+        section(rows_of({"n-4-aligned": [0.5] * 12}, episodes), known, plans.PLAN)
+        .answer[0]
+        .startswith("No result yet: of the 36 policies of the core none is trained")
+    )
+
+
+def under_the_cut(rates: dict[str, list[float]]) -> pd.DataFrame:
+    """Episodes of the core's policies under the cut, with these success rates."""
+    table = rows_of(rates)
+    return table[table["kind"] == "episodes"].assign(arm="future-unread")
+
+
+def test_the_sentence_about_the_cut() -> None:
+    assert section_of(CORE).answer[2] == (
+        "Not measured: what the trained policies do when their rows no longer attend to the future tokens."
+    )
+    begin = (
+        "Exploratory: when state and action rows of the trained policies no longer attend to the future "
+        "tokens, those with 32 tokens "
+    )
+    for four, many, said in (
+        (
+            *(MORE, FEWER),
+            r"succeed less often, a change of -65.0 points \(B; L\); those with 4 tokens "
+            r"succeed more often, a "
+            r"change of 65.0 points \(B; L\)\.",
+        ),
+        (
+            *(FEWER, []),
+            r"are not measured; those with 4 tokens show no change of 10 points or more: 0.0 "
+            r"points \(B; L\)\.",
+        ),
+        (
+            *([], [*MORE[:4], *FEWER[4:6]]),
+            r"may succeed more or less often \(undecided\), the change is -23.3 points \(B; 6 "
+            r"training seeds; "
+            r"L\); those with 4 tokens are not measured\.",
+        ),
+        (
+            *([], FEWER[:1]),
+            r"may succeed more or less often \(undecided\), the change is -60.0 points \(no "
+            r"interval; 1 training "
+            r"seed; L\); those with 4 tokens are not measured\.",
+        ),
+    ):
+        whole = section_of(CORE, under_the_cut({"n-4": four, "n-32": many}))
+        expected = said.replace("B;", f"{BOUNDS};").replace("L", LINK.replace("1", "4"))
+        assert re.fullmatch(re.escape(begin) + expected, whole.answer[2]), whole.answer[2]
+        assert whole.grids[3].heading == "Table 4"
+        assert whole.grids[3].columns[1] == "future-unread"
+
+
+def test_the_exploratory_sentence() -> None:
+    nothing = section_of(CORE).answer[3]
+    assert nothing.startswith(
+        "Not measured: 32 tokens against none, with scaled first weights; 32 tokens against 4, with scaled "
+        "first weights; 32 tokens against a wider head without tokens at the same cost of"
+    )
+    assert nothing.endswith("with patches of 32 against 16 pixels.")
+    some = {
+        **CORE,
+        "n-32-scaled": MORE,
+        "n-4-scaled": FEWER,
+        "n-32-aligned": MORE,
+        "n-0-wide": FEWER,
+        "n-0-long": [*MORE[:3], 0.1],
+        "n-4-patch-8": MORE,
+        "n-32-patch-8": FEWER,
+    }
+    sentence = section_of(some).answer[3]
+    assert re.fullmatch(
+        r"Exploratory: 32 tokens against 4, with scaled first weights: more success, 65.0 points "
+        r"\(B; \[table 3\]\S*\); "
+        r"32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 6\]\S*\); "
+        r"32 tokens against longer training .*: undecided, 15.0 points \(no interval; 4 "
+        r"training seeds; .*\); "
+        r"32 tokens with the alignment loss against without: no difference of 10 points or more, 0.0 points "
+        r"\(B; \[table 4\]\S*\); "
+        r"32 against 4 tokens, with patches of 8 against 16 pixels: a change in favour of 4, -130.0 points "
+        r"\(B; \[table 7\]\S*\); "
+        r"not measured: 32 tokens against none, with scaled first weights; "
+        r"32 against 4 tokens, with two cameras against one; 32 against 4 "
+        r"tokens, with patches of "
+        r"32 against 16 pixels\.".replace("B;", f"{BOUNDS};"),
+        sentence,
+    ), sentence
+    other = {**some, "n-0-wide": [1.0] * 8, "n-4-patch-8": FEWER, "n-32-patch-8": MORE}
+    sentence = section_of(other).answer[3]
+    assert "wider head without tokens at the same cost of a chunk: less success, -20.0 points" in sentence
+    assert "8 against 16 pixels: no change of 10 points or more, 0.0 points" in sentence
+    other = {**other, "n-4-scaled": MORE, "n-32-scaled": FEWER}
+    assert "8 against 16 pixels: a change in favour of 32, 130.0 points" in section_of(other).answer[3]
+
+
+def test_later_stages_have_their_tables() -> None:
+    whole = section_of(
+        {
+            **CORE,
+            "n-4-scaled": FEWER,
+            "n-32-scaled": MORE,
+            "n-4-aligned": MORE,
+            "n-0-wide": FEWER,
+            "n-4-patch-8": FEWER,
+            "n-32-patch-8": FEWER,
+        }
+    )
+    assert [grid.heading for grid in whole.grids] == [f"Table {place}" for place in range(1, 9)]
+    assert whole.grids[-1].columns == ("stage", "done", "planned")
+    by_name = {row[0]: row for grid in whole.grids[2:] for row in grid.rows}
+    assert by_name["n-4-aligned minus n-4-scaled"][3] == "more"
+    assert by_name["n-32-patch-8 minus n-4-patch-8"][3] == "small"
+    assert by_name["(n-32-patch-8 minus n-4-patch-8) minus (n-32-scaled minus n-4-scaled)"][3] == "less"
+
+
+def test_measures_are_related_to_what_a_cut_costs() -> None:
+    plain, cut = (
+        {"n-4": FEWER, "n-32": MORE},
+        {"n-4": FEWER, "n-32": [0.0, 0.3, 0.1, 0.2, 0.4, 0.5, 0.6, 0.8]},
+    )
+    table = rows_of(plain)
+    changed = rows_of(cut)
+    changed = changed[changed["kind"] == "episodes"].assign(arm="future-unread")
+    lost = {
+        (recipe, seed): round(plain[recipe][seed] - cut[recipe][seed], 6)
+        for recipe in plain
+        for seed in range(8)
+    }
+    rng = np.random.default_rng(0)
+    trained = table[table["kind"] == "training"]
+    measured = trained.assign(
+        kind="measures",
+        chunk_change=[
+            3 * lost[row["recipe"], row["training_seed"]] + 1 for row in trained.to_dict("records")
+        ],
+        attention_mass=rng.random(len(trained)),
+        gradient_share=0.5,
+        probe_r2=np.nan,
+    )
+    table = pd.concat([table, changed, measured[measured["policy"] != "n-4-seed-7"]])
+    found = relations(table, judged(table, ("a", "b"), range(10)), ("a", "b"), range(10))
+    assert [(one.measure, one.policies) for one in found] == [
+        ("chunk_change", 15),
+        ("attention_mass", 15),
+        ("gradient_share", 15),
+    ]
+    assert found[0].correlation.value == pytest.approx(1)
+    masses = dict(zip(measured["policy"], measured["attention_mass"], strict=True))
+    pairs = [(masses[f"{recipe}-seed-{seed}"], lost[recipe, seed]) for recipe in plain for seed in range(8)]
+    del pairs[7]
+    expected = spearmanr(*zip(*np.round(pairs, 12), strict=True)).statistic
+    assert found[1].correlation.value == pytest.approx(expected)
+    assert found[1].correlation.low < expected < found[1].correlation.high
+    assert math.isnan(found[2].correlation.value)  # the same for all
+    assert predicts(found[0])
+    assert not predicts(found[2])
+    assert not predicts(replace(found[0], policies=9))
+    complete = pd.concat([table, rows_of({"n-0": FEWER})])
+    whole = section(complete.assign(validation_loss=0.5), provenance_of(), plan_of(8))
+    assert whole.grids[-2].columns[0] == "measure"
+    assert [row[1::2] for row in whole.grids[-2].rows] == [["15", "15"]] * 3
+    assert re.fullmatch(
+        r"Exploratory: of the cheap measures, change of the chunk by the cut \(1.00, 1.00 "
+        r"to 1.00\) is correlated "
+        r"with the success that this cut costs \(rank correlation, 95 % interval over "
+        r"policies of all N together; "
+        r"\[table 5\]\(#table-5\)\); for attention of action rows to future rows \(.* to .*\), share of the "
+        r"gradient through future rows \(the same for all policies, or the cut costs all the same\) this is "
+        r"undecided\. All this holds for small policies, in one simulator, on a and b; it "
+        r"says nothing about GR00T "
+        r"N1.5 itself\.",
+        whole.answer[4],
+    ), whole.answer[4]
+    unknown = complete.assign(chunk_change=np.nan, validation_loss=0.5)
+    said = section(unknown, provenance_of(), plan_of(8)).answer[4]
+    assert said.startswith(
+        "Exploratory: of the cheap measures, none is shown to be correlated with the success"
+    )
+    assert section_of(CORE).answer[4].startswith("Not measured: which cheap measure is correlated with the")
+
+    # Policies of other stages count in the second number only.
+    other = complete[complete["policy"] == "n-32-seed-3"]
+    other = other.assign(stage="numbers", policy="n-16-seed-3", recipe="n-16")
+    table = pd.concat([complete, other]).assign(validation_loss=0.5)
+    grid = section(table, provenance_of(), plan_of(8)).grids[-2]
+    assert [row[1::2] for row in grid.rows] == [["15", "16"]] * 3
+    assert grid.rows[1][2].startswith(f"{expected:.2f} (")
+    alone = relation_grid("", [], found)
+    assert [row[1:4] for row in alone.rows] == [["0", "", "15"]] * 3
+
+
+def test_what_is_measured_has_its_tables() -> None:
+    """Means over training seeds by hand; what no policy has is left empty."""
+    rows = rows_of({name: [0.5] * 6 for name in ("n-0", "n-4", "n-32", "n-4-aligned")})
+    trained = rows[rows["kind"] == "training"].sample(frac=1, random_state=0)
+    trained = trained[trained["num_future_tokens"] > 0]
+    seeds, many = trained["training_seed"], trained["num_future_tokens"]
+    measured = []
+    for tokens, weight in itertools.product(("learned", "random"), ("kept", "lost")):
+        numbers: dict[str, Any] = {"effective_tokens": 2.0 + seeds, "largest_share": 0.25, "overlap": 0.5}
+        if tokens == "learned":
+            numbers |= {"overlap": 0.75 + 0.01 * seeds, "effective_tokens": many / 2 + seeds}
+        for size in ("two", "half", "all"):
+            has_it = (weight == "lost") | ((size == "two") & (seeds > 0)) | ((size == "half") & (many > 4))
+            numbers[f"explained_{size}"] = np.where(has_it, 0.5, np.nan)
+            numbers[f"ratio_{size}"] = np.where(has_it, 1.5, np.nan)
+        measured.append(trained.assign(kind="specialise", tokens=tokens, weight=weight, **numbers))
+    for group, share in {"future": 0.1, "state": 0.2, "action": 1.0, "all rows": 1.0}.items():
+        for block in ("all", "0"):
+            found = share * (1 + 0.1 * seeds) if block == "all" else 9.0
+            measured.append(trained.assign(kind="patching", group=group, block=block, share=found))
+    table = pd.concat([rows, *measured]).assign(validation_loss=0.5)
+    whole = section(table, provenance_of(), plan_of(6))
+    assert [figure.name for figure in whole.figures] == ["success", "losses", "overlap"]
+    captions = [grid.caption.split(".")[0] for grid in whole.grids]
+    assert captions == [f"Table {place}" for place in range(1, len(captions) + 1)]
+    maps, removed, sums, patched, progress = whole.grids[-5:]
+    done = {row[0]: row[1] for row in progress.rows}
+    assert (done["specialise"], done["patching"], done["measures"]) == ("18", "18", "0")
+    assert [row[0] for row in maps.rows] == ["n-4", "n-32", "n-4-aligned"]
+    overlaps = sign_flip([0.75 + 0.01 * seed for seed in range(6)]).difference
+    shown = f"{overlaps.value:.3f} ({overlaps.low:.3f} to {overlaps.high:.3f})"
+    assert maps.rows[1] == ["n-32", shown, "0.500 (0.500 to 0.500)", maps.rows[1][3]]
+    assert maps.rows[1][3].startswith(f"{overlaps.value - 0.5:.3f} (")
+    assert [row[:2] for row in removed.rows[:3]] == [["n-4", "kept"], ["n-4", "lost"], ["n-32", "kept"]]
+    assert removed.rows[2][2] == "18.5 (16.0 to 21.0)"
+    assert removed.rows[2][4:] == ["14.0 (14.0 to 14.0)", "0.250 (0.250 to 0.250)"]
+    assert sums.columns[2:4] == ("two: share explained", "two: ratio")
+    assert sums.rows[0][2:] == ["0.50 (no interval)", "1.50 (no interval)", "", "", "", ""]
+    assert sums.rows[2][4:] == ["0.50 (0.50 to 0.50)", "1.50 (1.50 to 1.50)", "", ""]
+    assert "" not in sums.rows[1]
+    assert [cell.split()[0] for cell in patched.rows[0]] == ["n-4", "0.12", "0.25", "1.25", "1.25"]
+    assert patched.columns == ("recipe", "future", "state", "action", "all rows")
+    only = section(table[table["kind"] != "specialise"], provenance_of(), plan_of(6))
+    assert only.grids[-2].rows == patched.rows
+    assert only.grids[-2].caption.startswith(f"Table {len(only.grids) - 1}. ")
+
+
+def test_success_by_task_and_by_loss() -> None:
+    """Table 1 and 2 for each task alone, and what success has to do with the held-out loss."""
+    table = rows_of({"n-0": FEWER, "n-4": FEWER, "n-32": MORE}).assign(validation_loss=0.5)
+    everywhere = (table["kind"] == "episodes") & (table["task"] == "b") & (table["recipe"] == "n-32")
+    table.loc[everywhere, "success"] = False
+    whole = section(table, provenance_of(), plan_of(8))
+    tests, policies = whole.grids[:2]
+    assert tests.columns[-2:] == policies.columns[2:4] == ("a", "b")
+    assert [row[-2].split(" (")[0] for row in tests.rows[:2]] == ["65.0", "65.0"]
+    assert [row[-1].split(" (")[0] for row in tests.rows[:2]] == ["-15.0", "-15.0"]
+    assert [cell.split(" (")[0] for cell in policies.rows[2][1:4]] == ["40.0", "80.0", "0.0"]
+    assert "held-out loss" not in whole.answer[4]
+    assert [figure.name for figure in whole.figures] == ["success", "losses"]
+
+    found = judged(table, ("a", "b"), range(10))
+    rates = {(recipe, seed): rate for recipe, of in found.rates.items() for seed, rate in of.items()}
+    trained = table["kind"] == "training"
+    worse = [-rates[row["recipe"], row["training_seed"]] for row in table[trained].to_dict("records")]
+    table.loc[trained, "validation_loss"] = worse
+    assert (
+        "Over the policies of the core, success is correlated with the held-out loss (rank correlation "
+        "-1.00, -1.00 to -1.00; second figure), so a difference between arms may be one of how far their "
+        "training came."
+    ) in section(table, provenance_of(), plan_of(8)).answer[4]
+
+
+def test_nothing_trained() -> None:
+    table = pd.DataFrame([{"kind": "recording", "recording": "tiny"}])
+    nothing = "No result yet: of the 36 policies of the core none is trained and has run all its episodes. "
+    assert Answer.summarise(table, provenance_of()).answer[0].startswith(nothing)
+    pilot = {"stage": "pilot", "recipe": "n-4-pilot", "policy": "n-4-pilot-seed-100", "training_seed": 100}
+    table = pd.DataFrame([{"kind": "training", **pilot, "num_future_tokens": 4, "validation_loss": 0.25}])
+    whole = Answer.summarise(table, provenance_of())
+    assert whole.answer[0].startswith(nothing)
+    assert [list(row) for row in whole.grids[-1].rows] == [["n-4-pilot-seed-100", "0.2500", "", ""]]
+
+
+def test_the_report_begins_with_the_answer(tmp_path: Path) -> None:
+    """Every claim is linked to a table that is there, in both forms."""
+    plan = plans.PLAN
+    episodes = list(plan.seeds)
+    rates = {name: [0.25, 0.5] * 6 for name in ("n-0", "n-4", "n-32")}
+    rows = rows_of(rates, len(episodes)).assign(validation_loss=0.5)
+    rows.to_csv(tmp_path / "answer.csv", index=False)
+    known = Provenance("answer", {"tasks": ["a", "b"], "episodes": episodes}, 1, 1)
+    write_provenance(known, tmp_path / "answer.json")
+    page, markdown = (path.read_text(encoding="utf-8") for path in write_report(tmp_path))
+    text = markdown.split("### Methods")[0]
+    assert re.search(r"### The answer\n\n1\. In these .*\n2\. .*\n3\. .*\n4\. .*\n5\. .*\n\n!\[", text)
+    assert text.rstrip().endswith("saccade study answer --out DIR\nsaccade study report DIR\n```")
+    linked = re.findall(r"\(#(.*?)\)", markdown)
+    assert linked
+    assert set(linked) == set(re.findall(r'href="#(.*?)"', page))
+    assert set(linked) <= {f"table-{place}" for place in re.findall(r"^#### Table (\d+)$", markdown, re.M)}
+    assert set(linked) <= set(re.findall(r'<h4 id="(.*?)"', page))
+    assert page.index("In these policies") < page.index("data:image/svg") < page.index("<h3>Methods")
+    assert "](README.md)" not in markdown
+    (tmp_path / "README.md").write_text("What was decided before.")
+    write_report(tmp_path)
+    assert "[README.md](README.md)" in (tmp_path / "report.md").read_text(encoding="utf-8")
