@@ -29,7 +29,7 @@ from saccade.parallel import cluster as parallel_cluster
 from saccade.sim import demos, graphics
 from saccade.sim.policy import DEMO_CHECKPOINT
 from saccade.study.cell import Cell, Rows
-from saccade.study.run import StudyError, run_cells
+from saccade.study.run import StudyError, run, run_cells
 
 if importlib.util.find_spec("ray") is None and "SACCADE_RAY" not in os.environ:
     pytest.skip("the extra ray is not installed; run make test-ray", allow_module_level=True)
@@ -179,6 +179,21 @@ def test_a_rollout_that_loses_a_process_and_a_node_has_the_episodes_of_one_proce
         assert episode.pop("milliseconds")["sample"] > 0  # differs from run to run
     assert outcomes[0] == outcomes[1]
     assert len(outcomes[0]) == 10
+
+
+def test_policies_of_the_study_answer_are_those_of_one_process(nodes: TwoNodes, tmp_path: Path) -> None:
+    """Recorded, trained on what others trained, and judged: each phase finds the files of the one before."""
+    from answer_cases import PLAN
+
+    from saccade.study.answer.study import Answer
+
+    tables = []
+    for name, workers in (("one", ALONE), ("two", nodes.workers)):
+        found = run(Answer(PLAN, ("core", "specialise")), tmp_path / name, workers=workers)
+        tables.append(found.drop(columns="seconds"))
+    pd.testing.assert_frame_equal(tables[0], tables[1])
+    assert set(tables[0]["kind"]) == {"recording", "backbone", "training", "episodes", "specialise"}
+    assert tables[0]["checkpoint_sha256"].nunique() == 7
 
 
 def test_demonstrations_are_those_of_one_process(nodes: TwoNodes, tmp_path: Path) -> None:
