@@ -135,6 +135,8 @@ cross() {
     export RUSTC="$WORK/bin/rustc" RUSTDOC="$WORK/bin/rustdoc" CARGO_TARGET_DIR="$WORK/target"
     export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
     export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64-static -cpu ${1:-max} -L /usr/aarch64-linux-gnu"
+    # The longest tests then compute fewer cases.
+    export SACCADE_TEST_EMULATED=1
     # No symbols for debuggers, and little optimisation of what tests only compare with: less to compile.
     export CARGO_PROFILE_DEV_DEBUG=0
     LEAST=(--config 'profile.dev.package."*".opt-level=1')
