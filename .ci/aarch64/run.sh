@@ -228,7 +228,7 @@ lint() (
 check() (
     cross
     # Debian has no standard library for them, but its sources, which are checked too.
-    unpack rust-web-src src/rustc-web
+    unpack rust-web-src lib/rustlib/src/rust/library
     export RUSTC_BOOTSTRAP=1
     for target in aarch64-apple-darwin x86_64-pc-windows-msvc; do
         echo "aarch64: checking for $target"
