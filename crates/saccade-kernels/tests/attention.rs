@@ -2,8 +2,8 @@
 
 mod common;
 
-use common::attention::{Case, Kind, REMOVED, assert_close, best, kinds};
-use common::{Strided, bits, isas, numbers, rows, rows_mut};
+use common::attention::{Case, ELEMENTS, Kind, REMOVED, best, kinds, kinds_of};
+use common::{Strided, assert_close, bits, isas, numbers, rows, rows_mut};
 
 use proptest::prelude::*;
 use saccade_kernels::{Element, Isa, LogitBias, Mask, PackedKeyValues, attention, bf16};
@@ -44,15 +44,17 @@ proptest! {
             None => 0.0,
             Some(_) => bias[head * head_stride + query * query_stride + key],
         };
-        for kind in kinds() {
-            let (out, bounds, weights, weight_bounds) = case.exact(kind.element, at);
-            let bias = rank.map(|_| LogitBias { values: &bias, head_stride, query_stride });
-            let plain = case.run(kind, threads, bias, None);
-            assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
-            let mut given = vec![f32::NAN; num_heads * queries * keys];
-            let with_weights = case.run(kind, threads, bias, Some(&mut given));
-            prop_assert_eq!(bits(&with_weights), bits(&plain));
-            assert_close(&format!("{kind}, weight"), &given, &weights, &weight_bounds);
+        for element in ELEMENTS {
+            let (out, bounds, weights, weight_bounds) = case.exact(element, at);
+            for kind in kinds_of(element) {
+                let bias = rank.map(|_| LogitBias { values: &bias, head_stride, query_stride });
+                let plain = case.run(kind, threads, bias, None);
+                assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
+                let mut given = vec![f32::NAN; num_heads * queries * keys];
+                let with_weights = case.run(kind, threads, bias, Some(&mut given));
+                prop_assert_eq!(bits(&with_weights), bits(&plain));
+                assert_close(&format!("{kind}, weight"), &given, &weights, &weight_bounds);
+            }
         }
     }
 }
@@ -61,9 +63,11 @@ proptest! {
 fn agrees_with_float64_at_the_heads_sizes() {
     for (queries, keys, head_dim) in [(49, 296, 48), (49, 49, 48), (60, 296, 64), (5, 700, 300)] {
         let case = Case::new(1, queries, keys, 2, head_dim, 0);
-        for kind in kinds() {
-            let (out, bounds, _, _) = case.exact(kind.element, |_, _, _| 0.0);
-            assert_close(&kind.to_string(), &case.run(kind, 2, None, None), &out, &bounds);
+        for element in ELEMENTS {
+            let (out, bounds, _, _) = case.exact(element, |_, _, _| 0.0);
+            for kind in kinds_of(element) {
+                assert_close(&kind.to_string(), &case.run(kind, 2, None, None), &out, &bounds);
+            }
         }
     }
 }
@@ -72,9 +76,11 @@ fn agrees_with_float64_at_the_heads_sizes() {
 fn logits_that_would_overflow_are_stable() {
     let mut case = Case::new(2, 7, 150, 2, 48, 0);
     case.scale = 60.0;
-    for kind in kinds() {
-        let (out, bounds, _, _) = case.exact(kind.element, |_, _, _| 0.0);
-        assert_close(&kind.to_string(), &case.run(kind, 1, None, None), &out, &bounds);
+    for element in ELEMENTS {
+        let (out, bounds, _, _) = case.exact(element, |_, _, _| 0.0);
+        for kind in kinds_of(element) {
+            assert_close(&kind.to_string(), &case.run(kind, 1, None, None), &out, &bounds);
+        }
     }
 }
 
@@ -90,15 +96,17 @@ fn denormals_are_as_good_as_zero() {
         Strided::new(&numbers(19, 37 * 96, 1.0), 37, 96, 0),
     ] {
         case.values = values;
-        for kind in kinds() {
-            let (out, mut bounds, weights, weight_bounds) = case.exact(kind.element, |_, _, _| 0.0);
+        for element in ELEMENTS {
+            let (out, mut bounds, weights, weight_bounds) = case.exact(element, |_, _, _| 0.0);
             bounds
                 .iter_mut()
                 .for_each(|bound| *bound += f64::from(f32::MIN_POSITIVE));
-            let mut given = vec![f32::NAN; 2 * 5 * 37];
-            let plain = case.run(kind, 1, None, Some(&mut given));
-            assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
-            assert_close(&format!("{kind}, weight"), &given, &weights, &weight_bounds);
+            for kind in kinds_of(element) {
+                let mut given = vec![f32::NAN; 2 * 5 * 37];
+                let plain = case.run(kind, 1, None, Some(&mut given));
+                assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
+                assert_close(&format!("{kind}, weight"), &given, &weights, &weight_bounds);
+            }
         }
     }
 }

@@ -2,8 +2,8 @@
 
 mod common;
 
-use common::attention::{Case, REMOVED, assert_close, kinds};
-use common::{bits, numbers, rows, rows_mut};
+use common::attention::{Case, ELEMENTS, REMOVED, kinds, kinds_of};
+use common::{assert_close, bits, numbers, rows, rows_mut};
 use proptest::prelude::*;
 use saccade_kernels::{Element, Isa, LogitBias, Mask, PackedKeyValues, Rows, attention};
 
@@ -38,13 +38,15 @@ proptest! {
             1 => causal(offset)(head, query, key),
             _ => values[(head * queries + query) * keys + key],
         };
-        for kind in kinds() {
-            let (out, bounds, weights, weight_bounds) = case.exact(kind.element, at);
-            let plain = case.run(kind, threads, given, None);
-            assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
-            let mut with = vec![f32::NAN; num_heads * queries * keys];
-            prop_assert_eq!(bits(&case.run(kind, threads, given, Some(&mut with))), bits(&plain));
-            assert_close(&format!("{kind}, weight"), &with, &weights, &weight_bounds);
+        for element in ELEMENTS {
+            let (out, bounds, weights, weight_bounds) = case.exact(element, at);
+            for kind in kinds_of(element) {
+                let plain = case.run(kind, threads, given, None);
+                assert_close(&format!("{kind}, output"), &plain, &out, &bounds);
+                let mut with = vec![f32::NAN; num_heads * queries * keys];
+                prop_assert_eq!(bits(&case.run(kind, threads, given, Some(&mut with))), bits(&plain));
+                assert_close(&format!("{kind}, weight"), &with, &weights, &weight_bounds);
+            }
         }
     }
 }

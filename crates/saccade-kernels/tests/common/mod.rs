@@ -13,6 +13,12 @@ pub fn isas() -> Vec<Isa> {
     isas
 }
 
+/// Whether an emulator runs this, some fifty times slower than a CPU, as `.ci/aarch64/run.sh` says. The longest tests then compute fewer
+/// cases, still on every instruction set.
+pub fn is_emulated() -> bool {
+    std::env::var_os("SACCADE_TEST_EMULATED").is_some()
+}
+
 /// Half a unit in the last place of 1.
 pub const ROUNDING: f64 = 1.0 / (1u64 << 24) as f64;
 
@@ -80,6 +86,18 @@ impl Strided {
             );
         }
         values
+    }
+}
+
+/// That every value is as near the exact one as its bound says.
+pub fn assert_close(what: &str, given: &[f32], exact: &[f64], bounds: &[f64]) {
+    assert_eq!(given.len(), exact.len());
+    for (index, ((&given, &exact), &bound)) in given.iter().zip(exact).zip(bounds).enumerate() {
+        let error = (f64::from(given) - exact).abs();
+        assert!(
+            error <= bound,
+            "{what} {index}: {given} instead of {exact}, off by {error}, allowed {bound}"
+        );
     }
 }
 
