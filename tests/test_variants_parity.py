@@ -21,10 +21,10 @@ import torch
 from engine_cases import TAME, TOLERANCE, arrays, both, random_masks, same, save, variant_configs
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from intervention_cases import Sizes, interventions
 from numpy.typing import NDArray
 from reference_cases import relative_error, variant_config
 from released import VARIANTS, load_released
-from test_intervention import Sizes, interventions
 from torch import Tensor
 
 import saccade
