@@ -75,6 +75,8 @@ class ActionHead(nn.Module):
         torch.Size([2, 2, 16, 32])
     """
 
+    mask_token: nn.Parameter  # if it is among `unused`
+
     def __init__(
         self,
         config: HeadConfig,
