@@ -30,8 +30,9 @@ def start_of(
         raise InputError(f"previous_chunk, chunking: expected both or neither, got {given} without {missing}")
     if previous is None or chunking is None:
         return noise, None
+    start = continued(noise, previous, chunking, config)  # first, since it checks that they fit the head
     strength = torch.from_numpy(velocity_strength(chunking, config.action_horizon)).to(noise)
-    return continued(noise, previous, chunking, config), strength[:, None]
+    return start, strength[:, None]
 
 
 def continued(start: Tensor, previous: Tensor, chunking: Chunking, config: HeadConfig) -> Tensor:
