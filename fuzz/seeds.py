@@ -17,6 +17,7 @@ HERE = Path(__file__).resolve().parent
 TESTS = HERE.parent / "tests"
 DATA = TESTS / "data"
 sys.path.insert(0, str(TESTS))
+import layout_heads  # noqa: E402
 import layouts  # noqa: E402
 import reference_cases  # noqa: E402
 
@@ -112,7 +113,7 @@ def checkpoints() -> dict[str, bytes]:
     seeds = {}
     with tempfile.TemporaryDirectory() as folder:
         for layout in layouts.LAYOUTS:
-            head = layouts.head_config(layout)
+            head = layout_heads.head_config(layout)
             head["diffusion_model_cfg"]["num_layers"] = 2
             layouts.write(Path(folder) / layout, layout, config=head)
             seeds[layout] = BETWEEN.join(checkpoint(Path(folder) / layout))
@@ -137,7 +138,7 @@ def resizes() -> dict[str, bytes]:
         # The number of tokens, and what the weights' bytes are.
         counts = {7: b"\x3f\x80\0", 2: b"\1\2\3\4\5\6\7", 3: b"", 0: b"\x3f"}
         for layout, sizes in {"nvidia": small, "saccade": small, "lerobot": wide}.items():
-            layouts.write(Path(folder) / layout, layout, config=layouts.head_config(layout) | sizes)
+            layouts.write(Path(folder) / layout, layout, config=layout_heads.head_config(layout) | sizes)
             config, header = checkpoint(Path(folder) / layout)
             for count, data in counts.items():
                 pieces = [struct.pack("<H", count) + config, header, data]

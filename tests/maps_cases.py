@@ -1,18 +1,22 @@
-"""Maps made by hand, for the tests of sheet and page."""
+"""Maps made by hand, and observations that maps are made of."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from released import load_released
 
 import saccade
 from saccade.maps.layout import parse_layout
 from saccade.maps.occlusion import DroppedPositions, Occlusion
 from saccade.maps.record import Maps, Selection
-from saccade.maps.view import View
+from saccade.maps.view import View, from_simulator
 from saccade.observation import Observation
-from saccade.sim.policy import DEMO_CHECKPOINT
+from saccade.sim.policy import DEMO_CHECKPOINT, Policy
 
 FUTURE = 3
 ACTIONS = 2
@@ -84,3 +88,41 @@ def one_hot_maps(
         redrawn=redrawn if future_tokens else None,
         occlusion=Occlusion("by hand", 1, change, 0.5),
     )
+
+
+@functools.cache
+def demo_policy() -> Policy:
+    """The bundled policy on one thread."""
+    return Policy.load(num_threads=1)
+
+
+def demo_head() -> saccade.ActionHead:
+    """The head of the bundled policy."""
+    found = demo_policy().whole.head
+    assert isinstance(found, saccade.ActionHead)
+    return found
+
+
+@functools.cache
+def pushed_view() -> View:
+    """The first observation of an episode of the task `push`."""
+    return from_simulator(demo_policy(), "push", 3, 0)
+
+
+def feature_arrays() -> dict[str, Any]:
+    """What the released single-view head was given, with the prompt that fits its T_vl."""
+    given = load_released("n15_single_view")
+    ids = [7] * 20 + [151669] * 256 + [8] * 20
+    return {
+        "backbone_features": given.backbone_features,
+        "state": given.state,
+        "embodiment_id": given.embodiment_id,
+        "noise": given.noise,
+        "input_ids": np.array([ids]),
+        "images": np.zeros((1, 32, 32, 3), np.uint8),
+    }
+
+
+def written(path: Path, arrays: dict[str, Any]) -> Path:
+    np.savez(path, **arrays)
+    return path

@@ -1,46 +1,40 @@
-"""Files that nobody should have made: pipes, devices, loops, holes of terabytes, names that drive a terminal,
-disks that fill up. Whatever reads or writes a checkpoint says what is wrong, once, and leaves nothing behind.
+"""Files that nobody should have made: pipes, devices, loops, holes of terabytes, names that drive a terminal.
+
+Whatever reads a checkpoint says what is wrong, once, and writes nothing.
 """
 
 from __future__ import annotations
 
-import contextlib
-import faulthandler
 import functools
 import json
 import math
 import os
 import resource
-import shutil
-import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import hostile_cases
 import pytest
-from released import load_released
+from hostile_cases import TINY, WRITERS, limited, names, refused
 
 import saccade
 from saccade import _saccade, cli
-from saccade.checkpoints import convert, describe, quantize, read_tensors, resize
-from saccade.errors import CheckpointError, SaccadeError
+from saccade.checkpoints import describe, quantize, read_tensors
+from saccade.errors import CheckpointError
 
-TINY = load_released("n15_tiny")
+# Fixtures.
+good, no_hang = hostile_cases.good, hostile_cases.no_hang
+
 
 # What takes the path of a checkpoint and writes nothing.
 READERS: dict[str, Callable[[Path], object]] = {
     "load": saccade.ActionHead.load,
     "read_tensors": read_tensors,
     "describe": describe,
-}
-# What takes the path of a checkpoint and that of a new one; options are those of the function.
-WRITERS: dict[str, Callable[..., object]] = {
-    "quantize": quantize,
-    "convert": lambda source, out, **options: convert(source, out, dtype="bfloat16", **options),
-    "resize": lambda source, out, **options: resize(source, out, num_future_tokens=6, **options),
 }
 # Commands with the path of a checkpoint and that of a new one.
 COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
@@ -49,24 +43,6 @@ COMMANDS: dict[str, Callable[[Path, Path], list[str]]] = {
     "convert": lambda source, out: ["convert", str(source), "--out", str(out), "--embodiment-ids", "1"],
     "resize": lambda source, out: ["resize", str(source), "--out", str(out), "--num-future-tokens", "6"],
 }
-
-
-@pytest.fixture(autouse=True)
-def no_hang() -> Iterator[None]:
-    """What waits for a pipe waits for ever, and no signal wakes it: the process ends with a traceback."""
-    faulthandler.dump_traceback_later(120, exit=True)
-    yield
-    faulthandler.cancel_dump_traceback_later()
-
-
-@pytest.fixture
-def good(tmp_path: Path) -> Path:
-    """A checkpoint with nothing wrong."""
-    folder = tmp_path / "good"
-    folder.mkdir()
-    shutil.copyfile(TINY.path, folder / "model.safetensors")
-    (folder / "config.json").write_text(json.dumps(TINY.config))
-    return folder
 
 
 def safetensors(header: str | dict[str, Any], data: bytes = b"") -> bytes:
@@ -216,21 +192,6 @@ BROKEN_CONFIGS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-def refused(call: Callable[[], object], message: str) -> None:
-    """That `call` raises an error of ours that can be read."""
-    with pytest.raises((SaccadeError, FileNotFoundError, MemoryError), match=message) as caught:
-        call()
-    text = str(caught.value)
-    assert "\x1b" not in text
-    assert "\x9b" not in text
-    assert len(text) < 2_000_000
-
-
-def names(folder: Path) -> set[str]:
-    """All that is in a folder, hidden files too."""
-    return {entry.name for entry in folder.iterdir()}
-
-
 @pytest.mark.parametrize("case", BROKEN_WEIGHTS)
 @pytest.mark.parametrize("entry", [*READERS, *WRITERS])
 def test_broken_weights(entry: str, case: str, good: Path) -> None:
@@ -351,17 +312,6 @@ def test_names_of_folders_may_be_any_bytes(good: Path) -> None:
     saccade.ActionHead.load(odd / "int8")
 
 
-@contextlib.contextmanager
-def limited(kind: int, soft: int) -> Iterator[None]:
-    """A limit of this process, for a while."""
-    before = resource.getrlimit(kind)
-    resource.setrlimit(kind, (soft, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(kind, before)
-
-
 def sharded(folder: Path, count: int) -> None:
     """The tensors of the file there, each in one of `count` files, without an index."""
     raw = (folder / "model.safetensors").read_bytes()
@@ -389,192 +339,6 @@ def test_more_files_than_may_be_open(entry: str, good: Path) -> None:
             "Too many open files",
         )
     assert names(good.parent) == {"good"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_disk_that_is_full(entry: str, good: Path) -> None:
-    with limited(resource.RLIMIT_FSIZE, 50_000):
-        refused(lambda: WRITERS[entry](good, good.parent / "out"), "out: .* cannot be written")
-    assert names(good.parent) == {"good"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_file_system_that_is_full(entry: str, good: Path, tmp_path: Path) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("mounting is not permitted here")
-    try:
-        refused(lambda: WRITERS[entry](good, disk / "out"), "out: .* cannot be written: No space left")
-        assert names(disk) == set()
-        subprocess.run([*mount[:4], "remount,ro", str(disk)], check=True)
-        refused(lambda: WRITERS[entry](good, disk / "out"), "out: .* cannot be written: Read-only")
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-@pytest.mark.parametrize(
-    ("out", "message"),
-    [
-        ("", "out: "),
-        ("/", "out: "),
-        ("..", "out: "),
-        ("a\0b", "out: "),
-        ("x" * 300, "out: .* File name too long"),
-        ("/proc/out", "out: .* cannot be written"),
-        ("good/config.json", "out: .* is not a directory"),
-        ("good/config.json/out", "out: "),
-        ("good", "out: .* holds the source"),
-        ("good/../good/.", "out: "),
-        ("dangling", "out: "),
-        ("itself", "out: "),
-    ],
-)
-def test_outputs_that_are_none(
-    entry: str, out: str, message: str, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "dangling").symlink_to("nowhere")
-    (tmp_path / "itself").symlink_to("itself")
-    monkeypatch.chdir(tmp_path)
-    before = {path.name: path.read_bytes() for path in good.iterdir()}
-    refused(lambda: WRITERS[entry](good, Path(out), force=True), message)
-    assert {path.name: path.read_bytes() for path in good.iterdir()} == before
-    assert names(tmp_path) == {"good", "dangling", "itself"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_behind_a_link_what_it_leads_to_is_replaced(entry: str, good: Path, tmp_path: Path) -> None:
-    other, out = tmp_path / "other", tmp_path / "out"
-    shutil.copytree(good, other)
-    out.symlink_to(other)
-    refused(lambda: WRITERS[entry](good, out), "exists already")
-    assert (other / "model.safetensors").read_bytes() == TINY.path.read_bytes()
-    WRITERS[entry](good, out, force=True)
-    assert out.is_symlink()
-    assert (other / "model.safetensors").read_bytes() != TINY.path.read_bytes()
-    saccade.ActionHead.load(out)
-    assert names(tmp_path) == {"good", "other", "out"}
-
-
-class Meddler:
-    """Does something once, in the middle of the writing."""
-
-    def __init__(self, act: Callable[[], object]) -> None:
-        self.act: Callable[[], object] | None = act
-
-    def __call__(self, done: int, total: int) -> None:
-        if self.act is not None and done > total // 3:
-            act, self.act = self.act, None
-            act()
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-@pytest.mark.parametrize("force", [False, True])
-def test_what_appears_under_the_name_meanwhile_is_not_replaced(
-    entry: str, force: bool, good: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-
-    def appear() -> None:
-        out.mkdir()
-        (out / "thesis.tex").write_text("the only copy")
-
-    refused(
-        lambda: WRITERS[entry](good, out, force=force, progress=Meddler(appear)),
-        "out: .*(thesis.tex|not empty)",
-    )
-    assert (out / "thesis.tex").read_text() == "the only copy"
-    assert names(tmp_path) == {"good", "out"}
-    assert names(out) == {"thesis.tex"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_checkpoint_that_appears_meanwhile_is_replaced_only_by_force(
-    entry: str, good: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    refused(
-        lambda: WRITERS[entry](good, out, progress=Meddler(lambda: shutil.copytree(good, out))),
-        "exists already|not empty",
-    )
-    assert (out / "model.safetensors").read_bytes() == TINY.path.read_bytes()
-    assert names(tmp_path) == {"good", "out"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-@pytest.mark.parametrize("change", ["shrinks", "grows", "is written to"])
-def test_a_source_that_changes_while_it_is_read(entry: str, change: str, good: Path, tmp_path: Path) -> None:
-    path = good / "model.safetensors"
-
-    def meddle() -> None:
-        if change == "shrinks":
-            os.truncate(path, path.stat().st_size // 2)
-        elif change == "grows":
-            with path.open("ab") as file:
-                file.write(b"more")
-        else:
-            with path.open("r+b") as file:
-                file.seek(-4, os.SEEK_END)
-                file.write(b"\xff\xff\xff\xff")
-            os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
-
-    refused(
-        lambda: WRITERS[entry](good, tmp_path / "out", progress=Meddler(meddle)),
-        "cannot be read from .*model.safetensors: (failed to fill whole buffer|it changed while it was read)",
-    )
-    assert names(tmp_path) == {"good"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_source_that_vanishes_is_still_there_for_who_opened_it(
-    entry: str, good: Path, tmp_path: Path
-) -> None:
-    expected = tmp_path / "expected"
-    WRITERS[entry](good, expected)
-    path = good / "model.safetensors"
-    WRITERS[entry](good, tmp_path / "out", progress=Meddler(path.unlink))
-    assert (tmp_path / "out" / path.name).read_bytes() == (expected / path.name).read_bytes()
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_folder_that_vanishes_while_it_is_written(entry: str, good: Path, tmp_path: Path) -> None:
-    work = tmp_path / "work"
-    work.mkdir()
-    refused(
-        lambda: WRITERS[entry](good, work / "out", progress=Meddler(lambda: shutil.rmtree(work))),
-        "out: .* cannot be written",
-    )
-    assert names(tmp_path) == {"good"}
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_folder_in_the_source_is_written_and_changes_nothing_there(entry: str, good: Path) -> None:
-    WRITERS[entry](good, good / "out")
-    assert names(good) == {"config.json", "model.safetensors", "out"}
-    assert (good / "model.safetensors").read_bytes() == TINY.path.read_bytes()
-    saccade.ActionHead.load(good)
-    saccade.ActionHead.load(good / "out")
-
-
-@pytest.mark.parametrize("entry", WRITERS)
-def test_a_killed_writer_leaves_no_checkpoint(entry: str, good: Path, tmp_path: Path) -> None:
-    code = (
-        "import os, signal, sys; sys.path.insert(0, os.environ['TESTS']);"
-        "import test_hostile_files as t; from pathlib import Path;"
-        "kill = lambda: os.kill(os.getpid(), signal.SIGKILL);"
-        "t.WRITERS[sys.argv[1]](Path('good'), Path('out'), progress=t.Meddler(kill))"
-    )
-    environment = os.environ | {"TESTS": str(Path(__file__).parent)}
-    done = subprocess.run(
-        [sys.executable, "-c", code, entry], cwd=tmp_path, env=environment, capture_output=True, check=False
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
-    (left,) = names(tmp_path) - {"good"}
-    assert left.startswith(".out.")
-    WRITERS[entry](good, tmp_path / "out")
-    saccade.ActionHead.load(tmp_path / "out")
 
 
 def of_holes(folder: Path, shapes: Iterable[tuple[str, list[int]]], dtype: str) -> None:

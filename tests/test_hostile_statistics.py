@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import faulthandler
 import json
 import os
 import shutil
@@ -11,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import hostile_cases
 import layouts
 import numpy as np
 import pytest
@@ -44,12 +44,7 @@ JUNK: list[Any] = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def no_hang() -> Iterator[None]:
-    """What waits for a pipe waits for ever, and no signal wakes it: the process ends with a traceback."""
-    faulthandler.dump_traceback_later(120, exit=True)
-    yield
-    faulthandler.cancel_dump_traceback_later()
+no_hang = hostile_cases.no_hang  # a fixture
 
 
 @pytest.fixture(scope="module")

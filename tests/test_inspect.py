@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import layout_heads
 import layouts
 import numpy as np
 import pytest
@@ -261,8 +262,8 @@ def test_tokens_that_are_not_finite(tmp_path: Path) -> None:
 
 def fine_tuned(base: Path, folder: Path, tensors: dict[str, Tensor] | None = None) -> Path:
     """A fork's checkpoint that started from `base`: a little training, one more embodiment, new decoders."""
-    config = layouts.head_config("fork")
-    own = layouts.head_tensors(config, seed=9, trained=[31])
+    config = layout_heads.head_config("fork")
+    own = layout_heads.head_tensors(config, seed=9, trained=[31])
     start = layouts.read(base, "action_head.")
     generator = torch.Generator().manual_seed(2)
     for name, tensor in start.items():
@@ -297,7 +298,7 @@ def test_beside_the_checkpoint_that_it_was_trained_from(base: Path, tmp_path: Pa
 
 def test_beside_a_checkpoint_that_was_dropped(base: Path, tmp_path: Path) -> None:
     """64 tokens where the checkpoint had 32, everything dropped, then trained."""
-    config = layouts.head_config("fork") | {"num_target_vision_tokens": 64}
+    config = layout_heads.head_config("fork") | {"num_target_vision_tokens": 64}
     folder = layouts.write(tmp_path / "dropped", "fork", config=config, seed=9, trained=[31])
     report = inspect(folder, reference=base, time=False)
     assert sides(report)["DiT blocks compared with the reference"] == "for"

@@ -1,4 +1,4 @@
-"""Interventions in the Rust head: against the torch reference in float64, and the properties they must have.
+"""Interventions in the Rust head: the properties they must have.
 
 Properties I1 to I13 are those of section 6 of the specification. Where the same numbers are computed in the
 same order, bits are compared; elsewhere to 1e-5 * max(1, |value|).
@@ -8,226 +8,35 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from engine_cases import TAME, TOLERANCE, arrays, both, configs, save
-from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import strategies as st
+from engine_cases import TOLERANCE, arrays, both, save
+from intervention_cases import ROWS, Head, Inputs, everything, inputs_of, small_head
 from numpy.typing import ArrayLike, NDArray
 from reference_cases import relative_error, small_config
 from released import load_released
 
 import saccade
 from saccade import Intervention
-from saccade.config import HeadConfig
-from saccade.reference import ActionHead as Reference
 from saccade.reference.random_weights import random_head, random_inputs
 
 OTHERS = ("state", "action")
-ROWS = ("state", "future", "action")
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """What the indices of an intervention may point to."""
-
-    config: HeadConfig
-    batch: int
-    num_vl_tokens: int
-    num_steps: int
-    num_future: int
-
-    def count(self, group: str) -> int:
-        """Tokens of a group."""
-        counts = {"state": 1, "future": self.num_future, "action": self.config.action_horizon}
-        return counts.get(group, self.num_vl_tokens)
-
-
-def some_indices(count: int) -> st.SearchStrategy[tuple[int, ...]]:
-    return st.lists(st.integers(0, count - 1), unique=True, min_size=1, max_size=4).map(tuple)
-
-
-def tokens(sizes: Sizes, groups: Sequence[str]) -> st.SearchStrategy[Any]:
-    """A group that has tokens, or some of them."""
-    group = st.sampled_from([name for name in groups if sizes.count(name) > 0])
-    return group | group.flatmap(lambda name: st.tuples(st.just(name), some_indices(sizes.count(name))))
-
-
-@st.composite
-def interventions(draw: st.DrawFn, sizes: Sizes) -> Intervention:
-    """Cuts, biases and patches of whole groups and of single tokens, everywhere or not."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**31 - 1)))
-
-    def count(chosen: Any) -> int:
-        return sizes.count(chosen) if isinstance(chosen, str) else len(chosen[1])
-
-    def bias(chosen: Any) -> float | NDArray[np.float32]:
-        if draw(st.booleans()):
-            return draw(st.sampled_from([-math.inf, -1.5, 0.0, 0.7, 2.0]))
-        values = rng.standard_normal(count(chosen)).astype(np.float32)
-        return np.where(rng.random(values.shape) < 0.2, np.float32(-np.inf), values)
-
-    def rows(chosen: Any) -> NDArray[np.float32]:
-        batch = (sizes.batch,) if draw(st.booleans()) else ()
-        return rng.standard_normal((*batch, count(chosen), sizes.config.width)).astype(np.float32)
-
-    def limit(count: int) -> tuple[int, ...] | None:
-        return draw(st.none() | some_indices(count))
-
-    config = sizes.config
-    pairs = st.tuples(tokens(sizes, ROWS), tokens(sizes, (*ROWS, "vl")))
-    places = st.tuples(st.integers(0, sizes.num_steps - 1), st.integers(0, config.num_layers - 1))
-    patched = draw(st.lists(st.tuples(places, tokens(sizes, ROWS)), max_size=2))
-    biased = draw(st.lists(tokens(sizes, (*ROWS, "vl")), max_size=3))
-    blocks = limit(config.num_layers)
-    return Intervention(
-        cut=[pair for pair in draw(st.lists(pairs, max_size=3)) if acts_somewhere(config, pair[1], blocks)],
-        key_bias={chosen: bias(chosen) for chosen in biased if acts_somewhere(config, chosen, blocks)},
-        patch={place: {chosen: rows(chosen)} for place, chosen in patched},
-        blocks=blocks,
-        steps=limit(sizes.num_steps),
-        heads=limit(config.num_heads),
-    )
-
-
-def acts_somewhere(config: HeadConfig, keys: Any, blocks: Sequence[int] | None) -> bool:
-    """Whether these keys exist in any of these blocks: `vl` in cross-attention, others in self-attention."""
-    group = keys if isinstance(keys, str) else keys[0]
-    chosen = range(config.num_layers) if blocks is None else blocks
-    is_self = {block % 2 == 1 and config.interleave_self_attention for block in chosen}
-    return (group != "vl") in is_self
-
-
-# The instruction set is set once for all of a test's examples.
-per_isa = settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=25
-)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A head twice, one call of it, and what to change."""
-
-    head: saccade.ActionHead
-    reference: Reference
-    inputs: dict[str, Any]  # tensors: features, state, noise, embodiment_id
-    drop_vl: NDArray[np.bool_] | None
-    num_steps: int
-    interventions: list[Intervention]
-
-
-@st.composite
-def cases(draw: st.DrawFn, max_steps: int) -> Case:
-    """Any sizes; 100 and 200 tokens are more than the attention kernel takes in one block of keys."""
-    config, seed = draw(configs()), draw(st.integers(0, 2**31 - 1))
-    batch, num_vl_tokens = draw(st.integers(1, 3)), draw(st.sampled_from([1, 2, 7, 33, 100, 200]))
-    num_future = draw(st.none() | st.sampled_from([0, 1, 3, 9]))
-    num_steps = draw(st.integers(1, max_steps))
-    head, reference = both(config, seed)
-    rng = np.random.default_rng(seed)
-    replaced = []
-    if num_future is not None:
-        replaced = [Intervention(future_tokens=rng.standard_normal((num_future, head.config.width)))]
-    count = head.config.num_future_tokens if num_future is None else num_future
-    sizes = Sizes(head.config, batch, num_vl_tokens, num_steps, count)
-    return Case(
-        head,
-        reference,
-        random_inputs(head.config, seed, batch=batch, num_vl_tokens=num_vl_tokens),
-        rng.random((batch, num_vl_tokens)) < 0.4 if draw(st.booleans()) else None,
-        num_steps,
-        draw(st.lists(interventions(sizes), min_size=1, max_size=2)) + replaced,
-    )
-
-
-def in_float64_if_tame(
-    case: Case, run: Callable[[], Any], differences: Callable[..., Iterator[float]]
-) -> Any:
-    """What the reference gives; the example is passed over if torch's own float32 is far from it."""
-    with torch.no_grad():
-        expected = run()
-        case.reference.float()
-        assume(max(differences(run(), expected)) <= TAME)
-    return expected
-
-
-@per_isa
-@given(case=cases(max_steps=3))
-def test_random_interventions_equal_the_reference(isa: str, case: Case) -> None:
-    assert case.head.isa == isa
-    options: dict[str, Any] = {"intervention": case.interventions, "num_steps": case.num_steps}
-    recorded: dict[str, Any] = options | {"record": ("attention", "hidden")}
-    given_arrays = arrays(case.inputs)
-    context = case.head.encode(given_arrays.pop("backbone_features"), drop_vl=case.drop_vl)
-    trace = case.head.trace(context, **given_arrays, **recorded)
-    np.testing.assert_array_equal(case.head.sample(context, **given_arrays, **options), trace.actions)
-
-    def run() -> Any:
-        rest = dict(case.inputs)
-        vl_embs = case.reference.encode(rest.pop("backbone_features"), drop_vl=case.drop_vl)
-        return case.reference.trace(vl_embs, **rest, drop_vl=case.drop_vl, **recorded)
-
-    def differences(one: Any, other: Any) -> Iterator[float]:
-        yield relative_error(one.actions, other.actions)
-        for kept, expected in ((one.attention, other.attention), (one.hidden, other.hidden)):
-            assert list(kept) == list(expected)
-            for place, array in kept.items():
-                yield relative_error(array, expected[place])
-
-    expected = in_float64_if_tame(case, run, differences)
-    assert trace.rows == expected.rows
-    assert max(differences(trace, expected)) <= TOLERANCE
-    for place, probabilities in trace.attention.items():
-        exactly_zero = np.asarray(expected.attention[place]) == 0
-        assert (np.asarray(probabilities)[exactly_zero] == 0).all()
-
-
-@settings(per_isa, max_examples=10)
-@given(case=cases(max_steps=1), buckets=st.lists(st.integers(0, 999), min_size=3, max_size=3))
-def test_velocity_with_interventions_equals_the_reference(isa: str, case: Case, buckets: list[int]) -> None:
-    assert case.head.isa == isa
-    names = ("backbone_features", "state", "embodiment_id", "noise")
-    features, *arguments = (case.inputs[name] for name in names)
-    arguments.append(np.array(buckets[: len(features)]))
-    context = case.head.encode(features, drop_vl=case.drop_vl)
-    velocity = case.head.velocity(context, *arguments, intervention=case.interventions)
-
-    def run() -> Any:
-        vl_embs = case.reference.encode(features, drop_vl=case.drop_vl)
-        options: dict[str, Any] = {"drop_vl": case.drop_vl, "intervention": case.interventions}
-        return case.reference.velocity(vl_embs, *arguments, **options)
-
-    def difference(one: Any, other: Any) -> Iterator[float]:
-        yield relative_error(one, other)
-
-    expected = in_float64_if_tame(case, run, difference)
-    assert relative_error(velocity, expected) <= TOLERANCE
-
 
 # A head whose sizes all differ, on every instruction set
-
-Head = saccade.ActionHead
-Inputs = dict[str, Any]
 
 
 @pytest.fixture
 def head(isa: str) -> Head:
-    head, _ = both(small_config(num_layers=4, vl_num_layers=1), seed=11)
-    assert head.isa == isa
-    return head
+    return small_head(isa)
 
 
 @pytest.fixture
 def inputs(head: Head) -> Inputs:
-    given_arrays = arrays(random_inputs(head.config, 12, batch=3, num_vl_tokens=6))
-    given_arrays["context"] = head.encode(given_arrays.pop("backbone_features"))
-    return given_arrays
+    return inputs_of(head)
 
 
 @pytest.fixture
@@ -435,24 +244,6 @@ def test_velocity_is_step_0(head: Head, inputs: Inputs) -> None:
         head.velocity(**arguments, actions=inputs["noise"], timestep=0, intervention=late)
 
 
-def everything(head: Head, batch: int) -> list[Intervention]:
-    """All kinds of changes at once, for this batch."""
-    rng = np.random.default_rng(1)
-    width, horizon = head.config.width, head.config.action_horizon
-    return [
-        Intervention(cut=[("action", ("vl", [0, 3])), (("future", [1]), "action")], heads=[0, 2]),
-        Intervention(key_bias={"state": 0.5, ("vl", (1,)): -1.0}, steps=[0, 2]),
-        Intervention(future_tokens=rng.standard_normal((6, width))),
-        Intervention(
-            patch={
-                (0, 2): {("future", (4, 0)): rng.standard_normal((2, width))},
-                (2, 3): {"action": rng.standard_normal((batch, horizon, width))},
-                (1, 1): {"state": rng.standard_normal((batch, 1, width))},
-            }
-        ),
-    ]
-
-
 def element_of(given_interventions: list[Intervention], element: int) -> list[Intervention]:
     """The same for one element of the batch."""
 
@@ -526,158 +317,3 @@ def test_torch_arrays(head: Head, inputs: Inputs) -> None:
         future_tokens=np.ones((4, head.config.width), order="F"),
     )
     assert equal(head.sample(**inputs, intervention=as_torch), head.sample(**inputs, intervention=as_numpy))
-
-
-# What does not fit
-
-
-def patched(step: int, block: int, group: Any, *shape: int) -> Intervention:
-    return Intervention(patch={(step, block): {group: np.zeros(shape, np.float32)}})
-
-
-@pytest.mark.parametrize(
-    ("intervention", "error", "message"),
-    [
-        (Intervention(blocks=[0, 4]), saccade.InputError, "blocks: expected 0 to 3, got 4"),
-        (
-            Intervention(blocks=[2**62]),
-            saccade.InputError,
-            "blocks: expected 0 to 3, got 4611686018427387904",
-        ),
-        (Intervention(steps=[3]), saccade.InputError, "steps: expected 0 to 2, got 3"),
-        (Intervention(heads=3), saccade.InputError, "heads: expected 0 to 2, got 3"),
-        (
-            Intervention(cut=[("action", ("future", [0, 40]))]),
-            saccade.InputError,
-            "cut: future token 40, expected 0 to 3",
-        ),
-        (
-            Intervention(cut=[(("action", [5]), "vl")]),
-            saccade.InputError,
-            "cut: action token 5, expected 0 to 4",
-        ),
-        (
-            Intervention(cut=[("action", ("vl", 6))]),
-            saccade.InputError,
-            "cut: vl token 6, expected 0 to 5",
-        ),
-        (
-            Intervention(key_bias={("state", 1): 0.5}),
-            saccade.InputError,
-            "key_bias: state token 1, expected 0 to 0",
-        ),
-        (
-            Intervention(key_bias={"future": np.zeros(5)}),
-            saccade.ShapeError,
-            "key_bias: expected a number or (4,) for future, got (5,)",
-        ),
-        (
-            Intervention(future_tokens=np.zeros((4, 13))),
-            saccade.ShapeError,
-            "future_tokens: expected (tokens, width) with width 12, got (4, 13)",
-        ),
-        (
-            [Intervention(future_tokens=np.zeros((4, 12)))] * 2,
-            saccade.InputError,
-            "future_tokens: expected at most one intervention that replaces them, got several",
-        ),
-        (
-            Intervention(future_tokens=np.zeros((0, 12)), cut=[("action", ("future", 0))]),
-            saccade.InputError,
-            "cut: future token 0, expected none, since the group has no token",
-        ),
-        (patched(3, 0, "state", 1, 12), saccade.InputError, "patch: step: expected 0 to 2, got 3"),
-        (patched(0, 4, "state", 1, 12), saccade.InputError, "patch: block: expected 0 to 3, got 4"),
-        (
-            patched(1, 2, ("future", (4,)), 1, 12),
-            saccade.InputError,
-            "patch[(1, 2)]: future token 4, expected 0 to 3",
-        ),
-        (
-            patched(1, 2, "future", 2, 4, 12),
-            saccade.ShapeError,
-            "patch[(1, 2)]: expected (tokens, width) = (4, 12) or (batch, tokens, width) = (3, 4, 12) for "
-            "future, got (2, 4, 12)",
-        ),
-        (patched(1, 2, "action", 4, 12), saccade.ShapeError, "got (4, 12)"),
-        (
-            [Intervention(key_bias={"future": 3e38})] * 2,
-            saccade.InputError,
-            "key_bias: expected biases whose sum for a key is below infinity",
-        ),
-        (
-            Intervention(future_tokens=np.zeros((20_000, 12)), cut=[("future", "state")]),
-            saccade.InputError,
-            "intervention: cuts and biases over 1 heads, 20006 rows and 20006 keys need 1600960144 bytes",
-        ),
-        (
-            "future",
-            saccade.InputError,
-            "intervention: expected an Intervention or a sequence of them, got str",
-        ),
-        (
-            [None],
-            saccade.InputError,
-            "intervention: expected an Intervention or a sequence of them, got a sequence with NoneType",
-        ),
-    ],
-)
-def test_what_does_not_fit_is_refused(
-    head: Head, inputs: Inputs, intervention: Any, error: type[Exception], message: str
-) -> None:
-    out = np.full((3, 5, 3), 7, np.float32)
-    with pytest.raises(error) as caught:
-        head.sample(**inputs, intervention=intervention, out=out)
-    assert message in str(caught.value)
-    assert (out == 7).all()
-    with pytest.raises(error):
-        head.trace(**inputs, intervention=intervention)
-
-
-@pytest.mark.parametrize(
-    ("fields", "error"),
-    [
-        ({"cut": [("action", ("vl", True))]}, saccade.InputError),
-        ({"cut": [("action", ("vl", [0.0]))]}, saccade.InputError),
-        ({"cut": [("action", ("vl", [1, 1]))]}, saccade.InputError),
-        ({"cut": [("action", ("vl", [-1]))]}, saccade.InputError),
-        ({"cut": [("vl", "state")]}, saccade.InputError),
-        ({"cut": [("action", "vision")]}, saccade.InputError),
-        ({"cut": "action"}, saccade.InputError),
-        ({"key_bias": {"vl": math.nan}}, saccade.InputError),
-        ({"key_bias": {"vl": math.inf}}, saccade.InputError),
-        ({"key_bias": {"vl": True}}, saccade.DtypeError),
-        ({"key_bias": {"vl": [1, 2]}}, saccade.DtypeError),
-        ({"patch": {(0, True): {"state": np.zeros((1, 12))}}}, saccade.InputError),
-        ({"patch": {0: {"state": np.zeros((1, 12))}}}, saccade.InputError),
-        ({"patch": {(0, 0): {"state": np.full((1, 12), math.nan)}}}, saccade.InputError),
-        ({"patch": {(0, 0): {"vl": np.zeros((1, 12))}}}, saccade.InputError),
-        ({"patch": {(0, 0): {"state": np.zeros(12)}}}, saccade.ShapeError),
-        ({"future_tokens": np.zeros(12)}, saccade.ShapeError),
-        ({"future_tokens": np.full((1, 12), math.inf)}, saccade.InputError),
-        ({"blocks": [False]}, saccade.InputError),
-        ({"heads": [-1]}, saccade.InputError),
-        ({"steps": 1.0}, saccade.InputError),
-        ({"cut": np.array(1)}, saccade.InputError),
-        ({"key_bias": {"vl": 10**400}}, saccade.InputError),
-        ({"key_bias": {("vl", 0): 1.0, ("vl", (0,)): 2.0}}, saccade.InputError),
-        ({"blocks": {1, "a"}}, saccade.InputError),
-        ({"blocks": ""}, saccade.InputError),
-        ({"steps": range(2**70)}, saccade.InputError),
-        ({"steps": range(-(10**12), 0)}, saccade.InputError),
-        ({"heads": np.array([[1]])}, saccade.InputError),
-    ],
-)
-def test_no_intervention_is_made_of_this(fields: dict[str, Any], error: type[Exception]) -> None:
-    with pytest.raises(error, match=next(iter(fields))) as caught:
-        Intervention(**fields)
-    assert type(caught.value) is error
-
-
-def test_what_is_kept_cannot_be_changed() -> None:
-    tokens = np.ones((2, 3), np.float32)
-    kept: Any = Intervention(future_tokens=tokens, key_bias={"vl": [1.0]}).future_tokens
-    tokens[:] = 0
-    assert (kept == 1).all()
-    with pytest.raises(ValueError, match="read-only"):
-        kept[0, 0] = 2

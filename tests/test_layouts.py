@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import layout_heads
 import layouts
 import numpy as np
 import pytest
@@ -59,11 +60,11 @@ def test_every_layout_loads_as_with_the_config_and_the_tensors_alone(
     # The head's tensors alone, and the config that the layout was made from.
     tensors = layouts.read(written[layout], EXPECTED[layout][2])
     save_file(tensors, tmp_path / "head.safetensors")
-    config = layouts.head_config(layout)
+    config = layout_heads.head_config(layout)
     alone = saccade.ActionHead.load(tmp_path / "head.safetensors", config=config, embodiment_ids=[31])
     assert head.config == alone.config
     assert head.config.num_future_tokens == config.get("num_target_vision_tokens", 0)
-    assert head.config.decoders == tuple(layouts.decoders(config).items())
+    assert head.config.decoders == tuple(layout_heads.decoders(config).items())
     assert np.array_equal(actions(head), actions(alone))
 
 
@@ -73,7 +74,7 @@ def test_every_layout_is_described(written: dict[str, Path], layout: str) -> Non
     assert (found.layout, found.version, found.prefix) == EXPECTED[layout]
     assert json.loads(json.dumps(found.head_config)) == found.head_config
     again = saccade.HeadConfig.from_dict(found.head_config)
-    assert again == saccade.HeadConfig.from_dict(layouts.head_config(layout))
+    assert again == saccade.HeadConfig.from_dict(layout_heads.head_config(layout))
     stored = load_file(sorted(written[layout].glob("model*.safetensors"))[0])
     tensors = {tensor.name: tensor for tensor in found.tensors}
     names = {torch.float32: "F32", torch.bfloat16: "BF16"}
@@ -98,7 +99,7 @@ def change_tensors(folder: Path, change: Callable[[Json], object]) -> None:
 
 
 def test_sizes_that_lerobots_config_lacks_come_from_the_tensors(tmp_path: Path) -> None:
-    config = layouts.head_config("lerobot")
+    config = layout_heads.head_config("lerobot")
     config |= {"num_target_vision_tokens": 7, "max_num_embodiments": 3, "max_seq_len": 20, "hidden_size": 24}
     config["diffusion_model_cfg"] |= {"num_layers": 2, "output_dim": 24, "num_attention_heads": 3}
     config["vl_self_attention_cfg"]["num_layers"] = 1
@@ -135,9 +136,9 @@ def test_n15_as_it_was_first_published_has_no_future_tokens(tmp_path: Path) -> N
 
 def test_a_forks_decoders_beside_the_config_of_the_model_that_it_started_from(tmp_path: Path) -> None:
     """The fork's model class makes its keys up while it loads and saves the config without them."""
-    config = layouts.head_config("fork")
+    config = layout_heads.head_config("fork")
     folder = layouts.write(tmp_path / "fork", "nvidia", config=config)
-    plain = layouts.n15_head()
+    plain = layout_heads.n15_head()
     change_config(folder, lambda config: config.update(action_head_cfg=plain))
     found = saccade.ActionHead.load(folder, embodiment_ids=[0]).config
     assert found == saccade.HeadConfig.from_dict(config)
@@ -265,11 +266,11 @@ def test_an_encoder_without_inputs(tmp_path: Path) -> None:
 
 
 def test_contradictions_of_a_config_alone() -> None:
-    config = {"model_type": "gr00t_n1_5", "action_head_cfg": layouts.n15_head()}
+    config = {"model_type": "gr00t_n1_5", "action_head_cfg": layout_heads.n15_head()}
     saccade.HeadConfig.from_dict(config)
     with pytest.raises(CheckpointError, match=r"action_head_cfg\.model_type is \"Gr00tN1d7\""):
         saccade.HeadConfig.from_dict(
-            config | {"action_head_cfg": layouts.n15_head() | {"model_type": "Gr00tN1d7"}}
+            config | {"action_head_cfg": layout_heads.n15_head() | {"model_type": "Gr00tN1d7"}}
         )
     with pytest.raises(CheckpointError, match="saccade is next to action_head_cfg"):
         saccade.HeadConfig.from_dict(config | {"saccade": {"future_key_bias": [0.0] * 32}})
@@ -282,7 +283,7 @@ def test_lerobots_n17_is_known_without_the_name_of_its_base(tmp_path: Path) -> N
 
 
 def test_heads_whose_width_lerobots_config_would_have_to_tell(tmp_path: Path) -> None:
-    config = layouts.head_config("lerobot")
+    config = layout_heads.head_config("lerobot")
     config["diffusion_model_cfg"] |= {"num_attention_heads": 2, "attention_head_dim": 40}
     config["input_embedding_dim"] = 80
     folder = layouts.write(tmp_path / "policy", "lerobot", config=config)

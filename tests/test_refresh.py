@@ -11,9 +11,9 @@ import torch
 from engine_cases import TAME, TOLERANCE, arrays, both, same, three_observations, tiny_head
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from intervention_cases import Case, cases, everything, per_isa
 from reference_cases import relative_error, small_config
 from released import load_released
-from test_intervention import Case, cases, everything, per_isa
 
 import saccade
 from saccade import Intervention

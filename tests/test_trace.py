@@ -1,4 +1,4 @@
-"""What `trace` and `encode(record=)` keep; a trace's numbers are compared in test_intervention.py too."""
+"""What `trace` and `encode(record=)` keep; test_intervention_parity.py compares a trace's numbers too."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import layout_heads
 import layouts
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
@@ -63,7 +64,7 @@ def backbone_tensors(layout: str) -> dict[str, Tensor]:
 
 def head_config(layout: str) -> Config:
     """The head's config of a layout, for features as wide as the backbone's."""
-    config = layouts.head_config(layout)
+    config = layout_heads.head_config(layout)
     width = about_backbone(layout)["text_config"]["hidden_size"]
     config["backbone_embedding_dim"] = width
     if "cross_attention_dim" in config["diffusion_model_cfg"]:

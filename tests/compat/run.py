@@ -26,7 +26,7 @@ PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--q
 
 #: The package of plugins/lerobot, and its tests.
 PLUGIN = ROOT / "plugins" / "lerobot"
-PLUGIN_TESTS = "plugin.py"
+PLUGIN_TESTS = ("plugin.py", "plugin_files.py", "plugin_environments.py")
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Release:
 #: In the order in which the environments build on each other; "" is the environment that runs this program.
 RELEASES = (
     Release("0.4.4", "", ("policies.py", "whole.py", "normalizers.py")),
-    Release("0.6.1", None, ("policies.py", "whole.py", "normalizers.py", "n17_parity.py", PLUGIN_TESTS)),
-    Release("0.5.1", "0.6.1", ("policies.py", "whole.py", "normalizers.py", PLUGIN_TESTS)),
+    Release("0.6.1", None, ("policies.py", "whole.py", "normalizers.py", "n17_parity.py", *PLUGIN_TESTS)),
+    Release("0.5.1", "0.6.1", ("policies.py", "whole.py", "normalizers.py", *PLUGIN_TESTS)),
 )
 
 INTRODUCTION = """\
@@ -161,7 +161,7 @@ def set_up(release: Release, python312: str | None) -> None:
         (site_packages(release.folder / "bin" / "python") / "below.pth").write_text(f"{below}\n")
     install = [*PIP, "--no-deps", "--requirement", str(release.packages)]
     subprocess.run([str(release.folder / "bin" / "python"), *install], check=True)
-    if PLUGIN_TESTS in release.tests:
+    if set(PLUGIN_TESTS) <= set(release.tests):
         editable = [*PIP, "--no-deps", "--no-build-isolation", "--editable", str(PLUGIN)]
         subprocess.run([str(release.folder / "bin" / "python"), *editable], check=True)
     stamp.write_text(release.packages.read_text())

@@ -13,6 +13,28 @@ from saccade.reference.checks import check_shape
 SLOWEST_RAMP = 1e-9  # a slower ramp is straight to nine digits as well, and could underflow
 
 
+def start_of(
+    noise: Tensor, previous: Tensor | None, chunking: Chunking | None, config: HeadConfig
+) -> tuple[Tensor, Tensor | None]:
+    """What a chunk starts from, and the factor of its velocity: the noise and None without a previous chunk.
+
+    Returns:
+        `continued (B, T, encoder_action_dim)` and `velocity_strength (T, 1)`.
+
+    Raises:
+        ShapeError: the previous chunk has the wrong shape.
+        InputError: one of `previous` and `chunking` is given without the other, or they do not fit the head.
+    """
+    if (previous is None) != (chunking is None):
+        given, missing = ("chunking", "previous_chunk") if chunking else ("previous_chunk", "chunking")
+        raise InputError(f"previous_chunk, chunking: expected both or neither, got {given} without {missing}")
+    if previous is None or chunking is None:
+        return noise, None
+    start = continued(noise, previous, chunking, config)  # first, since it checks that they fit the head
+    strength = torch.from_numpy(velocity_strength(chunking, config.action_horizon)).to(noise)
+    return start, strength[:, None]
+
+
 def continued(start: Tensor, previous: Tensor, chunking: Chunking, config: HeadConfig) -> Tensor:
     """Noise whose first actions are replaced by the end of the previous chunk.
 

@@ -26,26 +26,18 @@ from saccade.errors import InputError
 from saccade.integrator import INTEGRATORS, check_integrator
 from saccade.intervention import Intervention, Tokens
 from saccade.reference import loading
-from saccade.reference.checks import check_shape
-from saccade.reference.chunking import continued, velocity_strength
+from saccade.reference.checks import as_embodiment, check_shape
+from saccade.reference.chunking import start_of
 from saccade.reference.intervene import Mask, Run, removal_bias, token_mask
 from saccade.reference.layers import (
     NORM_EPS,
-    TABLE_STD,
     ActionEncoder,
     CategoryMlp,
     DiffusionTransformer,
     VlSelfAttention,
     token_table,
 )
-from saccade.reference.training import (
-    DROPOUT_PROB,
-    LOG_SIGMA,
-    MASK_TOKEN,
-    TimeDistribution,
-    flow_matching_error,
-    is_unused,
-)
+from saccade.reference.training import TimeDistribution, flow_matching_error, hold_unused, is_unused
 from saccade.trace import Trace
 
 if TYPE_CHECKING:
@@ -83,6 +75,8 @@ class ActionHead(nn.Module):
         torch.Size([2, 2, 16, 32])
     """
 
+    mask_token: nn.Parameter  # if it is among `unused`
+
     def __init__(
         self,
         config: HeadConfig,
@@ -108,7 +102,7 @@ class ActionHead(nn.Module):
         if config.add_pos_embed:
             self.position_embedding = token_table(config.max_positions, width)
         for name in unused:
-            self.hold_unused(name)
+            hold_unused(self, name, config)
 
     @classmethod
     def load(
@@ -144,17 +138,6 @@ class ActionHead(nn.Module):
         shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
         head.load_state_dict(loading.read_tensors(checkpoint, shapes, dtype), assign=True)
         return head
-
-    def hold_unused(self, name: str) -> None:
-        """Adds a parameter that only the released training uses, with that code's initial value."""
-        if name == MASK_TOKEN:
-            self.mask_token = nn.Parameter(TABLE_STD * torch.randn(1, 1, self.config.width))
-        elif name == DROPOUT_PROB:
-            self.register_buffer(DROPOUT_PROB, torch.zeros(self.config.num_embodiments))
-        else:
-            if not hasattr(self, "task_log_sigma"):
-                self.task_log_sigma = nn.ParameterDict()
-            self.task_log_sigma[name.removeprefix(LOG_SIGMA)] = nn.Parameter(torch.zeros(()))
 
     @property
     def dtype(self) -> torch.dtype:
@@ -247,7 +230,7 @@ class ActionHead(nn.Module):
         state = state[:, None] if state.ndim == 2 else state
         check_shape("state", state, (batch, config.state_history, config.state_dim))
         state = state.flatten(1)[:, None]  # (B, 1, history * state_dim)
-        embodiment_id = self.as_embodiment(embodiment_id, batch)
+        embodiment_id = as_embodiment(embodiment_id, batch, config.num_embodiments, self.device)
         timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
 
         state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
@@ -313,15 +296,8 @@ class ActionHead(nn.Module):
             future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
             **conditions,
         )
-        start, strength = self.as_input(noise), None
-        if (previous_chunk is None) != (chunking is None):
-            given, missing = ("chunking", "previous_chunk") if chunking else ("previous_chunk", "chunking")
-            raise InputError(
-                f"previous_chunk, chunking: expected both or neither, got {given} without {missing}"
-            )
-        if previous_chunk is not None and chunking is not None:
-            start = continued(start, self.as_input(previous_chunk), chunking, self.config)
-            strength = self.as_input(velocity_strength(chunking, self.config.action_horizon))[:, None]
+        previous = None if previous_chunk is None else self.as_input(previous_chunk)
+        start, strength = start_of(self.as_input(noise), previous, chunking, self.config)
         return self.follow(run, vl_embs, state, embodiment_id, start, strength)
 
     def trace(
@@ -507,21 +483,3 @@ class ActionHead(nn.Module):
         if isinstance(array, Tensor):
             return array.to(dtype=self.dtype, device=self.device)
         return torch.tensor(array, dtype=self.dtype, device=self.device)  # copies: the array may be read-only
-
-    def as_embodiment(self, embodiment_id: int | Tensor | np.ndarray, batch: int) -> int | Tensor:
-        """Checks embodiment ids. One id stays an int, so that one matrix product serves the whole batch.
-
-        Raises:
-            InputError: They are not integers, or the head has no such embodiment.
-            ShapeError: There is not one id for each row.
-        """
-        ids = embodiment_id if isinstance(embodiment_id, Tensor) else torch.tensor(embodiment_id)
-        if ids.ndim > 0:
-            check_shape("embodiment_id", ids, (batch,))
-        if ids.is_floating_point() or ids.dtype == torch.bool:
-            raise InputError(f"embodiment_id: {ids.dtype}, expected integers")
-        if ids.numel() and not 0 <= int(ids.min()) <= int(ids.max()) < self.config.num_embodiments:
-            raise InputError(
-                f"embodiment_id: {ids.tolist()}, expected 0 to {self.config.num_embodiments - 1}"
-            )
-        return int(ids) if ids.ndim == 0 else ids.to(dtype=torch.long, device=self.device)

@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "each test file uses a part")]
 
 pub mod attention;
+pub mod linear;
 
 use saccade_kernels::{Isa, Rows, RowsMut};
 

@@ -1,0 +1,153 @@
+"""A robot's units to the head's and back as lerobot does it, compared with lerobot's own steps."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import layouts
+import numpy as np
+import pytest
+import torch
+from normalizer_cases import as_array, draw, edit, load_processor, processor, step_config
+from published import sidecars
+
+from saccade import Normalizer
+
+
+@pytest.fixture(scope="module")
+def lerobot_steps() -> Any:
+    """lerobot's own `processor_groot.py`, run as it is; what it imports for pictures is not there."""
+    package = importlib.util.find_spec("lerobot")
+    assert package is not None
+    assert package.origin is not None
+    root = Path(package.origin).parent
+
+    def load(name: str, path: Path) -> Any:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        return module
+
+    def made(name: str, **names: Any) -> types.ModuleType:
+        module = types.ModuleType(name)
+        vars(module).update(names)
+        return module
+
+    class Registry:
+        @staticmethod
+        def register(name: str) -> Callable[[type], type]:
+            return lambda step: step
+
+    steps = ("AddBatchDimension", "Device", "RenameObservations")
+    stubs = {
+        "einops": made("einops", rearrange=None),
+        "lerobot.utils.import_utils": made("lerobot.utils.import_utils", _transformers_available=False),
+        "lerobot.policies": made("lerobot.policies", __path__=[]),
+        "lerobot.policies.groot": made("lerobot.policies.groot", __path__=[]),
+        "lerobot.policies.groot.configuration_groot": made("configuration_groot", GrootConfig=object),
+        "lerobot.processor": made(
+            "lerobot.processor",
+            __path__=[],
+            ProcessorStep=object,
+            ProcessorStepRegistry=Registry,
+            PolicyAction=torch.Tensor,
+            PolicyProcessorPipeline=dict,
+            **{f"{step}ProcessorStep": object for step in steps},
+        ),
+        "lerobot.processor.converters": made(
+            "converters", policy_action_to_transition=None, transition_to_policy_action=None
+        ),
+    }
+    with mock.patch.dict(sys.modules, stubs):
+        load("lerobot.processor.core", root / "processor" / "core.py")
+        return load("lerobot_processor_groot", root / "policies" / "groot" / "processor_groot.py")
+
+
+@pytest.mark.parametrize("layout", ["lerobot", "fork", "fork-split"])
+def test_a_lerobot_checkpoint_gives_the_bits_of_lerobots_own_steps(
+    layout: str, lerobot_steps: Any, tmp_path: Path
+) -> None:
+    sidecars(tmp_path, layout, seed=3)
+    normalizer = Normalizer.load(tmp_path)
+    statistics: dict[str, dict[str, torch.Tensor]] = {"observation.state": {}, "action": {}}
+    for key in statistics:
+        width = 7 if key == "observation.state" else 6
+        seed = 3 if key == "observation.state" else 103
+        for name, values in layouts.flat_statistics(key, width, seed).items():
+            statistics[key][name.rpartition(".")[2]] = values
+    pack = lerobot_steps.GrootPackInputsStep(
+        state_horizon=1, action_horizon=5, max_state_dim=12, max_action_dim=8, stats=statistics
+    )
+    unpack = lerobot_steps.GrootActionUnpackUnnormalizeStep(env_action_dim=6, stats=statistics)
+    state, chunk, robot = draw(4, 7), draw(4, 5, 8, seed=1), draw(4, 5, 6, seed=2)
+
+    packed = pack(
+        {
+            "observation": {"observation.state": torch.from_numpy(state)},
+            "action": torch.from_numpy(robot),
+            "complementary_data": {},
+        }
+    )
+    assert np.array_equal(as_array(normalizer.state(state)), packed["observation"]["state"][:, 0].numpy())
+    assert np.array_equal(as_array(normalizer.unactions(robot)), packed["action"].numpy())
+    assert packed["complementary_data"]["embodiment_id"].tolist() == [normalizer.embodiment_id] * 4
+    # Their step takes one action at a time; the constant dimension comes back as the constant.
+    theirs = unpack({"action": torch.from_numpy(chunk).reshape(20, 8)})["action"].reshape(4, 5, 6)
+    assert np.array_equal(as_array(normalizer.actions(chunk)), theirs.numpy())
+    assert np.array_equal(
+        as_array(normalizer.actions(chunk))[..., 5], np.full((4, 5), statistics["action"]["min"][5])
+    )
+
+
+def test_a_tag_that_lerobot_does_not_know_is_embodiment_0(tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot")
+    edit(
+        tmp_path / "policy_preprocessor.json",
+        lambda values: step_config(values).update(embodiment_tag="mine"),
+    )
+    assert Normalizer.load(tmp_path).embodiment_id == 0
+
+
+def test_without_min_max_lerobot_leaves_the_numbers_alone(tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot")
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        edit(tmp_path / name, lambda values: step_config(values).update(normalize_min_max=False))
+    normalizer, state = Normalizer.load(tmp_path), draw(2, 7)
+    assert np.array_equal(as_array(normalizer.state(state))[:, :7], state)
+    assert np.array_equal(as_array(normalizer.actions(draw(2, 3, 8))), draw(2, 3, 8)[..., :6])
+
+
+def test_lerobot_after_0_5_1_clips_states(tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot-n17", seed=5)
+    normalizer, state = Normalizer.load(tmp_path), draw(50, 7, scale=5.0)
+    low, high = (layouts.flat_statistics("s", 7, 5)[f"s.{name}"].numpy() for name in ("min", "max"))
+    expected = np.clip(2 * (state[:, :6] - low[:6]) / (high[:6] - low[:6]) - 1, -1, 1)
+    assert np.allclose(as_array(normalizer.state(state))[:, :6], expected, atol=1e-6)
+    assert not as_array(normalizer.state(state))[:, 6:].any()
+    assert normalizer.embodiment_id == layouts.N17_EMBODIMENTS["new_embodiment"]
+
+
+def test_a_lerobot_checkpoint_with_isaacs_groups_is_read_like_isaacs(tmp_path: Path) -> None:
+    config, statistics = processor(use_percentiles=True)
+    isaac = load_processor(tmp_path / "isaac", config, statistics)
+    sidecars(tmp_path / "lerobot", "lerobot-n17")
+    edit(
+        tmp_path / "lerobot" / "policy_preprocessor.json",
+        lambda values: step_config(values).update(
+            raw_stats=statistics["robot"],
+            modality_config=config["processor_kwargs"]["modality_configs"]["robot"],
+            use_percentiles=True,
+        ),
+    )
+    lerobot = Normalizer.load(tmp_path / "lerobot")
+    assert np.array_equal(as_array(lerobot.state(draw(3, 4)))[:, :9], as_array(isaac.state(draw(3, 4))))
+    assert np.array_equal(as_array(lerobot.actions(draw(3, 4, 8))), as_array(isaac.actions(draw(3, 4, 8))))
