@@ -173,31 +173,37 @@ def test_attention_equals_loops_over_heads() -> None:
         torch.testing.assert_close(out[row], attention.to_out[0](torch.cat(heads, dim=1)))
 
 
-def test_attention_is_the_same_with_and_without_weights() -> None:
+@pytest.mark.parametrize("shape", [None, (7,), (5, 7), (2, 1, 1, 7), (2, 3, 5, 7)])
+def test_attention_is_the_same_with_and_without_weights(shape: tuple[int, ...] | None) -> None:
     attention, x, context = random_attention()
-    plain, none = attention(x, context)
-    written_out, _ = attention(x, context, return_weights=True)
+    bias = None if shape is None else torch.randn(shape, generator=torch.Generator().manual_seed(0)).double()
+    if bias is not None:
+        bias[..., 3] = -torch.inf
+    plain, none = attention(x, context, logit_bias=bias)
+    written_out, _ = attention(x, context, logit_bias=bias, return_weights=True)
     assert none is None
     torch.testing.assert_close(plain, written_out)
 
 
-def test_minus_infinity_removes_a_key() -> None:
+@pytest.mark.parametrize("return_weights", [False, True])
+def test_minus_infinity_removes_a_key(return_weights: bool) -> None:
     attention, x, context = random_attention()
     bias = torch.zeros(7).double()
     bias[[1, 4]] = -torch.inf
-    out, weights = attention(x, context, logit_bias=bias, return_weights=True)
+    out, weights = attention(x, context, logit_bias=bias, return_weights=return_weights)
     without, _ = attention(x, context[:, [0, 2, 3, 5, 6]])
     torch.testing.assert_close(out, without)
-    assert (weights[..., [1, 4]] == 0).all()
+    assert not return_weights or (weights[..., [1, 4]] == 0).all()
 
 
-def test_a_query_with_no_key_left_gets_the_bias_and_finite_gradients() -> None:
+@pytest.mark.parametrize("return_weights", [False, True])
+def test_a_query_with_no_key_left_gets_the_bias_and_finite_gradients(return_weights: bool) -> None:
     attention, x, context = random_attention()
     x.requires_grad_()
     bias = torch.zeros(5, 7).double()
     bias[2] = -torch.inf
-    out, weights = attention(x, context, logit_bias=bias, return_weights=True)
-    assert (weights[:, :, 2] == 0).all()
+    out, weights = attention(x, context, logit_bias=bias, return_weights=return_weights)
+    assert not return_weights or (weights[:, :, 2] == 0).all()
     torch.testing.assert_close(out[:, 2], attention.to_out[0].bias.expand(2, 12))
     out.sum().backward()
     assert x.grad is not None

@@ -14,6 +14,7 @@ from answer_cases import PLAN, RECORDING, TASK, TINY, recipe
 from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import main
 from saccade.errors import InputError
+from saccade.reference.layers import TABLE_STD
 from saccade.sim import graphics, train
 from saccade.sim.learner import new_learner
 from saccade.sim.policy import num_vl_tokens
@@ -168,6 +169,7 @@ def test_scaled_first_weights_are_the_same_numbers() -> None:
     assert len(changed) == 7  # two layers of the state's encoder, three of the actions', two of the decoder
     for name in changed:
         assert float((larger[name] - 5 * plain[name]).abs().max()) < 1e-6
+    assert plans.BASE.category_std == TABLE_STD
     assert "category_std" not in TINY.to_dict()
     assert scaled.to_dict() == {**TINY.to_dict(), "category_std": 0.1}
     assert TrainingSettings(**scaled.to_dict()) == scaled

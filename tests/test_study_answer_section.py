@@ -184,8 +184,8 @@ def test_the_sentence_about_the_cut() -> None:
 def test_the_exploratory_sentence() -> None:
     nothing = section_of(CORE).answer[3]
     assert nothing.startswith(
-        "Not measured: 32 tokens against none, with scaled first weights; 32 tokens against 4, with scaled "
-        "first weights; 32 tokens against a wider head without tokens at the same cost of"
+        "Not measured: 32 tokens against none, with larger first weights (scaled); 32 tokens against 4, with "
+        "larger first weights (scaled); 32 tokens against a wider head without tokens at the same cost of"
     )
     assert nothing.endswith("with patches of 32 against 16 pixels.")
     some = {
@@ -200,16 +200,16 @@ def test_the_exploratory_sentence() -> None:
     }
     sentence = section_of(some).answer[3]
     assert re.fullmatch(
-        r"Exploratory: 32 tokens against 4, with scaled first weights: more success, 65.0 points "
+        r"Exploratory: 32 tokens against 4, with larger first weights \(scaled\): more success, 65.0 points "
         r"\(B; \[table 3\]\S*\); "
-        r"32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 6\]\S*\); "
+        r"32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 5\]\S*\); "
         r"32 tokens against longer training .*: undecided, 15.0 points \(no interval; 4 "
         r"training seeds; .*\); "
         r"32 tokens with the alignment loss against without: no difference of 10 points or more, 0.0 points "
         r"\(B; \[table 4\]\S*\); "
         r"32 against 4 tokens, with patches of 8 against 16 pixels: a change in favour of 4, -130.0 points "
-        r"\(B; \[table 7\]\S*\); "
-        r"not measured: 32 tokens against none, with scaled first weights; "
+        r"\(B; \[table 6\]\S*\); "
+        r"not measured: 32 tokens against none, with larger first weights \(scaled\); "
         r"32 against 4 tokens, with two cameras against one; 32 against 4 "
         r"tokens, with patches of "
         r"32 against 16 pixels\.".replace("B;", f"{BOUNDS};"),
@@ -235,7 +235,7 @@ def test_later_stages_have_their_tables() -> None:
             "n-32-patch-8": FEWER,
         }
     )
-    assert [grid.heading for grid in whole.grids] == [f"Table {place}" for place in range(1, 9)]
+    assert [grid.heading for grid in whole.grids] == [f"Table {place}" for place in range(1, 8)]
     assert whole.grids[-1].columns == ("stage", "done", "planned")
     by_name = {row[0]: row for grid in whole.grids[2:] for row in grid.rows}
     assert by_name["n-4-aligned minus n-4-scaled"][3] == "more"

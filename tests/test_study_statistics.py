@@ -200,3 +200,5 @@ def test_a_vectorized_bootstrap_is_the_same() -> None:
     assert statistics.bootstrap(values, range(12), product, vectorized=True) == statistics.bootstrap(
         values, range(12), product
     )
+    with pytest.raises(InputError, match="clusters: given 6 for 12 values"):
+        statistics.bootstrap(values, [*range(6)] * 2, product, vectorized=True)

@@ -11,26 +11,27 @@ from __future__ import annotations
 
 import torch
 
-from saccade.reference.layers import TABLE_STD, ActionEncoder, CategoryMlp
+from saccade.reference.layers import TABLE_STD, ActionEncoder, CategoryLinear, CategoryMlp
 from saccade.sim.training_settings import CATEGORY_STD, RELEASED_WIDTH, released_std
 from saccade.study.answer.plan import BASE
 
-CHUNKS, HORIZON, ACTION_DIM, DRAWS = 64, 16, 4, 16
+CHUNKS, HORIZON, DRAWS = 64, 16, 16
+ACTION_DIM, RELEASED_ACTION_DIM = 4, 32
 HIDDEN = 1024  # of the decoder in GR00T N1.5
 
 
 @torch.no_grad()
-def scales(width: int, hidden: int, std: float) -> tuple[float, float]:
+def scales(width: int, hidden: int, action_dim: int, std: float) -> tuple[float, float]:
     """The part of the actions in their rows, and in what the decoder makes of them."""
     rows, decoded = [], []
     for seed in range(DRAWS):
         torch.manual_seed(seed)
-        encoder = ActionEncoder(1, ACTION_DIM, width)
-        decoder = CategoryMlp(1, width, hidden, ACTION_DIM)
-        for module in (encoder, decoder):
-            for parameter in module.parameters():
-                parameter.mul_(std / CATEGORY_STD)
-        noise = torch.randn(CHUNKS, HORIZON, ACTION_DIM)
+        encoder = ActionEncoder(1, action_dim, width)
+        decoder = CategoryMlp(1, width, hidden, action_dim)
+        for module in (*encoder.modules(), *decoder.modules()):
+            if isinstance(module, CategoryLinear):
+                module.W.mul_(std / CATEGORY_STD)
+        noise = torch.randn(CHUNKS, HORIZON, action_dim)
         found = encoder(noise, torch.zeros(CHUNKS, dtype=torch.long), 0)  # (chunks, horizon, width)
         rows.append(found.std(dim=0).mean())
         decoded.append(decoder(found, 0).std(dim=0).mean())
@@ -39,15 +40,16 @@ def scales(width: int, hidden: int, std: float) -> tuple[float, float]:
 
 def main() -> None:
     """Prints a table in Markdown."""
-    print("| width | deviation | part of the actions in a row | of the positions | after the decoder |")
-    print("| --- | --- | --- | --- | --- |")
-    for width, hidden, std in (
-        (RELEASED_WIDTH, HIDDEN, CATEGORY_STD),
-        (BASE.width, BASE.width, CATEGORY_STD),
-        (BASE.width, BASE.width, released_std(BASE.width)),
+    print("| width | action dimensions | deviation | actions in a row | positions | after the decoder |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for width, hidden, action_dim, std in (
+        (RELEASED_WIDTH, HIDDEN, RELEASED_ACTION_DIM, CATEGORY_STD),
+        (RELEASED_WIDTH, HIDDEN, ACTION_DIM, CATEGORY_STD),
+        (BASE.width, BASE.width, ACTION_DIM, CATEGORY_STD),
+        (BASE.width, BASE.width, ACTION_DIM, released_std(BASE.width)),
     ):
-        row, decoded = scales(width, hidden, std)
-        print(f"| {width} | {std:.4f} | {row:.4f} | {TABLE_STD} | {decoded:.1e} |")
+        row, decoded = scales(width, hidden, action_dim, std)
+        print(f"| {width:,} | {action_dim} | {std:.3f} | {row:.4f} | {TABLE_STD} | {decoded:.1e} |")
 
 
 if __name__ == "__main__":

@@ -23,15 +23,18 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
     return f"features-{start_sha256[:16]}-{recording_sha256[:16]}-{samples}.npy"
 
 
-CATEGORY_STD, RELEASED_WIDTH = 0.02, 1536  # of the released code and of GR00T N1.5
+CATEGORY_STD = 0.02  # of the released code: `saccade.reference.layers.TABLE_STD`, which needs torch
+RELEASED_WIDTH = 1536  # of GR00T N1.5
+#: Settings that were added after the first runs; see `TrainingSettings.to_dict`.
+ADDED = ("category_std",)
 
 
 def released_std(width: int) -> float:
-    """The `category_std` with which layers of this width begin as those of GR00T N1.5 do.
+    """The `category_std` with which a layer whose input has this width begins on the scale of GR00T N1.5.
 
-    What a linear layer returns grows with the square root of its width. With the released 0.02, a head of
-    width 64 begins with encoded actions that are 25 times smaller than those of GR00T N1.5, beside positions
-    that are as large (`studies/answer/initial_scale.py`).
+    What a linear layer returns grows with the square root of the width of its input. With the released 0.02,
+    the encoded actions of a head of width 64 begin much smaller than their positions, which they do not in
+    GR00T N1.5 (`studies/answer/initial_scale.py`).
 
     Example:
         >>> released_std(1536), round(released_std(64), 3)
@@ -65,7 +68,7 @@ class TrainingSettings:
         seed: Seed of initial weights, order and noise.
         category_std: Standard deviation of the initial category-specific weights, those of the state encoder
             and of the encoder and the decoder of the actions. 0.02 is that of the released code, which is
-            made for a width of 1536; see `released_std`.
+            used at a width of 1536; see `released_std`.
         blind: Whether all pictures are black, for a policy that shows what can be done without them.
         width, num_layers, num_heads: Sizes of the head; the language model has as many heads.
         language_width: Width of the language model, and of the head's VL self-attention on its features; 0
@@ -153,9 +156,10 @@ class TrainingSettings:
         Without settings that were added after the first runs, where they have their defaults: so these runs
         can be continued and compared with later ones.
         """
-        added = {"category_std"}
-        defaults = {one.name: one.default for one in fields(self) if one.name in added}
-        return {name: value for name, value in asdict(self).items() if defaults.get(name, self) != value}
+        left_out = {
+            one.name for one in fields(self) if one.name in ADDED and getattr(self, one.name) == one.default
+        }
+        return {name: value for name, value in asdict(self).items() if name not in left_out}
 
     @property
     def features_width(self) -> int:

@@ -217,7 +217,9 @@ class Store:
     def write(self) -> None:
         """Writes table and provenance from the finished cells."""
         records = sorted(self.finished.values(), key=lambda record: sortable(record["key"]))
-        write_table([row for record in records for row in record["rows"]], table_path(self.out, self.study))
+        rows = [row for record in records for row in record["rows"]]
+        write_table(rows, table_path(self.out, self.study))
+        versions = sorted({str(row["saccade"]) for row in rows if row.get("saccade")})
         provenance = Provenance(
             study=self.study,
             table_sha256=sha256_of(table_path(self.out, self.study)),
@@ -226,7 +228,7 @@ class Store:
             total=self.total,
             failed=[{"key": list(one.cell.key), "error": one.error} for one in self.failed],
             cell_seconds=round(sum(record["seconds"] for record in records), 1),
-            packages=packages(),
+            packages={**packages(), **({"saccade": " and ".join(versions)} if versions else {})},
             machine={
                 "cpu": cpu_name(),
                 "system": platform.platform(),

@@ -226,10 +226,11 @@ def bootstrap(
         statistic: A function of such rows that does not depend on their order.
         draws, seed: Number of bootstrap samples and seed of the random generator.
         vectorized: Whether `statistic` also takes `(draws, observations, ...)` and returns `(draws,)`. Each
-            observation is then a cluster.
+            observation must be a cluster of its own.
 
     Raises:
-        InputError: `clusters` does not have one entry per observation, or there are no observations.
+        InputError: `clusters` does not have one entry per observation, there are no observations, or, with
+            `vectorized`, a cluster has several.
 
     Example:
         >>> mean = bootstrap([1.0, 1.0, 3.0, 3.0], ["a", "a", "b", "b"])
@@ -246,6 +247,10 @@ def bootstrap(
         return bootstrap_ratio(rows, np.ones(len(rows)), names, draws=draws, seed=seed)
     value = float(statistic(rows))
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    if vectorized and len(numbers) < len(rows):
+        raise InputError(
+            f"clusters: given {len(numbers)} for {len(rows)} values, expected as many: vectorized"
+        )
     if len(numbers) < 2:
         return Estimate(value, math.nan, math.nan)
     number_of = np.array([numbers[name] for name in names])

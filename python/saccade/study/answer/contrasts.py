@@ -95,7 +95,9 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-32-scaled", "n-4-scaled"),
         difference("n-4-scaled", "n-0-scaled"),
         difference("n-0-scaled", "n-0"),
+        difference("n-4-scaled", "n-4"),
         difference("n-32-scaled", "n-32"),
+        difference("n-4", "n-0"),
     ),
     "alignment": (
         difference("n-4-aligned", "n-4-scaled"),
@@ -104,7 +106,6 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-32-aligned", "n-0-scaled"),
     ),
     "numbers": (
-        difference("n-4", "n-0"),
         difference("n-1-scaled", "n-0-scaled"),
         difference("n-16-scaled", "n-4-scaled"),
         difference("n-64-scaled", "n-32-scaled"),

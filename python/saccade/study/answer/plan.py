@@ -229,7 +229,7 @@ BASE = TrainingSettings(
 # No future tokens, so that a backbone has nothing of any N.
 BACKBONE = replace(BASE, only="backbone", steps=4000, learning_rate=1e-3, seed=0, num_future_tokens=0)
 ALIGNMENT = 0.2  # the weight of the loss in FLARE
-# First weights on the scale that GR00T N1.5 has. With those of `BASE`, half of the core's policies had not
+# Larger first weights, see `released_std`. With those of `BASE`, half of the core's policies had not
 # left the first plateau of their loss when the training ended; with these there is none (the page's pilots).
 SCALED = replace(BASE, steps=1000, category_std=round(released_std(BASE.width), 3))
 # What makes a policy without future tokens as costly as `SCALED`: `costs.matched_width` for a chunk,

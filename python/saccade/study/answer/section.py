@@ -163,7 +163,7 @@ def success_picture(found: Judged) -> Picture:
 
     A line for each training seed, and the means with their intervals, filled in the core.
     """
-    plots = {"core": CORE, "scaled first weights (exploratory)": SCALED}
+    plots = {"core": CORE, "larger first weights, scaled (exploratory)": SCALED}
     plots = {title: {one: n for one, n in of.items() if one in found.rates} for title, of in plots.items()}
     plots = {title: counts for title, counts in plots.items() if counts}
     picture, all_axes = figures.new_picture(height=4.0, columns=len(plots))

@@ -6,7 +6,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -308,7 +308,8 @@ class Answer(Study):
             (directory / name).unlink(missing_ok=True)
         run = read_run(directory, ("image_size", "num_cameras", "num_vl_tokens"))
         found = cost(settings, self.plan.recording(recording))
-        known = {name: value for name, value in run.settings.items() if name not in ALREADY}
+        recorded = {**asdict(settings), **run.settings}
+        known = {name: value for name, value in recorded.items() if name not in ALREADY}
         losses = {name: loss for name, loss in run.history[-1].items() if name != "step"}
         return {
             **planned.columns,
