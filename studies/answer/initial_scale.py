@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import torch
 
-from saccade.reference.layers import TABLE_STD, ActionEncoder, CategoryLinear, CategoryMlp
+from saccade.reference.layers import TABLE_STD, ActionEncoder, CategoryMlp
+from saccade.sim.learner import scale_categories
 from saccade.sim.training_settings import CATEGORY_STD, RELEASED_WIDTH, released_std
 from saccade.study.answer.plan import BASE
 
@@ -28,9 +29,8 @@ def scales(width: int, hidden: int, action_dim: int, std: float) -> tuple[float,
         torch.manual_seed(seed)
         encoder = ActionEncoder(1, action_dim, width)
         decoder = CategoryMlp(1, width, hidden, action_dim)
-        for module in (*encoder.modules(), *decoder.modules()):
-            if isinstance(module, CategoryLinear):
-                module.W.mul_(std / CATEGORY_STD)
+        for module in (encoder, decoder):
+            scale_categories(module, std)
         noise = torch.randn(CHUNKS, HORIZON, action_dim)
         found = encoder(noise, torch.zeros(CHUNKS, dtype=torch.long), 0)  # (chunks, horizon, width)
         rows.append(found.std(dim=0).mean())

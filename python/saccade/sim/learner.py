@@ -212,13 +212,11 @@ def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
 
 
 @torch.no_grad()
-def scale_categories(learner: Learner, std: float) -> None:
-    """Gives new category-specific weights another standard deviation than `TABLE_STD`."""
-    if std == TABLE_STD:
-        return
-    for module in learner.modules():
-        if isinstance(module, CategoryLinear):
-            module.W.mul_(std / TABLE_STD)
+def scale_categories(module: nn.Module, std: float) -> None:
+    """Gives the new category-specific weights of a module another standard deviation than `TABLE_STD`."""
+    for inner in module.modules():
+        if isinstance(inner, CategoryLinear):
+            inner.W.mul_(std / TABLE_STD)
 
 
 class ImageTargets(nn.Module):
