@@ -30,6 +30,7 @@ from torch import Tensor
 
 from saccade._arrays import Float32Array
 from saccade._files import sha256_of, write_atomically, write_json
+from saccade._json import changed
 from saccade.backbone_inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.processor import Processor
@@ -319,9 +320,8 @@ def resume(run: Run, path: Path) -> None:
     state = torch.load(path, weights_only=True)
     settings = run.settings.to_dict()
     if state["settings"] != settings:
-        names = {**state["settings"], **settings}
-        changed = [name for name in names if state["settings"].get(name) != settings.get(name)]
-        raise InputError(f"{path}: the run was started with other settings ({', '.join(changed)})")
+        other = ", ".join(changed(state["settings"], settings))
+        raise InputError(f"{path}: the run was started with other settings ({other})")
     if state["config"] != described(run.config):
         raise InputError(f"{path}: the run was started with other demonstrations")
     run.step, run.history = state["step"], state["history"]

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import pandas as pd
 
 from saccade._files import sha256_of, writable_directory, write_json
+from saccade._json import changed
 from saccade.environment import cpu_name
 from saccade.errors import InputError, SaccadeError
 from saccade.parallel import ALONE, Lost, Workers, each
@@ -187,7 +188,7 @@ class Store:
         if not path.exists():
             return
         before = read_provenance(path).settings
-        names = [name for name in {**before, **self.settings} if before.get(name) != self.settings.get(name)]
+        names = changed(before, self.settings)
         if names:
             changes = [f"{name} {before.get(name)!r}, now {self.settings.get(name)!r}" for name in names]
             raise InputError(
@@ -228,7 +229,7 @@ class Store:
             total=self.total,
             failed=[{"key": list(one.cell.key), "error": one.error} for one in self.failed],
             cell_seconds=round(sum(record["seconds"] for record in records), 1),
-            packages={**packages(), **({"saccade": " and ".join(versions)} if versions else {})},
+            packages={"saccade": " and ".join(versions) or code_version(), **packages()},
             machine={
                 "cpu": cpu_name(),
                 "system": platform.platform(),
@@ -271,8 +272,8 @@ class Guarded:
 
 @functools.cache
 def packages() -> dict[str, str]:
-    """Versions of saccade and of the installed packages that compute with it."""
-    found = {"saccade": code_version()}
+    """Versions of the installed packages that saccade computes with."""
+    found = {}
     for name in RECORDED_PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)

@@ -249,7 +249,7 @@ def bootstrap(
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
     if vectorized and len(numbers) < len(rows):
         raise InputError(
-            f"clusters: given {len(numbers)} for {len(rows)} values, expected as many: vectorized"
+            f"clusters: given {len(numbers)} for {len(rows)} values, expected as many if vectorized"
         )
     if len(numbers) < 2:
         return Estimate(value, math.nan, math.nan)

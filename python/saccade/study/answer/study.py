@@ -14,6 +14,7 @@ import pandas as pd
 
 from saccade._arguments import add_list
 from saccade._files import checkpoint_identity, sha256_of
+from saccade._json import changed
 from saccade.errors import InputError
 from saccade.sim.training_settings import STATE_FILE, features_name
 from saccade.study.answer import plan as plans
@@ -346,7 +347,7 @@ class Answer(Study):
         if backbone is not None:
             wanted["start_sha256"] = sha256_of(backbone / TENSOR_FILE)
         found = {name: value for name, value in run.settings.items() if name != "demonstrations"}
-        other = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
+        other = changed(found, wanted)
         if other:
             raise InputError(f"{directory}: was trained with other settings ({', '.join(other)})")
         counts = dict(self.plan.recording(planned.recording).counts)
