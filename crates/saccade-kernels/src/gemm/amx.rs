@@ -8,7 +8,7 @@ use super::dot_int8::Quantizing;
 use super::outliers::MultiplyOutliers;
 use super::streams::Parts;
 use super::{Block, Gemm, PanelMut, ROW_BLOCK, Shape, Source, odd_lines, panel};
-use crate::simd::Simd;
+use crate::simd::{Simd, Vector};
 use crate::tiles::{Ahead, MAX_ROWS, Operation, Product, Session, TILE, TileUnit};
 use crate::weights::WeightRef;
 
@@ -141,12 +141,11 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
 
     unsafe fn multiply(&self, block: &Block<'_>) {
         let (tiles, steps) = (&block.range, Self::steps(block.in_features));
-        let first_row = block.tiles.first_row(tiles.start);
+        let first_row = block.rows().start;
         if steps == 0 {
-            let rows = block.tiles.first_row(tiles.end) - first_row;
             // SAFETY: the block's sums have room for its rows.
-            unsafe { block.sums.write_bytes(0, rows * COLUMNS) };
-            return;
+            unsafe { block.sums.write_bytes(0, block.rows().len() * COLUMNS) };
+            return (block.finish)(block.rows());
         }
         // Sums stay in their tiles over a part: on their way to memory and back they cost more than weights that are read again from the
         // second-level cache.
@@ -158,6 +157,15 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
             for part in parts.iter() {
                 for tile in tiles.clone() {
                     let (first, end) = (block.tiles.first_row(tile), block.tiles.first_row(tile + 1));
+                    let is_last = part.end == steps;
+                    if is_last {
+                        for row in first..end {
+                            let out = block.out.wrapping_offset(row as isize * block.out_stride);
+                            for line in 0..COLUMNS / 16 {
+                                <<U::Simd as Simd>::Vector as Vector>::prefetch(out.wrapping_add(16 * line).cast());
+                            }
+                        }
+                    }
                     session.multiply(&Product {
                         operation: E::OPERATION,
                         rows: end - first,
@@ -176,6 +184,9 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                         add: part.start > 0,
                         ahead: ahead(&parts, &part, tile - tiles.start, end - first),
                     });
+                    if is_last {
+                        (block.finish)(first..end);
+                    }
                 }
             }
         }

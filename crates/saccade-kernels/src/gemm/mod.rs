@@ -145,6 +145,16 @@ pub(crate) struct Block<'a> {
     pub out: *const f32,
     /// Elements from one row of them to the next.
     pub out_stride: isize,
+    /// To be called with rows whose sums are complete, once for each row of the block. Results are made of them at once.
+    pub finish: &'a dyn Fn(Range<usize>),
+}
+
+impl Block<'_> {
+    /// Its rows, as rows of the call.
+    #[inline(always)]
+    pub(crate) fn rows(&self) -> Range<usize> {
+        self.tiles.first_row(self.range.start)..self.tiles.first_row(self.range.end)
+    }
 }
 
 /// A product of rows with packed weights on one instruction set. [`PackedLinear`](crate::PackedLinear) splits rows and panels, and makes
@@ -186,7 +196,7 @@ pub(crate) unsafe trait Gemm: Send + Sync {
     /// for [`Product::Int8`] `source.quantized` and, if they are given, `source.outliers`. No other thread reads or writes these places.
     unsafe fn convert(&self, source: &Source, rows: Range<usize>);
 
-    /// Writes the sums of a block of rows times a panel.
+    /// Writes the sums of a block of rows times a panel, and has them finished.
     ///
     /// # Safety
     /// The panel was packed by this product. `block.x` holds the rows of the block, for converted rows also [`Shape::rows_beyond`] more;

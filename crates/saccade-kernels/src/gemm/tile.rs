@@ -118,6 +118,7 @@ pub(super) unsafe fn multiply<S: Simd, P: Step<S>>(block: &Block<'_>) {
             vectors => unreachable!("a tile of {vectors} vectors"),
         }
     }
+    (block.finish)(block.rows());
 }
 
 /// # Safety

@@ -332,28 +332,40 @@ impl PackedLinear {
         let mut sums = SumBuffer([const { MaybeUninit::uninit() }; MAX_SUMS]);
         let sums = sums.0.as_mut_ptr().cast::<u32>();
         let out = call.out.wrapping_add(first);
+        let weights = &self.panels.words[panel * size..][..size];
+        let finish = |done: Range<usize>| {
+            let sums = sums.wrapping_add((done.start - rows.start) * columns);
+            self.finish(call, done, panel, weights, sums);
+        };
         let block = Block {
             x: call.x,
             x_stride: call.x_stride,
             in_features: self.in_features,
             tiles: call.tiles,
             range,
-            weights: &self.panels.words[panel * size..][..size],
+            weights,
             ahead,
             streams: self.streams,
             sums,
             out,
             out_stride: call.out_stride,
+            finish: &finish,
         };
         // SAFETY: the product has packed the panel and, where it does so, converted the rows; the block's sums fit.
         unsafe { self.gemm.multiply(&block) };
-        let mut apart = [const { MaybeUninit::uninit() }; MAX_SUMS];
+    }
+
+    /// Makes results of the sums of some rows and panel number `panel`, whose words are `weights`.
+    fn finish(&self, call: &Call<'_>, rows: Range<usize>, panel: usize, weights: &[u32], sums: *const u32) {
+        let columns = self.gemm.shape().columns;
+        let first = panel * columns;
         let outliers = call.outliers.get(rows.clone()).unwrap_or_default();
         let has_outliers = outliers.iter().any(|outliers| !outliers.is_empty());
+        let mut apart = [const { MaybeUninit::uninit() }; MAX_SUMS];
         if has_outliers {
             self.gemm.multiply_outliers(MultiplyOutliers {
                 outliers,
-                panel: block.weights,
+                panel: weights,
                 columns,
                 run: 1,
                 sums: &mut apart[..rows.len() * columns],
@@ -374,7 +386,7 @@ impl PackedLinear {
                 outliers,
                 apart: has_outliers.then_some(&apart[..]),
             },
-            out,
+            out: call.out.wrapping_add(first),
             out_stride: call.out_stride,
         });
     }
