@@ -52,8 +52,13 @@ fn main() {
                 let mut contenders = Vec::new();
                 for &threads in &options.threads {
                     for (order, layers) in &layers {
-                        let (mut out, mut scratch) = (vec![0.0f32; rows * outputs + 16], LinearScratch::new());
- let off = if std::env::var_os("ALIGN").is_some() { out.as_ptr().align_offset(64) } else { 0 };
+                        let (mut out, mut scratch) =
+                            (vec![0.0f32; rows * outputs + 16], LinearScratch::new());
+                        let off = if std::env::var_os("ALIGN").is_some() {
+                            out.as_ptr().align_offset(64)
+                        } else {
+                            0
+                        };
                         let (x, mut turn) = (&x, 0);
                         contenders.push(Contender {
                             name: (*order).to_owned(),
@@ -62,7 +67,10 @@ fn main() {
                             work: (rows * inputs * outputs) as f64,
                             relative_to: (*order == "streams").then(|| "in order".to_owned()),
                             run: Box::new(move || {
-                                let (x, out) = (Rows::new(x, inputs), RowsMut::new(&mut out[off..off + rows * outputs], outputs));
+                                let (x, out) = (
+                                    Rows::new(x, inputs),
+                                    RowsMut::new(&mut out[off..off + rows * outputs], outputs),
+                                );
                                 let layer = &layers[turn % layers.len()];
                                 turn += 1;
                                 layer

@@ -170,6 +170,71 @@ impl<T: Zeroable> DerefMut for AlignedBuffer<T> {
     }
 }
 
+/// Numbers on a 64-byte boundary, of which there may be more or fewer from call to call: activations between layers.
+///
+/// Vectors of AVX-512 are whole cache lines. In a `Vec`, which begins anywhere, each of them lies across two: int8 `sample` of N1.5 took
+/// 1.08 times as long, bfloat16 1.03 times (Intel with AMX, 2 threads).
+///
+/// ```
+/// let mut hidden = saccade_kernels::Activations::new();
+/// hidden.sized(3)?.fill(1.0);
+/// assert_eq!(hidden.sized(5)?, [1.0, 1.0, 1.0, 0.0, 0.0]);
+/// assert_eq!(hidden[..], [1.0, 1.0, 1.0, 0.0, 0.0]);
+/// # Ok::<(), saccade_kernels::AllocError>(())
+/// ```
+pub struct Activations {
+    memory: AlignedBuffer<f32>,
+    /// Those that are in use.
+    len: usize,
+}
+
+impl Activations {
+    /// None, and no memory.
+    #[must_use]
+    pub fn new() -> Self {
+        Self {
+            memory: AlignedBuffer::empty(),
+            len: 0,
+        }
+    }
+
+    /// Sets their number. The first ones keep their values, new ones are zero. Memory is kept for the next call.
+    ///
+    /// # Errors
+    /// [`AllocError`] if there is not enough memory; everything is left as it was.
+    pub fn sized(&mut self, len: usize) -> Result<&mut [f32], AllocError> {
+        if len > self.memory.len() {
+            let mut memory = AlignedBuffer::zeroed(len)?;
+            memory[..self.len].copy_from_slice(&self.memory[..self.len]);
+            self.memory = memory;
+        } else if len > self.len {
+            self.memory[self.len..len].fill(0.0);
+        }
+        self.len = len;
+        Ok(&mut self.memory[..len])
+    }
+}
+
+impl Default for Activations {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Deref for Activations {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        &self.memory[..self.len]
+    }
+}
+
+impl DerefMut for Activations {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut self.memory[..self.len]
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -194,5 +259,21 @@ mod tests {
             assert!(buffer.iter().all(|&element| element == 0) && buffer.len() == len);
             assert_eq!(buffer.as_ptr().addr() % if len > 0 { ALIGNMENT } else { 1 }, 0);
         }
+    }
+
+    #[test]
+    fn activations_keep_what_they_hold() {
+        let mut activations = Activations::new();
+        assert!(activations.is_empty());
+        activations.sized(3).unwrap().copy_from_slice(&[1.0, 2.0, 3.0]);
+        let error = activations.sized(usize::MAX / 2).unwrap_err();
+        assert_eq!(error, AllocError { bytes: usize::MAX });
+        assert_eq!(activations[..], [1.0, 2.0, 3.0], "left as they were");
+        for (len, expected) in [(2, &[1.0, 2.0][..]), (4, &[1.0, 2.0, 0.0, 0.0]), (0, &[])] {
+            assert_eq!(activations.sized(len).unwrap(), expected);
+        }
+        let many = activations.sized(HUGE_PAGE).unwrap();
+        assert!(many.iter().all(|&element| element == 0.0) && many.len() == HUGE_PAGE);
+        assert_eq!(activations.as_ptr().addr() % ALIGNMENT, 0);
     }
 }

@@ -34,7 +34,7 @@ mod tiles;
 mod weights;
 
 pub use activation::{exp, gelu_erf, gelu_tanh, relu, silu};
-pub use aligned::AllocError;
+pub use aligned::{Activations, AllocError};
 pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
 pub use cpu::CpuReport;
 pub use half::bf16;

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::ops::check_interrupted;
+use saccade_kernels::Activations;
 
 /// Makes room for `len` elements in all.
 ///
@@ -59,10 +60,12 @@ pub(crate) fn collected<T>(
 ///
 /// # Errors
 /// [`Error::Memory`] if the system refuses it.
-pub(crate) fn sized(buffer: &mut Vec<f32>, len: usize) -> Result<&mut [f32]> {
-    reserve("activations", buffer, len)?;
-    fill(buffer, len, 0.0)?;
-    Ok(buffer)
+pub(crate) fn sized(buffer: &mut Activations, len: usize) -> Result<&mut [f32]> {
+    let refused = |_| Error::Memory {
+        what: "activations",
+        bytes: len.saturating_mul(size_of::<f32>()),
+    };
+    buffer.sized(len).map_err(refused)
 }
 
 /// The product of `sizes`.
@@ -88,13 +91,13 @@ mod tests {
         let error = filled("features", usize::MAX / 8, 0.0_f32).unwrap_err();
         let expected = format!("features: cannot allocate {} bytes of memory", usize::MAX / 8 * 4);
         assert!(error.to_string().starts_with(&expected), "{error}");
-        let mut buffer = vec![1.0; 3];
+        let mut buffer = Activations::new();
+        sized(&mut buffer, 3).unwrap().fill(1.0);
         assert!(matches!(
             sized(&mut buffer, usize::MAX / 2),
             Err(Error::Memory { .. })
         ));
-        assert_eq!(buffer, [1.0; 3], "left as it was");
-        assert_eq!(sized(&mut buffer, 2).unwrap(), [1.0; 2]);
+        assert_eq!(buffer[..], [1.0; 3], "left as it was");
     }
 
     #[test]

@@ -162,7 +162,9 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                         for row in first..end {
                             let out = block.out.wrapping_offset(row as isize * block.out_stride);
                             for line in 0..COLUMNS / 16 {
-                                <<U::Simd as Simd>::Vector as Vector>::prefetch(out.wrapping_add(16 * line).cast());
+                                <<U::Simd as Simd>::Vector as Vector>::prefetch(
+                                    out.wrapping_add(16 * line).cast(),
+                                );
                             }
                         }
                     }

@@ -1,6 +1,6 @@
 //! From patches to tokens: squares of patches are joined, normed, and projected to the width of the language model.
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::config::PatchOrder;
 use crate::alloc::sized;
@@ -36,9 +36,9 @@ pub(super) struct ConnectorSizes {
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
 pub(super) struct ConnectorBuffers {
-    pub joined: Vec<f32>,
-    pub normed: Vec<f32>,
-    pub hidden: Vec<f32>,
+    pub joined: Activations,
+    pub normed: Activations,
+    pub hidden: Activations,
 }
 
 impl Connector {
@@ -73,7 +73,7 @@ impl Connector {
         &self,
         engine: Engine,
         x: &[f32],
-        (buffers, scratch): ([&mut Vec<f32>; 2], &mut LinearScratch),
+        (buffers, scratch): ([&mut Activations; 2], &mut LinearScratch),
         out: &mut [f32],
     ) -> Result<()> {
         let [normed, hidden] = buffers;

@@ -1,6 +1,6 @@
 //! A loaded backbone: its layers, its config and the memory that its calls share.
 
-use saccade_kernels::Isa;
+use saccade_kernels::{Activations, Isa};
 
 use super::config::BackboneConfig;
 use super::layers::BackboneLayers;
@@ -29,7 +29,7 @@ pub(super) struct BackboneBuffers {
     pub vision: VisionBuffers,
     pub language: LanguageBuffers,
     /// Features where a last layer changes their width.
-    pub projected: Vec<f32>,
+    pub projected: Activations,
 }
 
 impl Backbone {

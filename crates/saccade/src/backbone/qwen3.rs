@@ -1,6 +1,6 @@
 //! Qwen3, the language model: the layers that are kept, over the tokens of words and views.
 
-use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
 
 use super::config::LanguageConfig;
 use crate::alloc::sized;
@@ -50,9 +50,9 @@ pub(super) type Additions<'a> = Vec<(usize, &'a [f32])>;
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
 pub(super) struct LanguageBuffers {
-    pub x: Vec<f32>,
-    pub y: Vec<f32>,
-    hidden: Vec<f32>,
+    pub x: Activations,
+    pub y: Activations,
+    hidden: Activations,
     attention: GroupedBuffers,
     pub linear: LinearScratch,
 }
@@ -143,7 +143,12 @@ impl Qwen3 {
     }
 
     /// The rows `x` after the last norm, if there is one, in `y`.
-    pub(super) fn finish<'a>(&self, engine: Engine, x: &'a [f32], y: &'a mut Vec<f32>) -> Result<&'a [f32]> {
+    pub(super) fn finish<'a>(
+        &self,
+        engine: Engine,
+        x: &'a [f32],
+        y: &'a mut Activations,
+    ) -> Result<&'a [f32]> {
         let Some(norm) = &self.norm else {
             return Ok(x);
         };

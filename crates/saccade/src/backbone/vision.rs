@@ -13,6 +13,7 @@ use crate::alloc::{collected, filled, reserve};
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::weights::Weights;
+use saccade_kernels::Activations;
 
 /// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at 2048 patches the weights are
 /// read once for 8 views, and the largest buffer is 35 MB at N1.5's size.
@@ -46,7 +47,7 @@ impl EncodedViews {
 #[derive(Default)]
 pub(super) struct VisionBuffers {
     /// `(patches, width)`.
-    pub x: Vec<f32>,
+    pub x: Activations,
     /// The pixels of patches, `(patches, elements)`.
     pub patch_vectors: Vec<f32>,
     pub block: BlockBuffers,

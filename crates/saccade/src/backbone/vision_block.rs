@@ -1,6 +1,6 @@
 //! The blocks that both vision towers are made of: attention within a view, and a feed-forward layer.
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::config::VisionConfig;
 use crate::alloc::sized;
@@ -32,8 +32,8 @@ pub(super) struct VisionBlock {
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
 pub(super) struct BlockBuffers {
-    pub y: Vec<f32>,
-    pub hidden: Vec<f32>,
+    pub y: Activations,
+    pub hidden: Activations,
     pub attention: GroupedBuffers,
     pub linear: LinearScratch,
 }

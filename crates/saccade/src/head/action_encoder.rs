@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
-use saccade_kernels::{Epilogue, LinearScratch, Matrix, WeightRef, silu};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, Matrix, WeightRef, silu};
 
 use super::cache::Cache;
 use super::category::CategoryLinear;
@@ -81,8 +81,8 @@ impl ActionEncoder {
         engine: Engine,
         noisy: &NoisyRows<'_>,
         bucket: impl Fn(usize) -> usize,
-        tokens: &mut Vec<f32>,
-        encoded: &mut Vec<f32>,
+        tokens: &mut Activations,
+        encoded: &mut Activations,
         scratch: &mut LinearScratch,
     ) -> Result<()> {
         let NoisyRows { embodiment_ids, x } = *noisy;

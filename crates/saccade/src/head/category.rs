@@ -1,6 +1,6 @@
 //! Layers with separate weights for each embodiment (`CategorySpecificLinear` and `CategorySpecificMLP` of the released code).
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::embodiments::Embodiments;
 use crate::alloc::sized;
@@ -117,8 +117,8 @@ impl CategoryMlp {
         engine: Engine,
         embodiment_ids: &[usize],
         x: &[f32],
-        hidden: &mut Vec<f32>,
-        out: &'a mut Vec<f32>,
+        hidden: &mut Activations,
+        out: &'a mut Activations,
         scratch: &mut LinearScratch,
     ) -> Result<&'a mut [f32]> {
         let rows = x.len() / self.layer1.in_features;

@@ -2,7 +2,7 @@
 
 use std::sync::Mutex;
 
-use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
 
 use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
@@ -177,7 +177,7 @@ impl CrossAttention {
             self.engine,
             encoder_hidden_states.data(),
             &filled("keys and values", batch, num_vl_tokens)?,
-            &mut Vec::new(),
+            &mut Activations::new(),
             &mut LinearScratch::new(),
         )?;
         Ok(KeyValues {

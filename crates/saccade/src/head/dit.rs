@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
 
 use super::cache::Cache;
 use super::context::Context;
@@ -114,14 +114,14 @@ impl BlockCall<'_> {
 /// Memory of one pass that is kept for the next.
 pub(crate) struct DitBuffers {
     /// The residual stream, `(sequences, rows, width)`: filled by the caller, unless only the action rows run.
-    pub h: Vec<f32>,
+    pub h: Activations,
     /// That of the action rows alone, `(sequences, action_rows, width)`: filled by the caller where only they run.
-    pub action: Vec<f32>,
+    pub action: Activations,
     /// One for each batch element: filled by the caller.
     pub times: Vec<Arc<TimeModulations>>,
-    y: Vec<f32>,
-    y_all: Vec<f32>,
-    hidden: Vec<f32>,
+    y: Activations,
+    y_all: Activations,
+    hidden: Activations,
     attention: AttentionBuffers,
     /// Keys and values by block; empty for cross-attention.
     held: Vec<Vec<PackedKeyValues>>,
@@ -130,12 +130,12 @@ pub(crate) struct DitBuffers {
 impl DitBuffers {
     pub(crate) fn new() -> Self {
         Self {
-            h: Vec::new(),
-            action: Vec::new(),
+            h: Activations::new(),
+            action: Activations::new(),
             times: Vec::new(),
-            y: Vec::new(),
-            y_all: Vec::new(),
-            hidden: Vec::new(),
+            y: Activations::new(),
+            y_all: Activations::new(),
+            hidden: Activations::new(),
             attention: AttentionBuffers::new(),
             held: Vec::new(),
         }
@@ -247,7 +247,7 @@ impl Dit {
         pass: &Pass<'_>,
         recorded: &mut Recorded<StepBlock>,
         buffers: &mut DitBuffers,
-        out: &mut Vec<f32>,
+        out: &mut Activations,
     ) -> Result<()> {
         buffers.held.resize_with(self.blocks.len(), Vec::new);
         // Taken out for the call, so that the blocks can have the other buffers; put back even if it fails.
@@ -266,8 +266,8 @@ impl Dit {
         pass: &Pass<'_>,
         recorded: &mut Recorded<StepBlock>,
         buffers: &mut DitBuffers,
-        h: &mut Vec<f32>,
-        action: &mut Vec<f32>,
+        h: &mut Activations,
+        action: &mut Activations,
     ) -> Result<()> {
         let groups = &pass.changes.extent.groups;
         let last = self.blocks.len() - 1;
@@ -297,7 +297,7 @@ impl Dit {
         engine: Engine,
         action: &[f32],
         buffers: &mut DitBuffers,
-        out: &mut Vec<f32>,
+        out: &mut Activations,
     ) -> Result<()> {
         let y = sized(&mut buffers.y, action.len())?;
         let norm = ModulatedNorm::new(self.width, OUTPUT_EPS, |time| &time.output);
@@ -403,7 +403,7 @@ impl Dit {
 }
 
 /// Copies the action rows, the last of each sequence, from `h` to `action`.
-fn gather_action_rows(groups: &Groups, width: usize, h: &[f32], action: &mut Vec<f32>) -> Result<()> {
+fn gather_action_rows(groups: &Groups, width: usize, h: &[f32], action: &mut Activations) -> Result<()> {
     let (sequence, actions) = (groups.num_rows() * width, groups.action * width);
     let action = sized(action, h.len() / sequence * actions)?;
     for (from, to) in h.chunks_exact(sequence).zip(action.chunks_exact_mut(actions)) {

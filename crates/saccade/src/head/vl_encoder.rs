@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use saccade_kernels::{Epilogue, LinearScratch, PackedKeyValues};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
 
 use super::context::Seen;
 use crate::alloc::{collected, filled, sized};
@@ -61,18 +61,18 @@ pub(crate) type Encoded = (Vec<f32>, Vec<Vec<PackedKeyValues>>);
 
 /// Memory of one `encode` that is kept for the next.
 pub(crate) struct EncodeBuffers {
-    y: Vec<f32>,
+    y: Activations,
     gathered: Vec<f32>,
-    hidden: Vec<f32>,
+    hidden: Activations,
     attention: AttentionBuffers,
 }
 
 impl EncodeBuffers {
     pub(crate) fn new() -> Self {
         Self {
-            y: Vec::new(),
+            y: Activations::new(),
             gathered: Vec::new(),
-            hidden: Vec::new(),
+            hidden: Activations::new(),
             attention: AttentionBuffers::new(),
         }
     }

@@ -1,6 +1,6 @@
 //! Memory of one call, kept for the next call.
 
-use saccade_kernels::LinearScratch;
+use saccade_kernels::{Activations, LinearScratch};
 
 use super::dit::DitBuffers;
 use super::vl_encoder::EncodeBuffers;
@@ -12,26 +12,26 @@ pub(crate) struct Workspace {
     /// By batch element.
     pub embodiment_ids: Vec<usize>,
     /// The state encoder's hidden layer, `(batch, hidden_dim)`.
-    pub state_hidden: Vec<f32>,
+    pub state_hidden: Activations,
     /// State rows, `(batch, width)`.
-    pub state: Vec<f32>,
+    pub state: Activations,
     /// Noisy actions, `(batch, samples, action_horizon, encoder_action_dim)`.
-    pub x: Vec<f32>,
+    pub x: Activations,
     /// `x` at the start of a step of two evaluations.
-    pub start: Vec<f32>,
+    pub start: Activations,
     /// What the velocity of each action of a chunk is multiplied by.
-    pub strength: Vec<f32>,
+    pub strength: Activations,
     /// The action encoder's hidden layer, `(batch, samples, action_horizon, width)`.
-    pub tokens: Vec<f32>,
+    pub tokens: Activations,
     /// Action rows, `(batch, samples, action_horizon, width)`.
-    pub encoded: Vec<f32>,
+    pub encoded: Activations,
     /// The transformer's output rows, `(batch, samples, action_horizon, hidden_dim)`.
-    pub output: Vec<f32>,
-    pub decoder_hidden: Vec<f32>,
+    pub output: Activations,
+    pub decoder_hidden: Activations,
     /// One decoder's output, `(batch, samples, action_horizon, width of the decoder)`.
-    pub decoded: Vec<f32>,
+    pub decoded: Activations,
     /// `(batch, samples, action_horizon, action_dim)`.
-    pub velocity: Vec<f32>,
+    pub velocity: Activations,
     pub linear: LinearScratch,
 }
 
@@ -41,17 +41,17 @@ impl Workspace {
             encode: EncodeBuffers::new(),
             dit: DitBuffers::new(),
             embodiment_ids: Vec::new(),
-            state_hidden: Vec::new(),
-            state: Vec::new(),
-            x: Vec::new(),
-            start: Vec::new(),
-            strength: Vec::new(),
-            tokens: Vec::new(),
-            encoded: Vec::new(),
-            output: Vec::new(),
-            decoder_hidden: Vec::new(),
-            decoded: Vec::new(),
-            velocity: Vec::new(),
+            state_hidden: Activations::new(),
+            state: Activations::new(),
+            x: Activations::new(),
+            start: Activations::new(),
+            strength: Activations::new(),
+            tokens: Activations::new(),
+            encoded: Activations::new(),
+            output: Activations::new(),
+            decoder_hidden: Activations::new(),
+            decoded: Activations::new(),
+            velocity: Activations::new(),
             linear: LinearScratch::new(),
         }
     }

@@ -1,6 +1,6 @@
 //! Multi-head attention with its projections: what VL blocks, DiT blocks and the cross-attention on its own share.
 
-use saccade_kernels::{Epilogue, LinearScratch, LogitBias, PackedKeyValues, Rows};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, LogitBias, PackedKeyValues, Rows};
 
 use super::linear::Linear;
 use super::weights::Weights;
@@ -22,11 +22,11 @@ pub(crate) struct Attention {
 
 /// Memory of one attention call that is kept for the next.
 pub(crate) struct AttentionBuffers {
-    q: Vec<f32>,
-    kv: Vec<f32>,
-    mix: Vec<f32>,
+    q: Activations,
+    kv: Activations,
+    mix: Activations,
     bias: Vec<f32>,
-    weights: Vec<f32>,
+    weights: Activations,
     packed: Vec<PackedKeyValues>,
     /// For the linear layers around the attention too: they run one after the other.
     pub linear: LinearScratch,
@@ -43,11 +43,11 @@ pub(crate) struct Held<'a> {
 impl AttentionBuffers {
     pub(crate) fn new() -> Self {
         Self {
-            q: Vec::new(),
-            kv: Vec::new(),
-            mix: Vec::new(),
+            q: Activations::new(),
+            kv: Activations::new(),
+            mix: Activations::new(),
             bias: Vec::new(),
-            weights: Vec::new(),
+            weights: Activations::new(),
             packed: Vec::new(),
             linear: LinearScratch::new(),
         }
@@ -193,7 +193,7 @@ impl Attention {
         engine: Engine,
         source: &[f32],
         counts: &[usize],
-        buffer: &mut Vec<f32>,
+        buffer: &mut Activations,
         scratch: &mut LinearScratch,
     ) -> Result<Vec<PackedKeyValues>> {
         let (keys, values) = self.keys_values(engine, source, buffer, scratch)?;
@@ -214,7 +214,7 @@ impl Attention {
         &self,
         engine: Engine,
         source: &[f32],
-        buffer: &'a mut Vec<f32>,
+        buffer: &'a mut Activations,
         scratch: &mut LinearScratch,
     ) -> Result<(Rows<'a>, Rows<'a>)> {
         let both = self.to_kv.out_features();

@@ -1,6 +1,6 @@
 //! Gated feed-forward layers.
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::linear::Linear;
 use super::weights::Weights;
@@ -48,7 +48,7 @@ impl GatedMlp {
         &self,
         engine: Engine,
         y: &[f32],
-        buffer: &mut Vec<f32>,
+        buffer: &mut Activations,
         scratch: &mut LinearScratch,
         x: &mut [f32],
     ) -> Result<()> {

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use saccade_kernels::{Epilogue, LinearScratch, Mask, PackedKeyValues, Rows};
+use saccade_kernels::{Activations, Epilogue, LinearScratch, Mask, PackedKeyValues, Rows};
 
 use super::linear::Linear;
 use super::rms_norm::RmsNorm;
@@ -70,8 +70,8 @@ pub(crate) struct GroupedAttention {
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
 pub(crate) struct GroupedBuffers {
-    qkv: Vec<f32>,
-    mix: Vec<f32>,
+    qkv: Activations,
+    mix: Activations,
     packed: Option<PackedKeyValues>,
 }
 

@@ -1,6 +1,6 @@
 //! Feed-forward layers.
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::linear::Linear;
 use super::weights::Weights;
@@ -43,7 +43,7 @@ impl FeedForward {
         &self,
         engine: Engine,
         y: &[f32],
-        buffer: &mut Vec<f32>,
+        buffer: &mut Activations,
         scratch: &mut LinearScratch,
         x: &mut [f32],
     ) -> Result<()> {

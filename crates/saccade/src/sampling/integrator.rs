@@ -2,6 +2,7 @@
 
 use crate::alloc::sized;
 use crate::error::{Error, Result};
+use saccade_kernels::Activations;
 
 /// How the velocity is followed from noise to actions in one step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -39,7 +40,13 @@ impl Integrator {
 
     /// Prepares `x` for adding the velocity of evaluation number `index` of a step of length `dt`, and gives what the velocity is multiplied
     /// by. `start` holds `x` as it was at the start of a step of two evaluations.
-    pub(crate) fn advance(self, index: usize, dt: f32, x: &mut [f32], start: &mut Vec<f32>) -> Result<f32> {
+    pub(crate) fn advance(
+        self,
+        index: usize,
+        dt: f32,
+        x: &mut [f32],
+        start: &mut Activations,
+    ) -> Result<f32> {
         Ok(match (self, index) {
             (Self::Euler, _) => dt,
             (Self::Midpoint, 0) => {
