@@ -94,6 +94,21 @@ pub(crate) struct InTiles<U, E> {
 }
 
 impl<U: TileUnit, E: Elements> InTiles<U, E> {
+    /// Asks memory for where the results of some rows go: by the time that their sums are made, they are here.
+    ///
+    /// # Safety
+    /// Called on the CPU of the unit.
+    #[inline(always)]
+    unsafe fn ask_for_results(&self, block: &Block<'_>, rows: Range<usize>) {
+        for row in rows {
+            let out = block.out.wrapping_offset(row as isize * block.out_stride);
+            for tile in 0..COLUMNS / TILE {
+                // SAFETY: prefetching is allowed at any address; the caller's promise.
+                unsafe { <U::Simd as Simd>::Vector::prefetch(out.wrapping_add(tile * TILE).cast()) };
+            }
+        }
+    }
+
     /// Steps over which is summed.
     fn steps(in_features: usize) -> usize {
         in_features.div_ceil(TILE * E::OPERATION.per_word())
@@ -159,14 +174,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                     let (first, end) = (block.tiles.first_row(tile), block.tiles.first_row(tile + 1));
                     let is_last = part.end == steps;
                     if is_last {
-                        for row in first..end {
-                            let out = block.out.wrapping_offset(row as isize * block.out_stride);
-                            for line in 0..COLUMNS / 16 {
-                                <<U::Simd as Simd>::Vector as Vector>::prefetch(
-                                    out.wrapping_add(16 * line).cast(),
-                                );
-                            }
-                        }
+                        self.ask_for_results(block, first..end);
                     }
                     session.multiply(&Product {
                         operation: E::OPERATION,
@@ -186,6 +194,8 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                         add: part.start > 0,
                         ahead: ahead(&parts, &part, tile - tiles.start, end - first),
                     });
+                    // At once, while the sums are in the nearest cache and the results on their way to it: `encode` of N1.5 takes 0.95
+                    // (bfloat16) and 0.91 (int8) of the time with all rows after the panel (Intel with AMX, 2 threads).
                     if is_last {
                         (block.finish)(first..end);
                     }

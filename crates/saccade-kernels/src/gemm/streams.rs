@@ -174,6 +174,7 @@ mod tests {
             sums: std::ptr::null_mut(),
             out: std::ptr::null(),
             out_stride: 0,
+            finish: &|_| (),
         };
         let parts = Parts::new(&block, step_words, steps, part_steps);
         let mut asked = HashSet::new();

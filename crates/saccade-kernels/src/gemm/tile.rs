@@ -126,7 +126,7 @@ pub(super) unsafe fn multiply<S: Simd, P: Step<S>>(block: &Block<'_>) {
 #[inline(always)]
 unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize>(block: &Block<'_>) {
     let tiles = &block.range;
-    let first_row = block.tiles.first_row(tiles.start);
+    let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(P::STEP);
     let parts = Parts::new(block, NV * V::LANES, steps, BLOCK_STEPS);
     for part in parts.iter() {

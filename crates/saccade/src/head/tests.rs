@@ -63,10 +63,15 @@ fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRow
     workspace
         .embodiment_ids
         .extend((0..context.batch).map(|element| element % 2));
-    workspace.x = numbers(
+    let actions = numbers(
         context.batch * config.action_horizon * config.encoder_action_dim,
         2,
     );
+    workspace
+        .x
+        .sized(actions.len())
+        .unwrap()
+        .copy_from_slice(&actions);
     let times = &mut workspace.dit.times;
     times.resize(context.batch, head.layers.dit.time(head.engine, bucket).unwrap());
     let state = numbers(context.batch * config.state_history * config.state_dim, 3);
@@ -81,7 +86,7 @@ fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRow
     };
     head.step_velocity(&pass, |_| bucket, &mut Recorded::default(), &mut workspace)
         .unwrap();
-    workspace.velocity
+    workspace.velocity.to_vec()
 }
 
 const FILES: [&str; 5] = [
@@ -159,7 +164,12 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
     };
     let mut workspace = Workspace::new();
     workspace.embodiment_ids.push(id);
-    workspace.x = numbers(head.config.action_horizon * head.config.encoder_action_dim, 2);
+    let actions = numbers(head.config.action_horizon * head.config.encoder_action_dim, 2);
+    workspace
+        .x
+        .sized(actions.len())
+        .unwrap()
+        .copy_from_slice(&actions);
     head.encode_actions(|_| bucket, &mut workspace).unwrap();
 
     let mut tau = vec![0.0; width];

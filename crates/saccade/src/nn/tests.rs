@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use saccade_checkpoint::Checkpoint;
-use saccade_kernels::{Epilogue, Isa, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, Isa, LinearScratch};
 
 use super::gated_mlp::GatedMlp;
 use super::grouped_attention::{
@@ -181,7 +181,9 @@ fn feed_forwards_of_any_hidden_width_and_activation() {
             named.layers(|weights| FeedForward::new(weights, DIFFUSERS, [6, 11], activation, Role::Block))
         {
             let (mut out, scratch) = (x.clone(), &mut LinearScratch::new());
-            layer.add(engine, &y, &mut Vec::new(), scratch, &mut out).unwrap();
+            layer
+                .add(engine, &y, &mut Activations::new(), scratch, &mut out)
+                .unwrap();
             assert_close(&out, &expected, &format!("{} {activation:?}", engine.isa));
         }
     }
@@ -208,7 +210,9 @@ fn gated_layers_multiply_the_activated_gate() {
         .for_each(|(sum, x)| *sum += f64::from(*x));
     for (engine, layer) in named.layers(|weights| GatedMlp::new(weights, 6, 9, Epilogue::Silu, false)) {
         let (mut out, scratch) = (x.clone(), &mut LinearScratch::new());
-        layer.add(engine, &y, &mut Vec::new(), scratch, &mut out).unwrap();
+        layer
+            .add(engine, &y, &mut Activations::new(), scratch, &mut out)
+            .unwrap();
         assert_close(&out, &expected, &engine.isa.to_string());
     }
 }
@@ -403,7 +407,7 @@ fn the_layers_of_qwen_are_those_of_transformers() {
     assert_released(
         "qwen3.mlp",
         |weights| GatedMlp::new(weights, 20, 28, Epilogue::Silu, false),
-        |engine, layer, y, x| layer.add(engine, y, &mut Vec::new(), &mut LinearScratch::new(), x),
+        |engine, layer, y, x| layer.add(engine, y, &mut Activations::new(), &mut LinearScratch::new(), x),
     );
     assert_released(
         "qwen3.norm",
@@ -437,6 +441,6 @@ fn the_layers_of_siglip_are_those_of_transformers() {
     assert_released(
         "siglip.mlp",
         |weights| FeedForward::new(weights, ["fc1", "fc2"], [24, 36], Epilogue::GeluTanh, Role::Block),
-        |engine, layer, y, x| layer.add(engine, y, &mut Vec::new(), &mut LinearScratch::new(), x),
+        |engine, layer, y, x| layer.add(engine, y, &mut Activations::new(), &mut LinearScratch::new(), x),
     );
 }

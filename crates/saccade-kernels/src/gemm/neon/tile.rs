@@ -119,7 +119,7 @@ pub(super) unsafe fn multiply<S: Simd, P: Step<S>, const NV: usize>(block: &Bloc
     let mut widened = [const { MaybeUninit::<u32>::uninit() }; MAX_WIDENED];
     let widened = widened.as_mut_ptr().cast();
     let tiles = &block.range;
-    let first_row = block.tiles.first_row(tiles.start);
+    let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(P::DEPTH);
     let block_steps = if P::STEP_WORDS > P::PANEL_WORDS {
         P::PART_STEPS
@@ -158,6 +158,7 @@ pub(super) unsafe fn multiply<S: Simd, P: Step<S>, const NV: usize>(block: &Bloc
             }
         }
     }
+    (block.finish)(block.rows());
 }
 
 /// A tile: its first row and its rows, the weights of the part, where its sums go, and its number among those of the block.
