@@ -61,11 +61,16 @@ pub(crate) fn collected<T>(
 /// # Errors
 /// [`Error::Memory`] if the system refuses it.
 pub(crate) fn sized(buffer: &mut Activations, len: usize) -> Result<&mut [f32]> {
-    let refused = |_| Error::Memory {
+    buffer.reserve(len).map_err(|_| Error::Memory {
         what: "activations",
         bytes: len.saturating_mul(size_of::<f32>()),
-    };
-    buffer.sized(len).map_err(refused)
+    })?;
+    while buffer.len() + TOGETHER < len {
+        check_interrupted()?;
+        buffer.resize(buffer.len() + TOGETHER);
+    }
+    buffer.resize(len);
+    Ok(buffer)
 }
 
 /// The product of `sizes`.

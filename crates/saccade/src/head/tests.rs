@@ -10,6 +10,7 @@ use super::encode::Features;
 use super::load::LoadOptions;
 use super::plan::tensor_shapes;
 use super::workspace::Workspace;
+use crate::alloc::sized;
 use crate::array::Array;
 use crate::inspect::changes::Changes;
 use crate::inspect::trace::Recorded;
@@ -67,9 +68,7 @@ fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRow
         context.batch * config.action_horizon * config.encoder_action_dim,
         2,
     );
-    workspace
-        .x
-        .sized(actions.len())
+    sized(&mut workspace.x, actions.len())
         .unwrap()
         .copy_from_slice(&actions);
     let times = &mut workspace.dit.times;
@@ -165,9 +164,7 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
     let mut workspace = Workspace::new();
     workspace.embodiment_ids.push(id);
     let actions = numbers(head.config.action_horizon * head.config.encoder_action_dim, 2);
-    workspace
-        .x
-        .sized(actions.len())
+    sized(&mut workspace.x, actions.len())
         .unwrap()
         .copy_from_slice(&actions);
     head.encode_actions(|_| bucket, &mut workspace).unwrap();
