@@ -58,6 +58,8 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn round(self) -> Self;
     /// `self * 2^exponent` for whole exponents in `-252..=254`; NaN in `self` stays.
     unsafe fn scale_by_power_of_two(self, exponent: Self) -> Self;
+    /// The f32 whose sign and exponent are the low nine bits of each lane.
+    unsafe fn low_bits_as_exponent(self) -> Self;
     /// `value` in those lanes where `probe == value`, `self` in the others.
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self;
     /// Sum of the lanes, in an order that is fixed.

@@ -195,6 +195,12 @@ unsafe impl Vector for __m512 {
     }
 
     #[inline(always)]
+    unsafe fn low_bits_as_exponent(self) -> Self {
+        // SAFETY: as in splat.
+        unsafe { _mm512_castsi512_ps(_mm512_slli_epi32::<23>(_mm512_castps_si512(self))) }
+    }
+
+    #[inline(always)]
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
         // SAFETY: as in splat.
         unsafe { _mm512_mask_mov_ps(self, _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(probe, value), value) }
