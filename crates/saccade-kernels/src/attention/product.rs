@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
 use super::mask::Mask;
 use crate::simd::{Kernel, Simd, Vector};
-use crate::tiles::{Ahead, Operation, Product, Session, TILE, TileUnit};
+use crate::tiles::{Ahead, MAX_COLUMNS, Operation, Product, Session, TILE, TileUnit};
 
 /// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
 pub(super) struct TileProduct {
@@ -67,10 +67,10 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
     #[inline(always)]
     unsafe fn multiply(&mut self, _: S, product: &TileProduct) {
         const { assert!(S::Vector::LANES == TILE) }
-        let mut vector = 0;
-        while vector < product.vectors {
-            let are_together = product.b_vector == TILE && product.vectors - vector >= 3;
-            let columns = if are_together { 3 } else { 1 };
+        let groups = product.vectors.div_ceil(MAX_COLUMNS);
+        for group in 0..groups {
+            let first = product.vectors * group / groups;
+            let end = product.vectors * (group + 1) / groups;
             // SAFETY: the caller's promise.
             unsafe {
                 self.multiply(&Product {
@@ -78,18 +78,18 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
                     rows: product.rows,
                     x: product.factors.cast(),
                     x_stride: product.factors_stride,
-                    w: product.b.add(vector * product.b_vector),
+                    w: product.b.add(first * product.b_vector),
                     w_stride: product.b_step,
+                    w_column: product.b_vector,
                     w_step: TILE * product.b_step,
-                    columns,
+                    columns: end - first,
                     steps: product.depth.div_ceil(<Self as Multiply<S, Pairs>>::KEYS),
-                    sums: product.out.add(vector * TILE).cast(),
+                    sums: product.out.add(first * TILE).cast(),
                     sums_stride: product.out_stride,
                     add: product.add,
                     ahead: Ahead::NOTHING,
                 });
             }
-            vector += columns;
         }
     }
 }
