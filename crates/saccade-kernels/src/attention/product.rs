@@ -67,10 +67,9 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
     #[inline(always)]
     unsafe fn multiply(&mut self, _: S, product: &TileProduct) {
         const { assert!(S::Vector::LANES == TILE) }
-        let groups = product.vectors.div_ceil(MAX_COLUMNS);
-        for group in 0..groups {
-            let first = product.vectors * group / groups;
-            let end = product.vectors * (group + 1) / groups;
+        let mut first = 0;
+        while first < product.vectors {
+            let columns = columns_at_once(product, product.vectors - first);
             // SAFETY: the caller's promise.
             unsafe {
                 self.multiply(&Product {
@@ -82,7 +81,7 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
                     w_stride: product.b_step,
                     w_column: product.b_vector,
                     w_step: TILE * product.b_step,
-                    columns: end - first,
+                    columns,
                     steps: product.depth.div_ceil(<Self as Multiply<S, Pairs>>::KEYS),
                     sums: product.out.add(first * TILE).cast(),
                     sums_stride: product.out_stride,
@@ -90,7 +89,18 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
                     ahead: Ahead::NOTHING,
                 });
             }
+            first += columns;
         }
+    }
+}
+
+/// How many of the `left` tiles of columns a unit takes at once: as many products in flight as its tiles of sums allow.
+fn columns_at_once(product: &TileProduct, left: usize) -> usize {
+    match left {
+        _ if product.rows <= TILE => left.div_ceil(left.div_ceil(MAX_COLUMNS)),
+        // Not 3 and 1: a single column waits for each of its products.
+        3 | 5.. if product.b_vector == TILE => 3,
+        _ => left.min(2),
     }
 }
 

@@ -156,15 +156,66 @@ macro_rules! row_kernel {
     };
 }
 
+/// Two tiles of rows (tiles 6 and 5) by a tile of columns, the job's stride after the one before it.
+macro_rules! products_of_two {
+    ($operation:literal, $first:literal, $second:literal) => {
+        concat!(
+            "tileloadd tmm7, [{c} + {w_stride}*1]\n",
+            $operation,
+            " tmm",
+            $first,
+            ", tmm6, tmm7\n",
+            ask_ahead!(),
+            "\n",
+            $operation,
+            " tmm",
+            $second,
+            ", tmm5, tmm7\n",
+            ask_ahead!(),
+            "\n",
+            "add {c}, [{job} + {w_column}]"
+        )
+    };
+}
+
+/// Two tiles of rows by as many of columns as are listed: each `tile of the first rows, of the second, bytes in the sums`.
+macro_rules! two_rows_kernel {
+    ($operation:literal, $name:ident, $($first:literal, $second:literal, $column:literal);+) => {
+        kernel!(
+            $name,
+            zero concat!(each_sum!(zero: $($first),+), each_sum!(zero: $($second),+)),
+            load concat!(
+                each_sum!(load "sums": $($first, $column);+),
+                each_sum!(load "second_sums": $($second, $column);+)
+            ),
+            step [
+                "tileloadd tmm6, [{x} + {x_stride}*1]",
+                "tileloadd tmm5, [{second} + {x_stride}*1]",
+                "mov {c}, {w}",
+                $(products_of_two!($operation, $first, $second),)+
+                "add {second}, 64"
+            ],
+            store concat!(
+                each_sum!(store "sums": $($first, $column);+),
+                each_sum!(store "second_sums": $($second, $column);+)
+            ),
+            apart: w_column,
+            two: second
+        );
+    };
+}
+
 /// The kernels of an operation.
 macro_rules! kernels {
-    ($operation:literal, [$row1:ident, $row2:ident, $row3:ident, $row4:ident, $row5:ident, $row6:ident], $block:ident) => {
+    ($operation:literal, [$row1:ident, $row2:ident, $row3:ident, $row4:ident, $row5:ident, $row6:ident], [$two1:ident, $two2:ident], $block:ident) => {
         row_kernel!($operation, $row1, "0", "0");
         row_kernel!($operation, $row2, "0", "0"; "1", "64");
         row_kernel!($operation, $row3, "0", "0"; "1", "64"; "2", "128");
         row_kernel!($operation, $row4, "0", "0"; "1", "64"; "2", "128"; "3", "192");
         row_kernel!($operation, $row5, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256");
         row_kernel!($operation, $row6, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256"; "5", "320");
+        two_rows_kernel!($operation, $two1, "0", "1", "0");
+        two_rows_kernel!($operation, $two2, "0", "1", "0"; "2", "3", "64");
         // Six tiles of sums, one of rows and one of weights, which are read twice from the nearest cache.
         kernel!(
             $block,
@@ -196,11 +247,13 @@ macro_rules! kernels {
 kernels!(
     "tdpbf16ps",
     [bf16_row1, bf16_row2, bf16_row3, bf16_row4, bf16_row5, bf16_row6],
+    [bf16_two1, bf16_two2],
     bf16_block
 );
 kernels!(
     "tdpbusd",
     [int8_row1, int8_row2, int8_row3, int8_row4, int8_row5, int8_row6],
+    [int8_two1, int8_two2],
     int8_block
 );
 
@@ -209,6 +262,10 @@ const BF16_ROWS: [unsafe fn(&Job); MAX_COLUMNS] =
     [bf16_row1, bf16_row2, bf16_row3, bf16_row4, bf16_row5, bf16_row6];
 const INT8_ROWS: [unsafe fn(&Job); MAX_COLUMNS] =
     [int8_row1, int8_row2, int8_row3, int8_row4, int8_row5, int8_row6];
+
+/// Those of two tiles of rows.
+const BF16_TWO_ROWS: [unsafe fn(&Job); 2] = [bf16_two1, bf16_two2];
+const INT8_TWO_ROWS: [unsafe fn(&Job); 2] = [int8_two1, int8_two2];
 
 /// Independent products, from tiles that stay what they are: of zeros, whose speed is that of any numbers.
 macro_rules! chains {
@@ -274,8 +331,10 @@ unsafe impl TileUnit for Amx {
     unsafe fn run(self, (): &mut (), operation: Operation, shape: Shape, job: &Job) {
         let kernel = match (operation, shape) {
             (Operation::Bf16, Shape::Row(columns)) => BF16_ROWS[columns - 1],
+            (Operation::Bf16, Shape::TwoRows(columns)) => BF16_TWO_ROWS[columns - 1],
             (Operation::Bf16, Shape::Block) => bf16_block,
             (Operation::Int8, Shape::Row(columns)) => INT8_ROWS[columns - 1],
+            (Operation::Int8, Shape::TwoRows(columns)) => INT8_TWO_ROWS[columns - 1],
             (Operation::Int8, Shape::Block) => int8_block,
         };
         // SAFETY: the caller's promise.
@@ -343,9 +402,8 @@ mod tests {
         };
         for add in [false, true] {
             of(3, false, add);
-            if rows <= TILE {
-                (1..=MAX_COLUMNS).for_each(|columns| of(columns, true, add));
-            }
+            let most = if rows <= TILE { MAX_COLUMNS } else { 2 };
+            (1..=most).for_each(|columns| of(columns, true, add));
         }
     }
 

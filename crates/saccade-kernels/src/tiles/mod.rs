@@ -62,7 +62,7 @@ impl Ahead {
 #[derive(Clone, Copy)]
 pub(crate) struct Product {
     pub operation: Operation,
-    /// `1 ..= MAX_ROWS`; at most [`TILE`] where `columns` is not 3.
+    /// `1 ..= MAX_ROWS`.
     pub rows: usize,
     pub x: *const u32,
     /// Words from one row to the next, of each operand.
@@ -70,11 +70,12 @@ pub(crate) struct Product {
     /// Rows of 16 words: elements of the summed dimension below each other.
     pub w: *const u32,
     pub w_stride: usize,
-    /// Words from a tile to the one of the next column; [`TILE`] where there are more rows than that.
+    /// Words from a tile to the one of the next column.
     pub w_column: usize,
     /// Words from one step to the next.
     pub w_step: usize,
-    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMNS`.
+    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMNS` where there are at most [`TILE`] rows, else 1, 2, or 3 that are next to
+    /// each other in `w` too.
     pub columns: usize,
     /// Steps of [`TILE`] words over which is summed, at least one.
     pub steps: usize,
@@ -111,6 +112,8 @@ pub(crate) struct Job {
 pub(crate) enum Shape {
     /// One by `1 ..= MAX_COLUMNS`, anywhere.
     Row(usize),
+    /// Two by one or two, anywhere.
+    TwoRows(usize),
     /// Two by three, next to each other.
     Block,
 }
@@ -236,6 +239,7 @@ impl<U: TileUnit> Session<U> {
         let rows = product.rows;
         let (tile_rows, shape) = match (product.columns, rows) {
             (1..=MAX_COLUMNS, 1..=TILE) => (rows, Shape::Row(product.columns)),
+            (1..=2, ..=MAX_ROWS) => (rows.div_ceil(2), Shape::TwoRows(product.columns)),
             (3, ..=MAX_ROWS) if product.w_column == TILE => (rows.div_ceil(2), Shape::Block),
             (columns, rows) => unreachable!("{rows} rows by {columns} tiles"),
         };

@@ -183,6 +183,7 @@ unsafe impl TileUnit for Software {
     unsafe fn run(self, registers: &mut Registers, operation: Operation, shape: Shape, job: &Job) {
         let (row_tiles, columns) = match shape {
             Shape::Row(columns) => (1, columns),
+            Shape::TwoRows(columns) => (2, columns),
             Shape::Block => (2, 3),
         };
         let sums =
