@@ -46,13 +46,13 @@ pub(super) struct QueryTile<'a> {
 }
 
 /// A tile of float32 keys and values.
-pub(super) struct FloatTile<'a>(pub QueryTile<'a>);
+pub(super) struct FloatTile<'a>(pub &'a QueryTile<'a>);
 
 /// A tile of bfloat16 keys and values.
-pub(super) struct Bf16Tile<'a>(pub QueryTile<'a>);
+pub(super) struct Bf16Tile<'a>(pub &'a QueryTile<'a>);
 
 /// A tile of bfloat16 keys and values, for a unit that multiplies tiles.
-pub(super) struct UnitTile<'a>(pub QueryTile<'a>);
+pub(super) struct UnitTile<'a>(pub &'a QueryTile<'a>);
 
 impl Kernel for FloatTile<'_> {
     type Output = ();
@@ -95,7 +95,7 @@ impl TileKernel for UnitTile<'_> {
 
 /// The tile on the vectors beside its unit.
 struct BesideUnit<'a, U> {
-    tile: QueryTile<'a>,
+    tile: &'a QueryTile<'a>,
     unit: U,
 }
 
