@@ -20,6 +20,9 @@ const MAX_VALUES: usize = 256;
 /// Elements of the queries that are on the stack at a time: an even number of whole vectors. Wider heads take more passes.
 const MAX_DEPTH: usize = 256;
 
+/// Words of a cache line.
+const LINE: usize = 16;
+
 pub(super) struct Call<'a> {
     pub kv: &'a PackedKeyValues,
     /// Consecutive heads of queries that share a head of keys and values.
@@ -227,8 +230,18 @@ unsafe fn attend<
             for (r, (max, running)) in maxima.iter_mut().zip(running.iter()).enumerate() {
                 *max = row(r).logits::<V>(probabilities.add(r * KEY_BLOCK), running.max);
             }
+            let block_values = values.add(first / A::STEP * value_width);
             for (r, (running, &max)) in running.iter_mut().zip(&maxima).enumerate() {
                 let row = row(r);
+                // The first of a head's tiles asks for the values while it computes: from memory they came at its bandwidth while nothing else
+                // was done.
+                if tile.first == 0 {
+                    let words = count.div_ceil(A::STEP) * value_width;
+                    let lines = words.div_ceil(LINE);
+                    for line in lines * r / tile.rows..lines * (r + 1) / tile.rows {
+                        V::prefetch(block_values.wrapping_add(line * LINE).cast());
+                    }
+                }
                 let probabilities = probabilities.add(r * KEY_BLOCK);
                 let rescale = row.softmax::<S, V, A>(probabilities, max, running);
                 if columns.first == 0
@@ -247,7 +260,7 @@ unsafe fn attend<
                 rows: tile.rows,
                 factors: probabilities,
                 factors_stride: KEY_BLOCK,
-                b: values.add(first / A::STEP * value_width + columns.first),
+                b: block_values.add(columns.first),
                 b_step: value_width,
                 b_vector: V::LANES,
                 depth: count,
