@@ -94,6 +94,17 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn dot_bytes(sum: Self::Ints, x: Self::Ints, w: Self::Ints) -> Self::Ints;
     /// Asks for the cache line at `at`, which may be any address. A hint: it may do nothing.
     unsafe fn prefetch(at: *const u8);
+    /// Column `c` of the first `LANES` rows of a square as row `c` of `LANES * LANES` words: the first `LANES` columns.
+    #[inline(always)]
+    unsafe fn turn_over(square: &[[u32; MAX_LANES]; MAX_LANES], to: *mut u32) {
+        // SAFETY: the caller gives room for all words.
+        let to = unsafe { std::slice::from_raw_parts_mut(to, Self::LANES * Self::LANES) };
+        for (column, to) in to.chunks_exact_mut(Self::LANES).enumerate() {
+            for (to, row) in to.iter_mut().zip(square) {
+                *to = row[column];
+            }
+        }
+    }
     /// Whether multiply-adds take a factor from a lane of four: [`Self::fma_lane`] and [`Dots::bf16_lane`].
     const BY_LANE: bool = false;
     /// `self * factors[LANE] + addend`, rounded once.
