@@ -226,7 +226,6 @@ fn weights_are_the_probabilities_that_were_used() {
 
 #[test]
 fn bits_do_not_depend_on_threads_nor_on_other_queries() {
-    // With 17 heads, one thread and two take whole heads, and more threads take tiles.
     for (queries, keys, num_heads, head_dim) in [
         (100, 296, 4, 64),
         (49, 97, 4, 48),

@@ -22,9 +22,6 @@ use tile::{Bf16Tile, Call, FloatTile, QueryTile, UnitTile};
 /// Multiply-adds from which a second thread pays: some 10 us of one core.
 const MACS_FOR_THREADS: usize = 1 << 19;
 
-/// Heads for each thread from which threads take whole heads: fewer would leave threads without work at the end.
-const HEADS_OF_THREAD: usize = 8;
-
 /// `out[q] = softmax(q K^T * scale + bias) V` for each head, heads side by side, over the keys that `mask` leaves.
 ///
 /// `queries` and `out` are `(queries, num_heads * head_dim)`. The keys have as many heads, or a divisor of it: then groups of
@@ -103,29 +100,21 @@ pub fn attention(
     } else {
         threads
     };
-    // With enough heads a task is one of them, so that its keys and values are read by one core. Else it is a tile.
-    let tiles_of_task = if num_heads >= HEADS_OF_THREAD * threads {
-        tiles
-    } else {
-        1
-    };
     // Tiles of one head follow each other: its keys and values are then in the caches of all threads.
-    parallel_for(threads, num_heads * tiles / tiles_of_task, &|task| {
-        for tile in task * tiles_of_task..(task + 1) * tiles_of_task {
-            let (head, tile) = (tile / tiles, tile % tiles);
-            // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
-            let (first, end) = (rows * tile / tiles, rows * (tile + 1) / tiles);
-            let tile = QueryTile {
-                call: &call,
-                head,
-                first,
-                rows: end - first,
-            };
-            match kv.element() {
-                Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(&tile)),
-                Element::Bf16 => kv.isa().run(Bf16Tile(&tile)),
-                _ => kv.isa().run(FloatTile(&tile)),
-            }
+    parallel_for(threads, num_heads * tiles, &|task| {
+        let (head, tile) = (task / tiles, task % tiles);
+        // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
+        let (first, end) = (rows * tile / tiles, rows * (tile + 1) / tiles);
+        let tile = QueryTile {
+            call: &call,
+            head,
+            first,
+            rows: end - first,
+        };
+        match kv.element() {
+            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(&tile)),
+            Element::Bf16 => kv.isa().run(Bf16Tile(&tile)),
+            _ => kv.isa().run(FloatTile(&tile)),
         }
     });
 }
