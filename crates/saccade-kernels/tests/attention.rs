@@ -226,16 +226,21 @@ fn weights_are_the_probabilities_that_were_used() {
 
 #[test]
 fn bits_do_not_depend_on_threads_nor_on_other_queries() {
-    for (queries, keys, head_dim) in [(100, 296, 64), (49, 97, 48), (30, 5, 7)] {
-        let case = Case::new(8, queries, keys, 4, head_dim, 0);
+    for (queries, keys, num_heads, head_dim) in [
+        (100, 296, 4, 64),
+        (49, 97, 4, 48),
+        (35, 40, 17, 20),
+        (30, 5, 4, 7),
+    ] {
+        let case = Case::new(8, queries, keys, num_heads, head_dim, 0);
         let all = case.queries.values();
-        let width = 4 * head_dim;
+        let width = num_heads * head_dim;
         for kind in kinds() {
             let held = case.held(kind);
-            let mut weights = vec![0.0; 4 * queries * keys];
+            let mut weights = vec![0.0; num_heads * queries * keys];
             let expected = bits(&case.run(kind, 1, None, Some(&mut weights)));
             for threads in [2, 3, 8] {
-                let mut other = vec![0.0; 4 * queries * keys];
+                let mut other = vec![0.0; num_heads * queries * keys];
                 assert_eq!(
                     bits(&case.run(kind, threads, None, Some(&mut other))),
                     expected,

@@ -7,7 +7,7 @@ use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::isa::Isa;
 use crate::pool::parallel_for;
 use crate::rows::Rows;
-use crate::tiles::TILE;
+use crate::tiles::{MAX_ROWS, TILE};
 use crate::weights::Element;
 
 /// Elements from which packing on a second thread pays.
@@ -357,7 +357,7 @@ impl PackedKeyValues {
     /// Queries that are taken together at most.
     pub(super) fn tile_rows(&self) -> usize {
         if self.is_tiled() {
-            TILE
+            MAX_ROWS
         } else {
             self.isa.vectors().tile_rows
         }

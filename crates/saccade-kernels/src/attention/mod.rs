@@ -112,9 +112,9 @@ pub fn attention(
             rows: end - first,
         };
         match kv.element() {
-            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(tile)),
-            Element::Bf16 => kv.isa().run(Bf16Tile(tile)),
-            _ => kv.isa().run(FloatTile(tile)),
+            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(&tile)),
+            Element::Bf16 => kv.isa().run(Bf16Tile(&tile)),
+            _ => kv.isa().run(FloatTile(&tile)),
         }
     });
 }

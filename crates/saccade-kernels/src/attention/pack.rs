@@ -182,6 +182,11 @@ impl Head<'_> {
                 }
                 let to = &mut self.keys_to[(panel * steps + step) * V::LANES..];
                 let count = V::LANES.min(steps - step);
+                if start == 0 && count == V::LANES {
+                    // SAFETY: both squares are whole; the caller has the instruction set.
+                    unsafe { V::turn_over(&square, to.as_mut_ptr()) };
+                    continue;
+                }
                 for (word, to) in to.chunks_exact_mut(V::LANES).take(count).enumerate() {
                     for (to, row) in to.iter_mut().zip(&square).skip(start) {
                         *to = row[word];

@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
 use super::mask::Mask;
 use crate::simd::{Kernel, Simd, Vector};
-use crate::tiles::{Ahead, Operation, Product, Session, TILE, TileUnit};
+use crate::tiles::{Ahead, MAX_COLUMNS, Operation, Product, Session, TILE, TileUnit};
 
 /// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
 pub(super) struct TileProduct {
@@ -67,10 +67,9 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
     #[inline(always)]
     unsafe fn multiply(&mut self, _: S, product: &TileProduct) {
         const { assert!(S::Vector::LANES == TILE) }
-        let mut vector = 0;
-        while vector < product.vectors {
-            let are_together = product.b_vector == TILE && product.vectors - vector >= 3;
-            let columns = if are_together { 3 } else { 1 };
+        let mut first = 0;
+        while first < product.vectors {
+            let columns = columns_at_once(product, product.vectors - first);
             // SAFETY: the caller's promise.
             unsafe {
                 self.multiply(&Product {
@@ -78,19 +77,30 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
                     rows: product.rows,
                     x: product.factors.cast(),
                     x_stride: product.factors_stride,
-                    w: product.b.add(vector * product.b_vector),
+                    w: product.b.add(first * product.b_vector),
                     w_stride: product.b_step,
+                    w_column: product.b_vector,
                     w_step: TILE * product.b_step,
                     columns,
                     steps: product.depth.div_ceil(<Self as Multiply<S, Pairs>>::KEYS),
-                    sums: product.out.add(vector * TILE).cast(),
+                    sums: product.out.add(first * TILE).cast(),
                     sums_stride: product.out_stride,
                     add: product.add,
                     ahead: Ahead::NOTHING,
                 });
             }
-            vector += columns;
+            first += columns;
         }
+    }
+}
+
+/// How many of the `left` tiles of columns a unit takes at once: as many products in flight as its tiles of sums allow.
+fn columns_at_once(product: &TileProduct, left: usize) -> usize {
+    match left {
+        _ if product.rows <= TILE => left.div_ceil(left.div_ceil(MAX_COLUMNS)),
+        // Not 3 and 1: a single column waits for each of its products.
+        3 | 5.. if product.b_vector == TILE => 3,
+        _ => left.min(2),
     }
 }
 

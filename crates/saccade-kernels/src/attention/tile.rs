@@ -9,7 +9,7 @@ use super::mask::Mask;
 use super::product::{InVectors, Multiply, Removed, TileProduct};
 use super::softmax::{Row, Running};
 use crate::simd::{Dot, Dots, Kernel, MAX_TILE_ROWS, Simd, Vector, load, store};
-use crate::tiles::{Session, TILE, TileKernel, TileUnit};
+use crate::tiles::{MAX_ROWS, Session, TileKernel, TileUnit};
 
 /// Keys between two updates of a query's running maximum, at most: whole pairs of vectors of every instruction set.
 const KEY_BLOCK: usize = 320;
@@ -19,6 +19,9 @@ const MAX_VALUES: usize = 256;
 
 /// Elements of the queries that are on the stack at a time: an even number of whole vectors. Wider heads take more passes.
 const MAX_DEPTH: usize = 256;
+
+/// Words of a cache line.
+const LINE: usize = 16;
 
 pub(super) struct Call<'a> {
     pub kv: &'a PackedKeyValues,
@@ -46,13 +49,13 @@ pub(super) struct QueryTile<'a> {
 }
 
 /// A tile of float32 keys and values.
-pub(super) struct FloatTile<'a>(pub QueryTile<'a>);
+pub(super) struct FloatTile<'a>(pub &'a QueryTile<'a>);
 
 /// A tile of bfloat16 keys and values.
-pub(super) struct Bf16Tile<'a>(pub QueryTile<'a>);
+pub(super) struct Bf16Tile<'a>(pub &'a QueryTile<'a>);
 
 /// A tile of bfloat16 keys and values, for a unit that multiplies tiles.
-pub(super) struct UnitTile<'a>(pub QueryTile<'a>);
+pub(super) struct UnitTile<'a>(pub &'a QueryTile<'a>);
 
 impl Kernel for FloatTile<'_> {
     type Output = ();
@@ -95,7 +98,7 @@ impl TileKernel for UnitTile<'_> {
 
 /// The tile on the vectors beside its unit.
 struct BesideUnit<'a, U> {
-    tile: QueryTile<'a>,
+    tile: &'a QueryTile<'a>,
     unit: U,
 }
 
@@ -107,7 +110,7 @@ impl<U: TileUnit> Kernel for BesideUnit<'_, U> {
         // SAFETY: no other session is open; called within `Simd::run`; keys and values are pairs of bfloat16 in whole steps.
         unsafe {
             let mut session = Session::new(self.unit);
-            self.tile.run_as::<S, Pairs, _, TILE>(simd, &mut session);
+            self.tile.run_as::<S, Pairs, _, MAX_ROWS>(simd, &mut session);
         }
     }
 }
@@ -188,15 +191,20 @@ unsafe fn attend<
         sum: 0.0,
     }; ROWS];
     let running = &mut running[..tile.rows];
+    let mut maxima = [f32::NEG_INFINITY; ROWS];
     let block = keys_of_block(&call.mask, len, M::KEYS);
     // Keys beyond are seen by none of these queries.
     let visible = call.mask.visible(tile.first + tile.rows - 1, len);
     let kv_head = tile.head / call.heads_per_kv_head;
+    // Whether no value that a query does not see can make a difference.
+    let can_multiply = kv.is_finite() || matches!(call.mask, Mask::None);
     // SAFETY: the scratch holds as many rows as a tile may have, of MAX_DEPTH factors, KEY_BLOCK probabilities and `padded` sums; blocks end
     // at the last key or before it, and its vector is padded in the keys; everything else is the caller's promise.
     unsafe {
-        for i in (0..tile.rows * padded).step_by(V::LANES) {
-            V::splat(0.0).store(sums.add(i));
+        if visible == 0 || !can_multiply {
+            for i in (0..tile.rows * padded).step_by(V::LANES) {
+                V::splat(0.0).store(sums.add(i));
+            }
         }
         let keys = kv.head_keys(kv_head).as_ptr();
         let values = kv.head_values(kv_head).as_ptr();
@@ -210,41 +218,58 @@ unsafe fn attend<
                 factors,
                 probabilities,
             );
-            for (r, running) in running.iter_mut().enumerate() {
-                let row = Row {
-                    mask: &call.mask,
-                    head: tile.head,
-                    query: tile.first + r,
-                    len,
-                    first,
-                    count,
-                };
+            let row = |r: usize| Row {
+                mask: &call.mask,
+                head: tile.head,
+                query: tile.first + r,
+                len,
+                first,
+                count,
+            };
+            // All maxima before all exponentials: rows are then independent, and the CPU works on several of them at once.
+            for (r, (max, running)) in maxima.iter_mut().zip(running.iter()).enumerate() {
+                *max = row(r).logits::<V>(probabilities.add(r * KEY_BLOCK), running.max);
+            }
+            let block_values = values.add(first / A::STEP * value_width);
+            for (r, (running, &max)) in running.iter_mut().zip(&maxima).enumerate() {
+                let row = row(r);
+                // The first of a head's tiles asks for the values while it computes: from memory they came at its bandwidth while nothing else
+                // was done.
+                if tile.first == 0 {
+                    let words = count.div_ceil(A::STEP) * value_width;
+                    let lines = words.div_ceil(LINE);
+                    for line in lines * r / tile.rows..lines * (r + 1) / tile.rows {
+                        V::prefetch(block_values.wrapping_add(line * LINE).cast());
+                    }
+                }
                 let probabilities = probabilities.add(r * KEY_BLOCK);
-                let rescale = row.softmax::<S, V, A>(probabilities, running);
+                let rescale = row.softmax::<S, V, A>(probabilities, max, running);
                 if columns.first == 0
                     && let Some(weights) = call.weights(tile.head, tile.first + r)
                 {
                     row.keep_weights::<S, A>(probabilities, rescale, weights);
                 }
-                for i in (0..padded).step_by(V::LANES) {
-                    let at = sums.add(r * padded + i);
-                    V::load(at).mul(V::splat(rescale)).store(at);
+                if first > 0 {
+                    for i in (0..padded).step_by(V::LANES) {
+                        let at = sums.add(r * padded + i);
+                        V::load(at).mul(V::splat(rescale)).store(at);
+                    }
                 }
             }
             let product = TileProduct {
                 rows: tile.rows,
                 factors: probabilities,
                 factors_stride: KEY_BLOCK,
-                b: values.add(first / A::STEP * value_width + columns.first),
+                b: block_values.add(columns.first),
                 b_step: value_width,
                 b_vector: V::LANES,
                 depth: count,
                 out: sums,
                 out_stride: padded,
                 vectors: padded / V::LANES,
-                add: true,
+                add: first > 0,
             };
-            if kv.is_finite() || matches!(call.mask, Mask::None) {
+            if can_multiply {
                 multiplier.multiply(simd, &product);
             } else {
                 let removed = Removed {
@@ -331,12 +356,13 @@ impl QueryTile<'_> {
         for (r, running) in running.iter().enumerate() {
             // Nothing was added where no key is left: zeros divided by one.
             let divisor = if running.sum == 0.0 { 1.0 } else { running.sum };
+            let factor = 1.0 / divisor;
             // SAFETY: the caller's promise; a row of the weights has an element for every key.
             unsafe {
                 let out = call.out.offset((self.first + r) as isize * call.out_stride);
                 let out = out.add(self.head * call.kv.head_dim() + columns.first);
                 for i in (0..columns.count).step_by(V::LANES) {
-                    let value = V::load(sums.add(r * padded + i)).div(V::splat(divisor));
+                    let value = V::load(sums.add(r * padded + i)).mul(V::splat(factor));
                     store(value, out.add(i), V::LANES.min(columns.count - i));
                 }
                 if columns.first == 0

@@ -186,6 +186,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                         x_stride: block.x_stride.cast_unsigned(),
                         w: block.weights.as_ptr().add(part.start * STEP_WORDS),
                         w_stride: COLUMNS,
+                        w_column: TILE,
                         w_step: STEP_WORDS,
                         columns: 3,
                         steps: part.len(),

@@ -58,6 +58,8 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn round(self) -> Self;
     /// `self * 2^exponent` for whole exponents in `-252..=254`; NaN in `self` stays.
     unsafe fn scale_by_power_of_two(self, exponent: Self) -> Self;
+    /// The f32 whose sign and exponent are the low nine bits of each lane.
+    unsafe fn low_bits_as_exponent(self) -> Self;
     /// `value` in those lanes where `probe == value`, `self` in the others.
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self;
     /// Sum of the lanes, in an order that is fixed.
@@ -92,6 +94,17 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn dot_bytes(sum: Self::Ints, x: Self::Ints, w: Self::Ints) -> Self::Ints;
     /// Asks for the cache line at `at`, which may be any address. A hint: it may do nothing.
     unsafe fn prefetch(at: *const u8);
+    /// Column `c` of the first `LANES` rows of a square as row `c` of `LANES * LANES` words: the first `LANES` columns.
+    #[inline(always)]
+    unsafe fn turn_over(square: &[[u32; MAX_LANES]; MAX_LANES], to: *mut u32) {
+        // SAFETY: the caller gives room for all words.
+        let to = unsafe { std::slice::from_raw_parts_mut(to, Self::LANES * Self::LANES) };
+        for (column, to) in to.chunks_exact_mut(Self::LANES).enumerate() {
+            for (to, row) in to.iter_mut().zip(square) {
+                *to = row[column];
+            }
+        }
+    }
     /// Whether multiply-adds take a factor from a lane of four: [`Self::fma_lane`] and [`Dots::bf16_lane`].
     const BY_LANE: bool = false;
     /// `self * factors[LANE] + addend`, rounded once.

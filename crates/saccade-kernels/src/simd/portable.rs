@@ -157,6 +157,11 @@ unsafe impl<const N: usize> Vector for Lanes<N> {
     }
 
     #[inline(always)]
+    unsafe fn low_bits_as_exponent(self) -> Self {
+        Self(self.0.map(|x| f32::from_bits(x.to_bits() << 23)))
+    }
+
+    #[inline(always)]
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
         let mut out = self.0;
         for ((out, probe), value) in out.iter_mut().zip(probe.0).zip(value.0) {

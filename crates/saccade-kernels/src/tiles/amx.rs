@@ -4,7 +4,7 @@
 
 use std::mem::offset_of;
 
-use super::{Config, Job, Operation, Shape, TILE, TileUnit};
+use super::{Config, Job, MAX_COLUMNS, Operation, Shape, TILE, TileUnit};
 use crate::cpu::tiles::permission;
 use crate::simd::Simd;
 use crate::simd::x86_64::avx512::Avx512Amx;
@@ -57,6 +57,21 @@ macro_rules! product {
     };
 }
 
+/// The same for columns that are anywhere: the first, and those that follow each other by the job's stride.
+macro_rules! products_apart {
+    ($operation:literal, $($sum:literal),+) => {
+        concat!(
+            "mov {c}, {w}\n",
+            $(
+                "tileloadd tmm7, [{c} + {w_stride}*1]\n",
+                $operation, " tmm", $sum, ", tmm6, tmm7\n",
+                "add {c}, [{job} + {w_column}]\n",
+                ask_ahead!(), "\n"
+            ),+
+        )
+    };
+}
+
 /// Tiles of sums to zero, or from memory, and back to it: each `tile, bytes from the first of its rows`. The first row is at `$rows` of the job.
 macro_rules! each_sum {
     (zero: $($tile:literal),+) => {
@@ -76,9 +91,9 @@ macro_rules! each_sum {
     };
 }
 
-/// One or two tiles of rows by one or three of columns, as a function of the job: sums from zero or memory, the steps, sums to memory.
+/// Tiles of rows by tiles of columns, as a function of the job: sums from zero or memory, the steps, sums to memory.
 macro_rules! kernel {
-    ($name:ident, zero $zero:expr, load $load:expr, step [$($step:expr),+], store $store:expr $(, $second:ident)?) => {
+    ($name:ident, zero $zero:expr, load $load:expr, step [$($step:expr),+], store $store:expr $(, apart: $apart:ident)? $(, two: $second:ident)?) => {
         /// # Safety
         /// AMX is permitted and its tiles have the sizes of the job, whose pointers are valid for them.
         unsafe fn $name(job: &Job) {
@@ -118,6 +133,7 @@ macro_rules! kernel {
                     lines = const offset_of!(Job, ahead_lines),
                     sums_stride = const offset_of!(Job, sums_stride),
                     sums = const offset_of!(Job, sums)
+                    $(, $apart = const offset_of!(Job, w_column), c = out(reg) _)?
                     $(, $second = inout(reg) job.x[1] => _,
                     second_sums = const offset_of!(Job, sums) + size_of::<*mut u32>())?
                 );
@@ -126,28 +142,80 @@ macro_rules! kernel {
     };
 }
 
-/// The kernels of an operation.
-macro_rules! kernels {
-    ($operation:literal, $single:ident, $row:ident, $block:ident) => {
+/// A tile of rows by as many of columns as are listed: each `tile, bytes from the first of its rows in the sums`.
+macro_rules! row_kernel {
+    ($operation:literal, $name:ident, $($tile:literal, $column:literal);+) => {
         kernel!(
-            $single,
-            zero each_sum!(zero: "0"),
-            load each_sum!(load "sums": "0", "0"),
-            step ["tileloadd tmm6, [{x} + {x_stride}*1]", product!($operation, "0", "0")],
-            store each_sum!(store "sums": "0", "0")
+            $name,
+            zero each_sum!(zero: $($tile),+),
+            load each_sum!(load "sums": $($tile, $column);+),
+            step ["tileloadd tmm6, [{x} + {x_stride}*1]", products_apart!($operation, $($tile),+)],
+            store each_sum!(store "sums": $($tile, $column);+),
+            apart: w_column
         );
+    };
+}
+
+/// Two tiles of rows (tiles 6 and 5) by a tile of columns, the job's stride after the one before it.
+macro_rules! products_of_two {
+    ($operation:literal, $first:literal, $second:literal) => {
+        concat!(
+            "tileloadd tmm7, [{c} + {w_stride}*1]\n",
+            $operation,
+            " tmm",
+            $first,
+            ", tmm6, tmm7\n",
+            ask_ahead!(),
+            "\n",
+            $operation,
+            " tmm",
+            $second,
+            ", tmm5, tmm7\n",
+            ask_ahead!(),
+            "\n",
+            "add {c}, [{job} + {w_column}]"
+        )
+    };
+}
+
+/// Two tiles of rows by as many of columns as are listed: each `tile of the first rows, of the second, bytes in the sums`.
+macro_rules! two_rows_kernel {
+    ($operation:literal, $name:ident, $($first:literal, $second:literal, $column:literal);+) => {
         kernel!(
-            $row,
-            zero each_sum!(zero: "0", "1", "2"),
-            load each_sum!(load "sums": "0", "0"; "1", "64"; "2", "128"),
+            $name,
+            zero concat!(each_sum!(zero: $($first),+), each_sum!(zero: $($second),+)),
+            load concat!(
+                each_sum!(load "sums": $($first, $column);+),
+                each_sum!(load "second_sums": $($second, $column);+)
+            ),
             step [
                 "tileloadd tmm6, [{x} + {x_stride}*1]",
-                product!($operation, "0", "0"),
-                product!($operation, "1", "64"),
-                product!($operation, "2", "128")
+                "tileloadd tmm5, [{second} + {x_stride}*1]",
+                "mov {c}, {w}",
+                $(products_of_two!($operation, $first, $second),)+
+                "add {second}, 64"
             ],
-            store each_sum!(store "sums": "0", "0"; "1", "64"; "2", "128")
+            store concat!(
+                each_sum!(store "sums": $($first, $column);+),
+                each_sum!(store "second_sums": $($second, $column);+)
+            ),
+            apart: w_column,
+            two: second
         );
+    };
+}
+
+/// The kernels of an operation.
+macro_rules! kernels {
+    ($operation:literal, [$row1:ident, $row2:ident, $row3:ident, $row4:ident, $row5:ident, $row6:ident], [$two1:ident, $two2:ident], $block:ident) => {
+        row_kernel!($operation, $row1, "0", "0");
+        row_kernel!($operation, $row2, "0", "0"; "1", "64");
+        row_kernel!($operation, $row3, "0", "0"; "1", "64"; "2", "128");
+        row_kernel!($operation, $row4, "0", "0"; "1", "64"; "2", "128"; "3", "192");
+        row_kernel!($operation, $row5, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256");
+        row_kernel!($operation, $row6, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256"; "5", "320");
+        two_rows_kernel!($operation, $two1, "0", "1", "0");
+        two_rows_kernel!($operation, $two2, "0", "1", "0"; "2", "3", "64");
         // Six tiles of sums, one of rows and one of weights, which are read twice from the nearest cache.
         kernel!(
             $block,
@@ -171,13 +239,33 @@ macro_rules! kernels {
                 each_sum!(store "sums": "0", "0"; "1", "64"; "2", "128"),
                 each_sum!(store "second_sums": "3", "0"; "4", "64"; "5", "128")
             ),
-            second
+            two: second
         );
     };
 }
 
-kernels!("tdpbf16ps", bf16_single, bf16_row, bf16_block);
-kernels!("tdpbusd", int8_single, int8_row, int8_block);
+kernels!(
+    "tdpbf16ps",
+    [bf16_row1, bf16_row2, bf16_row3, bf16_row4, bf16_row5, bf16_row6],
+    [bf16_two1, bf16_two2],
+    bf16_block
+);
+kernels!(
+    "tdpbusd",
+    [int8_row1, int8_row2, int8_row3, int8_row4, int8_row5, int8_row6],
+    [int8_two1, int8_two2],
+    int8_block
+);
+
+/// Those of a tile of rows, by the number of columns.
+const BF16_ROWS: [unsafe fn(&Job); MAX_COLUMNS] =
+    [bf16_row1, bf16_row2, bf16_row3, bf16_row4, bf16_row5, bf16_row6];
+const INT8_ROWS: [unsafe fn(&Job); MAX_COLUMNS] =
+    [int8_row1, int8_row2, int8_row3, int8_row4, int8_row5, int8_row6];
+
+/// Those of two tiles of rows.
+const BF16_TWO_ROWS: [unsafe fn(&Job); 2] = [bf16_two1, bf16_two2];
+const INT8_TWO_ROWS: [unsafe fn(&Job); 2] = [int8_two1, int8_two2];
 
 /// Independent products, from tiles that stay what they are: of zeros, whose speed is that of any numbers.
 macro_rules! chains {
@@ -241,17 +329,16 @@ unsafe impl TileUnit for Amx {
 
     #[inline]
     unsafe fn run(self, (): &mut (), operation: Operation, shape: Shape, job: &Job) {
+        let kernel = match (operation, shape) {
+            (Operation::Bf16, Shape::Row(columns)) => BF16_ROWS[columns - 1],
+            (Operation::Bf16, Shape::TwoRows(columns)) => BF16_TWO_ROWS[columns - 1],
+            (Operation::Bf16, Shape::Block) => bf16_block,
+            (Operation::Int8, Shape::Row(columns)) => INT8_ROWS[columns - 1],
+            (Operation::Int8, Shape::TwoRows(columns)) => INT8_TWO_ROWS[columns - 1],
+            (Operation::Int8, Shape::Block) => int8_block,
+        };
         // SAFETY: the caller's promise.
-        unsafe {
-            match (operation, shape) {
-                (Operation::Bf16, Shape::Single) => bf16_single(job),
-                (Operation::Bf16, Shape::Row) => bf16_row(job),
-                (Operation::Bf16, Shape::Block) => bf16_block(job),
-                (Operation::Int8, Shape::Single) => int8_single(job),
-                (Operation::Int8, Shape::Row) => int8_row(job),
-                (Operation::Int8, Shape::Block) => int8_block(job),
-            }
-        }
+        unsafe { kernel(job) }
     }
 
     fn chains(self, operation: Operation) -> usize {
@@ -280,12 +367,25 @@ mod tests {
     /// What both units make of a product with these operands.
     fn both(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &[u32], before: &[u32]) {
         let amx = Amx::new().expect("looked at before");
-        let of = |columns: usize, add: bool| {
+        let of = |columns: usize, apart: bool, add: bool| {
             let [mut hard, mut soft] = [before.to_vec(), before.to_vec()];
-            let with = |sums| Product {
-                columns,
-                add,
-                ..product(operation, x, w, sums)
+            let with = |sums| {
+                let product = Product {
+                    columns,
+                    add,
+                    sums_stride: MAX_COLUMNS * TILE,
+                    ..product(operation, x, w, sums)
+                };
+                if !apart {
+                    return product;
+                }
+                Product {
+                    w_stride: TILE,
+                    w_step: TILE * TILE,
+                    // Columns overlap, so that all of them fit.
+                    w_column: (w.len() - steps * TILE * TILE) / (MAX_COLUMNS - 1),
+                    ..product
+                }
             };
             // SAFETY: the operands have these sizes.
             unsafe {
@@ -301,10 +401,9 @@ mod tests {
             }
         };
         for add in [false, true] {
-            of(3, add);
-            if rows <= TILE {
-                of(1, add);
-            }
+            of(3, false, add);
+            let most = if rows <= TILE { MAX_COLUMNS } else { 2 };
+            (1..=most).for_each(|columns| of(columns, true, add));
         }
     }
 
@@ -320,7 +419,11 @@ mod tests {
         }
         for rows in 1..=MAX_ROWS {
             let steps = 1 + rows % 4;
-            let (x_size, w_size, sums) = (rows * TILE * steps, 3 * TILE * TILE * steps, rows * 3 * TILE);
+            let (x_size, w_size, sums) = (
+                rows * TILE * steps,
+                3 * TILE * TILE * steps,
+                rows * MAX_COLUMNS * TILE,
+            );
             for seed in 0..8 {
                 let (x, w, before) = (
                     words(seed, x_size),

@@ -17,6 +17,9 @@ pub(crate) const TILE: usize = 16;
 /// Rows of a product at most: two tiles.
 pub(crate) const MAX_ROWS: usize = 2 * TILE;
 
+/// Tiles of columns of a product with one tile of rows at most: as many as there are tiles for sums.
+pub(crate) const MAX_COLUMNS: usize = 6;
+
 /// What is multiplied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Operation {
@@ -59,17 +62,20 @@ impl Ahead {
 #[derive(Clone, Copy)]
 pub(crate) struct Product {
     pub operation: Operation,
-    /// `1 ..= MAX_ROWS`; with one column, at most [`TILE`].
+    /// `1 ..= MAX_ROWS`.
     pub rows: usize,
     pub x: *const u32,
     /// Words from one row to the next, of each operand.
     pub x_stride: usize,
-    /// Rows of 16 words, or of 48 for `columns` of 3: elements of the summed dimension below each other.
+    /// Rows of 16 words: elements of the summed dimension below each other.
     pub w: *const u32,
     pub w_stride: usize,
+    /// Words from a tile to the one of the next column.
+    pub w_column: usize,
     /// Words from one step to the next.
     pub w_step: usize,
-    /// Tiles next to each other: 1 or 3.
+    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMNS` where there are at most [`TILE`] rows, else 1, 2, or 3 that are next to
+    /// each other in `w` too.
     pub columns: usize,
     /// Steps of [`TILE`] words over which is summed, at least one.
     pub steps: usize,
@@ -88,6 +94,7 @@ pub(crate) struct Job {
     pub x_stride: usize,
     pub w: *const u32,
     pub w_stride: usize,
+    pub w_column: usize,
     pub w_step: usize,
     pub sums: [*mut u32; 2],
     pub sums_stride: usize,
@@ -103,11 +110,11 @@ pub(crate) struct Job {
 /// Tiles of rows and of columns of a [`Job`]: what units have kernels for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Shape {
-    /// One by one.
-    Single,
-    /// One by three.
-    Row,
-    /// Two by three.
+    /// One by `1 ..= MAX_COLUMNS`, anywhere.
+    Row(usize),
+    /// Two by one or two, anywhere.
+    TwoRows(usize),
+    /// Two by three, next to each other.
     Block,
 }
 
@@ -225,15 +232,17 @@ impl<U: TileUnit> Session<U> {
     /// same sums of it. So no row is touched that is not there, and a tile costs what it has rows.
     ///
     /// # Safety
-    /// All pointers are valid for what `product` names; for `columns` of 3, rows of `w` and of `sums` hold 48 words.
-    #[inline]
+    /// All pointers are valid for what `product` names; rows of `sums` hold 16 words for each column.
+    // Inlined, so that the job is written once: a product read back from memory by wider loads than it was stored waits for all stores
+    // before it, tiles of sums among them (Intel with AMX: 8 % of attention).
+    #[inline(always)]
     pub(crate) unsafe fn multiply(&mut self, product: &Product) {
         const WORD: usize = size_of::<u32>();
         let rows = product.rows;
         let (tile_rows, shape) = match (product.columns, rows) {
-            (1, 1..=TILE) => (rows, Shape::Single),
-            (3, 1..=TILE) => (rows, Shape::Row),
-            (3, ..=MAX_ROWS) => (rows.div_ceil(2), Shape::Block),
+            (1..=MAX_COLUMNS, 1..=TILE) => (rows, Shape::Row(product.columns)),
+            (1..=2, ..=MAX_ROWS) => (rows.div_ceil(2), Shape::TwoRows(product.columns)),
+            (3, ..=MAX_ROWS) if product.w_column == TILE => (rows.div_ceil(2), Shape::Block),
             (columns, rows) => unreachable!("{rows} rows by {columns} tiles"),
         };
         debug_assert!(product.steps > 0);
@@ -243,6 +252,7 @@ impl<U: TileUnit> Session<U> {
             x_stride: WORD * product.x_stride,
             w: product.w,
             w_stride: WORD * product.w_stride,
+            w_column: WORD * product.w_column,
             w_step: WORD * product.w_step,
             sums: [
                 product.sums,

@@ -182,12 +182,12 @@ unsafe impl TileUnit for Software {
 
     unsafe fn run(self, registers: &mut Registers, operation: Operation, shape: Shape, job: &Job) {
         let (row_tiles, columns) = match shape {
-            Shape::Single => (1, 1),
-            Shape::Row => (1, 3),
+            Shape::Row(columns) => (1, columns),
+            Shape::TwoRows(columns) => (2, columns),
             Shape::Block => (2, 3),
         };
-        // Tiles of sums: three for each tile of rows.
-        let sums = |row: usize, column: usize| (3 * row + column, job.sums[row].wrapping_add(column * TILE));
+        let sums =
+            |row: usize, column: usize| (columns * row + column, job.sums[row].wrapping_add(column * TILE));
         let all = (0..row_tiles).flat_map(|row| (0..columns).map(move |column| (row, column)));
         // SAFETY: the caller's promise.
         unsafe {
@@ -202,7 +202,7 @@ unsafe impl TileUnit for Software {
             for step in 0..job.steps {
                 for (row, column) in all.clone() {
                     registers.load(X, job.x[row].add(step * TILE), job.x_stride);
-                    let w = job.w.byte_add(step * job.w_step).add(column * TILE);
+                    let w = job.w.byte_add(step * job.w_step + column * job.w_column);
                     registers.load(W, w, job.w_stride);
                     registers.multiply(operation, sums(row, column).0);
                 }
@@ -275,6 +275,7 @@ pub(super) mod tests {
             x_stride: TILE * steps,
             w: w.as_ptr(),
             w_stride: 3 * TILE,
+            w_column: TILE,
             w_step: 3 * TILE * TILE,
             columns: 3,
             steps,

@@ -194,6 +194,12 @@ unsafe impl Vector for float32x4_t {
     }
 
     #[inline(always)]
+    unsafe fn low_bits_as_exponent(self) -> Self {
+        // SAFETY: as in splat.
+        unsafe { vreinterpretq_f32_s32(vshlq_n_s32::<23>(vreinterpretq_s32_f32(self))) }
+    }
+
+    #[inline(always)]
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
         // SAFETY: as in splat.
         unsafe { vbslq_f32(vceqq_f32(probe, value), value, self) }

@@ -163,6 +163,12 @@ unsafe impl Vector for __m256 {
     }
 
     #[inline(always)]
+    unsafe fn low_bits_as_exponent(self) -> Self {
+        // SAFETY: as in splat.
+        unsafe { _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_castps_si256(self))) }
+    }
+
+    #[inline(always)]
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
         // SAFETY: as in splat.
         unsafe { _mm256_blendv_ps(self, value, _mm256_cmp_ps::<_CMP_EQ_OQ>(probe, value)) }

@@ -5,7 +5,7 @@ use std::mem::transmute;
 
 use super::{NEAREST, simd_type};
 use crate::cpu::Cpu;
-use crate::simd::{Dots, Kernel, NoDots, Simd, Vector};
+use crate::simd::{Dots, Kernel, MAX_LANES, NoDots, Simd, Vector};
 
 simd_type! {
     /// AVX-512 F, VL, BW and DQ.
@@ -195,6 +195,12 @@ unsafe impl Vector for __m512 {
     }
 
     #[inline(always)]
+    unsafe fn low_bits_as_exponent(self) -> Self {
+        // SAFETY: as in splat.
+        unsafe { _mm512_castsi512_ps(_mm512_slli_epi32::<23>(_mm512_castps_si512(self))) }
+    }
+
+    #[inline(always)]
     unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
         // SAFETY: as in splat.
         unsafe { _mm512_mask_mov_ps(self, _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(probe, value), value) }
@@ -312,6 +318,49 @@ unsafe impl Vector for __m512 {
         unsafe {
             let pairs = _mm512_maddubs_epi16(x, w);
             _mm512_add_epi32(sum, _mm512_madd_epi16(pairs, _mm512_set1_epi16(1)))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn turn_over(square: &[[u32; MAX_LANES]; MAX_LANES], to: *mut u32) {
+        // SAFETY: the caller gives room for sixteen vectors.
+        unsafe {
+            let mut rows = [_mm512_setzero_si512(); 16];
+            for (row, from) in rows.iter_mut().zip(square) {
+                *row = _mm512_loadu_si512(from.as_ptr().cast());
+            }
+            // Quarters of vectors become squares of four by four that are turned over: of rows 4 i to 4 i + 3, column c of each.
+            let mut turned = rows;
+            for i in (0..16).step_by(4) {
+                let [a, b, c, d] = [rows[i], rows[i + 1], rows[i + 2], rows[i + 3]];
+                let (low_ab, high_ab) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
+                let (low_cd, high_cd) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
+                turned[i] = _mm512_unpacklo_epi64(low_ab, low_cd);
+                turned[i + 1] = _mm512_unpackhi_epi64(low_ab, low_cd);
+                turned[i + 2] = _mm512_unpacklo_epi64(high_ab, high_cd);
+                turned[i + 3] = _mm512_unpackhi_epi64(high_ab, high_cd);
+            }
+            // Then the quarters themselves: 0x88 takes the even ones of two vectors, 0xdd the odd ones.
+            for c in 0..4 {
+                let [a, b, e, d] = [turned[c], turned[4 + c], turned[8 + c], turned[12 + c]];
+                let even = [
+                    _mm512_shuffle_i32x4::<0x88>(a, b),
+                    _mm512_shuffle_i32x4::<0x88>(e, d),
+                ];
+                let odd = [
+                    _mm512_shuffle_i32x4::<0xdd>(a, b),
+                    _mm512_shuffle_i32x4::<0xdd>(e, d),
+                ];
+                let columns = [
+                    _mm512_shuffle_i32x4::<0x88>(even[0], even[1]),
+                    _mm512_shuffle_i32x4::<0x88>(odd[0], odd[1]),
+                    _mm512_shuffle_i32x4::<0xdd>(even[0], even[1]),
+                    _mm512_shuffle_i32x4::<0xdd>(odd[0], odd[1]),
+                ];
+                for (quarter, column) in columns.into_iter().enumerate() {
+                    _mm512_storeu_si512(to.add(16 * (4 * quarter + c)).cast(), column);
+                }
+            }
         }
     }
 
