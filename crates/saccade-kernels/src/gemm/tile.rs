@@ -131,7 +131,15 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
     let tiles = &block.range;
     let first_row = block.tiles.first_row(tiles.start);
     let steps = block.in_features.div_ceil(P::STEP);
-    let parts = Parts::new(block, NV * V::LANES, steps, BLOCK_STEPS);
+    // As streams, a part is asked for while the one before it is multiplied. One of 1024 steps after one of 512 would take twice the pace:
+    // parts of 512 made 1536 steps 1.04 to 1.08 times as fast (AVX-512, float32, Intel with AMX), and no difference where 1024 divides them.
+    let is_uneven = steps > BLOCK_STEPS && !steps.is_multiple_of(BLOCK_STEPS);
+    let part_steps = if block.streams && is_uneven {
+        BLOCK_STEPS / 2
+    } else {
+        BLOCK_STEPS
+    };
+    let parts = Parts::new(block, NV * V::LANES, steps, part_steps);
     for part in parts.iter() {
         for number in tiles.clone() {
             let (first, end) = (block.tiles.first_row(number), block.tiles.first_row(number + 1));
