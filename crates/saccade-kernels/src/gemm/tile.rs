@@ -19,10 +19,6 @@ pub(super) const SUM_PART: usize = 512;
 /// to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4, AVX-512 from 0.94 to 0.95.
 const BLOCK_STEPS: usize = 1024;
 
-/// Steps of a turn of the innermost loop. What counts steps and finds rows takes ports from the multiply-adds on Intel: with one step a turn,
-/// 0.9 of the rate of float32 at 49 x 1536 x 6144 and 296 x 2048 x 8192, AVX-512 and AVX2 (Intel with AMX, one thread). Eight gain no more.
-const UNROLLED: usize = 4;
-
 /// One step over `k`: vectors of words of the panel, each of which holds [`Self::STEP`] consecutive `k` of its column, and as many `k` of
 /// each row.
 pub(super) trait Step<S: Simd> {
@@ -32,6 +28,9 @@ pub(super) trait Step<S: Simd> {
     const PART_STEPS: usize;
     /// Rows of the largest tile.
     const TILE_ROWS: usize;
+    /// Steps of a turn of the innermost loop. What counts steps and finds rows takes ports from the products on Intel: with one step a turn,
+    /// 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more.
+    const UNROLLED: usize = 4;
     /// A vector of sums.
     type Sum: Copy;
 
@@ -238,15 +237,15 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
                 } else {
                     let Range { mut start, end } = round;
                     let mut words = weights.add(start * row_elements);
-                    while start + UNROLLED <= end {
-                        for index in 0..UNROLLED {
+                    while start + P::UNROLLED <= end {
+                        for index in 0..P::UNROLLED {
                             V::prefetch(next.cast());
                             next = next.wrapping_add(tile.ahead.pitch);
                             let words = words.add(index * row_elements);
                             P::multiply_add(&mut acc, &rows, words, start + index, P::STEP);
                         }
-                        words = words.add(UNROLLED * row_elements);
-                        start += UNROLLED;
+                        words = words.add(P::UNROLLED * row_elements);
+                        start += P::UNROLLED;
                     }
                     for step in start..end {
                         V::prefetch(next.cast());
