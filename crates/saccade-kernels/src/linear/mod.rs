@@ -307,7 +307,7 @@ impl PackedLinear {
             (call.quantized, call.outliers) = (converted.quantized, converted.outliers);
         }
         let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
-        let order = Order::new(blocks, num_panels, panel_bytes, TASKS_PER_THREAD * threads);
+        let order = Order::new(blocks, num_panels, panel_bytes, TASKS_PER_THREAD * threads, threads);
         parallel_for(threads, order.tasks(), &|task| {
             let (block, panel) = order.at(task);
             let range = tiles.count * block / blocks..tiles.count * (block + 1) / blocks;

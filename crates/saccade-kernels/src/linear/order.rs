@@ -19,16 +19,18 @@ pub(super) struct Order {
     blocks: usize,
     panels: usize,
     groups: usize,
+    threads: usize,
 }
 
 impl Order {
     /// `blocks` of rows through `panels` of `panel_bytes`. A group has `least` panels or more, for threads that work next to each other.
-    pub(super) fn new(blocks: usize, panels: usize, panel_bytes: usize, least: usize) -> Self {
+    pub(super) fn new(blocks: usize, panels: usize, panel_bytes: usize, least: usize, threads: usize) -> Self {
         let in_group = (GROUP_BYTES / panel_bytes.max(1)).max(least).max(1);
         Self {
             blocks,
             panels,
             groups: panels.div_ceil(in_group),
+            threads,
         }
     }
 
@@ -43,12 +45,15 @@ impl Order {
             blocks,
             panels,
             groups,
+            threads,
         } = *self;
         // Groups before this one have `blocks` tasks for each of their panels.
         let group = ((task / blocks + 1) * groups - 1) / panels;
         let (first, end) = (panels * group / groups, panels * (group + 1) / groups);
         let within = task - blocks * first;
-        (within / (end - first), first + within % (end - first))
+        let count = end - first;
+        let (turn, lane) = (within % count / threads, within % count % threads);
+        (within / count, first + lane * (count / threads) + lane.min(count % threads) + turn)
     }
 
     /// How many panels further the one is that the thread of `task` probably takes next, if `threads` take turns. Zero where it takes an
