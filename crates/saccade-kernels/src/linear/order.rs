@@ -29,7 +29,7 @@ impl Order {
         Self {
             blocks,
             panels,
-            groups: panels.div_ceil(in_group),
+            groups: if blocks == 1 { 1 } else { panels.div_ceil(in_group) },
             threads,
         }
     }
