@@ -94,24 +94,21 @@ pub(crate) struct InTiles<U, E> {
 }
 
 impl<U: TileUnit, E: Elements> InTiles<U, E> {
-    /// Asks memory for where the results of some rows go: by the time that their sums are made, they are here.
-    ///
-    /// # Safety
-    /// Called on the CPU of the unit.
-    #[inline(always)]
-    unsafe fn ask_for_results(&self, block: &Block<'_>, rows: Range<usize>) {
-        for row in rows {
-            let out = block.out.wrapping_offset(row as isize * block.out_stride);
-            for tile in 0..COLUMNS / TILE {
-                // SAFETY: prefetching is allowed at any address; the caller's promise.
-                unsafe { <U::Simd as Simd>::Vector::prefetch(out.wrapping_add(tile * TILE).cast()) };
-            }
-        }
-    }
-
     /// Steps over which is summed.
     fn steps(in_features: usize) -> usize {
         in_features.div_ceil(TILE * E::OPERATION.per_word())
+    }
+
+    /// Asks memory for where the results of some rows go: by the time that their sums are made, they are here.
+    #[inline(always)]
+    fn ask_for_results(&self, block: &Block<'_>, rows: Range<usize>) {
+        for row in rows {
+            let out = block.out.wrapping_offset(row as isize * block.out_stride);
+            for tile in 0..COLUMNS / TILE {
+                // SAFETY: prefetching is allowed at any address; the unit is the proof of its vectors.
+                unsafe { <U::Simd as Simd>::Vector::prefetch(out.wrapping_add(tile * TILE).cast()) };
+            }
+        }
     }
 }
 
@@ -166,7 +163,8 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
         // second-level cache.
         let part_steps = steps.div_ceil(steps.div_ceil(PART_STEPS)).next_multiple_of(8);
         let parts = Parts::new(block, STEP_WORDS, steps, part_steps);
-        // SAFETY: no other session is open; the tile's rows are in the block, its steps in the panel, and its sums within the block's.
+        // SAFETY: no other session is open, and finishing uses no tiles; the tile's rows are in the block, its steps in the panel, and its sums
+        // within the block's.
         unsafe {
             let mut session = Session::new(self.unit);
             for part in parts.iter() {

@@ -145,7 +145,7 @@ pub(crate) struct Block<'a> {
     pub out: *const f32,
     /// Elements from one row of them to the next.
     pub out_stride: isize,
-    /// To be called with rows whose sums are complete, once for each row of the block. Results are made of them at once.
+    /// Makes results of the sums of rows of the call. It uses vectors, never tiles.
     pub finish: &'a dyn Fn(Range<usize>),
 }
 
@@ -165,8 +165,8 @@ impl Block<'_> {
 /// `scales[column] * quantized[row].scale * (sum - quantized[row].zero * sums[column])` is the product.
 ///
 /// # Safety
-/// A value exists only on a CPU that has the instructions. [`Self::convert`] and [`Self::multiply`] read and write only what their contracts
-/// name. [`Self::shape`] never changes, and keeps to the bounds of [`Shape`] and [`MAX_SUMS`].
+/// A value exists only on a CPU that has the instructions. [`Self::convert`] and [`Self::multiply`] do what their contracts say, and read and
+/// write nothing else: `multiply` finishes no row whose sums are not complete. [`Self::shape`] never changes, and keeps to the bounds of [`Shape`] and [`MAX_SUMS`].
 pub(crate) unsafe trait Gemm: Send + Sync {
     /// The proof that this CPU has the instructions.
     fn new() -> Option<Self>
@@ -196,7 +196,8 @@ pub(crate) unsafe trait Gemm: Send + Sync {
     /// for [`Product::Int8`] `source.quantized` and, if they are given, `source.outliers`. No other thread reads or writes these places.
     unsafe fn convert(&self, source: &Source, rows: Range<usize>);
 
-    /// Writes the sums of a block of rows times a panel, and has them finished.
+    /// Writes the sums of a block of rows times a panel, and calls [`Block::finish`] once for each of its rows, when all sums of the row are
+    /// complete.
     ///
     /// # Safety
     /// The panel was packed by this product. `block.x` holds the rows of the block, for converted rows also [`Shape::rows_beyond`] more;

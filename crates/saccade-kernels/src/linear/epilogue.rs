@@ -53,7 +53,7 @@ pub(super) struct Int8<'a> {
     pub scales: &'a [f32],
     pub sums: &'a [i32],
     pub quantized: &'a [Quantized],
-    /// Of each row of the block, if any row has some.
+    /// Of each of the rows, if any row has some.
     pub outliers: &'a [Outliers],
     /// Their products with the whole numbers that weights are, in rows of the panel's columns, written for rows that have outliers; none if
     /// no row has.
@@ -130,7 +130,7 @@ impl Finish<'_> {
 }
 
 impl Finish<'_> {
-    /// What the outliers of a row of the block add to it, if it has any.
+    /// What the outliers of a row add to it, if it has any. Rows count from the first one.
     #[inline(always)]
     fn apart(&self, row: usize) -> Option<*const f32> {
         let apart = self.int8.apart?;

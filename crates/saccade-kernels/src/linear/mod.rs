@@ -307,11 +307,11 @@ impl PackedLinear {
             (call.quantized, call.outliers) = (converted.quantized, converted.outliers);
         }
         let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
-        let order = Order::new(blocks, num_panels, panel_bytes, TASKS_PER_THREAD * threads, threads);
+        let order = Order::new(blocks, num_panels, panel_bytes, threads, TASKS_PER_THREAD);
         parallel_for(threads, order.tasks(), &|task| {
             let (block, panel) = order.at(task);
             let range = tiles.count * block / blocks..tiles.count * (block + 1) / blocks;
-            self.run_panel(&call, range, columns, panel, order.ahead(task, threads));
+            self.run_panel(&call, range, columns, panel, order.ahead(task));
         });
         Ok(())
     }
@@ -335,7 +335,8 @@ impl PackedLinear {
         let weights = &self.panels.words[panel * size..][..size];
         let finish = |done: Range<usize>| {
             let sums = sums.wrapping_add((done.start - rows.start) * columns);
-            self.finish(call, done, panel, weights, sums);
+            // SAFETY: the product calls this with rows of the block whose sums are complete.
+            unsafe { self.finish(call, done, panel, weights, sums) };
         };
         let block = Block {
             x: call.x,
@@ -356,7 +357,17 @@ impl PackedLinear {
     }
 
     /// Makes results of the sums of some rows and panel number `panel`, whose words are `weights`.
-    fn finish(&self, call: &Call<'_>, rows: Range<usize>, panel: usize, weights: &[u32], sums: *const u32) {
+    ///
+    /// # Safety
+    /// `sums` points to the complete sums of these rows, which are in the call.
+    unsafe fn finish(
+        &self,
+        call: &Call<'_>,
+        rows: Range<usize>,
+        panel: usize,
+        weights: &[u32],
+        sums: *const u32,
+    ) {
         let columns = self.gemm.shape().columns;
         let first = panel * columns;
         let outliers = call.outliers.get(rows.clone()).unwrap_or_default();

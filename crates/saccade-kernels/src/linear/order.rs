@@ -8,6 +8,11 @@
 //! Bytes from memory where the shared cache holds a group but not the layer, bf16, 1568 rows, 2 threads: 1536 x 6144 reads 43 MB (326 MB block by
 //! block), 6144 x 1536 reads 96 MB (340 MB). The multiply-adds take 6 ms at the peak of two Sapphire Rapids cores with AMX, in which they can
 //! read 160 MB.
+//!
+//! Threads that take turns have lanes of panels: the first takes them from the front of a group on, the second from its middle. Panels next to
+//! each other are never written at the same time, since a core that asks for a cache line of results also asks for its neighbour, which the
+//! other core is writing. The weights of a thread follow each other, too. `sample` of N1.5 takes 0.88 (int8) and 0.94 (bfloat16) of the time
+//! with panels dealt by turns (Intel with AMX, 2 threads; float32 0.98; not measured on AMD).
 
 /// Bytes of the panels of a group: less than a few cores' part of the shared cache (2 to 4 MB a core on servers), and several times the
 /// activations of a block.
@@ -19,16 +24,24 @@ pub(super) struct Order {
     blocks: usize,
     panels: usize,
     groups: usize,
+    /// Lanes of a group.
     threads: usize,
 }
 
 impl Order {
-    /// `blocks` of rows through `panels` of `panel_bytes`. A group has `least` panels or more, for threads that work next to each other.
-    pub(super) fn new(blocks: usize, panels: usize, panel_bytes: usize, least: usize, threads: usize) -> Self {
-        let in_group = (GROUP_BYTES / panel_bytes.max(1)).max(least).max(1);
+    /// `blocks` of rows through `panels` of `panel_bytes` on `threads`, each of which has at least `per_thread` panels of a group.
+    pub(super) fn new(
+        blocks: usize,
+        panels: usize,
+        panel_bytes: usize,
+        threads: usize,
+        per_thread: usize,
+    ) -> Self {
+        let in_group = (GROUP_BYTES / panel_bytes.max(1)).max(per_thread * threads);
         Self {
             blocks,
             panels,
+            // One block meets each panel once.
             groups: if blocks == 1 { 1 } else { panels.div_ceil(in_group) },
             threads,
         }
@@ -39,7 +52,7 @@ impl Order {
     }
 
     /// The block and the panel of task number `task`. Within a group, blocks outside and panels inside: threads then share a block of
-    /// activations and walk the weights next to each other.
+    /// activations.
     pub(super) fn at(&self, task: usize) -> (usize, usize) {
         let Self {
             blocks,
@@ -50,16 +63,19 @@ impl Order {
         // Groups before this one have `blocks` tasks for each of their panels.
         let group = ((task / blocks + 1) * groups - 1) / panels;
         let (first, end) = (panels * group / groups, panels * (group + 1) / groups);
-        let within = task - blocks * first;
         let count = end - first;
-        let (turn, lane) = (within % count / threads, within % count % threads);
-        (within / count, first + lane * (count / threads) + lane.min(count % threads) + turn)
+        let within = task - blocks * first;
+        let (block, turn) = (within / count, within % count);
+        let (lane, step) = (turn % threads, turn / threads);
+        // The first lanes have one panel more, where they are not equal.
+        let lane_first = count / threads * lane + lane.min(count % threads);
+        (block, first + lane_first + step)
     }
 
-    /// How many panels further the one is that the thread of `task` probably takes next, if `threads` take turns. Zero where it takes an
-    /// earlier one, which the first block has brought into a cache.
-    pub(super) fn ahead(&self, task: usize, threads: usize) -> usize {
-        let next = task + threads;
+    /// How many panels further the one is that the thread of `task` probably takes next. Zero where it takes an earlier one, which the first
+    /// block has brought into a cache.
+    pub(super) fn ahead(&self, task: usize) -> usize {
+        let next = task + self.threads;
         if next >= self.tasks() {
             return 0;
         }
@@ -73,21 +89,23 @@ mod tests {
 
     #[test]
     fn every_block_passes_every_panel_once() {
-        for (blocks, panels, in_group) in [
-            (1, 1, 1),
-            (1, 7, 2),
-            (3, 1, 4),
-            (3, 7, 3),
-            (17, 32, 5),
-            (2, 128, 128),
-        ] {
-            let order = Order::new(blocks, panels, GROUP_BYTES / in_group, 1);
-            let mut seen: Vec<_> = (0..order.tasks()).map(|task| order.at(task)).collect();
-            seen.sort_unstable();
-            let all: Vec<_> = (0..blocks)
-                .flat_map(|block| (0..panels).map(move |panel| (block, panel)))
-                .collect();
-            assert_eq!(seen, all, "{order:?}");
+        for threads in [1, 2, 3, 8] {
+            for (blocks, panels, in_group) in [
+                (1, 1, 1),
+                (1, 7, 2),
+                (3, 1, 4),
+                (3, 7, 3),
+                (17, 32, 5),
+                (2, 128, 128),
+            ] {
+                let order = Order::new(blocks, panels, GROUP_BYTES / in_group, threads, 1);
+                let mut seen: Vec<_> = (0..order.tasks()).map(|task| order.at(task)).collect();
+                seen.sort_unstable();
+                let all: Vec<_> = (0..blocks)
+                    .flat_map(|block| (0..panels).map(move |panel| (block, panel)))
+                    .collect();
+                assert_eq!(seen, all, "{order:?}");
+            }
         }
     }
 
@@ -112,7 +130,7 @@ mod tests {
     #[test]
     fn weights_come_from_memory_once_for_all_rows() {
         let panel_bytes = 4 * 1536 * 48;
-        let order = Order::new(17, 128, panel_bytes, 8);
+        let order = Order::new(17, 128, panel_bytes, 2, 4);
         let held = GROUP_BYTES / panel_bytes;
         assert_eq!(reads(&order, held), 128);
         // As before: one block after the other through all panels.
@@ -122,23 +140,33 @@ mod tests {
 
     #[test]
     fn groups_are_not_smaller_than_what_threads_need() {
-        let order = Order::new(17, 128, GROUP_BYTES, 64);
+        let order = Order::new(17, 128, GROUP_BYTES, 16, 4);
         assert_eq!(order.groups, 2);
-        assert_eq!(Order::new(1, 5, 0, 0).groups, 1);
+        assert_eq!(Order::new(2, 5, 0, 1, 1).groups, 1);
+        assert_eq!(Order::new(1, 128, GROUP_BYTES, 1, 1).groups, 1, "one block");
+    }
+
+    #[test]
+    fn threads_that_take_turns_are_apart_and_go_on_to_the_next_panel() {
+        let order = Order::new(1, 7, 1, 2, 1);
+        let panels: Vec<_> = (0..7).map(|task| order.at(task).1).collect();
+        assert_eq!(panels, [0, 4, 1, 5, 2, 6, 3]);
+        let ahead: Vec<_> = (0..7).map(|task| order.ahead(task)).collect();
+        assert_eq!(ahead, [1, 1, 1, 1, 1, 0, 0]);
     }
 
     #[test]
     fn the_next_panel_is_asked_for_unless_it_was_there_before() {
         let order = Order {
             blocks: 2,
-            panels: 6,
+            panels: 8,
             groups: 2,
+            threads: 2,
         };
-        let ahead = |task| order.ahead(task, 2);
-        // Tasks: panels 0 1 2, 0 1 2, 3 4 5, 3 4 5.
-        let panels: Vec<_> = (0..12).map(|task| order.at(task).1).collect();
-        assert_eq!(panels, [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]);
-        let expected = [2, 0, 0, 2, 2, 2, 2, 0, 0, 2, 0, 0];
-        assert_eq!((0..12).map(ahead).collect::<Vec<_>>(), expected);
+        // The first block takes panels 0 to 3, the second takes them, then the first takes 4 to 7.
+        let panels: Vec<_> = (0..16).map(|task| order.at(task).1).collect();
+        assert_eq!(panels, [0, 2, 1, 3, 0, 2, 1, 3, 4, 6, 5, 7, 4, 6, 5, 7]);
+        let ahead: Vec<_> = (0..16).map(|task| order.ahead(task)).collect();
+        assert_eq!(ahead, [1, 1, 0, 0, 1, 1, 3, 3, 1, 1, 0, 0, 1, 1, 0, 0]);
     }
 }
