@@ -216,7 +216,8 @@ mod tests {
 
     #[test]
     fn exponentials_below_zero_end_at_zero() {
-        let errors = [3e-7, 1.1e-4]; // relative, of the two polynomials
+        // Relative, of the two polynomials at zero; `x log2(e)` is rounded once or twice, and its whole part is then lost.
+        let errors = [3e-7, 1.1e-4];
         for isa in Isa::available() {
             for x in [
                 0.0,
@@ -232,6 +233,7 @@ mod tests {
             ] {
                 let exact = if x < -87.7 { 0.0 } else { f64::from(x).exp() };
                 for (lanes, error) in isa.run(ExpBelowZero(x)).iter().zip(errors) {
+                    let error = error + 1.5e-7 * f64::from(x.abs().min(88.0));
                     for &lane in lanes {
                         let distance = (f64::from(lane) - exact).abs();
                         assert!(
