@@ -182,10 +182,12 @@ impl<T: Zeroable> DerefMut for AlignedBuffer<T> {
 /// hidden.fill(1.0);
 /// hidden.resize(5);
 /// assert_eq!(hidden[..], [1.0, 1.0, 1.0, 0.0, 0.0]);
+/// hidden.reserve(6)?;
+/// assert!(hidden.is_empty());
 /// # Ok::<(), saccade_kernels::AllocError>(())
 /// ```
 pub struct Activations {
-    /// Of which no more than `len` elements may have been written.
+    /// Only the first `len` elements are sure to have been written.
     memory: AlignedBuffer<f32>,
     len: usize,
 }
@@ -200,17 +202,16 @@ impl Activations {
         }
     }
 
-    /// Makes room for `len` of them in all.
+    /// Makes room for `len` of them in all. Where that takes other memory, the memory so far is given back first, and none are left: peak
+    /// memory is that of the larger number, not of both.
     ///
     /// # Errors
-    /// [`AllocError`] if there is not enough memory; everything is left as it was.
+    /// [`AllocError`] if there is not enough memory; none are left then either.
     pub fn reserve(&mut self, len: usize) -> Result<(), AllocError> {
         if len > self.memory.len {
+            *self = Self::new();
             // SAFETY: elements are written before they are counted in `len`, and no others are read.
-            let mut memory = unsafe { AlignedBuffer::<f32>::unwritten(len)? };
-            // SAFETY: there is room for these elements, and both are different memory.
-            unsafe { memory.pointer().copy_from_nonoverlapping(self.as_ptr(), self.len) };
-            self.memory = memory;
+            self.memory = unsafe { AlignedBuffer::unwritten(len)? };
         }
         Ok(())
     }
@@ -282,20 +283,33 @@ mod tests {
     }
 
     #[test]
-    fn activations_keep_what_they_hold() {
+    fn activations_are_kept_within_their_memory() {
         let mut activations = Activations::new();
         assert!(activations.is_empty());
         activations.reserve(3).unwrap();
         activations.resize(3);
         activations.copy_from_slice(&[1.0, 2.0, 3.0]);
-        let error = activations.reserve(usize::MAX / 2).unwrap_err();
-        assert_eq!(error, AllocError { bytes: usize::MAX });
-        assert_eq!(activations[..], [1.0, 2.0, 3.0], "left as they were");
-        activations.reserve(HUGE_PAGE).unwrap();
-        for (len, expected) in [(2, &[1.0, 2.0][..]), (4, &[1.0, 2.0, 0.0, 0.0]), (0, &[])] {
+        for (len, expected) in [(2, &[1.0, 2.0][..]), (3, &[1.0, 2.0, 0.0]), (0, &[])] {
+            activations.reserve(len).unwrap();
             activations.resize(len);
             assert_eq!(activations[..], *expected);
         }
+    }
+
+    #[test]
+    fn activations_that_need_other_memory_begin_anew() {
+        let mut activations = Activations::new();
+        for len in [3, HUGE_PAGE] {
+            activations.reserve(len).unwrap();
+            assert!(activations.is_empty());
+            activations.resize(len);
+            assert!(activations.iter().all(|&element| element == 0.0));
+            activations.fill(1.0);
+        }
+        let error = activations.reserve(usize::MAX / 2).unwrap_err();
+        assert_eq!(error, AllocError { bytes: usize::MAX });
+        assert!(activations.is_empty());
+        activations.reserve(HUGE_PAGE).unwrap();
         activations.resize(HUGE_PAGE);
         assert!(activations.iter().all(|&element| element == 0.0));
         assert_eq!(activations.as_ptr().addr() % ALIGNMENT, 0);

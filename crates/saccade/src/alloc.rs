@@ -1,7 +1,7 @@
 //! Memory whose size a caller decides: asked for, never assumed.
 
 use crate::error::{Error, Result};
-use crate::ops::check_interrupted;
+use crate::ops::{check_interrupted, refused};
 use saccade_kernels::Activations;
 
 /// Makes room for `len` elements in all.
@@ -19,11 +19,11 @@ pub(crate) fn reserve<T>(what: &'static str, buffer: &mut Vec<T>, len: usize) ->
 /// `len` times `value`.
 ///
 /// # Errors
-/// [`Error::Memory`] if the system refuses it.
+/// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
 pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Result<Vec<T>> {
     let mut buffer = Vec::new();
     reserve(what, &mut buffer, len)?;
-    fill(&mut buffer, len, value)?;
+    in_stretches(0, len, |len| buffer.resize(len, value.clone()))?;
     Ok(buffer)
 }
 
@@ -31,13 +31,17 @@ pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Resu
 /// four gigabytes in a second.
 const TOGETHER: usize = 1 << 24;
 
-/// Sets the length of a buffer that has room for it.
-fn fill<T: Clone>(buffer: &mut Vec<T>, len: usize, value: T) -> Result<()> {
-    while buffer.len() + TOGETHER < len {
+/// Calls `resize` with greater and greater lengths from `held` on, the last of which is `len`.
+///
+/// # Errors
+/// [`Error::Interrupted`].
+fn in_stretches(mut held: usize, len: usize, mut resize: impl FnMut(usize)) -> Result<()> {
+    while held + TOGETHER < len {
         check_interrupted()?;
-        buffer.resize(buffer.len() + TOGETHER, value.clone());
+        held += TOGETHER;
+        resize(held);
     }
-    buffer.resize(len, value);
+    resize(len);
     Ok(())
 }
 
@@ -56,20 +60,14 @@ pub(crate) fn collected<T>(
     Ok(buffer)
 }
 
-/// Sets the length of a buffer that keeps its memory from call to call. New elements are zero.
+/// Sets the length of a buffer that keeps its memory from call to call, for elements that are then written: what they are before depends on
+/// earlier calls.
 ///
 /// # Errors
-/// [`Error::Memory`] if the system refuses it.
+/// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
 pub(crate) fn sized(buffer: &mut Activations, len: usize) -> Result<&mut [f32]> {
-    buffer.reserve(len).map_err(|_| Error::Memory {
-        what: "activations",
-        bytes: len.saturating_mul(size_of::<f32>()),
-    })?;
-    while buffer.len() + TOGETHER < len {
-        check_interrupted()?;
-        buffer.resize(buffer.len() + TOGETHER);
-    }
-    buffer.resize(len);
+    buffer.reserve(len).map_err(refused("activations"))?;
+    in_stretches(buffer.len(), len, |len| buffer.resize(len))?;
     Ok(buffer)
 }
 
@@ -97,23 +95,34 @@ mod tests {
         let expected = format!("features: cannot allocate {} bytes of memory", usize::MAX / 8 * 4);
         assert!(error.to_string().starts_with(&expected), "{error}");
         let mut buffer = Activations::new();
-        sized(&mut buffer, 3).unwrap().fill(1.0);
-        assert!(matches!(
-            sized(&mut buffer, usize::MAX / 2),
-            Err(Error::Memory { .. })
-        ));
-        assert_eq!(buffer[..], [1.0; 3], "left as it was");
+        let error = sized(&mut buffer, usize::MAX / 8).unwrap_err();
+        let expected = format!("activations: cannot allocate {} bytes of memory", usize::MAX);
+        assert!(error.to_string().starts_with(&expected), "{error}");
+        assert_eq!(sized(&mut buffer, 3).unwrap(), [0.0; 3], "usable afterwards");
     }
 
     #[test]
     fn filling_stops_when_asked_to() {
         let len = 3 * TOGETHER + 5;
         assert_eq!(filled("features", len, 1_u8).unwrap().len(), len);
+        assert!(is_stopped(|| filled("features", len, 1_u8).map(drop)));
+    }
+
+    #[test]
+    fn sizing_stops_when_asked_to() {
+        let (mut buffer, len) = (Activations::new(), TOGETHER + 5);
+        assert!(is_stopped(|| sized(&mut buffer, len).map(drop)));
+        assert!(buffer.is_empty(), "before anything is written");
+        assert_eq!(sized(&mut buffer, len).unwrap().len(), len);
+    }
+
+    /// Whether `work` gives up if it is to.
+    fn is_stopped(work: impl FnOnce() -> Result<()>) -> bool {
         let stopped = crate::interruptible(&|| true, || {
             std::thread::sleep(std::time::Duration::from_millis(30));
-            filled("features", len, 1_u8)
+            work()
         });
-        assert!(matches!(stopped, Err(Error::Interrupted)));
+        matches!(stopped, Err(Error::Interrupted))
     }
 
     #[test]

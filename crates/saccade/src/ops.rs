@@ -48,7 +48,7 @@ pub(crate) fn rows_mut(data: &mut [f32], width: usize) -> RowsMut<'_> {
 }
 
 /// The error for memory that a kernel was refused.
-fn refused(what: &'static str) -> impl Fn(AllocError) -> Error {
+pub(crate) fn refused(what: &'static str) -> impl Fn(AllocError) -> Error {
     move |AllocError { bytes }| Error::Memory { what, bytes }
 }
 

@@ -170,7 +170,7 @@ impl Head<'_> {
             let keys = panel * V::LANES..(panel + 1) * V::LANES;
             // Lanes before the first key given stay.
             let (start, end) = (first.saturating_sub(keys.start), V::LANES.min(len - keys.start));
-            // WordLayout of as many keys, a row a key, to be turned over; zeros for keys beyond the last one.
+            // WordLayout of as many keys, a row a key, to be transposed; zeros for keys beyond the last one.
             let mut square = [[0; MAX_LANES]; MAX_LANES];
             for step in (0..steps).step_by(V::LANES) {
                 for (lane, to) in square.iter_mut().enumerate().take(end).skip(start) {
@@ -180,14 +180,14 @@ impl Head<'_> {
                     // SAFETY: the row has these elements; the caller has the instruction set.
                     unsafe { W::along(row, count, to.as_mut_ptr()) };
                 }
-                let to = &mut self.keys_to[(panel * steps + step) * V::LANES..];
                 let count = V::LANES.min(steps - step);
+                let to = &mut self.keys_to[(panel * steps + step) * V::LANES..][..count * V::LANES];
                 if start == 0 && count == V::LANES {
-                    // SAFETY: both squares are whole; the caller has the instruction set.
-                    unsafe { V::turn_over(&square, to.as_mut_ptr()) };
+                    // SAFETY: the caller has the instruction set.
+                    unsafe { V::transpose(&square, to) };
                     continue;
                 }
-                for (word, to) in to.chunks_exact_mut(V::LANES).take(count).enumerate() {
+                for (word, to) in to.chunks_exact_mut(V::LANES).enumerate() {
                     for (to, row) in to.iter_mut().zip(&square).skip(start) {
                         *to = row[word];
                     }

@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
 use super::mask::Mask;
 use crate::simd::{Kernel, Simd, Vector};
-use crate::tiles::{Ahead, MAX_COLUMNS, Operation, Product, Session, TILE, TileUnit};
+use crate::tiles::{Ahead, MAX_COLUMN_TILES, Operation, Product, Session, TILE, TileUnit};
 
 /// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
 pub(super) struct TileProduct {
@@ -97,7 +97,7 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
 /// How many of the `left` tiles of columns a unit takes at once: as many products in flight as its tiles of sums allow.
 fn columns_at_once(product: &TileProduct, left: usize) -> usize {
     match left {
-        _ if product.rows <= TILE => left.div_ceil(left.div_ceil(MAX_COLUMNS)),
+        _ if product.rows <= TILE => left.div_ceil(left.div_ceil(MAX_COLUMN_TILES)),
         // Not 3 and 1: a single column waits for each of its products.
         3 | 5.. if product.b_vector == TILE => 3,
         _ => left.min(2),

@@ -4,7 +4,7 @@ use super::arithmetic::TileArithmetic;
 use super::mask::Mask;
 use crate::simd::{MAX_LANES, Simd, Vector, load};
 
-/// From the middle on what a removed key is added; any number of lanes before it.
+/// Zeros, then -inf: loaded `n` before the middle, `n` lanes stay as they are.
 static SEEN_THEN_REMOVED: [f32; 2 * MAX_LANES] = {
     let mut lanes = [0.0; 2 * MAX_LANES];
     let mut lane = MAX_LANES;

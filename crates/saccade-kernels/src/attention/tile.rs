@@ -8,7 +8,7 @@ use super::keys_values::PackedKeyValues;
 use super::mask::Mask;
 use super::product::{InVectors, Multiply, Removed, TileProduct};
 use super::softmax::{Row, Running};
-use crate::simd::{Dot, Dots, Kernel, MAX_TILE_ROWS, Simd, Vector, load, store};
+use crate::simd::{Dot, Dots, Kernel, LINE, MAX_TILE_ROWS, Simd, Vector, load, store};
 use crate::tiles::{MAX_ROWS, Session, TileKernel, TileUnit};
 
 /// Keys between two updates of a query's running maximum, at most: whole pairs of vectors of every instruction set.
@@ -19,9 +19,6 @@ const MAX_VALUES: usize = 256;
 
 /// Elements of the queries that are on the stack at a time: an even number of whole vectors. Wider heads take more passes.
 const MAX_DEPTH: usize = 256;
-
-/// Words of a cache line.
-const LINE: usize = 16;
 
 pub(super) struct Call<'a> {
     pub kv: &'a PackedKeyValues,
@@ -196,7 +193,7 @@ unsafe fn attend<
     // Keys beyond are seen by none of these queries.
     let visible = call.mask.visible(tile.first + tile.rows - 1, len);
     let kv_head = tile.head / call.heads_per_kv_head;
-    // Whether no value that a query does not see can make a difference.
+    // Whether zeros may be multiplied by the values of removed keys.
     let can_multiply = kv.is_finite() || matches!(call.mask, Mask::None);
     // SAFETY: the scratch holds as many rows as a tile may have, of MAX_DEPTH factors, KEY_BLOCK probabilities and `padded` sums; blocks end
     // at the last key or before it, and its vector is padded in the keys; everything else is the caller's promise.
@@ -230,16 +227,17 @@ unsafe fn attend<
             for (r, (max, running)) in maxima.iter_mut().zip(running.iter()).enumerate() {
                 *max = row(r).logits::<V>(probabilities.add(r * KEY_BLOCK), running.max);
             }
-            let block_values = values.add(first / A::STEP * value_width);
+            let block_values = values.add(first / A::STEP * value_width + columns.first);
             for (r, (running, &max)) in running.iter_mut().zip(&maxima).enumerate() {
                 let row = row(r);
                 // The first of a head's tiles asks for the values while it computes: from memory they came at its bandwidth while nothing else
-                // was done.
+                // was done (Intel with AMX; not measured on AMD).
                 if tile.first == 0 {
-                    let words = count.div_ceil(A::STEP) * value_width;
-                    let lines = words.div_ceil(LINE);
-                    for line in lines * r / tile.rows..lines * (r + 1) / tile.rows {
-                        V::prefetch(block_values.wrapping_add(line * LINE).cast());
+                    let steps = count.div_ceil(A::STEP);
+                    for step in steps * r / tile.rows..steps * (r + 1) / tile.rows {
+                        for column in (0..padded).step_by(LINE) {
+                            V::prefetch(block_values.wrapping_add(step * value_width + column).cast());
+                        }
                     }
                 }
                 let probabilities = probabilities.add(r * KEY_BLOCK);
@@ -260,7 +258,7 @@ unsafe fn attend<
                 rows: tile.rows,
                 factors: probabilities,
                 factors_stride: KEY_BLOCK,
-                b: block_values.add(columns.first),
+                b: block_values,
                 b_step: value_width,
                 b_vector: V::LANES,
                 depth: count,
@@ -356,13 +354,12 @@ impl QueryTile<'_> {
         for (r, running) in running.iter().enumerate() {
             // Nothing was added where no key is left: zeros divided by one.
             let divisor = if running.sum == 0.0 { 1.0 } else { running.sum };
-            let factor = 1.0 / divisor;
             // SAFETY: the caller's promise; a row of the weights has an element for every key.
             unsafe {
                 let out = call.out.offset((self.first + r) as isize * call.out_stride);
                 let out = out.add(self.head * call.kv.head_dim() + columns.first);
                 for i in (0..columns.count).step_by(V::LANES) {
-                    let value = V::load(sums.add(r * padded + i)).mul(V::splat(factor));
+                    let value = V::load(sums.add(r * padded + i)).div(V::splat(divisor));
                     store(value, out.add(i), V::LANES.min(columns.count - i));
                 }
                 if columns.first == 0

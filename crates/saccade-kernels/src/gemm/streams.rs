@@ -5,15 +5,23 @@
 use std::ops::Range;
 
 use super::Block;
-
-/// Words of a cache line.
-pub(super) const LINE: usize = 16;
+use crate::simd::LINE;
 
 /// Words of a stream: a page, because the CPU's own prefetching follows one stream in each.
 const STREAM: usize = 1024;
 
 /// Streams of a stretch of weights at most. A whole panel of 6144 inputs overflows the second-level cache before it is used.
 const MAX_STREAMS: usize = 48;
+
+impl Block<'_> {
+    /// Whether weights are asked for as streams, where a step meets `step_words` of them.
+    #[inline(always)]
+    pub(super) fn asks_as_streams(&self, step_words: usize) -> bool {
+        // Streams whose steps are one line would ask for each line once a tile. In order, AVX2 was 0.99 to 1.17 times as fast on an Intel with
+        // AMX (float32, bfloat16 widened and int8), AVX-512 with its three lines 0.70 to 1.01 times.
+        self.streams && step_words > LINE
+    }
+}
 
 /// The panel that a block goes through, in parts: all tiles take one part, then all the next.
 pub(super) struct Parts<'a> {
@@ -22,6 +30,8 @@ pub(super) struct Parts<'a> {
     step_words: usize,
     steps: usize,
     part_steps: usize,
+    /// [`Block::asks_as_streams`].
+    streams: bool,
 }
 
 impl<'a> Parts<'a> {
@@ -33,6 +43,7 @@ impl<'a> Parts<'a> {
             step_words,
             steps,
             part_steps,
+            streams: block.asks_as_streams(step_words),
         }
     }
 
@@ -60,10 +71,7 @@ impl<'a> Parts<'a> {
     #[inline(always)]
     pub(super) fn lines(&self, part: &Range<usize>, tile: usize) -> Lines {
         let tiles = self.block.range.len();
-        if !self.block.streams || self.step_words <= LINE {
-            // Streams whose steps are one line would ask for each line once a tile. In order, AVX2 was 0.99 to 1.17 times as fast on an Intel
-            // with AMX (float32, bfloat16 widened and int8), AVX-512 with its three lines 0.70 to 1.01 times.
-            //
+        if !self.streams {
             // The tile's share of the next panel, spread over its steps.
             let weights = self.block.weights;
             let (share, pitch) = (weights.len() * tile / tiles, self.step_words.div_ceil(tiles));
@@ -92,7 +100,7 @@ impl Parts<'_> {
     /// The same where steps are long: several lines in each of them.
     pub(super) fn bursts(&self, part: &Range<usize>, tile: usize) -> Bursts {
         let tiles = self.block.range.len();
-        if !self.block.streams {
+        if !self.streams {
             let Lines { first, pitch, .. } = self.lines(part, tile);
             return Bursts {
                 first,
@@ -240,10 +248,9 @@ mod tests {
                     false => asked(rows, sizes, streams, of_lines),
                     true => asked(rows, sizes, streams, of_bursts),
                 };
-                let streams = streams && step_words > LINE;
                 // In order: the panel that this thread takes next. As streams: the parts after the first, and the first of that panel.
                 let first = (part_steps * step_words / LINE) as isize;
-                let wanted: HashSet<isize> = match streams {
+                let wanted: HashSet<isize> = match streams && step_words > LINE {
                     false => (2 * panel..3 * panel).collect(),
                     true => (first..panel).chain(2 * panel..2 * panel + first).collect(),
                 };

@@ -7,16 +7,16 @@
 use std::hint::black_box;
 use std::ops::Range;
 
-use super::streams::{LINE, Lines, Parts};
+use super::streams::{Lines, Parts};
 use super::{Block, Shape};
-use crate::simd::{Simd, Vector};
+use crate::simd::{LINE, Simd, Vector};
 
 /// One running float32 sum over the 8192 inputs of a feed-forward loses five times as much as parts of 512 do (measured on the full head).
 pub(super) const SUM_PART: usize = 512;
 
 /// Steps over the summed dimension after which the next tile takes the same part of the panel, which is then still in the cache: whole
 /// parts. Each begins the rows' streams again; with two parts of float32, together with huge pages for the weights, AVX2 went from 0.85
-/// to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4, AVX-512 from 0.94 to 0.95.
+/// to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4, AVX-512 from 0.94 to 0.95 (with one step a turn).
 const BLOCK_STEPS: usize = 1024;
 
 /// One step over `k`: vectors of words of the panel, each of which holds [`Self::STEP`] consecutive `k` of its column, and as many `k` of
@@ -29,7 +29,8 @@ pub(super) trait Step<S: Simd> {
     /// Rows of the largest tile.
     const TILE_ROWS: usize;
     /// Steps of a turn of the innermost loop. What counts steps and finds rows takes ports from the products on Intel: with one step a turn,
-    /// 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more.
+    /// 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more. Not measured on
+    /// AMD.
     const UNROLLED: usize = 4;
     /// A vector of sums.
     type Sum: Copy;
@@ -131,15 +132,19 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
     let tiles = &block.range;
     let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(P::STEP);
+    let step_words = NV * V::LANES;
+    // Streams must not change where sums are cut; integers are not cut.
+    const { assert!(P::PART_STEPS > BLOCK_STEPS || (BLOCK_STEPS / 2).is_multiple_of(P::PART_STEPS)) }
     // As streams, a part is asked for while the one before it is multiplied. One of 1024 steps after one of 512 would take twice the pace:
     // parts of 512 made 1536 steps 1.04 to 1.08 times as fast (AVX-512, float32, Intel with AMX), and no difference where 1024 divides them.
+    // Not measured on AMD, whose families ask in order.
     let is_uneven = steps > BLOCK_STEPS && !steps.is_multiple_of(BLOCK_STEPS);
-    let part_steps = if block.streams && is_uneven {
+    let part_steps = if is_uneven && block.asks_as_streams(step_words) {
         BLOCK_STEPS / 2
     } else {
         BLOCK_STEPS
     };
-    let parts = Parts::new(block, NV * V::LANES, steps, part_steps);
+    let parts = Parts::new(block, step_words, steps, part_steps);
     for part in parts.iter() {
         for number in tiles.clone() {
             let (first, end) = (block.tiles.first_row(number), block.tiles.first_row(number + 1));
@@ -191,12 +196,8 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
         let row_elements = NV * V::LANES;
         let mut x = [block.x; MR];
         for (r, x) in x.iter_mut().enumerate() {
-            *x = block.x.offset((tile.row + r) as isize * block.x_stride);
-        }
-        // Hidden: compilers compute each row from the one before it again in every step.
-        let mut rows = x;
-        for row in &mut rows {
-            *row = black_box(*row);
+            // Hidden: compilers compute each row from the one before it again in every step.
+            *x = black_box(block.x.offset((tile.row + r) as isize * block.x_stride));
         }
         let weights = block.weights.as_ptr();
         if part.start == 0 {
@@ -221,7 +222,7 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
             let mut step = first;
             while step < whole {
                 // Memory works while the sums are made. Measured at 49 x 1536 x 6144 on Zen 4, in order, share of the FMA peak without and
-                // with it: 0.89 and 0.95 (AVX-512), 0.69 and 0.85 (AVX2).
+                // with it, with one step a turn: 0.89 and 0.95 (AVX-512), 0.69 and 0.85 (AVX2).
                 let (mut next, steps) = tile.ahead.at(step - part.start);
                 // Hidden: compilers find the smaller of the two again in each step.
                 let round = step..black_box(whole.min(step + steps));
@@ -242,7 +243,7 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
                             V::prefetch(next.cast());
                             next = next.wrapping_add(tile.ahead.pitch);
                             let words = words.add(index * row_elements);
-                            P::multiply_add(&mut acc, &rows, words, start + index, P::STEP);
+                            P::multiply_add(&mut acc, &x, words, start + index, P::STEP);
                         }
                         words = words.add(P::UNROLLED * row_elements);
                         start += P::UNROLLED;

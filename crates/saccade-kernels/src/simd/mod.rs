@@ -13,6 +13,9 @@ pub(crate) mod x86_64;
 /// Lanes of the widest vector.
 pub(crate) const MAX_LANES: usize = 16;
 
+/// Words of a cache line.
+pub(crate) const LINE: usize = 16;
+
 /// Rows of the largest tile of any instruction set.
 pub(crate) const MAX_TILE_ROWS: usize = 8;
 
@@ -94,11 +97,10 @@ pub(crate) unsafe trait Vector: Copy {
     unsafe fn dot_bytes(sum: Self::Ints, x: Self::Ints, w: Self::Ints) -> Self::Ints;
     /// Asks for the cache line at `at`, which may be any address. A hint: it may do nothing.
     unsafe fn prefetch(at: *const u8);
-    /// Column `c` of the first `LANES` rows of a square as row `c` of `LANES * LANES` words: the first `LANES` columns.
+    /// The transpose of the first `LANES` rows and columns of `square`, to `LANES` rows of `LANES` words.
     #[inline(always)]
-    unsafe fn turn_over(square: &[[u32; MAX_LANES]; MAX_LANES], to: *mut u32) {
-        // SAFETY: the caller gives room for all words.
-        let to = unsafe { std::slice::from_raw_parts_mut(to, Self::LANES * Self::LANES) };
+    unsafe fn transpose(square: &[[u32; MAX_LANES]; MAX_LANES], to: &mut [u32]) {
+        assert_eq!(to.len(), Self::LANES * Self::LANES);
         for (column, to) in to.chunks_exact_mut(Self::LANES).enumerate() {
             for (to, row) in to.iter_mut().zip(square) {
                 *to = row[column];
@@ -235,3 +237,37 @@ pub(crate) struct NoDots;
 
 // SAFETY: nothing is needed beyond the vector's own instruction set.
 unsafe impl<V: Vector> Dots<V> for NoDots {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::isa::Isa;
+
+    struct Transpose<'a>(&'a [[u32; MAX_LANES]; MAX_LANES]);
+
+    impl Kernel for Transpose<'_> {
+        type Output = Vec<Vec<u32>>;
+
+        #[inline(always)]
+        unsafe fn run<S: Simd>(self, _: S) -> Self::Output {
+            let lanes = S::Vector::LANES;
+            let mut to = vec![0; lanes * lanes];
+            // SAFETY: called within `Simd::run`.
+            unsafe { S::Vector::transpose(self.0, &mut to) };
+            to.chunks_exact(lanes).map(<[u32]>::to_vec).collect()
+        }
+    }
+
+    #[test]
+    fn squares_are_transposed() {
+        let square = std::array::from_fn(|row| std::array::from_fn(|column| (100 * row + column) as u32));
+        for isa in Isa::available() {
+            let columns = isa.run(Transpose(&square));
+            for (column, rows) in columns.iter().enumerate() {
+                for (row, &word) in rows.iter().enumerate() {
+                    assert_eq!(word, square[row][column], "{isa}: row {row}, column {column}");
+                }
+            }
+        }
+    }
+}

@@ -4,7 +4,7 @@
 
 use std::mem::offset_of;
 
-use super::{Config, Job, MAX_COLUMNS, Operation, Shape, TILE, TileUnit};
+use super::{Config, Job, MAX_COLUMN_TILES, Operation, Shape, TILE, TileUnit};
 use crate::cpu::tiles::permission;
 use crate::simd::Simd;
 use crate::simd::x86_64::avx512::Avx512Amx;
@@ -205,20 +205,12 @@ macro_rules! two_rows_kernel {
     };
 }
 
-/// The kernels of an operation.
-macro_rules! kernels {
-    ($operation:literal, [$row1:ident, $row2:ident, $row3:ident, $row4:ident, $row5:ident, $row6:ident], [$two1:ident, $two2:ident], $block:ident) => {
-        row_kernel!($operation, $row1, "0", "0");
-        row_kernel!($operation, $row2, "0", "0"; "1", "64");
-        row_kernel!($operation, $row3, "0", "0"; "1", "64"; "2", "128");
-        row_kernel!($operation, $row4, "0", "0"; "1", "64"; "2", "128"; "3", "192");
-        row_kernel!($operation, $row5, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256");
-        row_kernel!($operation, $row6, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256"; "5", "320");
-        two_rows_kernel!($operation, $two1, "0", "1", "0");
-        two_rows_kernel!($operation, $two2, "0", "1", "0"; "2", "3", "64");
-        // Six tiles of sums, one of rows and one of weights, which are read twice from the nearest cache.
+/// Two tiles of rows by three of columns, next to each other. Six tiles of sums, one of rows and one of weights, which are read twice from the
+/// nearest cache.
+macro_rules! block_kernel {
+    ($operation:literal, $name:ident) => {
         kernel!(
-            $block,
+            $name,
             zero each_sum!(zero: "0", "1", "2", "3", "4", "5"),
             load concat!(
                 each_sum!(load "sums": "0", "0"; "1", "64"; "2", "128"),
@@ -244,28 +236,24 @@ macro_rules! kernels {
     };
 }
 
-kernels!(
-    "tdpbf16ps",
-    [bf16_row1, bf16_row2, bf16_row3, bf16_row4, bf16_row5, bf16_row6],
-    [bf16_two1, bf16_two2],
-    bf16_block
-);
-kernels!(
-    "tdpbusd",
-    [int8_row1, int8_row2, int8_row3, int8_row4, int8_row5, int8_row6],
-    [int8_two1, int8_two2],
-    int8_block
-);
+row_kernel!("tdpbf16ps", bf16_row1, "0", "0");
+row_kernel!("tdpbf16ps", bf16_row2, "0", "0"; "1", "64");
+row_kernel!("tdpbf16ps", bf16_row3, "0", "0"; "1", "64"; "2", "128");
+row_kernel!("tdpbf16ps", bf16_row4, "0", "0"; "1", "64"; "2", "128"; "3", "192");
+row_kernel!("tdpbf16ps", bf16_row5, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256");
+row_kernel!("tdpbf16ps", bf16_row6, "0", "0"; "1", "64"; "2", "128"; "3", "192"; "4", "256"; "5", "320");
+two_rows_kernel!("tdpbf16ps", bf16_two1, "0", "1", "0");
+two_rows_kernel!("tdpbf16ps", bf16_two2, "0", "1", "0"; "2", "3", "64");
+block_kernel!("tdpbf16ps", bf16_block);
+row_kernel!("tdpbusd", int8_row3, "0", "0"; "1", "64"; "2", "128");
+block_kernel!("tdpbusd", int8_block);
 
-/// Those of a tile of rows, by the number of columns.
-const BF16_ROWS: [unsafe fn(&Job); MAX_COLUMNS] =
+/// Those of bfloat16 with a tile of rows, by the number of columns.
+const BF16_ROWS: [unsafe fn(&Job); MAX_COLUMN_TILES] =
     [bf16_row1, bf16_row2, bf16_row3, bf16_row4, bf16_row5, bf16_row6];
-const INT8_ROWS: [unsafe fn(&Job); MAX_COLUMNS] =
-    [int8_row1, int8_row2, int8_row3, int8_row4, int8_row5, int8_row6];
 
-/// Those of two tiles of rows.
+/// Those with two tiles of rows.
 const BF16_TWO_ROWS: [unsafe fn(&Job); 2] = [bf16_two1, bf16_two2];
-const INT8_TWO_ROWS: [unsafe fn(&Job); 2] = [int8_two1, int8_two2];
 
 /// Independent products, from tiles that stay what they are: of zeros, whose speed is that of any numbers.
 macro_rules! chains {
@@ -333,9 +321,9 @@ unsafe impl TileUnit for Amx {
             (Operation::Bf16, Shape::Row(columns)) => BF16_ROWS[columns - 1],
             (Operation::Bf16, Shape::TwoRows(columns)) => BF16_TWO_ROWS[columns - 1],
             (Operation::Bf16, Shape::Block) => bf16_block,
-            (Operation::Int8, Shape::Row(columns)) => INT8_ROWS[columns - 1],
-            (Operation::Int8, Shape::TwoRows(columns)) => INT8_TWO_ROWS[columns - 1],
+            (Operation::Int8, Shape::Row(3)) => int8_row3,
             (Operation::Int8, Shape::Block) => int8_block,
+            (Operation::Int8, shape) => unreachable!("a product of int8 in {shape:?}"),
         };
         // SAFETY: the caller's promise.
         unsafe { kernel(job) }
@@ -360,7 +348,7 @@ unsafe impl TileUnit for Amx {
 mod tests {
     use std::io::Write;
 
-    use super::super::software::tests::{pairs, product, words};
+    use super::super::software::tests::{layouts, pairs, product, words};
     use super::super::{MAX_ROWS, Product, Session, Software};
     use super::*;
 
@@ -373,7 +361,7 @@ mod tests {
                 let product = Product {
                     columns,
                     add,
-                    sums_stride: MAX_COLUMNS * TILE,
+                    sums_stride: MAX_COLUMN_TILES * TILE,
                     ..product(operation, x, w, sums)
                 };
                 if !apart {
@@ -383,7 +371,7 @@ mod tests {
                     w_stride: TILE,
                     w_step: TILE * TILE,
                     // Columns overlap, so that all of them fit.
-                    w_column: (w.len() - steps * TILE * TILE) / (MAX_COLUMNS - 1),
+                    w_column: (w.len() - steps * TILE * TILE) / (MAX_COLUMN_TILES - 1),
                     ..product
                 }
             };
@@ -401,9 +389,7 @@ mod tests {
             }
         };
         for add in [false, true] {
-            of(3, false, add);
-            let most = if rows <= TILE { MAX_COLUMNS } else { 2 };
-            (1..=most).for_each(|columns| of(columns, true, add));
+            layouts(operation, rows).for_each(|(columns, apart)| of(columns, apart, add));
         }
     }
 
@@ -422,7 +408,7 @@ mod tests {
             let (x_size, w_size, sums) = (
                 rows * TILE * steps,
                 3 * TILE * TILE * steps,
-                rows * MAX_COLUMNS * TILE,
+                rows * MAX_COLUMN_TILES * TILE,
             );
             for seed in 0..8 {
                 let (x, w, before) = (

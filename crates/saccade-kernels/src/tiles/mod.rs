@@ -18,7 +18,7 @@ pub(crate) const TILE: usize = 16;
 pub(crate) const MAX_ROWS: usize = 2 * TILE;
 
 /// Tiles of columns of a product with one tile of rows at most: as many as there are tiles for sums.
-pub(crate) const MAX_COLUMNS: usize = 6;
+pub(crate) const MAX_COLUMN_TILES: usize = 6;
 
 /// What is multiplied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,8 +74,8 @@ pub(crate) struct Product {
     pub w_column: usize,
     /// Words from one step to the next.
     pub w_step: usize,
-    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMNS` where there are at most [`TILE`] rows, else 1, 2, or 3 that are next to
-    /// each other in `w` too.
+    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMN_TILES` where there are at most [`TILE`] rows, else 1, 2, or 3 that are next to
+    /// each other in `w` too. Always 3 of int8.
     pub columns: usize,
     /// Steps of [`TILE`] words over which is summed, at least one.
     pub steps: usize,
@@ -107,10 +107,10 @@ pub(crate) struct Job {
     pub ahead_lines: usize,
 }
 
-/// Tiles of rows and of columns of a [`Job`]: what units have kernels for.
+/// Tiles of rows and of columns of a [`Job`]: what units have kernels for; of int8 only those with three of columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Shape {
-    /// One by `1 ..= MAX_COLUMNS`, anywhere.
+    /// One by `1 ..= MAX_COLUMN_TILES`, anywhere.
     Row(usize),
     /// Two by one or two, anywhere.
     TwoRows(usize),
@@ -118,7 +118,8 @@ pub(crate) enum Shape {
     Block,
 }
 
-/// The sizes of all tiles, as LDTILECFG reads them. Tiles 0 to 5 hold sums, 6 rows, 7 weights.
+/// The sizes of all tiles, as LDTILECFG reads them. Tiles 0 to 5 hold sums, 6 rows, 7 weights; with [`Shape::TwoRows`], which has at most
+/// four tiles of sums, 5 holds the second rows.
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Config {
@@ -240,11 +241,16 @@ impl<U: TileUnit> Session<U> {
         const WORD: usize = size_of::<u32>();
         let rows = product.rows;
         let (tile_rows, shape) = match (product.columns, rows) {
-            (1..=MAX_COLUMNS, 1..=TILE) => (rows, Shape::Row(product.columns)),
+            (1..=MAX_COLUMN_TILES, 1..=TILE) => (rows, Shape::Row(product.columns)),
             (1..=2, ..=MAX_ROWS) => (rows.div_ceil(2), Shape::TwoRows(product.columns)),
             (3, ..=MAX_ROWS) if product.w_column == TILE => (rows.div_ceil(2), Shape::Block),
             (columns, rows) => unreachable!("{rows} rows by {columns} tiles"),
         };
+        assert!(
+            product.operation == Operation::Bf16 || product.columns == 3,
+            "{} tiles of int8",
+            product.columns
+        );
         debug_assert!(product.steps > 0);
         let second = rows - tile_rows;
         let job = Job {

@@ -231,7 +231,7 @@ unsafe impl TileUnit for Software {
 pub(super) mod tests {
     use half::bf16;
 
-    use super::super::{Ahead, MAX_ROWS, Product, Session};
+    use super::super::{Ahead, MAX_COLUMN_TILES, MAX_ROWS, Product, Session};
     use super::*;
 
     pub(in super::super) fn words(seed: u32, count: usize) -> Vec<u32> {
@@ -259,28 +259,54 @@ pub(super) mod tests {
         [word & 0xffff, word >> 16].map(|bits| bf16::from_bits(bits as u16).to_f64())
     }
 
-    /// One step of `rows` by three tiles.
-    pub(in super::super) fn product<'a>(
+    /// How many tiles of columns a product of so many rows may have, and whether they are apart in `w`.
+    pub(in super::super) fn layouts(
         operation: Operation,
-        x: &'a [u32],
-        w: &'a [u32],
-        sums: &'a mut [u32],
+        rows: usize,
+    ) -> impl Iterator<Item = (usize, bool)> {
+        let columns = match operation {
+            Operation::Bf16 => 1..=MAX_COLUMN_TILES,
+            Operation::Int8 => 3..=3,
+        };
+        let all = columns.flat_map(|columns| [(columns, false), (columns, true)]);
+        all.filter(move |&(columns, apart)| match apart {
+            false => columns <= 3,
+            true => columns < 3 || rows <= TILE,
+        })
+    }
+
+    /// By three tiles next to each other.
+    pub(in super::super) fn product(operation: Operation, x: &[u32], w: &[u32], sums: &mut [u32]) -> Product {
+        product_in(operation, (3, false), x, w, sums)
+    }
+
+    /// By as many tiles, next to each other or one after the other.
+    fn product_in(
+        operation: Operation,
+        (columns, apart): (usize, bool),
+        x: &[u32],
+        w: &[u32],
+        sums: &mut [u32],
     ) -> Product {
-        assert_eq!((x.len() % TILE, w.len() % (3 * TILE * TILE)), (0, 0));
-        let steps = w.len() / (3 * TILE * TILE);
+        assert_eq!((x.len() % TILE, w.len() % (columns * TILE * TILE)), (0, 0));
+        let steps = w.len() / (columns * TILE * TILE);
+        let (w_stride, w_column, w_step) = match apart {
+            false => (columns * TILE, TILE, columns * TILE * TILE),
+            true => (TILE, steps * TILE * TILE, TILE * TILE),
+        };
         Product {
             operation,
             rows: x.len() / TILE / steps,
             x: x.as_ptr(),
             x_stride: TILE * steps,
             w: w.as_ptr(),
-            w_stride: 3 * TILE,
-            w_column: TILE,
-            w_step: 3 * TILE * TILE,
-            columns: 3,
+            w_stride,
+            w_column,
+            w_step,
+            columns,
             steps,
             sums: sums.as_mut_ptr(),
-            sums_stride: 3 * TILE,
+            sums_stride: columns * TILE,
             add: false,
             ahead: Ahead::NOTHING,
         }
@@ -288,31 +314,35 @@ pub(super) mod tests {
 
     #[test]
     fn software_tiles_agree_with_float64() {
-        for rows in 1..=MAX_ROWS {
-            let steps = 1 + rows % 3;
+        let cases =
+            (1..=MAX_ROWS).flat_map(|rows| layouts(Operation::Bf16, rows).map(move |layout| (rows, layout)));
+        for (rows, layout) in cases {
+            let (columns, steps) = (layout.0, 1 + rows % 3);
             let (x, w) = (
                 pairs(rows as u32, rows * TILE * steps),
-                pairs(77, 3 * TILE * TILE * steps),
+                pairs(77, columns * TILE * TILE * steps),
             );
-            let mut sums = vec![7; rows * 3 * TILE];
+            let mut sums = vec![7; rows * columns * TILE];
+            let product = product_in(Operation::Bf16, layout, &x, &w, &mut sums);
             // SAFETY: the operands have these sizes.
-            unsafe { Session::new(Software).multiply(&product(Operation::Bf16, &x, &w, &mut sums)) };
+            unsafe { Session::new(Software).multiply(&product) };
             for row in 0..rows {
-                for column in 0..3 * TILE {
+                for column in 0..columns * TILE {
                     let products = (0..TILE * steps).flat_map(|k| {
-                        let (x, w) = (
-                            elements(x[row * TILE * steps + k]),
-                            elements(w[k * 3 * TILE + column]),
-                        );
+                        let at = k / TILE * product.w_step
+                            + k % TILE * product.w_stride
+                            + column / TILE * product.w_column
+                            + column % TILE;
+                        let (x, w) = (elements(x[row * TILE * steps + k]), elements(w[at]));
                         [x[0] * w[0], x[1] * w[1]]
                     });
                     let (exact, size) = products.fold((0.0, 0.0), |(sum, size), product: f64| {
                         (sum + product, size + product.abs())
                     });
-                    let given = f64::from(f32::from_bits(sums[row * 3 * TILE + column]));
+                    let given = f64::from(f32::from_bits(sums[row * columns * TILE + column]));
                     assert!(
                         (given - exact).abs() <= size * 1e-5,
-                        "({row}, {column}): {given}, {exact}"
+                        "{layout:?}, ({row}, {column}): {given}, {exact}"
                     );
                 }
             }
@@ -398,15 +428,17 @@ pub(super) mod tests {
     #[test]
     fn software_tiles_give_a_row_the_same_bits_in_any_product() {
         let steps = 3;
-        let (x, w) = (
-            pairs(1, MAX_ROWS * TILE * steps),
-            pairs(2, 3 * TILE * TILE * steps),
-        );
-        for operation in [Operation::Bf16, Operation::Int8] {
+        let x = pairs(1, MAX_ROWS * TILE * steps);
+        let cases = [Operation::Bf16, Operation::Int8]
+            .into_iter()
+            .flat_map(|operation| layouts(operation, 1).map(move |layout| (operation, layout)));
+        for (operation, layout) in cases {
+            let width = layout.0 * TILE;
+            let w = pairs(2, width * TILE * steps);
             let of = |rows: std::ops::Range<usize>| {
-                let mut sums = vec![0; rows.len() * 3 * TILE];
+                let mut sums = vec![0; rows.len() * width];
                 let x = &x[rows.start * TILE * steps..rows.end * TILE * steps];
-                let whole = product(operation, x, &w, &mut sums);
+                let whole = product_in(operation, layout, x, &w, &mut sums);
                 // SAFETY: the operands have these sizes.
                 unsafe {
                     let mut session = Session::new(Software);
@@ -426,12 +458,11 @@ pub(super) mod tests {
                 sums
             };
             let alone: Vec<u32> = (0..MAX_ROWS).flat_map(|row| of(row..row + 1)).collect();
-            for rows in [0..32, 0..17, 3..20, 5..30, 16..32, 31..32] {
-                assert_eq!(
-                    of(rows.clone()),
-                    alone[rows.start * 3 * TILE..rows.end * 3 * TILE],
-                    "{rows:?}"
-                );
+            for rows in [0..16, 3..10, 0..32, 0..17, 3..20, 5..30, 16..32, 31..32] {
+                if layouts(operation, rows.len()).any(|of_rows| of_rows == layout) {
+                    let expected = &alone[rows.start * width..rows.end * width];
+                    assert_eq!(of(rows.clone()), expected, "{operation:?}, {layout:?}, {rows:?}");
+                }
             }
         }
     }

@@ -1,6 +1,6 @@
 //! The vision tower of Qwen3-VL, which N1.7 has, with the mergers that make tokens of its patches.
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use super::connector::{Connector, ConnectorNames, ConnectorSizes};
@@ -136,24 +136,21 @@ impl Qwen3Vl {
         &self,
         engine: Engine,
         views: &[ViewPixels<'_>],
-        patch_vectors: &mut Vec<f32>,
+        patch_vectors: &mut Activations,
         scratch: &mut LinearScratch,
         x: &mut [f32],
     ) -> Result<Rotation> {
         let (width, side) = (self.config.width, self.config.table_side());
         let rows = x.len() / width;
-        patch_vectors.clear();
-        reserve(
-            "activations",
-            patch_vectors,
-            rows * self.patch_embed.in_features(),
-        )?;
+        let patch_vectors = sized(patch_vectors, rows * self.patch_embed.in_features())?;
         let mut places = Vec::new();
         reserve("positions", &mut places, rows)?;
         let mut rows = x.chunks_exact_mut(width);
+        let mut first = 0;
         for view in views {
             check_interrupted()?;
-            patch_vectors.extend_from_slice(view.pixels);
+            patch_vectors[first..][..view.pixels.len()].copy_from_slice(view.pixels);
+            first += view.pixels.len();
             let [by_row, by_column]: [Vec<Taps>; 2] = view.grid.map(|count| evenly_spaced(side, count));
             let of_view = patch_places(self.config.merge, view.grid)?;
             for ([row, column], x) in of_view.iter().zip(&mut rows) {

@@ -1,6 +1,6 @@
 //! SigLIP, the vision tower of N1.5 and N1.6, with the connector behind it.
 
-use saccade_kernels::{Epilogue, LinearScratch};
+use saccade_kernels::{Activations, Epilogue, LinearScratch};
 
 use super::config::{BackboneConfig, CHANNELS, PatchOrder, PixelOrder, VisionConfig};
 use super::connector::{Connector, ConnectorNames, ConnectorSizes, join};
@@ -9,7 +9,7 @@ use super::positions::{Taps, antialiased, interpolate};
 use super::released::Names;
 use super::vision::{EncodedViews, VisionBuffers};
 use super::vision_block::{BlockNames, VisionBlock};
-use crate::alloc::{reserve, sized};
+use crate::alloc::sized;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::grouped_attention::{Projections, Qkv};
@@ -161,18 +161,18 @@ impl Siglip {
         &self,
         engine: Engine,
         views: &[ViewPixels<'_>],
-        patch_vectors: &mut Vec<f32>,
+        patch_vectors: &mut Activations,
         scratch: &mut LinearScratch,
         x: &mut [f32],
     ) -> Result<()> {
         let (width, side) = (self.config.width, self.config.table_side());
         let elements = self.patch_embedding.in_features();
-        patch_vectors.clear();
-        reserve("activations", patch_vectors, x.len() / width * elements)?;
+        let patch_vectors = sized(patch_vectors, x.len() / width * elements)?;
+        let mut vectors = patch_vectors.chunks_exact_mut(elements);
         let mut rows = x.chunks_exact_mut(width);
         for view in views {
             check_interrupted()?;
-            self.cut(view, patch_vectors);
+            self.cut(view, &mut vectors);
             let [by_row, by_column]: [Vec<Taps>; 2] = view.grid.map(|count| antialiased(side, count));
             for taps in &by_row {
                 for (columns, x) in by_column.iter().zip(&mut rows) {
@@ -184,12 +184,13 @@ impl Siglip {
             .apply(engine, patch_vectors, Epilogue::Add, x, scratch)
     }
 
-    /// Adds the patches of an image, row by row, to `patch_vectors`.
-    fn cut(&self, view: &ViewPixels<'_>, patch_vectors: &mut Vec<f32>) {
+    /// Writes the patches of an image, row by row, to the next of `vectors`.
+    fn cut<'a>(&self, view: &ViewPixels<'_>, vectors: &mut impl Iterator<Item = &'a mut [f32]>) {
         let size = self.config.patch_size;
         let [rows, columns] = view.grid;
         let (height, width) = (rows * size, columns * size);
-        for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
+        let places = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
+        for ((row, column), vector) in places.zip(vectors) {
             let line = |channel: usize, y: usize| {
                 let first = (channel * height + row * size + y) * width + column * size;
                 &view.pixels[first..first + size]
@@ -197,12 +198,16 @@ impl Siglip {
             match self.pixels {
                 PixelOrder::ChannelFirst => {
                     let lines = (0..CHANNELS).flat_map(|channel| (0..size).map(move |y| (channel, y)));
-                    lines.for_each(|(channel, y)| patch_vectors.extend_from_slice(line(channel, y)));
+                    for ((channel, y), to) in lines.zip(vector.chunks_exact_mut(size)) {
+                        to.copy_from_slice(line(channel, y));
+                    }
                 }
                 PixelOrder::ChannelLast => {
-                    for y in 0..size {
+                    for (y, to) in vector.chunks_exact_mut(size * CHANNELS).enumerate() {
                         let lines: [_; CHANNELS] = std::array::from_fn(|channel| line(channel, y));
-                        patch_vectors.extend((0..size).flat_map(|x| lines.map(|line| line[x])));
+                        for (x, to) in to.chunks_exact_mut(CHANNELS).enumerate() {
+                            to.copy_from_slice(&lines.map(|line| line[x]));
+                        }
                     }
                 }
             }

@@ -49,7 +49,7 @@ pub(super) struct VisionBuffers {
     /// `(patches, width)`.
     pub x: Activations,
     /// The pixels of patches, `(patches, elements)`.
-    pub patch_vectors: Vec<f32>,
+    pub patch_vectors: Activations,
     pub block: BlockBuffers,
     pub connector: super::connector::ConnectorBuffers,
 }

@@ -2,9 +2,9 @@
 
 use std::ops::Range;
 
-use saccade_kernels::PackedKeyValues;
+use saccade_kernels::{Activations, PackedKeyValues};
 
-use crate::alloc::reserve;
+use crate::alloc::sized;
 use crate::config::Reads;
 use crate::error::Result;
 use crate::inspect::trace::Recorded;
@@ -96,18 +96,18 @@ impl Seen {
         elements: Range<usize>,
         vl: &'a [f32],
         context_dim: usize,
-        gathered: &'a mut Vec<f32>,
+        gathered: &'a mut Activations,
     ) -> Result<&'a [f32]> {
         let Some(positions) = &self.positions else {
             return Ok(vl);
         };
-        gathered.clear();
         let rows: usize = positions[elements.clone()].iter().map(Vec::len).sum();
-        reserve("activations", gathered, rows * context_dim)?;
+        let gathered = sized(gathered, rows * context_dim)?;
+        let mut rows = gathered.chunks_exact_mut(context_dim);
         let element = vl.len() / elements.len();
         for (vl, positions) in vl.chunks_exact(element).zip(&positions[elements]) {
-            for &position in positions {
-                gathered.extend_from_slice(&vl[position * context_dim..][..context_dim]);
+            for (&position, row) in positions.iter().zip(&mut rows) {
+                row.copy_from_slice(&vl[position * context_dim..][..context_dim]);
             }
         }
         Ok(gathered)

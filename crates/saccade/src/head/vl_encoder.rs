@@ -62,7 +62,7 @@ pub(crate) type Encoded = (Vec<f32>, Vec<Vec<PackedKeyValues>>);
 /// Memory of one `encode` that is kept for the next.
 pub(crate) struct EncodeBuffers {
     y: Activations,
-    gathered: Vec<f32>,
+    gathered: Activations,
     hidden: Activations,
     attention: AttentionBuffers,
 }
@@ -71,7 +71,7 @@ impl EncodeBuffers {
     pub(crate) fn new() -> Self {
         Self {
             y: Activations::new(),
-            gathered: Vec::new(),
+            gathered: Activations::new(),
             hidden: Activations::new(),
             attention: AttentionBuffers::new(),
         }

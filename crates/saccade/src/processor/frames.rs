@@ -9,7 +9,7 @@ use crate::alloc::{collected, filled, product};
 use crate::array::{Array, OwnedArray, first_not_finite};
 use crate::config::Version;
 use crate::error::{Error, Result, show_shape};
-use crate::ops::check_interrupted;
+use crate::ops::{check_interrupted, refused};
 
 const CHANNELS: usize = 3;
 
@@ -104,10 +104,7 @@ pub(super) fn view(settings: &Settings, isa: Isa, name: &str, frame: Frame<'_>) 
 }
 
 fn kernel<T>(result: std::result::Result<T, saccade_kernels::AllocError>) -> Result<T> {
-    result.map_err(|error| Error::Memory {
-        what: PIXELS,
-        bytes: error.bytes,
-    })
+    result.map_err(refused(PIXELS))
 }
 
 /// The bytes of a frame.

@@ -8,8 +8,8 @@ use std::mem::MaybeUninit;
 use std::ops::Range;
 
 use crate::gemm::{Block, Shape};
-use crate::simd::Simd;
 use crate::simd::aarch64::instructions::prefetch;
+use crate::simd::{LINE, Simd};
 
 /// Columns of a panel.
 pub(super) const COLUMNS: usize = 12;
@@ -19,9 +19,6 @@ pub(super) const SUM_PART: usize = 512;
 
 /// Words of a panel after which the next tile takes the same part of it, which is then still in the cache.
 const BLOCK_WORDS: usize = 12 << 10;
-
-/// Words of a cache line.
-const LINE: usize = 16;
 
 /// Words of a vector.
 const VECTOR: usize = 4;

@@ -322,34 +322,37 @@ unsafe impl Vector for __m512 {
     }
 
     #[inline(always)]
-    unsafe fn turn_over(square: &[[u32; MAX_LANES]; MAX_LANES], to: *mut u32) {
-        // SAFETY: the caller gives room for sixteen vectors.
+    unsafe fn transpose(square: &[[u32; MAX_LANES]; MAX_LANES], to: &mut [u32]) {
+        assert_eq!(to.len(), 16 * 16);
+        // SAFETY: as in splat; rows of both have sixteen words.
         unsafe {
             let mut rows = [_mm512_setzero_si512(); 16];
             for (row, from) in rows.iter_mut().zip(square) {
                 *row = _mm512_loadu_si512(from.as_ptr().cast());
             }
-            // Quarters of vectors become squares of four by four that are turned over: of rows 4 i to 4 i + 3, column c of each.
-            let mut turned = rows;
+            // Each quarter of four rows is a square of four by four, which is transposed: `quarters[4 * i + c]` holds, of rows 4 i to 4 i + 3,
+            // columns c, 4 + c, 8 + c and 12 + c.
+            let mut quarters = rows;
             for i in (0..16).step_by(4) {
                 let [a, b, c, d] = [rows[i], rows[i + 1], rows[i + 2], rows[i + 3]];
                 let (low_ab, high_ab) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
                 let (low_cd, high_cd) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
-                turned[i] = _mm512_unpacklo_epi64(low_ab, low_cd);
-                turned[i + 1] = _mm512_unpackhi_epi64(low_ab, low_cd);
-                turned[i + 2] = _mm512_unpacklo_epi64(high_ab, high_cd);
-                turned[i + 3] = _mm512_unpackhi_epi64(high_ab, high_cd);
+                quarters[i] = _mm512_unpacklo_epi64(low_ab, low_cd);
+                quarters[i + 1] = _mm512_unpackhi_epi64(low_ab, low_cd);
+                quarters[i + 2] = _mm512_unpacklo_epi64(high_ab, high_cd);
+                quarters[i + 3] = _mm512_unpackhi_epi64(high_ab, high_cd);
             }
-            // Then the quarters themselves: 0x88 takes the even ones of two vectors, 0xdd the odd ones.
+            // Then the quarters change places: 0x88 takes the even ones of two vectors, 0xdd the odd ones.
             for c in 0..4 {
-                let [a, b, e, d] = [turned[c], turned[4 + c], turned[8 + c], turned[12 + c]];
+                let [rows_0, rows_4, rows_8, rows_12] =
+                    [quarters[c], quarters[4 + c], quarters[8 + c], quarters[12 + c]];
                 let even = [
-                    _mm512_shuffle_i32x4::<0x88>(a, b),
-                    _mm512_shuffle_i32x4::<0x88>(e, d),
+                    _mm512_shuffle_i32x4::<0x88>(rows_0, rows_4),
+                    _mm512_shuffle_i32x4::<0x88>(rows_8, rows_12),
                 ];
                 let odd = [
-                    _mm512_shuffle_i32x4::<0xdd>(a, b),
-                    _mm512_shuffle_i32x4::<0xdd>(e, d),
+                    _mm512_shuffle_i32x4::<0xdd>(rows_0, rows_4),
+                    _mm512_shuffle_i32x4::<0xdd>(rows_8, rows_12),
                 ];
                 let columns = [
                     _mm512_shuffle_i32x4::<0x88>(even[0], even[1]),
@@ -358,7 +361,8 @@ unsafe impl Vector for __m512 {
                     _mm512_shuffle_i32x4::<0xdd>(odd[0], odd[1]),
                 ];
                 for (quarter, column) in columns.into_iter().enumerate() {
-                    _mm512_storeu_si512(to.add(16 * (4 * quarter + c)).cast(), column);
+                    let row = &mut to[16 * (4 * quarter + c)..][..16];
+                    _mm512_storeu_si512(row.as_mut_ptr().cast(), column);
                 }
             }
         }
