@@ -19,6 +19,7 @@ mod tile;
 use std::ops::Range;
 
 use crate::aligned::Zeroable;
+use crate::simd::LINE;
 use crate::weights::WeightRef;
 use outliers::{MultiplyOutliers, Outliers};
 
@@ -222,7 +223,5 @@ pub(crate) fn available<G: Gemm + 'static>() -> Option<Box<dyn Gemm>> {
 /// Words of a converted row with `per_word` elements in a word: whole cache lines, an odd number of them. Rows at multiples of a page would
 /// compete for the same few places in the cache.
 fn odd_lines(in_features: usize, per_word: usize) -> usize {
-    /// Words of a cache line.
-    const LINE: usize = 16;
     in_features.div_ceil(per_word).next_multiple_of(LINE) | LINE
 }

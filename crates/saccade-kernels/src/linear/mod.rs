@@ -154,7 +154,8 @@ impl PackedLinear {
     }
 
     /// Asks memory for the weights as many streams, or in their order, instead of as was measured to be faster on this family of CPUs. For
-    /// programs that measure it: results have the same bits.
+    /// programs that measure it: results have the same bits. Panels whose steps are one cache line (AVX2, narrow portable vectors) are asked
+    /// for in their order either way, and so are those of NEON.
     #[must_use]
     pub fn with_streams(self, streams: bool) -> Self {
         Self { streams, ..self }
