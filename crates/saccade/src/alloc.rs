@@ -1,8 +1,9 @@
 //! Memory whose size a caller decides: asked for, never assumed.
 
+use saccade_kernels::Activations;
+
 use crate::error::{Error, Result};
 use crate::ops::{check_interrupted, refused};
-use saccade_kernels::Activations;
 
 /// Makes room for `len` elements in all.
 ///

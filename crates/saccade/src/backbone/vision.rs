@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use saccade_kernels::Activations;
+
 use super::config::{BackboneConfig, Tower};
 use super::features::View;
 use super::inputs::{ViewPixels, num_tokens};
@@ -13,7 +15,6 @@ use crate::alloc::{collected, filled, reserve};
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::weights::Weights;
-use saccade_kernels::Activations;
 
 /// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at 2048 patches the weights are
 /// read once for 8 views, and the largest buffer is 35 MB at N1.5's size.

@@ -1,8 +1,9 @@
 //! How the velocity is followed from noise to actions.
 
+use saccade_kernels::Activations;
+
 use crate::alloc::sized;
 use crate::error::{Error, Result};
-use saccade_kernels::Activations;
 
 /// How the velocity is followed from noise to actions in one step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
