@@ -40,7 +40,7 @@ const SAPPHIRE_RAPIDS: Rates = Rates {
 const ZEN_4: Rates = Rates {
     float32: 113.0,
     bf16_dot: 228.0,
-    // Not measured.
+    // Layers alone, 49 rows, two threads: int8 1.04 times as fast, bfloat16 1.02 times, float32 and 296 rows 1.0 times. The whole head: 1.0 times.
     streams: false,
 };
 

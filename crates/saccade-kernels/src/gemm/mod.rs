@@ -136,6 +136,8 @@ pub(crate) struct Block<'a> {
     pub range: Range<usize>,
     /// The panel.
     pub weights: &'a [u32],
+    /// Its first columns, which the layer has. The sums of vectors of columns beyond them need not be written.
+    pub width: usize,
     /// How many panels further the one is that this thread will probably take next.
     pub ahead: usize,
     /// Whether to ask memory for weights as many streams, rather than for one line after the other.

@@ -180,6 +180,7 @@ mod tests {
             tiles,
             range: 0..tiles.count,
             weights: &weights,
+            width: step_words,
             ahead: 2,
             streams,
             sums: std::ptr::null_mut(),

@@ -112,23 +112,32 @@ pub(super) fn shape<S: Simd, P: Step<S>>() -> Shape {
 /// As there, with panels of `TILE_VECTORS` vectors of words of `P::STEP` elements; called within [`Simd::run`] of `S`.
 #[inline(always)]
 pub(super) unsafe fn multiply<S: Simd, P: Step<S>>(block: &Block<'_>) {
+    // Vectors of the panel that have columns. Those of a narrow last panel are all that is computed: 128 outputs are 8 vectors of AVX-512, not
+    // the 9 of three whole panels.
+    let used = block.width.div_ceil(S::Vector::LANES);
     // SAFETY: the caller's promise.
     unsafe {
-        match S::Vector::TILE_VECTORS {
-            1 => panel_rows::<S, S::Vector, P, 1>(block),
-            2 => panel_rows::<S, S::Vector, P, 2>(block),
-            3 => panel_rows::<S, S::Vector, P, 3>(block),
-            4 => panel_rows::<S, S::Vector, P, 4>(block),
-            vectors => unreachable!("a tile of {vectors} vectors"),
+        match (S::Vector::TILE_VECTORS, used) {
+            (1, _) => panel_rows::<S, S::Vector, P, 1, 1>(block),
+            (2, 1) => panel_rows::<S, S::Vector, P, 2, 1>(block),
+            (2, _) => panel_rows::<S, S::Vector, P, 2, 2>(block),
+            (3, 1) => panel_rows::<S, S::Vector, P, 3, 1>(block),
+            (3, 2) => panel_rows::<S, S::Vector, P, 3, 2>(block),
+            (3, _) => panel_rows::<S, S::Vector, P, 3, 3>(block),
+            (vectors, _) => unreachable!("a tile of {vectors} vectors"),
         }
     }
     (block.finish)(block.rows());
 }
 
+/// The first `UV` vectors of a panel of `NV`.
+///
 /// # Safety
 /// As [`multiply`].
 #[inline(always)]
-unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize>(block: &Block<'_>) {
+unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize, const UV: usize>(
+    block: &Block<'_>,
+) {
     let tiles = &block.range;
     let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(P::STEP);
@@ -157,14 +166,14 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
                     is_one_of_few: tiles.len() < NV,
                 };
                 match end - first {
-                    1 => tile_part::<S, V, P, NV, 1>(block, &part, &tile),
-                    2 if P::TILE_ROWS >= 2 => tile_part::<S, V, P, NV, 2>(block, &part, &tile),
-                    3 if P::TILE_ROWS >= 3 => tile_part::<S, V, P, NV, 3>(block, &part, &tile),
-                    4 if P::TILE_ROWS >= 4 => tile_part::<S, V, P, NV, 4>(block, &part, &tile),
-                    5 if P::TILE_ROWS >= 5 => tile_part::<S, V, P, NV, 5>(block, &part, &tile),
-                    6 if P::TILE_ROWS >= 6 => tile_part::<S, V, P, NV, 6>(block, &part, &tile),
-                    7 if P::TILE_ROWS >= 7 => tile_part::<S, V, P, NV, 7>(block, &part, &tile),
-                    8 if P::TILE_ROWS >= 8 => tile_part::<S, V, P, NV, 8>(block, &part, &tile),
+                    1 => tile_part::<S, V, P, NV, UV, 1>(block, &part, &tile),
+                    2 if P::TILE_ROWS >= 2 => tile_part::<S, V, P, NV, UV, 2>(block, &part, &tile),
+                    3 if P::TILE_ROWS >= 3 => tile_part::<S, V, P, NV, UV, 3>(block, &part, &tile),
+                    4 if P::TILE_ROWS >= 4 => tile_part::<S, V, P, NV, UV, 4>(block, &part, &tile),
+                    5 if P::TILE_ROWS >= 5 => tile_part::<S, V, P, NV, UV, 5>(block, &part, &tile),
+                    6 if P::TILE_ROWS >= 6 => tile_part::<S, V, P, NV, UV, 6>(block, &part, &tile),
+                    7 if P::TILE_ROWS >= 7 => tile_part::<S, V, P, NV, UV, 7>(block, &part, &tile),
+                    8 if P::TILE_ROWS >= 8 => tile_part::<S, V, P, NV, UV, 8>(block, &part, &tile),
                     rows => unreachable!("a tile of {rows} rows"),
                 }
             }
@@ -181,12 +190,19 @@ struct RowTile {
     is_one_of_few: bool,
 }
 
-/// `MR` rows by `NV` vectors over one part of `k`.
+/// `MR` rows by `UV` vectors of `NV` over one part of `k`.
 ///
 /// # Safety
 /// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, and `tile.sums` room for them.
 #[inline(always)]
-unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize, const MR: usize>(
+unsafe fn tile_part<
+    S: Simd<Vector = V>,
+    V: Vector,
+    P: Step<S>,
+    const NV: usize,
+    const UV: usize,
+    const MR: usize,
+>(
     block: &Block<'_>,
     part: &Range<usize>,
     tile: &RowTile,
@@ -206,7 +222,7 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
                 let out = block
                     .out
                     .wrapping_offset((tile.row + r) as isize * block.out_stride);
-                for v in 0..NV {
+                for v in 0..UV {
                     V::prefetch(out.wrapping_add(v * V::LANES).cast());
                 }
             }
@@ -214,7 +230,7 @@ unsafe fn tile_part<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize,
         let mut first = part.start;
         loop {
             let end = part.end.min(first + P::PART_STEPS);
-            let mut acc = [[P::zero(); NV]; MR];
+            let mut acc = [[P::zero(); UV]; MR];
             // Rows that are not converted may end within the last step.
             let whole = end.min(block.in_features / P::STEP);
             // Few rows leave little time: a step's share is then longer than a cache line. The loops are apart because one register more

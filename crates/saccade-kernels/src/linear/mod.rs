@@ -346,6 +346,7 @@ impl PackedLinear {
             tiles: call.tiles,
             range,
             weights,
+            width: columns.min(self.out_features - first),
             ahead,
             streams: self.streams,
             sums,

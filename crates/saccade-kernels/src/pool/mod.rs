@@ -110,11 +110,8 @@ impl Pool {
                 continue;
             }
             let idle_since = Instant::now();
-            while self.offers.load(Ordering::Relaxed) == seen && idle_since.elapsed() < SPIN {
-                for _ in 0..32 {
-                    std::hint::spin_loop();
-                }
-            }
+            let is_asked = || self.offers.load(Ordering::Relaxed) != seen;
+            while !spin_until(is_asked) && idle_since.elapsed() < SPIN {}
             if self.offers.load(Ordering::SeqCst) == seen {
                 self.sleep(seen);
             }
@@ -196,6 +193,17 @@ impl Pool {
             resume_unwind(panic);
         }
     }
+}
+
+/// Spins until `is_over`, but not long: a clock is to be asked meanwhile, which takes as long as a few turns. Returns whether it was.
+///
+/// It looks in every turn. 32 turns without a look are 0.6 us on Zen 4 and several times that on Intel, beside loops of 10 us.
+#[inline(always)]
+fn spin_until(is_over: impl Fn() -> bool) -> bool {
+    (0..32).any(|_| {
+        std::hint::spin_loop();
+        is_over()
+    })
 }
 
 thread_local! {

@@ -7,6 +7,7 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::place::Place;
+use super::spin_until;
 
 /// One call of [`parallel_for`](crate::parallel_for), on the caller's stack.
 pub(super) struct Job<'a> {
@@ -176,16 +177,14 @@ impl Slot {
     /// Waits until nobody is inside: spins for `patience`, then sleeps.
     pub(super) fn wait_until_empty(&self, patience: Duration) {
         let since = Instant::now();
-        while self.inside.load(Ordering::SeqCst) != 0 {
-            if since.elapsed() < patience {
-                for _ in 0..32 {
-                    std::hint::spin_loop();
-                }
+        let is_empty = || self.inside.load(Ordering::SeqCst) == 0;
+        while !is_empty() {
+            if spin_until(is_empty) || since.elapsed() < patience {
                 continue;
             }
             let mut bed = lock(&self.bed);
             self.caller_sleeps.store(true, Ordering::SeqCst);
-            while self.inside.load(Ordering::SeqCst) != 0 {
+            while !is_empty() {
                 bed = self.wake.wait(bed).unwrap_or_else(PoisonError::into_inner);
             }
             self.caller_sleeps.store(false, Ordering::SeqCst);
