@@ -153,7 +153,8 @@ rust() (
 
 extension() (
     cross
-    PYO3_NO_PYTHON=1 cargo build --locked --quiet "${LEAST[@]}" --target $TARGET -p saccade-python
+    # An extension finds the symbols of Python in the program that loads it.
+    PYO3_NO_PYTHON=1 cargo build --locked --quiet "${LEAST[@]}" --target $TARGET -p saccade-python --features pyo3/extension-module
     rm -rf "$WORK/site"
     mkdir -p "$WORK/site"
     git ls-files python/saccade | tar --create --files-from - | tar --extract --directory "$WORK/site" --strip-components 1
