@@ -87,12 +87,12 @@ compiler() {
 }
 
 # Debian's ARM Python is unpacked, not set up, so no ARM program has to run meanwhile. pip of this machine fetches the
-# packages for it.
+# packages for it; NumPy's needs the C++ library of the system.
 python() {
     [ -e "$WORK/python.done" ] && return
     rm -rf "$ROOT" "$WORK/venv" "$WORK/packages"
     # shellcheck source=/dev/null
-    (. /etc/os-release && sources | mmdebstrap --quiet --variant=extract --arch=arm64 --include=python3 "$VERSION_CODENAME" "$ROOT" -)
+    (. /etc/os-release && sources | mmdebstrap --quiet --variant=extract --arch=arm64 --include=python3,libstdc++6 "$VERSION_CODENAME" "$ROOT" -)
     python3 -m venv "$WORK/venv"
     # NumPy apart from what only tests need: a wheel is tested with it alone.
     arm_pip "$(arm_site)" "numpy>=2"
