@@ -87,9 +87,9 @@ compiler() {
 }
 
 # Debian's ARM Python is unpacked, not set up, so no ARM program has to run meanwhile. pip of this machine fetches the
-# packages for it; NumPy's needs the C++ library of the system.
+# packages for it; NumPy's wheel loads the system's C++ library.
 python() {
-    [ -e "$WORK/python.done" ] && return
+    [ -e "$WORK/python.done" ] && [ -e "$ROOT/usr/lib/aarch64-linux-gnu/libstdc++.so.6" ] && return
     rm -rf "$ROOT" "$WORK/venv" "$WORK/packages"
     # shellcheck source=/dev/null
     (. /etc/os-release && sources | mmdebstrap --quiet --variant=extract --arch=arm64 --include=python3,libstdc++6 "$VERSION_CODENAME" "$ROOT" -)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from benches.awake import wake
 from benches.backbone import setup
 from saccade._arrays import Float32Array
 
@@ -179,6 +180,7 @@ def round_of(pipes: dict[str, Connection], said: dict[str, Any], index: int) -> 
     for name in names[turn:] + names[:turn]:
         for work in said[name]:
             time.sleep(PAUSE)
+            wake()
             pipes[name].send(work)
             answer = pipes[name].recv()
             if isinstance(answer, Exception):

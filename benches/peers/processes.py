@@ -12,7 +12,6 @@ import importlib
 import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -24,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from benches.awake import wake
 from benches.checkpoints import n15
 from benches.peers import inputs, policy_inputs
 from benches.peers.cases import Case
@@ -31,7 +31,6 @@ from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Built, Task
 
 PAUSE = 0.2  # seconds of rest before a measurement; the threads of the one before have gone to sleep by then
-WAKE = 0.2  # seconds that every processor is then busy
 SAMPLE = 0.05  # minimum seconds of a sample: long compared with the clock's resolution and a scheduler tick
 
 
@@ -270,18 +269,6 @@ def timed(pipe: Connection, name: str, work: str) -> float:
     if isinstance(answer, Exception):
         raise answer
     return float(answer)
-
-
-def wake() -> None:
-    """Keeps every processor busy for a moment.
-
-    A hypervisor may wake two processors of a machine on one core: on a virtual Zen 4, two processes pinned to
-    a processor each ran at 0.6 of their speed for 80 ms after a pause, which is a third of a chunk in int8.
-    """
-    busy = f"import time; end = time.monotonic() + {WAKE}\nwhile time.monotonic() < end: pass"
-    processors = len(os.sched_getaffinity(0))
-    for process in [subprocess.Popen([sys.executable, "-S", "-c", busy]) for _ in range(processors)]:
-        process.wait()
 
 
 def note(message: str) -> None:
