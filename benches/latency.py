@@ -39,11 +39,11 @@ from typing import Any
 import numpy as np
 
 import saccade
-from benches.awake import wake
 from benches.peers import inputs, machine
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Task
+from benches.warm import warm_up
 
 SECTIONS = ("loaded", "callers", "small", "overhead")
 LOADED = ("saccade-float32", "saccade-bfloat16", "saccade-int8", "lerobot-bfloat16")
@@ -79,6 +79,7 @@ def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path)
         pipe.send("ready")
         while (asked := pipe.recv()) is not None:
             work, times = asked
+            warm_up(works[work])
             pipe.send([timed(works[work]) for _ in range(times)])
     except Exception as error:
         pipe.send(RuntimeError(f"{name}: {type(error).__name__}: {error}"))
@@ -114,8 +115,7 @@ class Contenders:
         return answer
 
     def ask(self, name: str, work: str, times: int) -> list[float]:
-        """Seconds of each of `times` consecutive calls, on processors that are awake."""
-        wake()
+        """Seconds of each of `times` consecutive calls, after calls that warm up."""
         self._pipes[name].send((work, times))
         return list(self._answer(name))
 
@@ -294,8 +294,7 @@ def small(args: argparse.Namespace, before: Report) -> Report:
             for turn in range(args.rounds):
                 for name in rotated(names, turn):
                     for work in ("sample", "both"):
-                        # The first calls warm up threads and caches.
-                        taken = contenders.ask(name, work, 25)[5:]
+                        taken = contenders.ask(name, work, 20)
                         seconds[name][work].append(statistics.median(taken))
         runs.append({"threads": threads, "seconds": seconds})
     return {"runs": runs}

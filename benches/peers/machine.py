@@ -20,7 +20,7 @@ AMX = ("amx_tile", "amx_bf16", "amx_int8")
 PACKAGES = ("saccade", "torch", "lerobot", "transformers", "diffusers", "onnxruntime", "openvino", "numpy")
 
 
-TIMING = "rest, wake"
+TIMING = "rest, warm-up"
 """What comes before a measurement. Records without it had the rest alone."""
 
 
