@@ -235,6 +235,7 @@ test-aarch64:
 test-aarch64-all:
 	CPUS="max,sve=off neoverse-n1 cortex-a72 max" .ci/aarch64/run.sh test
 
+# The plugin needs Python 3.12 to run, as lerobot does, but not to be packed.
 wheel:
 	@$(PYTHON) .ci/needs.py python rust
 	@$(MAKE) -s $(WHEEL_VENV)/.tools
@@ -242,7 +243,7 @@ wheel:
 	rm -rf dist
 	for target in $(WHEEL_TARGETS); do $(WHEEL_VENV)/bin/python .ci/wheels/build.py --out dist --target $$target $(WHEEL_ARGS) || exit 1; done
 	SOURCE_DATE_EPOCH=$$(git show --no-patch --format=%ct) $(WHEEL_VENV)/bin/python -m pip wheel --disable-pip-version-check --quiet \
-		--no-deps --no-build-isolation --wheel-dir dist plugins/lerobot
+		--no-deps --no-build-isolation --ignore-requires-python --wheel-dir dist plugins/lerobot
 
 test-wheel: wheel
 	@$(PYTHON) .ci/needs.py opengl qemu

@@ -43,6 +43,7 @@ from benches.peers import inputs, machine
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Task
+from benches.warm import warm_up
 
 SECTIONS = ("loaded", "callers", "small", "overhead")
 LOADED = ("saccade-float32", "saccade-bfloat16", "saccade-int8", "lerobot-bfloat16")
@@ -56,17 +57,12 @@ SMALL = (
 )
 NUM_CALLERS = 8
 SETTLE = 0.3  # seconds for the scheduler to distribute a new load
-# Seconds of calls before short ones are timed. Hypervisors may wake two processors on one core: on a virtual
-# Zen 4, two processes pinned to a processor each then ran at 0.6 of their speed for 80 ms after a pause.
-WARM = 0.2
 
 Report = dict[str, Any]
 
 
 def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path) -> None:
-    """A contender's process: builds its head, then answers `(work, count, warm)` with `count` times in
-    seconds, of calls that follow at least `warm` seconds of the same ones.
-    """
+    """A contender's process: builds its head, then answers `(work, count)` with `count` times in seconds."""
     try:
         arrays = inputs.inputs_of(case, saccade.HeadConfig.from_file(source / "config.json"))
         arrays["expected"] = arrays["noise"]  # of the result's shape
@@ -82,10 +78,8 @@ def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path)
             work()
         pipe.send("ready")
         while (asked := pipe.recv()) is not None:
-            work, times, warm = asked
-            begin = time.perf_counter()
-            while time.perf_counter() - begin < warm:
-                works[work]()
+            work, times = asked
+            warm_up(works[work])
             pipe.send([timed(works[work]) for _ in range(times)])
     except Exception as error:
         pipe.send(RuntimeError(f"{name}: {type(error).__name__}: {error}"))
@@ -120,9 +114,9 @@ class Contenders:
             raise answer
         return answer
 
-    def ask(self, name: str, work: str, times: int, warm: float = 0.0) -> list[float]:
-        """Seconds of each of `times` consecutive calls, after `warm` seconds of them."""
-        self._pipes[name].send((work, times, warm))
+    def ask(self, name: str, work: str, times: int) -> list[float]:
+        """Seconds of each of `times` consecutive calls, after calls that warm up."""
+        self._pipes[name].send((work, times))
         return list(self._answer(name))
 
     def __enter__(self) -> Contenders:
@@ -300,7 +294,7 @@ def small(args: argparse.Namespace, before: Report) -> Report:
             for turn in range(args.rounds):
                 for name in rotated(names, turn):
                     for work in ("sample", "both"):
-                        taken = contenders.ask(name, work, 20, WARM)
+                        taken = contenders.ask(name, work, 20)
                         seconds[name][work].append(statistics.median(taken))
         runs.append({"threads": threads, "seconds": seconds})
     return {"runs": runs}

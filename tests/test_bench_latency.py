@@ -23,7 +23,7 @@ def run(work: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_sections_run_and_loaded_adds_up(tmp_path: Path) -> None:
     arguments = ["--size", "small", "--rounds", "1", "--contenders", "saccade-float32"]
     loaded = [*arguments, "--chunks", "3", "--chunks-a-turn", "3", "--busy", "1"]
-    finished = run(tmp_path, "overhead", "callers", "loaded", *loaded)
+    finished = run(tmp_path, "overhead", "callers", "small", "loaded", *loaded)
     assert finished.returncode == 0, finished.stderr
     assert run(tmp_path, "loaded", *loaded).returncode == 0
     report: dict[str, Any] = json.loads((tmp_path / "results.json").read_text())
@@ -33,6 +33,7 @@ def test_sections_run_and_loaded_adds_up(tmp_path: Path) -> None:
     printed = run(tmp_path, "report").stdout
     assert "| saccade float32 |" in printed
     assert "| encode |" in printed
+    assert "The bundled policy's sizes" in printed
     assert f"{latency.NUM_CALLERS} callers" in printed
     assert not list(tmp_path.glob("*.part"))
 

@@ -87,12 +87,12 @@ compiler() {
 }
 
 # Debian's ARM Python is unpacked, not set up, so no ARM program has to run meanwhile. pip of this machine fetches the
-# packages for it.
+# packages for it; NumPy's wheel loads the system's C++ library.
 python() {
-    [ -e "$WORK/python.done" ] && return
+    [ -e "$WORK/python.done" ] && [ -e "$ROOT/usr/lib/aarch64-linux-gnu/libstdc++.so.6" ] && return
     rm -rf "$ROOT" "$WORK/venv" "$WORK/packages"
     # shellcheck source=/dev/null
-    (. /etc/os-release && sources | mmdebstrap --quiet --variant=extract --arch=arm64 --include=python3 "$VERSION_CODENAME" "$ROOT" -)
+    (. /etc/os-release && sources | mmdebstrap --quiet --variant=extract --arch=arm64 --include=python3,libstdc++6 "$VERSION_CODENAME" "$ROOT" -)
     python3 -m venv "$WORK/venv"
     # NumPy apart from what only tests need: a wheel is tested with it alone.
     arm_pip "$(arm_site)" "numpy>=2"
@@ -153,7 +153,8 @@ rust() (
 
 extension() (
     cross
-    PYO3_NO_PYTHON=1 cargo build --locked --quiet "${LEAST[@]}" --target $TARGET -p saccade-python
+    # An extension finds the symbols of Python in the program that loads it.
+    PYO3_NO_PYTHON=1 cargo build --locked --quiet "${LEAST[@]}" --target $TARGET -p saccade-python --features pyo3/extension-module
     rm -rf "$WORK/site"
     mkdir -p "$WORK/site"
     git ls-files python/saccade | tar --create --files-from - | tar --extract --directory "$WORK/site" --strip-components 1

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from benches.backbone import setup
+from benches.warm import warm_up
 from saccade._arrays import Float32Array
 
 PAUSE = 0.2  # seconds of rest before a measurement; the threads of the one before have gone to sleep by then
@@ -106,6 +107,7 @@ def worker(pipe: Connection, task: Task) -> None:
             errors[name] = float(np.abs(call() - expected).max() / np.abs(expected).max())
         pipe.send(errors)
         while (asked := pipe.recv()) is not None:
+            warm_up(works[asked])
             start = time.perf_counter()
             works[asked]()
             pipe.send(time.perf_counter() - start)

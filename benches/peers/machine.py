@@ -20,6 +20,10 @@ AMX = ("amx_tile", "amx_bf16", "amx_int8")
 PACKAGES = ("saccade", "torch", "lerobot", "transformers", "diffusers", "onnxruntime", "openvino", "numpy")
 
 
+TIMING = "rest, warm-up"
+"""What comes before a measurement. Records without it had the rest alone."""
+
+
 def describe() -> dict[str, Any]:
     """CPU, its flags that matter here, cores, memory, versions of all engines, the build of saccade.
 
@@ -45,6 +49,7 @@ def describe() -> dict[str, Any]:
             **{name: version(name) for name in PACKAGES},
             "ggml": os.environ.get("SACCADE_PEERS_GGML_VERSION", ""),
         },
+        "timing": TIMING,
         "build": hashlib.sha256(Path(saccade._saccade.__file__).read_bytes()).hexdigest()[:12],
         "commit": said("git", "describe", "--always", "--dirty", "--exclude", "*"),
     }

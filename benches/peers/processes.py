@@ -28,6 +28,7 @@ from benches.peers import inputs, policy_inputs
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Built, Task
+from benches.warm import warm_up
 
 PAUSE = 0.2  # seconds of rest before a measurement; the threads of the one before have gone to sleep by then
 SAMPLE = 0.05  # minimum seconds of a sample: long compared with the clock's resolution and a scheduler tick
@@ -116,8 +117,11 @@ def difference(result: Any, expected: Any) -> tuple[float, float]:
 
 
 def seconds_of(built: Built, work: str, repeats: dict[str, int]) -> float:
-    """Seconds of one call of a layer or piece; the mean over a sample if calls are short."""
+    """Seconds of one call of a layer or piece, after calls that warm up; the mean over a sample if calls are
+    short.
+    """
     run, times = built.works[work], repeats.get(work, 1)
+    warm_up(run)
     start = time.perf_counter()
     for _ in range(times):
         run()

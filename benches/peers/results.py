@@ -38,10 +38,12 @@ class Results:
 
     def begin(self, machine: dict[str, Any]) -> bool:
         """Names the machine of what is measured from now on. Measurements of another CPU, build or version of
-        an engine are set aside under another name: no table mixes them. Whether there were any.
+        an engine, or that were timed in another way, are set aside under another name: no table mixes them.
+        Whether there were any.
         """
         before = self.data["machine"]
-        other = bool(before) and any(before[key] != machine[key] for key in ("cpu", "build", "versions"))
+        same = ("cpu", "build", "versions", "timing")
+        other = bool(before) and any(before.get(key) != machine.get(key) for key in same)
         if other:
             self.path.replace(self.path.with_name(f"{self.path.stem}-{before['build']}{self.path.suffix}"))
             self.data = {"format": FORMAT, "machine": {}, "peaks": [], "linear": [], "records": []}

@@ -218,6 +218,35 @@ fn long_sums_agree_with_float64() {
     }
 }
 
+/// The last panel of a layer computes only the vectors that have columns.
+#[test]
+fn bits_of_a_column_do_not_depend_on_how_many_follow() {
+    let (inputs, outputs, row_count) = (67, 48, 9);
+    let (weight, bias) = (numbers(1, inputs * outputs, 1.0), numbers(2, outputs, 1.0));
+    let x = numbers(3, row_count * inputs, 1.0);
+    for isa in isas() {
+        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+            let first = |count: usize| {
+                let weight = WeightRef::F32(Matrix::new(&weight[..count * inputs], inputs));
+                let layer =
+                    PackedLinear::pack(isa, arithmetic, 1, &[(weight, Some(&bias[..count]))]).unwrap();
+                apply(&layer, 1, &x, Epilogue::GeluTanh)
+            };
+            let all = first(outputs);
+            for count in 1..outputs {
+                let few = first(count);
+                for (few, all) in few.chunks_exact(count).zip(all.chunks_exact(outputs)) {
+                    assert_eq!(
+                        bits(few),
+                        bits(&all[..count]),
+                        "{isa}, {arithmetic:?}, {count} columns"
+                    );
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn bits_do_not_depend_on_threads() {
     for (inputs, outputs, row_count) in [(96, 500, 49), (1100, 200, 49), (2048, 130, 300)] {

@@ -136,8 +136,8 @@ pub(crate) struct Block<'a> {
     pub range: Range<usize>,
     /// The panel.
     pub weights: &'a [u32],
-    /// Its first columns, which the layer has. The sums of vectors of columns beyond them need not be written.
-    pub width: usize,
+    /// Columns of it whose sums must be written. The others may be left unwritten, and nobody reads them.
+    pub needed: usize,
     /// How many panels further the one is that this thread will probably take next.
     pub ahead: usize,
     /// Whether to ask memory for weights as many streams, rather than for one line after the other.
@@ -148,7 +148,7 @@ pub(crate) struct Block<'a> {
     pub out: *const f32,
     /// Elements from one row of them to the next.
     pub out_stride: isize,
-    /// Makes results of the sums of rows of the call. It uses vectors, never tiles.
+    /// Makes results of the needed sums of rows of the call. It uses vectors, never tiles.
     pub finish: &'a dyn Fn(Range<usize>),
 }
 
@@ -199,8 +199,8 @@ pub(crate) unsafe trait Gemm: Send + Sync {
     /// for [`Product::Int8`] `source.quantized` and, if they are given, `source.outliers`. No other thread reads or writes these places.
     unsafe fn convert(&self, source: &Source, rows: Range<usize>);
 
-    /// Writes the sums of a block of rows times a panel, and calls [`Block::finish`] once for each of its rows, when all sums of the row are
-    /// complete.
+    /// Writes the sums of a block of rows times a panel, those of [`Block::needed`] columns at least, and calls [`Block::finish`] once for each
+    /// of its rows, when these sums of the row are complete.
     ///
     /// # Safety
     /// The panel was packed by this product. `block.x` holds the rows of the block, for converted rows also [`Shape::rows_beyond`] more;

@@ -29,8 +29,8 @@ pub(super) trait Step<S: Simd> {
     /// Rows of the largest tile.
     const TILE_ROWS: usize;
     /// Steps of a turn of the innermost loop. What counts steps and finds rows takes ports from the products on Intel: with one step a turn,
-    /// 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more. Not measured on
-    /// AMD.
+    /// 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more. Not
+    /// measured alone on AMD.
     const UNROLLED: usize = 4;
     /// A vector of sums.
     type Sum: Copy;
@@ -112,9 +112,9 @@ pub(super) fn shape<S: Simd, P: Step<S>>() -> Shape {
 /// As there, with panels of `TILE_VECTORS` vectors of words of `P::STEP` elements; called within [`Simd::run`] of `S`.
 #[inline(always)]
 pub(super) unsafe fn multiply<S: Simd, P: Step<S>>(block: &Block<'_>) {
-    // Vectors of the panel that have columns. Those of a narrow last panel are all that is computed: 128 outputs are 8 vectors of AVX-512, not
-    // the 9 of three whole panels.
-    let used = block.width.div_ceil(S::Vector::LANES);
+    const { assert!(S::Vector::TILE_VECTORS <= 3) }
+    // 128 outputs are 8 vectors of AVX-512, not the 9 of three whole panels: a head of width 128 took 0.93 of the time on one thread of a Zen 4.
+    let used = block.needed.div_ceil(S::Vector::LANES);
     // SAFETY: the caller's promise.
     unsafe {
         match (S::Vector::TILE_VECTORS, used) {
@@ -138,6 +138,7 @@ pub(super) unsafe fn multiply<S: Simd, P: Step<S>>(block: &Block<'_>) {
 unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize, const UV: usize>(
     block: &Block<'_>,
 ) {
+    const { assert!(1 <= UV && UV <= NV) }
     let tiles = &block.range;
     let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(P::STEP);
@@ -146,7 +147,7 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
     const { assert!(P::PART_STEPS > BLOCK_STEPS || (BLOCK_STEPS / 2).is_multiple_of(P::PART_STEPS)) }
     // As streams, a part is asked for while the one before it is multiplied. One of 1024 steps after one of 512 would take twice the pace:
     // parts of 512 made 1536 steps 1.04 to 1.08 times as fast (AVX-512, float32, Intel with AMX), and no difference where 1024 divides them.
-    // Not measured on AMD, whose families ask in order.
+    // Families of AMD ask in order.
     let is_uneven = steps > BLOCK_STEPS && !steps.is_multiple_of(BLOCK_STEPS);
     let part_steps = if is_uneven && block.asks_as_streams(step_words) {
         BLOCK_STEPS / 2
@@ -290,6 +291,64 @@ unsafe fn tile_part<
             first = end;
             if first >= part.end {
                 return;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{PanelMut, Product, Tiles};
+    use super::*;
+    use crate::isa::Isa;
+    use crate::matrix::Matrix;
+    use crate::weights::WeightRef;
+
+    /// Otherwise a narrow panel would cost as much as a whole one, and results would not tell.
+    #[test]
+    fn only_vectors_with_needed_columns_are_computed() {
+        const UNTOUCHED: u32 = 0x7fc0_0bad;
+        let x = [1.0_f32, 2.0, 3.0, 4.0, 5.0];
+        for isa in Isa::available() {
+            if cfg!(target_arch = "aarch64") && isa != Isa::Portable {
+                continue; // products of another file, which write all sums
+            }
+            let gemm = isa.gemm(Product::Float32);
+            let (shape, lanes) = (gemm.shape(), isa.vectors().lanes);
+            let mut words = vec![0; gemm.panel_words(x.len())];
+            let weights = [1.0; 5];
+            let panel = PanelMut {
+                words: &mut words,
+                scales: &mut [],
+                sums: &mut [],
+            };
+            gemm.pack(WeightRef::F32(Matrix::new(&weights, x.len())), 0, panel);
+            for needed in (lanes..=shape.columns).step_by(lanes) {
+                let mut sums = vec![UNTOUCHED; shape.columns];
+                let tiles = Tiles::new(1, shape);
+                let block = Block {
+                    x: x.as_ptr().cast(),
+                    x_stride: 0,
+                    in_features: x.len(),
+                    tiles,
+                    range: 0..1,
+                    weights: &words,
+                    needed,
+                    ahead: 0,
+                    streams: false,
+                    sums: sums.as_mut_ptr(),
+                    out: std::ptr::null(),
+                    out_stride: 0,
+                    finish: &|_| (),
+                };
+                // SAFETY: the product has packed the panel; the row and its sums are above.
+                unsafe { gemm.multiply(&block) };
+                assert_eq!(f32::from_bits(sums[0]), 15.0, "{isa}");
+                let untouched = sums.iter().map(|&sum| sum == UNTOUCHED);
+                assert!(
+                    untouched.eq((0..shape.columns).map(|column| column >= needed)),
+                    "{isa}, {needed}"
+                );
             }
         }
     }

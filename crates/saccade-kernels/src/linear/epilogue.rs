@@ -32,7 +32,7 @@ pub enum Epilogue {
 /// The sums of some rows and one panel, and where the results go.
 pub(super) struct Finish<'a> {
     pub epilogue: Epilogue,
-    /// Rows of `columns` words, from the first of `rows` on.
+    /// Rows of `columns` words, from the first of `rows` on. Those of `width` columns are written, up to whole vectors.
     pub sums: *const u32,
     pub columns: usize,
     pub rows: Range<usize>,
@@ -65,7 +65,7 @@ impl Kernel for Finish<'_> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) {
-        // SAFETY: the views of the call have the rows and columns; all sums have been written.
+        // SAFETY: the views of the call have the rows and columns; the sums of their columns have been written, in whole vectors.
         unsafe {
             if self.int8.scales.is_empty() {
                 self.of::<S::Vector, FloatSums>();
@@ -105,7 +105,7 @@ impl Finish<'_> {
         for vector in 0..self.width.div_ceil(V::LANES) {
             let column = vector * V::LANES;
             let lanes = V::LANES.min(self.width - column);
-            // SAFETY: the caller's promise; partial vectors stay within the panel's columns.
+            // SAFETY: the caller's promise; partial vectors stay within the panel's columns, and their sums were written as whole vectors.
             unsafe {
                 let bias = V::load(self.bias.as_ptr().add(column));
                 let columns = M::columns::<V>(&self.int8, column);

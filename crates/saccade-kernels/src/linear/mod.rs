@@ -336,7 +336,7 @@ impl PackedLinear {
         let weights = &self.panels.words[panel * size..][..size];
         let finish = |done: Range<usize>| {
             let sums = sums.wrapping_add((done.start - rows.start) * columns);
-            // SAFETY: the product calls this with rows of the block whose sums are complete.
+            // SAFETY: the product calls this with rows of the block whose needed sums are complete.
             unsafe { self.finish(call, done, panel, weights, sums) };
         };
         let block = Block {
@@ -346,7 +346,11 @@ impl PackedLinear {
             tiles: call.tiles,
             range,
             weights,
-            width: columns.min(self.out_features - first),
+            // The results are made in whole vectors.
+            needed: self
+                .panel_width(panel)
+                .next_multiple_of(self.isa.vectors().lanes)
+                .min(columns),
             ahead,
             streams: self.streams,
             sums,
@@ -358,10 +362,16 @@ impl PackedLinear {
         unsafe { self.gemm.multiply(&block) };
     }
 
+    /// Columns of panel number `panel` that the layer has.
+    fn panel_width(&self, panel: usize) -> usize {
+        let columns = self.gemm.shape().columns;
+        columns.min(self.out_features - panel * columns)
+    }
+
     /// Makes results of the sums of some rows and panel number `panel`, whose words are `weights`.
     ///
     /// # Safety
-    /// `sums` points to the complete sums of these rows, which are in the call.
+    /// `sums` points to the sums of these rows, which are in the call; those of [`Block::needed`] columns are complete.
     unsafe fn finish(
         &self,
         call: &Call<'_>,
@@ -390,7 +400,7 @@ impl PackedLinear {
             sums,
             columns,
             rows,
-            width: columns.min(self.out_features - first),
+            width: self.panel_width(panel),
             bias: &self.bias[columns_of.clone()],
             int8: Int8 {
                 scales: self.panels.scales.get(columns_of.clone()).unwrap_or_default(),

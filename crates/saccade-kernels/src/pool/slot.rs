@@ -106,7 +106,9 @@ pub(super) struct Pace {
     pub joined_at: usize,
 }
 
-/// A place where a call offers its job.
+/// A place where a call offers its job. On cache lines of its own: a caller that waits looks at it all the time, and another caller's workers
+/// write to the next one.
+#[repr(align(64))]
 pub(super) struct Slot {
     /// Null if the slot is free or closed.
     pub job: AtomicPtr<Job<'static>>,
@@ -176,19 +178,23 @@ impl Slot {
 
     /// Waits until nobody is inside: spins for `patience`, then sleeps.
     pub(super) fn wait_until_empty(&self, patience: Duration) {
-        let since = Instant::now();
         let is_empty = || self.inside.load(Ordering::SeqCst) == 0;
-        while !is_empty() {
-            if spin_until(is_empty) || since.elapsed() < patience {
-                continue;
+        let since = Instant::now();
+        loop {
+            // A worker that comes later finds no job, so nobody inside once is enough.
+            if spin_until(is_empty) {
+                return;
             }
-            let mut bed = lock(&self.bed);
-            self.caller_sleeps.store(true, Ordering::SeqCst);
-            while !is_empty() {
-                bed = self.wake.wait(bed).unwrap_or_else(PoisonError::into_inner);
+            if since.elapsed() >= patience {
+                break;
             }
-            self.caller_sleeps.store(false, Ordering::SeqCst);
         }
+        let mut bed = lock(&self.bed);
+        self.caller_sleeps.store(true, Ordering::SeqCst);
+        while !is_empty() {
+            bed = self.wake.wait(bed).unwrap_or_else(PoisonError::into_inner);
+        }
+        self.caller_sleeps.store(false, Ordering::SeqCst);
     }
 }
 

@@ -31,7 +31,7 @@ pub(crate) unsafe trait Vector: Copy {
     /// `TILE_VECTORS` factors and one broadcast factor stay in registers with them. The tile is large enough to hide the latency of the
     /// multiply-adds.
     const TILE_ROWS: usize;
-    /// Vectors of a row of that tile, at most 4.
+    /// Vectors of a row of that tile: at most 3 where linear layers are made of these vectors, 4 where only attention is.
     const TILE_VECTORS: usize;
     /// As many lanes of i32.
     type Ints: Copy;
