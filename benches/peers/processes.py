@@ -75,6 +75,7 @@ def worker(pipe: Connection, names: tuple[str, ...], case: Case, work_folder: Pa
     try:
         while (asked := pipe.recv()) is not None:
             name, work = asked
+            warm_up(built[name].works[work])
             pipe.send(seconds_of(built[name], work, repeats[name]))
     except Exception as error:
         pipe.send(RuntimeError(f"{type(error).__name__}: {error}"))
@@ -117,11 +118,8 @@ def difference(result: Any, expected: Any) -> tuple[float, float]:
 
 
 def seconds_of(built: Built, work: str, repeats: dict[str, int]) -> float:
-    """Seconds of one call of a layer or piece, after calls that warm up; the mean over a sample if calls are
-    short.
-    """
+    """Seconds of one call of a layer or piece; the mean over a sample if calls are short."""
     run, times = built.works[work], repeats.get(work, 1)
-    warm_up(run)
     start = time.perf_counter()
     for _ in range(times):
         run()

@@ -2,6 +2,7 @@
 
 mod common;
 
+use common::linear::apply;
 use common::{Strided, assert_close, bits, gamma, is_emulated, isas, numbers, rows, rows_mut};
 use half::bf16;
 use proptest::prelude::*;
@@ -184,21 +185,6 @@ fn layers(isa: Isa, inputs: usize, outputs: usize) -> [PackedLinear; 2] {
     })
 }
 
-fn apply(layer: &PackedLinear, threads: usize, x: &[f32], epilogue: Epilogue) -> Vec<f32> {
-    let mut out = vec![0.5; x.len() / layer.in_features() * layer.out_features()];
-    let columns = layer.out_features();
-    layer
-        .apply(
-            threads,
-            rows(x, layer.in_features()),
-            epilogue,
-            rows_mut(&mut out, columns),
-            &mut LinearScratch::new(),
-        )
-        .unwrap();
-    out
-}
-
 #[test]
 fn long_sums_agree_with_float64() {
     let inputs = 6144;
@@ -227,9 +213,7 @@ fn bits_of_a_column_do_not_depend_on_how_many_follow() {
     for isa in isas() {
         for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
             let first = |count: usize| {
-                let weight = WeightRef::F32(Matrix::new(&weight[..count * inputs], inputs));
-                let layer =
-                    PackedLinear::pack(isa, arithmetic, 1, &[(weight, Some(&bias[..count]))]).unwrap();
+                let layer = common::linear::pack(isa, arithmetic, &weight[..count * inputs], &bias[..count]);
                 apply(&layer, 1, &x, Epilogue::GeluTanh)
             };
             let all = first(outputs);
