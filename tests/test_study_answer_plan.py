@@ -21,6 +21,7 @@ from saccade.sim.policy import num_vl_tokens
 from saccade.sim.training_settings import TrainingSettings
 from saccade.study.answer import arms, costs
 from saccade.study.answer import plan as plans
+from saccade.study.answer import study as studies
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY
 from saccade.study.answer.measured import MEASURED
 from saccade.study.answer.study import Answer
@@ -36,6 +37,34 @@ def test_policies_that_are_measured() -> None:
         assert {policy.name for policy in MEASURED[stage].policies(plan)} == {*several, "n-1-seed-0"}
     known = Answer(plan, ("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), ""))
     assert known.num_cells == 7 + 6
+
+
+def test_phases(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The core is judged when all of it is trained, the later stages by and by."""
+    monkeypatch.setattr(studies, "SEEDS_TOGETHER", 1)
+    study = Answer(PLAN, ("core", "alignment", "measures"))
+    found = [(phase.stage, phase.kind, phase.seeds) for phase in study.phases]
+    assert found == [
+        ("core", "recording", ()),
+        ("core", "backbone", ()),
+        ("core", "training", (0, 1)),
+        ("core", "episodes", (0, 1)),
+        ("alignment", "recording", ()),
+        ("alignment", "backbone", ()),
+        ("alignment", "training", (0,)),
+        ("alignment", "episodes", (0,)),
+        ("alignment", "training", (1,)),
+        ("alignment", "episodes", (1,)),
+        ("measures", "measures", ()),
+    ]
+    known = replace(study, trained=dict.fromkeys(("backbone", "n-4-aligned-seed-0", "n-4-aligned-seed-1"), ""))
+    keys = [[cell.key for cell in known.cells_of(phase)] for phase in known.phases[6:10]]
+    assert keys == [
+        [("training", "n-4-aligned-seed-0")],
+        [("episodes", "n-4-aligned-seed-0", "plain", TASK)],
+        [("training", "n-4-aligned-seed-1")],
+        [("episodes", "n-4-aligned-seed-1", "plain", TASK)],
+    ]
 
 
 def test_the_arms_of_the_stages_that_train_nothing() -> None:

@@ -21,7 +21,7 @@ from saccade.study.answer import plan as plans
 from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
 from saccade.study.answer.measured import MEASURED
-from saccade.study.answer.plan import PILOT, Backbone, Plan, PlannedPolicy, Recording
+from saccade.study.answer.plan import CORE_STAGE, PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
 from saccade.study.answer.times import TIMES, latencies
 from saccade.study.cell import Cell, Rows
@@ -44,10 +44,30 @@ examples:
   saccade study answer --out out/answer
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
+SEEDS_TOGETHER = 2  # training seeds of a stage that are trained before they are judged, but for the core
 FIRST_EPISODES = 10  # of each task, for the stages of `MEASURED`
 ALREADY = ("seed", "demonstrations")  # settings of a run that the table has under other names
 #: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
 NOT_KEPT = (STATE_FILE, "loss.png")
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Cells that may run at the same time.
+
+    Attributes:
+        stage: Their stage.
+        kind: What is measured.
+        seeds: The training seeds of the policies; empty for all.
+    """
+
+    stage: str
+    kind: str
+    seeds: tuple[int, ...] = ()
+
+    def has(self, policy: PlannedPolicy) -> bool:
+        """Whether a policy of the stage belongs to it."""
+        return not self.seeds or policy.seed in self.seeds
 
 
 @dataclass(frozen=True)
@@ -114,23 +134,36 @@ class Answer(Study):
         }
 
     @property
-    def phases(self) -> list[tuple[str, str]]:
-        """Stage and kind of each phase. A stage is finished before the next one begins."""
-        without_training = {stage: (stage,) for stage in (*MEASURED, TIMES)} | dict.fromkeys(
-            ARMS, (EPISODES,)
-        )
-        training = (RECORDING, BACKBONE, TRAINING, EPISODES)
-        return [(stage, kind) for stage in self.stages for kind in without_training.get(stage, training)]
+    def phases(self) -> list[Phase]:
+        """A stage is finished before the next one begins. Some training seeds of a stage are trained and
+        judged before the next ones, so that a run which is stopped leaves whole pairs with their episodes;
+        but nothing of the core is judged before all of it is trained.
+        """
+        phases = []
+        for stage in self.stages:
+            if stage in (*MEASURED, TIMES):
+                phases.append(Phase(stage, stage))
+            elif stage in ARMS:
+                phases.append(Phase(stage, EPISODES))
+            else:
+                phases += [Phase(stage, kind) for kind in (RECORDING, BACKBONE)]
+                seeds = sorted({policy.seed for policy in self.plan.policies(stage)})
+                together = len(seeds) if stage == CORE_STAGE else SEEDS_TOGETHER
+                for first in range(0, len(seeds), together):
+                    some = tuple(seeds[first : first + together])
+                    phases += [Phase(stage, kind, some) for kind in (TRAINING, EPISODES)]
+        return phases
 
     def cells(self) -> Sequence[Cell]:
         """See `Study`: those of the phases so far."""
-        so_far = itertools.starmap(self.cells_of, self.phases[: self.phase + 1])
+        so_far = map(self.cells_of, self.phases[: self.phase + 1])
         return list({cell.key: cell for cell in itertools.chain.from_iterable(so_far)}.values())
 
-    def cells_of(self, stage: str, kind: str) -> Iterator[Cell]:
+    def cells_of(self, phase: Phase) -> Iterator[Cell]:
         """The cells of one phase. Stages may share recordings and backbones."""
+        kind = phase.kind
         if kind == EPISODES:
-            yield from self.episode_cells(stage)
+            yield from self.episode_cells(phase)
             return
         if kind == TIMES:  # one cell for all, which are timed alternately
             timed = self.timed(self.trained)
@@ -144,7 +177,9 @@ class Answer(Study):
                     settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.first_seeds)}
                     yield Cell((kind, policy.name), settings)
             return
-        for policy in self.plan.policies(stage):
+        for policy in self.plan.policies(phase.stage):
+            if not phase.has(policy):
+                continue
             backbone = policy.backbone
             recording = described(self.plan.recording(policy.recording))
             if kind == RECORDING:
@@ -155,12 +190,12 @@ class Answer(Study):
                 planned = {"training": policy.training.to_dict(), "recording": recording}
                 yield Cell((TRAINING, policy.name), {**planned, "backbone": self.trained[backbone.name]})
 
-    def episode_cells(self, stage: str) -> Iterator[Cell]:
+    def episode_cells(self, phase: Phase) -> Iterator[Cell]:
         """A cell for each task of each trained policy and arm: its own policies, or the arms of a stage that
         trains none, with all policies.
         """
-        for policy, arm in self.judged(stage):
-            if policy.name in self.trained:
+        for policy, arm in self.judged(phase.stage):
+            if policy.name in self.trained and phase.has(policy):
                 episodes = list(self.plan.episodes(policy.recipe.stage))
                 settings = {"checkpoint": self.trained[policy.name], "episodes": episodes}
                 yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
@@ -240,7 +275,7 @@ class Answer(Study):
         """See `Study`: the finished policies. Demonstrations, and policies in training, stay in the output
         directory, which other machines must share.
         """
-        if self.phases[self.phase][1] not in (EPISODES, *MEASURED, TIMES):
+        if self.phases[self.phase].kind not in (EPISODES, *MEASURED, TIMES):
             return ()
         trained = [one.name for one in self.plan.all_policies(pilots=True) if one.name in self.trained]
         return tuple(self.trainings[name] for name in trained if self.trainings[name].is_dir())
