@@ -245,8 +245,9 @@ wheel:
 	SOURCE_DATE_EPOCH=$$(git show --no-patch --format=%ct) $(WHEEL_VENV)/bin/python -m pip wheel --disable-pip-version-check --quiet \
 		--no-deps --no-build-isolation --ignore-requires-python --wheel-dir dist plugins/lerobot
 
-test-wheel: wheel
+test-wheel:
 	@$(PYTHON) .ci/needs.py opengl qemu
+	@$(MAKE) wheel
 	$(WHEEL_VENV)/bin/python .ci/wheels/test.py dist --page docs/wheels.md
 
 $(WHEEL_VENV)/.tools: .ci/wheels/requirements.txt

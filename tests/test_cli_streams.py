@@ -15,7 +15,7 @@ import pytest
 
 from saccade import _json
 from saccade._files import write_atomically, write_json
-from saccade.cli import main
+from saccade.cli import _output, main
 from saccade.sim.policy import DEMO_CHECKPOINT
 
 INSPECT = [sys.executable, "-m", "saccade", "inspect", str(DEMO_CHECKPOINT), "--no-time"]
@@ -152,3 +152,23 @@ def test_parity_prints_json_where_a_difference_is_not_a_number(
     monkeypatch.setattr(parity.Deviation, "between", lambda given, expected: nan)
     assert main(["parity", "--num-vl-tokens", "3", "--num-steps", "1", "--json"]) == 1
     assert strict(capsys.readouterr().out)["results"][0]["actions"] == {"max_abs": None, "max_rel": None}
+
+
+def test_progress_in_a_log_is_a_line_a_minute(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also without rich; short work prints nothing."""
+
+    def work() -> str:
+        with _output.progress_bar("copying", 3_000_000, in_bytes=True) as update:
+            update(1_000_000)
+            update(2_000_000, total=4_000_000, description="weights")
+        written = capsys.readouterr()
+        assert written.out == ""
+        return written.err
+
+    assert work() == ""
+    monkeypatch.setattr(_output, "LINE_SECONDS", 0.0)
+    assert work() == "copying: 1 MB of 3 MB\ncopying: 2 MB of 4 MB, weights\n"
+    monkeypatch.setitem(sys.modules, "rich.progress", None)
+    assert work() == "copying: 1 MB of 3 MB\ncopying: 2 MB of 4 MB, weights\n"

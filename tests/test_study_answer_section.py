@@ -121,7 +121,7 @@ def test_nothing_is_judged_before_the_core_is_complete() -> None:
     ]
     assert not partly.figures
     (stages,) = partly.grids
-    assert [list(row) for row in stages.rows[:3:2]] == [["core", "35", "36"], ["alignment", "12", "24"]]
+    assert [list(row) for row in stages.rows[:3:2]] == [["core", "35", "36"], ["alignment", "6", "12"]]
     assert "n-32-seed-11 (149 of 150 episodes)." in partly.summary[-1]
     assert "points (" not in " ".join([*partly.answer, *partly.summary])
     complete = section(table, known, plans.PLAN)
@@ -210,6 +210,7 @@ def test_the_exploratory_sentence() -> None:
         r"32 against 4 tokens, with patches of 8 against 16 pixels: a change in favour of 4, -130.0 points "
         r"\(B; \[table 6\]\S*\); "
         r"not measured: 32 tokens against none, with larger first weights \(scaled\); "
+        r"32 tokens against none, both trained longer; "
         r"32 against 4 tokens, with two cameras against one; 32 against 4 "
         r"tokens, with patches of "
         r"32 against 16 pixels\.".replace("B;", f"{BOUNDS};"),

@@ -8,6 +8,7 @@ import functools
 import io
 import os
 import sys
+import time
 import unicodedata
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 #: Characters of our texts, and what is written where the encoding of a stream lacks them.
 ASCII = {"–": "-", "—": "-", "×": "x", "·": "*", "…": "...", "“": '"', "”": '"', "→": "->", "±": "+-"}
+LINE_SECONDS = 60.0  # between two lines of progress
 REPLACE = "saccade-ascii"  # name of the error handler
 
 
@@ -125,11 +127,59 @@ class Update(Protocol):
         """Shows how much is done; None leaves total and description as they are."""
 
 
+class Lines:
+    """Progress where no bar can be shown, as in a log: a line on standard error, at most one a minute.
+
+    Args:
+        description: Description of the work.
+        total: Number of pieces of work; None if it is not known yet.
+        in_bytes: Whether the pieces are bytes.
+        clock: Returns the seconds since any moment.
+
+    Example:
+        >>> import contextlib, sys
+        >>> seconds = iter([0, 30, 61, 62])
+        >>> with contextlib.redirect_stderr(sys.stdout):
+        ...     lines = Lines("saccade study", 9, in_bytes=False, clock=lambda: next(seconds))
+        ...     for done in (1, 2, 3):
+        ...         lines(done, description="a cell")
+        saccade study: 2 of 9, a cell
+    """
+
+    def __init__(
+        self,
+        description: str,
+        total: int | None,
+        *,
+        in_bytes: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._work = description
+        self._total = total
+        self._in_bytes = in_bytes
+        self._clock = clock
+        self._printed = clock()
+
+    def __call__(self, completed: int, total: int | None = None, description: str | None = None) -> None:
+        """See `Update`."""
+        self._total = self._total if total is None else total
+        now = self._clock()
+        if now - self._printed < LINE_SECONDS:
+            return
+        self._printed = now
+        of = "" if self._total is None else f" of {self._amount(self._total)}"
+        last = "" if description is None else f", {description}"
+        print(f"{self._work}: {self._amount(completed)}{of}{last}", file=sys.stderr, flush=True)
+
+    def _amount(self, pieces: int) -> str:
+        return f"{pieces / 1e6:,.0f} MB" if self._in_bytes else str(pieces)
+
+
 @contextlib.contextmanager
 def progress_bar(
     description: str, total: int | None = None, *, in_bytes: bool = False, transient: bool = False
 ) -> Iterator[Update]:
-    """A progress bar on standard error, if that is a terminal and rich is installed.
+    """A progress bar on standard error; where that is not a terminal, or rich is missing, a line a minute.
 
     Args:
         description: description of the work.
@@ -137,10 +187,6 @@ def progress_bar(
         in_bytes: show megabytes instead of a count.
         transient: remove the bar at the end.
     """
-
-    def ignore(completed: int, total: int | None = None, description: str | None = None) -> None:
-        """There is no bar."""
-
     try:
         from rich.progress import (
             BarColumn,
@@ -151,20 +197,16 @@ def progress_bar(
             TimeRemainingColumn,
         )
     except ModuleNotFoundError:
-        yield ignore
+        yield Lines(description, total, in_bytes=in_bytes)
         return
     shown = console(stderr=True)
+    if not shown.is_terminal:  # a bar would leave a line in the output for each of its states
+        yield Lines(description, total, in_bytes=in_bytes)
+        return
     counted = DownloadColumn() if in_bytes else MofNCompleteColumn()
     text = TextColumn("{task.description}", markup=False)
-    # Outside a terminal the bar would only leave lines in the output.
     with Progress(
-        text,
-        BarColumn(),
-        counted,
-        TimeRemainingColumn(),
-        console=shown,
-        transient=transient,
-        disable=not shown.is_terminal,
+        text, BarColumn(), counted, TimeRemainingColumn(), console=shown, transient=transient
     ) as progress:
         bar = progress.add_task(description, total=total)
 

@@ -116,6 +116,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-32-scaled", "n-0-long"),
         difference("n-0-wide", "n-0-scaled"),
         difference("n-0-long", "n-0-scaled"),
+        difference("n-32-long", "n-0-long"),
     ),
     "vision": tuple(
         contrast

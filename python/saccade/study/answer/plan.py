@@ -292,7 +292,7 @@ PLAN = Plan(
             language_width=BASE.width,
             category_std=round(released_std(WIDTH), 3),
         ),
-        *recipes("compute", "-long", (0,), steps=STEPS),
+        *recipes("compute", "-long", (0, 32), steps=STEPS),
         *recipes("vision", "-two-cameras", (4, 32), backbone="backbone-two-cameras"),
         *recipes("vision", "-patch-32", (4, 32), backbone="backbone-patch-32", patch_size=32),
         *recipes("vision", "-patch-8", (4, 32), backbone="backbone-patch-8", patch_size=8),

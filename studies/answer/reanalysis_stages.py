@@ -1,0 +1,249 @@
+"""A second analysis of the later stages that train policies, from answer.csv and the README alone.
+
+`python studies/answer/reanalysis_stages.py` prints, for each stage that has rows, the check of the data, the
+success and held-out losses of each recipe, and the differences between recipes with their intervals: for both
+tasks together, and for each alone. All of it is exploratory, so there are no p values. It shares no code with
+`saccade study answer`. Differences are in percentage points; the slope is in points per unit of log2(N + 1).
+"""
+
+import csv
+import itertools
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from reanalysis import EPISODES, PLAN, RESULTS, TASKS, Row, expect, integer, interval, sign_flip
+
+Policy = tuple[str, int]  # a recipe and a training seed
+Contrast = tuple[str, dict[str, float]]  # its name, and what the success of each recipe is multiplied by
+
+STAGES = ("scaled", "alignment", "numbers", "compute", "vision", "vlsa")
+SUFFIXES = {"vision": ("two-cameras", "patch-32", "patch-8"), "vlsa": ("vlsa-0", "vlsa-4")}
+COUNTS = (0, 1, 4, 16, 32, 64)
+PARTS = {"both tasks": TASKS, **{task: (task,) for task in TASKS}}
+BASE = ("n-0-scaled", "n-4-scaled", "n-32-scaled")
+# Columns of a training row that may differ between policies of a stage, beside the results and N.
+VARIED: dict[str, set[str]] = {"scaled": set(), "numbers": set(), "vlsa": {"vl_num_layers"}}
+VARIED["alignment"] = {"alignment_loss", "validation_alignment_loss"}
+VARIED["compute"] = {"width", "steps", "category_std", "language_width"}
+VARIED["vision"] = {"num_cameras", "image_size", "patch_size", "num_vl_tokens"}
+VARIED["vision"] |= {"start_sha256", "demonstrations_sha256"}
+# What the end of a recipe's name says of its settings; None is a number that the README does not give.
+SAID: dict[str, dict[str, float | None]] = {"-wide": {"width": None}, "-long": {"steps": None}}
+SAID |= {"-aligned": {"alignment_weight": 0.2}, "-two-cameras": {"num_cameras": 2}}
+SAID |= {f"-patch-{size}": {"patch_size": size} for size in (8, 32)}
+SAID |= {f"-vlsa-{blocks}": {"vl_num_layers": blocks} for blocks in (0, 4)}
+
+
+def minus(a: str, b: str) -> Contrast:
+    """The difference of two recipes."""
+    return f"{a} - {b}", {a: 1, b: -1}
+
+
+def variant(suffix: str) -> list[Contrast]:
+    """N = 32 minus N = 4 in a variant, and how much more that is than in the policies of scaled."""
+    name, weights = minus(f"n-32-{suffix}", f"n-4-{suffix}")
+    more = {**weights, "n-32-scaled": -1, "n-4-scaled": 1}
+    return [(name, weights), (f"({name}) - (n-32-scaled - n-4-scaled)", more)]
+
+
+def slope() -> Contrast:
+    """The least-squares slope of success over log2(N + 1), which is a weighted sum of the successes."""
+    xs = [math.log2(n + 1) for n in COUNTS]
+    offsets = [x - statistics.fmean(xs) for x in xs]
+    squares = sum(offset**2 for offset in offsets)
+    weights = {f"n-{n}-scaled": offset / squares for n, offset in zip(COUNTS, offsets, strict=True)}
+    return "slope over log2(N + 1)", weights
+
+
+def contrasts(stage: str) -> list[Contrast]:
+    """The contrasts of a stage."""
+    none, four, many = BASE
+    if stage == "scaled":
+        return [minus(many, none), minus(many, four), minus(four, none)]
+    if stage == "alignment":
+        pairs = [("n-32-aligned", many), ("n-4-aligned", four), ("n-32-aligned", "n-4-aligned")]
+        return [minus(*pair) for pair in (*pairs, ("n-32-aligned", none))]
+    if stage == "numbers":
+        pairs = [("n-1-scaled", none), ("n-16-scaled", four), ("n-64-scaled", many)]
+        return [*(minus(*pair) for pair in pairs), slope()]
+    if stage == "compute":
+        pairs = [(many, "n-0-wide"), (many, "n-0-long"), ("n-0-wide", none), ("n-0-long", none)]
+        return [minus(*pair) for pair in (*pairs, ("n-32-long", "n-0-long"))]
+    return [contrast for suffix in SUFFIXES[stage] for contrast in variant(suffix)]
+
+
+def exact_interval(values: Sequence[float], level: float = 0.05) -> tuple[float, float] | None:
+    """The interval that inverts the sign-flip test of the mean exactly, or None where it has no ends.
+
+    Turning the signs of a subset of values - shift leaves their sum at least as far from zero exactly if the
+    shift lies between the means of the subset and of the others. The mean of all always lies there. So each
+    subset's mean that a shift passes on its way to it adds two assignments to the two that always count.
+    """
+    rank = math.floor(level * 2 ** (len(values) - 1))  # the least with 2 + 2 rank > level 2^n
+    if rank == 0:
+        return None
+    subsets = (chosen for k in range(len(values)) for chosen in itertools.combinations(values, k + 1))
+    means = sorted(math.fsum(subset) / len(subset) for subset in subsets)
+    return means[rank - 1], means[-rank]
+
+
+def verified(values: Sequence[float], ends: tuple[float, float], step: float = 1e-4) -> bool:
+    """Whether the test rejects just outside the ends only, and reanalysis.py has the same for 12 pairs."""
+    (low, high), inner = ends, min(step, (ends[1] - ends[0]) / 2)
+    shifts = {low - step: False, high + step: False, low: True, high: True}
+    shifts |= {low + inner: True, high - inner: True}
+    right = all((sign_flip([v - s for v in values]) > 0.05) == within for s, within in shifts.items())
+    if right and len(values) == 12:
+        return all(abs(a - b) < 1e-6 for a, b in zip(interval(values), ends, strict=True))
+    return right
+
+
+def policy(row: Row) -> Policy:
+    """The recipe and the training seed of a row."""
+    return row["recipe"], integer(row["training_seed"])
+
+
+def named(policies: Iterable[Policy]) -> str:
+    """The recipes and training seeds of policies, in words."""
+    groups = itertools.groupby(sorted(policies), key=lambda one: one[0])
+    return "; ".join(f"{name} of {[seed for _, seed in group]}" for name, group in groups) or "none"
+
+
+class Table:
+    """The policies of the stages, and how many episodes those solved that ran all of them."""
+
+    def __init__(self, rows: list[Row]) -> None:
+        mine = [row for row in rows if row["stage"] in STAGES]
+        self.trained = [row for row in mine if row["kind"] == "training"]
+        self.episodes = [row for row in mine if row["kind"] == "episodes" and row["arm"] == "plain"]
+        wanted = Counter((task, episode) for task in TASKS for episode in range(EPISODES))
+        ran = {policy(row): Counter[tuple[str, int]]() for row in (*self.trained, *self.episodes)}
+        for row in self.episodes:
+            ran[policy(row)][row["task"], integer(row["seed"])] += 1
+        self.partial = {one for one, episodes in ran.items() if episodes != wanted}
+        self.whole = ran.keys() - self.partial
+        self.won = Counter((policy(r), r["task"]) for r in self.episodes if r["success"] == "True")
+
+    def seeds(self, recipes: Iterable[str]) -> list[int]:
+        """The training seeds of which all recipes have policies that ran all episodes."""
+        return sorted(set.intersection(*({s for name, s in self.whole if name == r} for r in recipes)))
+
+    def rate(self, one: Policy, tasks: Sequence[str]) -> float:
+        """A policy's success in %, the mean over tasks."""
+        return 100 * sum(self.won[one, task] for task in tasks) / (EPISODES * len(tasks))
+
+    def values(self, weights: dict[str, float], tasks: Sequence[str]) -> list[float]:
+        """The weighted sum of the recipes' success for each training seed that all of them have."""
+        rates = [[k * self.rate((r, s), tasks) for r, k in weights.items()] for s in self.seeds(weights)]
+        return [math.fsum(of_seed) for of_seed in rates]
+
+
+def differing(rows: list[Row], may: set[str]) -> set[str]:
+    """The columns in which rows differ, without those that may."""
+    return {name for name in rows[0] if len({row[name] for row in rows}) > 1} - may
+
+
+def planned(row: Row) -> bool:
+    """Whether a policy's settings are the README's, as far as it and the recipe's name say them."""
+    number = integer(row["recipe"].split("-")[1])
+    settings: dict[str, float | None] = {**PLAN, "num_future_tokens": number, "steps": 1000}
+    for end, values in SAID.items():
+        settings |= values if row["recipe"].endswith(end) else {}
+    width = float(row["width"])
+    first_weights = abs(float(row["category_std"]) - 0.02 * math.sqrt(1536 / width)) < 0.0005
+    language = (float(row["language_width"]) or width) == 64  # 0 seems to stand for the head's width
+    as_said = all(value is None or float(row[name]) == value for name, value in settings.items())
+    return as_said and first_weights and language
+
+
+def check_all(table: Table, rows: list[Row]) -> None:
+    """Compare what all these stages share with what the README says of it."""
+    print("Check of the data of all these stages")
+    expect("success is True or False", {row["success"] for row in table.episodes} <= {"True", "False"})
+    failed = {integer(row["control_steps"]) for row in table.episodes if row["success"] == "False"}
+    expect("every failure ran 100 steps", failed <= {100})
+    ran = {(integer(row["control_steps"]), integer(row["chunks"])) for row in table.episodes}
+    expect("a chunk is 8 steps", all(chunks == math.ceil(steps / 8) for steps, chunks in ran))
+    names = {(row["policy"], "{}-seed-{}".format(*policy(row))) for row in (*table.trained, *table.episodes)}
+    expect("a policy's name is its recipe and seed", all(name == parts for name, parts in names))
+    hashes = [row["checkpoint_sha256"] for row in rows if row["kind"] == "training"]
+    expect(f"{len(hashes)} different checkpoints, with core and pilots", len(set(hashes)) == len(hashes))
+    expect("one settings_sha256 in the table", len({row["settings_sha256"] for row in rows}) == 1)
+    sources = [*table.trained, *(row for row in rows if row["kind"] == "backbone")]
+    for cameras, patch in sorted({(row["num_cameras"], row["patch_size"]) for row in table.trained}):
+        alike = [row for row in sources if (row["num_cameras"], row["patch_size"]) == (cameras, patch)]
+        starts = {row["start_sha256"][:12] for row in alike if row["kind"] == "training"}
+        used = {row["demonstrations_sha256"][:12] for row in alike}
+        what = f"{integer(cameras)} cameras, {integer(patch)} px: one start, one set of demonstrations"
+        expect(f"{what}: {sorted(starts)}, {sorted(used)}", len(starts) == len(used) == 1)
+
+
+def check_stage(table: Table, stage: str, trained: list[Row]) -> None:
+    """Compare the policies of one stage with what the README says of it."""
+    recipes = {name for _, weights in contrasts(stage) for name in weights}
+    recipes -= set() if stage == "scaled" else set(BASE)
+    wanted = set(itertools.product(recipes, range(12 if stage == "scaled" else 6)))
+    found = Counter(map(policy, trained))
+    missing, others = wanted - set(found), set(found) - wanted
+    expect(f"{len(wanted)} policies are there, but for: {named(missing)}", not missing)
+    expect(f"each once, and beside them: {named(others)}", not others and set(found.values()) == {1})
+    judged = {policy(row) for row in table.episodes if row["stage"] == stage}
+    expect(f"episodes only of those, but for: {named(judged - set(found))}", judged <= set(found))
+    left = table.partial & (judged | set(found))
+    expect(f"each ran episodes 0 to 74 of both tasks once; left out: {named(left)}", not left)
+    may = RESULTS | VARIED[stage]
+    odd = differing(trained, may)
+    expect(f"no columns differ that should not, but for: {sorted(odd)}", not odd)
+    may |= {"stage", "saccade"} | ({"alignment_weight"} if stage == "alignment" else set())
+    odd = differing([*trained, *(row for row in table.trained if row["stage"] == "scaled")], may)
+    expect(f"nor from scaled, beside the commit, but for: {sorted(odd)}", not odd)
+    expect("settings are the README's", all(map(planned, trained)))
+
+
+def describe(table: Table, trained: list[Row]) -> None:
+    """Print each recipe's success in %, and the range of its held-out losses."""
+    for recipe in sorted(
+        {row["recipe"] for row in trained}, key=lambda name: (name.split("-")[2:], len(name), name)
+    ):
+        rates = {part: table.values({recipe: 1}, tasks) for part, tasks in PARTS.items()}
+        success = ", ".join(f"{part} {statistics.fmean(of):.4f}" for part, of in rates.items() if of)
+        losses = [float(row["validation_loss"]) for row in trained if row["recipe"] == recipe]
+        print(f"  {recipe}: success of {len(table.seeds([recipe]))}: {success or 'none yet'};", end=" ")
+        print(f"held-out loss of {len(losses)}: {min(losses):.4f} to {max(losses):.4f}")
+
+
+def differences(table: Table, stage: str) -> None:
+    """Print the contrasts whose recipes are there, for both tasks and for each, and check their intervals."""
+    right, there = True, {recipe for recipe, _ in table.whole}
+    for name, weights in (contrast for contrast in contrasts(stage) if set(contrast[1]) <= there):
+        print(f"  {name}: {len(table.seeds(weights))} pairs, training seeds {table.seeds(weights)}")
+        for part, tasks in PARTS.items() if table.seeds(weights) else ():
+            values = table.values(weights, tasks)
+            ends = exact_interval(values)
+            numbers = [statistics.fmean(values), *(ends or ())]
+            mean, *shown = (f"{round(number, 4) + 0.0:+.4f}" for number in numbers)
+            print(f"    {part:<13} {mean:>9}  {f'95 % [{shown[0]}, {shown[1]}]' if shown else 'no interval'}")
+            right &= ends is None or verified(values, ends)
+    expect("the sign-flip test confirms every interval, and reanalysis.py's those of 12 pairs", right)
+
+
+def main() -> None:
+    """Print everything."""
+    with Path(__file__).with_name("answer.csv").open(newline="", encoding="utf-8") as file:
+        rows: list[Row] = list(csv.DictReader(file))
+    table = Table(rows)
+    check_all(table, rows)
+    for stage in STAGES:
+        trained = [row for row in table.trained if row["stage"] == stage]
+        print(f"\n{stage}" if trained else f"\n{stage}: no rows")
+        if trained:
+            check_stage(table, stage, trained)
+            describe(table, trained)
+            differences(table, stage)
+
+
+if __name__ == "__main__":
+    main()
