@@ -43,7 +43,8 @@ def test_phases(monkeypatch: pytest.MonkeyPatch) -> None:
     """The core is judged when all of it is trained, the later stages by and by."""
     monkeypatch.setattr(studies, "SEEDS_TOGETHER", 1)
     study = Answer(PLAN, ("core", "alignment", "measures"))
-    found = [(phase.stage, phase.kind, phase.seeds) for phase in study.phases]
+    phases = study.phases
+    found = [(phase.stage, phase.kind, phase.seeds) for phase in phases]
     assert found == [
         ("core", "recording", ()),
         ("core", "backbone", ()),
@@ -57,8 +58,12 @@ def test_phases(monkeypatch: pytest.MonkeyPatch) -> None:
         ("alignment", "episodes", (1,)),
         ("measures", "measures", ()),
     ]
-    known = replace(study, trained=dict.fromkeys(("backbone", "n-4-aligned-seed-0", "n-4-aligned-seed-1"), ""))
-    keys = [[cell.key for cell in known.cells_of(phase)] for phase in known.phases[6:10]]
+    monkeypatch.setattr(studies, "SEEDS_TOGETHER", 2)
+    three = replace(PLAN, recipes=(recipe("alignment", "n-4-aligned", (0, 1, 2)),))
+    assert [phase.seeds for phase in Answer(three, ("alignment",)).phases[2::2]] == [(0, 1), (2,)]
+    names = ("backbone", "n-4-aligned-seed-0", "n-4-aligned-seed-1")
+    known = replace(study, trained=dict.fromkeys(names, ""))
+    keys = [[cell.key for cell in known.cells_of(phase)] for phase in phases[6:10]]
     assert keys == [
         [("training", "n-4-aligned-seed-0")],
         [("episodes", "n-4-aligned-seed-0", "plain", TASK)],

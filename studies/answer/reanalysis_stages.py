@@ -2,8 +2,9 @@
 
 `python studies/answer/reanalysis_stages.py` prints, for each stage that has rows, the check of the data, the
 success and held-out losses of each recipe, and the differences between recipes with their intervals: for both
-tasks together, and for each alone. All of it is exploratory, so there are no p values. It shares no code with
-`saccade study answer`. Differences are in percentage points; the slope is in points per unit of log2(N + 1).
+tasks together, and for each alone. They are exploratory, so there are no p values. At the end comes the one
+test of these stages, that of the new pairs with more steps. It shares no code with `saccade study answer`.
+Differences are in percentage points; the slope is in points per unit of log2(N + 1).
 """
 
 import csv
@@ -19,34 +20,22 @@ from reanalysis import EPISODES, PLAN, RESULTS, TASKS, Row, expect, integer, int
 Policy = tuple[str, int]  # a recipe and a training seed
 Contrast = tuple[str, dict[str, float]]  # its name, and what the success of each recipe is multiplied by
 
-STAGES = ("scaled", "alignment", "numbers", "compute", "vision", "vlsa")
-SUFFIXES = {"vision": ("two-cameras", "patch-32", "patch-8"), "vlsa": ("vlsa-0", "vlsa-4")}
+STAGES = ("scaled", "alignment", "numbers", "compute")
 COUNTS = (0, 1, 4, 16, 32, 64)
 PARTS = {"both tasks": TASKS, **{task: (task,) for task in TASKS}}
 BASE = ("n-0-scaled", "n-4-scaled", "n-32-scaled")
 # Columns of a training row that may differ between policies of a stage, beside the results and N.
-VARIED: dict[str, set[str]] = {"scaled": set(), "numbers": set(), "vlsa": {"vl_num_layers"}}
+VARIED: dict[str, set[str]] = {"scaled": set(), "numbers": set()}
 VARIED["alignment"] = {"alignment_loss", "validation_alignment_loss"}
-VARIED["compute"] = {"width", "steps", "category_std", "language_width"}
-VARIED["vision"] = {"num_cameras", "image_size", "patch_size", "num_vl_tokens"}
-VARIED["vision"] |= {"start_sha256", "demonstrations_sha256"}
-# What the end of a recipe's name says of its settings; None is a number that the README does not give.
-SAID: dict[str, dict[str, float | None]] = {"-wide": {"width": None}, "-long": {"steps": None}}
-SAID |= {"-aligned": {"alignment_weight": 0.2}, "-two-cameras": {"num_cameras": 2}}
-SAID |= {f"-patch-{size}": {"patch_size": size} for size in (8, 32)}
-SAID |= {f"-vlsa-{blocks}": {"vl_num_layers": blocks} for blocks in (0, 4)}
+VARIED["compute"] = {"width", "steps", "category_std", "language_width", "saccade"}
+# What the end of a recipe's name says of its settings.
+SAID = {"-wide": {"width": 104.0}, "-long": {"steps": 1628.0}, "-aligned": {"alignment_weight": 0.2}}
+NEW_SEEDS = range(6, 12)  # of the recipes that end in -long: those that are tested
 
 
 def minus(a: str, b: str) -> Contrast:
     """The difference of two recipes."""
     return f"{a} - {b}", {a: 1, b: -1}
-
-
-def variant(suffix: str) -> list[Contrast]:
-    """N = 32 minus N = 4 in a variant, and how much more that is than in the policies of scaled."""
-    name, weights = minus(f"n-32-{suffix}", f"n-4-{suffix}")
-    more = {**weights, "n-32-scaled": -1, "n-4-scaled": 1}
-    return [(name, weights), (f"({name}) - (n-32-scaled - n-4-scaled)", more)]
 
 
 def slope() -> Contrast:
@@ -68,11 +57,10 @@ def contrasts(stage: str) -> list[Contrast]:
         return [minus(*pair) for pair in (*pairs, ("n-32-aligned", none))]
     if stage == "numbers":
         pairs = [("n-1-scaled", none), ("n-16-scaled", four), ("n-64-scaled", many)]
+        pairs += [("n-64-scaled", none), ("n-64-scaled", "n-1-scaled")]
         return [*(minus(*pair) for pair in pairs), slope()]
-    if stage == "compute":
-        pairs = [(many, "n-0-wide"), (many, "n-0-long"), ("n-0-wide", none), ("n-0-long", none)]
-        return [minus(*pair) for pair in (*pairs, ("n-32-long", "n-0-long"))]
-    return [contrast for suffix in SUFFIXES[stage] for contrast in variant(suffix)]
+    pairs = [(many, "n-0-wide"), (many, "n-0-long"), ("n-0-wide", none), ("n-0-long", none)]
+    return [minus(*pair) for pair in (*pairs, ("n-32-long", many), ("n-32-long", "n-0-long"))]
 
 
 def exact_interval(values: Sequence[float], level: float = 0.05) -> tuple[float, float] | None:
@@ -149,13 +137,13 @@ def differing(rows: list[Row], may: set[str]) -> set[str]:
 def planned(row: Row) -> bool:
     """Whether a policy's settings are the README's, as far as it and the recipe's name say them."""
     number = integer(row["recipe"].split("-")[1])
-    settings: dict[str, float | None] = {**PLAN, "num_future_tokens": number, "steps": 1000}
+    settings: dict[str, float] = {**PLAN, "num_future_tokens": number, "steps": 1000}
     for end, values in SAID.items():
         settings |= values if row["recipe"].endswith(end) else {}
     width = float(row["width"])
     first_weights = abs(float(row["category_std"]) - 0.02 * math.sqrt(1536 / width)) < 0.0005
-    language = (float(row["language_width"]) or width) == 64  # 0 seems to stand for the head's width
-    as_said = all(value is None or float(row[name]) == value for name, value in settings.items())
+    language = (float(row["language_width"]) or width) == 64  # 0 stands for the head's width
+    as_said = all(float(row[name]) == value for name, value in settings.items())
     return as_said and first_weights and language
 
 
@@ -185,7 +173,8 @@ def check_stage(table: Table, stage: str, trained: list[Row]) -> None:
     """Compare the policies of one stage with what the README says of it."""
     recipes = {name for _, weights in contrasts(stage) for name in weights}
     recipes -= set() if stage == "scaled" else set(BASE)
-    wanted = set(itertools.product(recipes, range(12 if stage == "scaled" else 6)))
+    twelve = {name for name in recipes if stage == "scaled" or name.endswith("-long")}
+    wanted = {(name, seed) for name in recipes for seed in range(12 if name in twelve else 6)}
     found = Counter(map(policy, trained))
     missing, others = wanted - set(found), set(found) - wanted
     expect(f"{len(wanted)} policies are there, but for: {named(missing)}", not missing)
@@ -209,9 +198,13 @@ def describe(table: Table, trained: list[Row]) -> None:
         {row["recipe"] for row in trained}, key=lambda name: (name.split("-")[2:], len(name), name)
     ):
         rates = {part: table.values({recipe: 1}, tasks) for part, tasks in PARTS.items()}
-        success = ", ".join(f"{part} {statistics.fmean(of):.4f}" for part, of in rates.items() if of)
+        of = {seed: table.rate((recipe, seed), TASKS) for seed in table.seeds([recipe])}
+        success = ", ".join(f"{part} {statistics.fmean(got):.4f}" for part, got in rates.items() if got)
         losses = [float(row["validation_loss"]) for row in trained if row["recipe"] == recipe]
         print(f"  {recipe}: success of {len(table.seeds([recipe]))}: {success or 'none yet'};", end=" ")
+        halves = [[rate for seed, rate in of.items() if (seed < 6) == first] for first in (True, False)]
+        shown = [f"{statistics.fmean(half):.4f}" for half in halves if half]
+        print(f"of seeds 0 to 5{' and 6 to 11' if len(shown) == 2 else ''}: {' and '.join(shown)};", end=" ")
         print(f"held-out loss of {len(losses)}: {min(losses):.4f} to {max(losses):.4f}")
 
 
@@ -230,6 +223,19 @@ def differences(table: Table, stage: str) -> None:
     expect("the sign-flip test confirms every interval, and reanalysis.py's those of 12 pairs", right)
 
 
+def test_new(table: Table) -> None:
+    """Print the test of N = 32 against N = 0 with more steps, over the training seeds added for it."""
+    recipes = ("n-32-long", "n-0-long")
+    if not set(NEW_SEEDS) <= set(table.seeds(recipes)):
+        print("\nThe test of the new pairs: not all of them are there")
+        return
+    values = [table.rate((recipes[0], s), TASKS) - table.rate((recipes[1], s), TASKS) for s in NEW_SEEDS]
+    low, high = exact_interval(values) or (math.nan, math.nan)
+    print("\nThe test of the new pairs, N = 32 minus N = 0 with more steps, training seeds 6 to 11")
+    print(f"  mean {statistics.fmean(values):+.4f}  95 % [{low:+.4f}, {high:+.4f}]", end="  ")
+    print(f"p = {float(sign_flip(values)):.6f}; {[round(value, 2) for value in values]}")
+
+
 def main() -> None:
     """Print everything."""
     with Path(__file__).with_name("answer.csv").open(newline="", encoding="utf-8") as file:
@@ -243,6 +249,7 @@ def main() -> None:
             check_stage(table, stage, trained)
             describe(table, trained)
             differences(table, stage)
+    test_new(table)
 
 
 if __name__ == "__main__":

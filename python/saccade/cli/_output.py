@@ -121,55 +121,37 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 
 class Update(Protocol):
-    """Moves a progress bar."""
+    """Moves a progress bar, or writes a line of progress."""
 
     def __call__(self, completed: int, total: int | None = None, description: str | None = None) -> None:
         """Shows how much is done; None leaves total and description as they are."""
 
 
 class Lines:
-    """Progress where no bar can be shown, as in a log: a line on standard error, at most one a minute.
+    """Progress where no bar can be shown, as in a log: at most one line a minute, on standard error.
 
     Args:
         description: Description of the work.
         total: Number of pieces of work; None if it is not known yet.
         in_bytes: Whether the pieces are bytes.
-        clock: Returns the seconds since any moment.
-
-    Example:
-        >>> import contextlib, sys
-        >>> seconds = iter([0, 30, 61, 62])
-        >>> with contextlib.redirect_stderr(sys.stdout):
-        ...     lines = Lines("saccade study", 9, in_bytes=False, clock=lambda: next(seconds))
-        ...     for done in (1, 2, 3):
-        ...         lines(done, description="a cell")
-        saccade study: 2 of 9, a cell
     """
 
-    def __init__(
-        self,
-        description: str,
-        total: int | None,
-        *,
-        in_bytes: bool,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._work = description
+    def __init__(self, description: str, total: int | None, *, in_bytes: bool) -> None:
+        self._description = description
         self._total = total
         self._in_bytes = in_bytes
-        self._clock = clock
-        self._printed = clock()
+        self._printed = time.monotonic()
 
     def __call__(self, completed: int, total: int | None = None, description: str | None = None) -> None:
         """See `Update`."""
         self._total = self._total if total is None else total
-        now = self._clock()
+        self._description = self._description if description is None else description
+        now = time.monotonic()
         if now - self._printed < LINE_SECONDS:
             return
         self._printed = now
         of = "" if self._total is None else f" of {self._amount(self._total)}"
-        last = "" if description is None else f", {description}"
-        print(f"{self._work}: {self._amount(completed)}{of}{last}", file=sys.stderr, flush=True)
+        print(f"{self._description}: {self._amount(completed)}{of}", file=sys.stderr, flush=True)
 
     def _amount(self, pieces: int) -> str:
         return f"{pieces / 1e6:,.0f} MB" if self._in_bytes else str(pieces)
@@ -179,7 +161,7 @@ class Lines:
 def progress_bar(
     description: str, total: int | None = None, *, in_bytes: bool = False, transient: bool = False
 ) -> Iterator[Update]:
-    """A progress bar on standard error; where that is not a terminal, or rich is missing, a line a minute.
+    """A progress bar on standard error; without a terminal or rich, at most one line a minute.
 
     Args:
         description: description of the work.

@@ -57,7 +57,7 @@ class Phase:
 
     Attributes:
         stage: Their stage.
-        kind: What is measured.
+        kind: What its cells do.
         seeds: The training seeds of the policies; empty for all.
     """
 
@@ -135,9 +135,11 @@ class Answer(Study):
 
     @property
     def phases(self) -> list[Phase]:
-        """A stage is finished before the next one begins. Some training seeds of a stage are trained and
-        judged before the next ones, so that a run which is stopped leaves whole pairs with their episodes;
-        but nothing of the core is judged before all of it is trained.
+        """The phases in their order: a stage is finished before the next one begins.
+
+        `SEEDS_TOGETHER` training seeds are trained and judged before the next ones, so that a run which is
+        stopped leaves whole pairs with their episodes; but nothing of the core is judged before all of it is
+        trained.
         """
         phases = []
         for stage in self.stages:
