@@ -159,7 +159,7 @@ def test_progress_in_a_log_is_at_most_a_line_a_minute(
 ) -> None:
     """Also without rich."""
     now = 0.0
-    monkeypatch.setattr(_output.time, "monotonic", lambda: now)
+    monkeypatch.setattr("saccade.cli._output.time.monotonic", lambda: now)
 
     def work() -> str:
         nonlocal now
