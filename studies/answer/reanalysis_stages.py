@@ -30,7 +30,7 @@ VARIED["alignment"] = {"alignment_loss", "validation_alignment_loss"}
 VARIED["compute"] = {"width", "steps", "category_std", "language_width", "saccade"}
 # What the end of a recipe's name says of its settings.
 SAID = {"-wide": {"width": 104.0}, "-long": {"steps": 1628.0}, "-aligned": {"alignment_weight": 0.2}}
-NEW_SEEDS = range(6, 12)  # of the recipes that end in -long: those that are tested
+FIRST_SEEDS, NEW_SEEDS = range(6), range(6, 12)  # of the recipes that end in -long the new ones are tested
 
 
 def minus(a: str, b: str) -> Contrast:
@@ -198,11 +198,12 @@ def describe(table: Table, trained: list[Row]) -> None:
         {row["recipe"] for row in trained}, key=lambda name: (name.split("-")[2:], len(name), name)
     ):
         rates = {part: table.values({recipe: 1}, tasks) for part, tasks in PARTS.items()}
-        of = {seed: table.rate((recipe, seed), TASKS) for seed in table.seeds([recipe])}
+        seeds = table.seeds([recipe])
         success = ", ".join(f"{part} {statistics.fmean(got):.4f}" for part, got in rates.items() if got)
         losses = [float(row["validation_loss"]) for row in trained if row["recipe"] == recipe]
-        print(f"  {recipe}: success of {len(table.seeds([recipe]))}: {success or 'none yet'};", end=" ")
-        halves = [[rate for seed, rate in of.items() if (seed < 6) == first] for first in (True, False)]
+        print(f"  {recipe}: success of {len(seeds)}: {success or 'none yet'};", end=" ")
+        rated = list(zip(seeds, rates["both tasks"], strict=True))
+        halves = [[rate for seed, rate in rated if (seed in NEW_SEEDS) == new] for new in (False, True)]
         shown = [f"{statistics.fmean(half):.4f}" for half in halves if half]
         print(f"of seeds 0 to 5{' and 6 to 11' if len(shown) == 2 else ''}: {' and '.join(shown)};", end=" ")
         print(f"held-out loss of {len(losses)}: {min(losses):.4f} to {max(losses):.4f}")
@@ -224,16 +225,19 @@ def differences(table: Table, stage: str) -> None:
 
 
 def test_new(table: Table) -> None:
-    """Print the test of N = 32 against N = 0 with more steps, over the training seeds added for it."""
+    """Print N = 32 minus N = 0 with more steps: of the first pairs, and the test of the new ones."""
     recipes = ("n-32-long", "n-0-long")
-    if not set(NEW_SEEDS) <= set(table.seeds(recipes)):
-        print("\nThe test of the new pairs: not all of them are there")
-        return
-    values = [table.rate((recipes[0], s), TASKS) - table.rate((recipes[1], s), TASKS) for s in NEW_SEEDS]
-    low, high = exact_interval(values) or (math.nan, math.nan)
-    print("\nThe test of the new pairs, N = 32 minus N = 0 with more steps, training seeds 6 to 11")
-    print(f"  mean {statistics.fmean(values):+.4f}  95 % [{low:+.4f}, {high:+.4f}]", end="  ")
-    print(f"p = {float(sign_flip(values)):.6f}; {[round(value, 2) for value in values]}")
+    for name, seeds in (("first pairs", FIRST_SEEDS), ("new pairs, the test", NEW_SEEDS)):
+        print(f"\nN = 32 minus N = 0 with more steps, training seeds {seeds[0]} to {seeds[-1]}: {name}")
+        if not set(seeds) <= set(table.seeds(recipes)):
+            print("  not all of them are there")
+            continue
+        for part, tasks in PARTS.items():
+            values = [table.rate((recipes[0], s), tasks) - table.rate((recipes[1], s), tasks) for s in seeds]
+            low, high = exact_interval(values) or (math.nan, math.nan)
+            print(f"  {part:<13} {statistics.fmean(values):+.4f}  95 % [{low:+.4f}, {high:+.4f}]", end="")
+            tested = seeds == NEW_SEEDS and part == "both tasks"
+            print(f"  p = {float(sign_flip(values)):.6f}" if tested else "", [round(v, 2) for v in values])
 
 
 def main() -> None:
