@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -168,7 +168,7 @@ class Answer(Study):
             yield from self.episode_cells(phase)
             return
         if kind == TIMES:  # one cell for all, which are timed alternately
-            timed = self.timed(self.trained)
+            timed = self.timed()
             if timed:
                 checkpoints = {name: self.trained[policy.name] for name, policy in timed.items()}
                 yield Cell((TIMES,), {"checkpoints": checkpoints})
@@ -214,11 +214,13 @@ class Answer(Study):
                 if arm.applies(policy.training.num_future_tokens):
                     yield policy, arm.name
 
-    def timed(self, known: Container[str]) -> dict[str, PlannedPolicy]:
-        """The policy of each recipe that is timed, by the recipe's name: the first one that is known."""
+    def timed(self) -> dict[str, PlannedPolicy]:
+        """The policy of each recipe that is timed, by the recipe's name: the first trained one whose weights
+        are here. Of some policies only the hashes are kept.
+        """
         found: dict[str, PlannedPolicy] = {}
         for policy in self.plan.all_policies(pilots=False):
-            if policy.name in known:
+            if policy.name in self.trained and self.trainings[policy.name].is_dir():
                 found.setdefault(policy.recipe.name, policy)
         return found
 
@@ -240,7 +242,7 @@ class Answer(Study):
         of_policies = [MEASURED[stage].policies(self.plan) for stage in self.stages if stage in MEASURED]
         measured = [one for policies in of_policies for one in policies if one.name in known]
         trained = len(recordings) + len(backbones) + len(planned)
-        timed = TIMES in self.stages and bool(self.timed(known))
+        timed = TIMES in self.stages and bool(planned or self.timed())
         return trained + len(runs) * len(self.plan.tasks) + len(measured) + timed
 
     def then(self, table: pd.DataFrame) -> Answer | None:
@@ -303,7 +305,7 @@ class Answer(Study):
 
     def time(self) -> Rows:
         """Latencies of a policy of each recipe, timed alternately."""
-        timed = list(self.timed(self.trained).values())
+        timed = list(self.timed().values())
         found = latencies([self.finished(policy.name) for policy in timed])
         return [{**policy.columns, **row} for policy, row in zip(timed, found, strict=True)]
 
