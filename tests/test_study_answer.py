@@ -317,7 +317,7 @@ def test_latencies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         shutil.rmtree(out / "answer" / "policies" / gone)
     assert main(["study", "answer", "--stages", "times", "--out", str(out)]) == 0
     table = read_table(out / "answer.csv")
-    assert list(table[table["kind"] == "times"]["policy"]) == ["n-0-seed-0", "n-4-seed-1", "n-32-seed-0"]
+    assert list(table[table["kind"] == "times"]["policy"]) == ["n-0-seed-0", "n-32-seed-0", "n-4-seed-1"]
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:

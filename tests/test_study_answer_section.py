@@ -187,7 +187,7 @@ def test_the_exploratory_sentence() -> None:
         "Not measured: 32 tokens against none, with larger first weights (scaled); 32 tokens against 4, with "
         "larger first weights (scaled); 32 tokens against a wider head without tokens at the same cost of"
     )
-    assert nothing.endswith("with patches of 32 against 16 pixels.")
+    assert nothing.endswith("with two cameras against three.")
     some = {
         **CORE,
         "n-32-scaled": MORE,
@@ -211,9 +211,10 @@ def test_the_exploratory_sentence() -> None:
         r"\(B; \[table 6\]\S*\); "
         r"not measured: 32 tokens against none, with larger first weights \(scaled\); "
         r"32 tokens against none, both trained longer \(.* tested alone in README.md\); "
-        r"32 against 4 tokens, with two cameras against one; 32 against 4 "
-        r"tokens, with patches of "
-        r"32 against 16 pixels\.".replace("B;", f"{BOUNDS};"),
+        r"32 against 4 tokens, with patches of 32 against 16 pixels; .* without VL self-attention .*; "
+        r".* with four blocks .*; 32 against 4 tokens, with two cameras against three\.".replace(
+            "B;", f"{BOUNDS};"
+        ),
         sentence,
     ), sentence
     other = {**some, "n-0-wide": [1.0] * 8, "n-4-patch-8": FEWER, "n-32-patch-8": MORE}

@@ -60,6 +60,11 @@ def interaction(suffix: str) -> Contrast:
     return Contrast(name, weights)
 
 
+def within(suffix: str) -> tuple[Contrast, ...]:
+    """What 32 tokens instead of 4 change in policies of another kind, alone and against those of `SCALED`."""
+    return difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix)
+
+
 def slope(counts: Mapping[str, int]) -> Contrast:
     """The least-squares slope of success over log2(N + 1).
 
@@ -118,14 +123,8 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-0-long", "n-0-scaled"),
         difference("n-32-long", "n-0-long"),
     ),
-    "vision": tuple(
-        contrast
-        for suffix in ("-two-cameras", "-patch-32", "-patch-8")
-        for contrast in (difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix))
-    ),
-    "vlsa": tuple(
-        contrast
-        for suffix in ("-vlsa-0", "-vlsa-4")
-        for contrast in (difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix))
-    ),
+    "patch-32": within("-patch-32"),
+    "vlsa": (*within("-vlsa-0"), *within("-vlsa-4")),
+    "patch-8": within("-patch-8"),
+    "two-cameras": within("-two-cameras"),
 }
