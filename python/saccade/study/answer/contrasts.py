@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+from saccade.study.answer.plan import LATER_SEEDS, SEEDS
 
 #: A difference of success rates that would matter. Smaller ones count as none.
 MARGIN = 0.10
 CORE = {"n-0": 0, "n-4": 4, "n-32": 32}  # N of the recipes of the confirmatory tests
 #: N of the recipes that the later stages are compared with, and of those with other numbers.
 SCALED = {f"n-{count}-scaled": count for count in (0, 1, 4, 16, 32, 64)}
+LONGER = {"n-0-long": 0, "n-32-long": 32}  # N of the recipes that are trained for longer
+#: The training seeds of `LONGER` that were added because of the others. They are tested alone.
+NEW_SEEDS = SEEDS[len(LATER_SEEDS) :]
+#: What is concluded from a contrast. `interval`: what its interval shows. `test`: what its p value shows, once
+#: all its training seeds are there. `estimate`: nothing, since some of its training seeds were run because of
+#: the others.
+Use: TypeAlias = Literal["interval", "test", "estimate"]
 
 
 @dataclass(frozen=True)
@@ -24,12 +34,16 @@ class Contrast:
         weights: The weight of each recipe.
         margin: The smallest absolute value that would matter.
         unit: What a value of 1 is 100 of.
+        seeds: The training seeds that it is restricted to; empty for all that are there.
+        use: What is concluded from it. Other ones than `interval` have `seeds`.
     """
 
     name: str
     weights: Mapping[str, float]
     margin: float = MARGIN
     unit: str = "points"
+    seeds: tuple[int, ...] = ()
+    use: Use = "interval"
 
     @property
     def recipes(self) -> tuple[str, ...]:
@@ -51,6 +65,18 @@ class Contrast:
 def difference(second: str, first: str) -> Contrast:
     """The success of one recipe minus that of another."""
     return Contrast(f"{second} minus {first}", {second: 1.0, first: -1.0})
+
+
+def in_parts(contrast: Contrast) -> tuple[Contrast, ...]:
+    """A contrast over the first training seeds, over those of `NEW_SEEDS`, and over both."""
+    parts: tuple[tuple[str, tuple[int, ...], Use], ...] = (
+        ("first six", LATER_SEEDS, "interval"),
+        ("new six: tested", NEW_SEEDS, "test"),
+        ("all twelve: estimate", SEEDS, "estimate"),
+    )
+    return tuple(
+        replace(contrast, name=f"{contrast.name}, {part}", seeds=seeds, use=use) for part, seeds, use in parts
+    )
 
 
 def interaction(suffix: str) -> Contrast:
@@ -93,7 +119,7 @@ def slope(counts: Mapping[str, int]) -> Contrast:
 #: all three.
 CONFIRMATORY = (difference("n-32", "n-0"), difference("n-32", "n-4"), slope(CORE))
 
-#: Everything else, by stage: intervals without a test.
+#: Everything else, by stage: intervals, and one test, of the pairs that were added.
 EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
     "scaled": (
         difference("n-32-scaled", "n-0-scaled"),
@@ -121,7 +147,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-32-scaled", "n-0-long"),
         difference("n-0-wide", "n-0-scaled"),
         difference("n-0-long", "n-0-scaled"),
-        difference("n-32-long", "n-0-long"),
+        *in_parts(difference("n-32-long", "n-0-long")),
     ),
     "patch-32": within("-patch-32"),
     "vlsa": (*within("-vlsa-0"), *within("-vlsa-4")),
