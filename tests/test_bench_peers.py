@@ -361,6 +361,7 @@ def test_a_run_is_kept_under_the_name_of_its_cpu(tmp_path: Path) -> None:
     assert [one.path.name for one in kept] == ["other-cpu-family-1.json", "some-cpu.json"]
     (tmp_path / "record" / "some-cpu.md").write_text("## What it shows\n\nSome sentence.\n")
     page = report.page(kept)
+    assert "CPUs measured: Other CPU, family 1; Some CPU. " in page
     assert page.index("## Other CPU, family 1") < page.index("## Some CPU") < page.index("### What it shows")
     assert "| saccade bfloat16 | 400 / 300 | 1600 / 800 |" in page
 
