@@ -21,12 +21,14 @@ from benches.peers import figures, goals, inputs, processes, report, text
 from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.engines import Task
-from benches.peers.floors import floor, limits
+from benches.peers.floors import floor, limits, machine_of
 from benches.peers.machine import describe, family_name
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
 from benches.peers.throughput import throughput
+from saccade.bench.cost import predict
 from saccade.bench.timing import quartiles
+from saccade.bench.work import Call
 from saccade.reference.random_weights import n15_config
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -345,6 +347,20 @@ def test_the_page_contains_what_was_measured() -> None:
         assert results.path.name == f"{results.slug}.json"
         assert (report.IMAGES / f"performance-{results.slug}.png").exists()
     assert report.PAGE.read_text() == report.page(measured)
+
+
+@pytest.mark.parametrize("slug", ["zen-4", "genuineintel-family-6-model-167"])
+def test_the_cost_model_expects_what_was_measured(slug: str) -> None:
+    (results,) = (results for results in records() if results.slug == slug)
+    config = text.config(CASE)
+    call = Call.of(config, CASE.num_vl_tokens, CASE.steps)
+    names = [name for name in results.names(CASE) if name.startswith("saccade") and "refresh" not in name]
+    assert len(names) >= 3
+    for name in names:
+        machine = machine_of(results, CASE, name)
+        assert machine is not None
+        for work, expected in predict(config, call, text.arithmetic(name), machine).items():
+            assert quartiles(results.seconds(CASE, name, work))[1] == pytest.approx(expected, rel=0.15)
 
 
 def test_a_run_is_kept_under_the_name_of_its_cpu(tmp_path: Path) -> None:
