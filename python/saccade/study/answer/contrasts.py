@@ -19,9 +19,9 @@ SCALED = {f"n-{count}-scaled": count for count in (0, 1, 4, 16, 32, 64)}
 LONGER = {"n-0-long": 0, "n-32-long": 32}  # N of the recipes that are trained for longer
 #: The training seeds of `LONGER` that were added because of the others. They are tested alone.
 NEW_SEEDS = SEEDS[len(LATER_SEEDS) :]
-#: What is concluded from a contrast. `interval`: what its interval shows. `test`: what its p value shows, once
-#: all its training seeds are there. `estimate`: nothing, since some of its training seeds were run because of
-#: the others.
+#: What is concluded from a contrast. `interval`: what its interval shows. `test`: what its p value shows.
+#: `estimate`: nothing, since some of its training seeds were run because of the others. The last two need all
+#: their training seeds.
 Use: TypeAlias = Literal["interval", "test", "estimate"]
 
 
