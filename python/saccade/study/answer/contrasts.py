@@ -79,16 +79,22 @@ def in_parts(contrast: Contrast) -> tuple[Contrast, ...]:
     )
 
 
-def interaction(suffix: str) -> Contrast:
-    """What 32 tokens instead of 4 change in policies of another kind, minus the same in those of `SCALED`."""
-    weights = {f"n-32{suffix}": 1.0, f"n-4{suffix}": -1.0, "n-32-scaled": -1.0, "n-4-scaled": 1.0}
-    name = f"(n-32{suffix} minus n-4{suffix}) minus (n-32-scaled minus n-4-scaled)"
-    return Contrast(name, weights)
+def interaction(contrast: Contrast, reference: Contrast) -> Contrast:
+    """One difference of recipes minus another.
+
+    Example:
+        >>> found = interaction(difference("b", "a"), difference("d", "c"))
+        >>> found.name, found.weights
+        ('(b minus a) minus (d minus c)', {'b': 1.0, 'a': -1.0, 'd': -1.0, 'c': 1.0})
+    """
+    weights = {**contrast.weights, **{name: -weight for name, weight in reference.weights.items()}}
+    return Contrast(f"({contrast.name}) minus ({reference.name})", weights)
 
 
 def within(suffix: str) -> tuple[Contrast, ...]:
     """What 32 tokens instead of 4 change in policies of another kind, alone and against those of `SCALED`."""
-    return difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix)
+    found = difference(f"n-32{suffix}", f"n-4{suffix}")
+    return found, interaction(found, difference("n-32-scaled", "n-4-scaled"))
 
 
 def slope(counts: Mapping[str, int]) -> Contrast:
@@ -129,6 +135,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-4-scaled", "n-4"),
         difference("n-32-scaled", "n-32"),
         difference("n-4", "n-0"),
+        interaction(difference("n-32-scaled", "n-0-scaled"), difference("n-32", "n-0")),
     ),
     "alignment": (
         difference("n-4-aligned", "n-4-scaled"),
@@ -148,6 +155,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-0-wide", "n-0-scaled"),
         difference("n-0-long", "n-0-scaled"),
         *in_parts(difference("n-32-long", "n-0-long")),
+        interaction(difference("n-32-long", "n-0-long"), difference("n-32-scaled", "n-0-scaled")),
     ),
     "patch-32": within("-patch-32"),
     "vlsa": (*within("-vlsa-0"), *within("-vlsa-4")),
