@@ -115,10 +115,10 @@ format: setup-test
 # It needs a target directory of its own, because dependencies are instrumented too. Under it a test may run for more
 # than a minute; the test runner then prints a warning, which allocates, so the test that counts allocations is skipped.
 # So are the tests that run out of memory, which AddressSanitizer reports as errors.
-# Valgrind emulates a CPU without AVX-512, so it covers the portable and AVX2 paths. It is slow, so the tests that try
-# many sizes are skipped.
+# Valgrind emulates a CPU without AVX-512, so it covers the portable and AVX2 paths, and tiles in software where a test has
+# them. It is slow, so the tests that compare many sizes with float64 are skipped. `narrow` takes a minute and a half.
 ASAN_TARGET := x86_64-unknown-linux-gnu
-VALGRIND_TESTS := attention layer_norm linear masks rms_norm rope
+VALGRIND_TESTS := attention layer_norm linear masks narrow narrow_weights outliers rms_norm rope
 ASAN_SKIPPED := allocates_nothing without_memory cannot_be_had cannot_be_started
 
 sanitize:

@@ -8,7 +8,7 @@ use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
 use saccade_kernels::{
-    Arithmetic, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef,
+    Arithmetic, Element, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef,
 };
 
 /// `(rows, in_features, out_features)`: a DiT block's feed-forward, and layers of the VL self-attention.
@@ -22,21 +22,41 @@ const SHAPES: [(usize, usize, usize); 4] = [
 /// Each contender walks through this many bytes of its weights before it meets the first again: several times any cache.
 const WEIGHT_BYTES: usize = 160 << 20;
 
+/// The widest panel that is asked for in its order either way, as [`PackedLinear::with_streams`] says: one cache line of float32. It holds for
+/// NEON too, whose panels are narrower.
+const COLUMNS_IN_ORDER: usize = 16;
+
+/// Whether streams change anything for an instruction set.
+fn has_streams(isa: Isa) -> bool {
+    // One output without inputs is one panel without weights, and holds a bias for each column.
+    let columns = PackedLinear::packed_nbytes(isa, Arithmetic::Float32, Element::F32, (1, 0))
+        .expect("float32 may have any inputs")
+        / size_of::<f32>();
+    columns > COLUMNS_IN_ORDER
+}
+
 fn main() {
     let options = Options::from_args();
     let mut report = Report::begin("streams", &options);
     println!("{}", saccade_kernels::CpuReport::current().family);
+    let (measured, left_out): (Vec<_>, Vec<_>) =
+        Isa::available().into_iter().partition(|&isa| has_streams(isa));
+    let left_out: Vec<_> = left_out.iter().map(Isa::to_string).collect();
+    println!(
+        "left out, because they ask in order either way: {}",
+        left_out.join(", ")
+    );
     for (rows, inputs, outputs) in SHAPES {
         let mut random = Random::new(1);
         let (x, weight) = (random.vec(rows * inputs, 1.0), random.vec(inputs * outputs, 0.05));
         let weight = WeightRef::F32(Matrix::new(&weight, inputs));
-        for isa in Isa::available() {
+        for &isa in &measured {
             for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
                 let name = format!(
                     "{isa}, {}, {rows} x {inputs} x {outputs}",
                     arithmetic_name(arithmetic)
                 );
-                if isa == Isa::Portable || !options.wants(&name) {
+                if !options.wants(&name) {
                     continue;
                 }
                 let pack =

@@ -48,7 +48,7 @@ def plan_of(num_seeds: int) -> plans.Plan:
 def section_of(rates: dict[str, list[float]], more: pd.DataFrame | None = None) -> Section:
     """The report's section for these success rates, and other rows of the table."""
     table = pd.concat([rows_of(rates), more])
-    return section(table.assign(validation_loss=0.5), provenance_of(), plan_of(len(rates["n-0"])))
+    return section(table.assign(validation_loss=0.05), provenance_of(), plan_of(len(rates["n-0"])))
 
 
 FEWER, MORE = [0.1, 0.2, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2], [0.7, 0.9, 0.8, 0.7, 0.9, 0.8, 0.7, 0.9]

@@ -14,7 +14,7 @@ import pytest
 import saccade
 from saccade import _saccade
 from saccade.bench import heads, roofline
-from saccade.bench.cost import PRECISIONS, Machine, floor, floors, limit, predict
+from saccade.bench.cost import PRECISIONS, Machine, floor, floors, limit, measured_like, predict
 from saccade.bench.timing import by_turns, pieces, profiled, quartiles
 from saccade.bench.work import Call, encode_work, sample_work, total
 from saccade.cli import bench, main
@@ -213,6 +213,20 @@ def test_the_model_grows_with_the_work() -> None:
         assert expected["encode"] > sum(least.values())
 
 
+def test_the_model_expects_less_of_tiles() -> None:
+    """Everything but AMX is expected to come as near to its floor as a Zen 4."""
+    config = n15()
+    call = Call.of(config, 296)
+    tiles = replace(MACHINE, isa="amx")
+    for precision in PRECISIONS:
+        assert (
+            predict(config, call, precision, tiles)["encode"]
+            > predict(config, call, precision, MACHINE)["encode"]
+        )
+    assert measured_like("amx").cpu == "a Xeon with AMX"
+    assert {measured_like(isa).cpu for isa in ("avx512", "avx2", "bf16")} == {"a Zen 4 with AVX-512"}
+
+
 def test_peaks_of_this_machine() -> None:
     peaks = _saccade.measure_peaks(1)
     assert list(peaks["macs_per_second"]) == _saccade.available_isas()
@@ -348,6 +362,7 @@ def test_json_has_times_profile_and_model(
         "num_image_tokens": None,
     }
     assert report["machine"]["num_threads"] == 1
+    assert report["efficiency_of"] == measured_like(report["machine"]["isa"]).cpu
     assert set(report["machine"]["macs_per_second"]) == set(PRECISIONS)
     config = saccade.ActionHead.load(folder).config
     works = {
@@ -393,6 +408,8 @@ def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -
     text = capsys.readouterr().out
     assert "the bundled policy" in text
     assert "T_vl 93, N 32, 4 steps, 1 samples, future_refresh 1" in text
+    isa = saccade.show_config("dicts")["isa"]
+    assert f"model     expected times, efficiency as on {measured_like(isa).cpu}\n" in text
     assert "float32 sample, by part" in text
     assert "feed_forward_out" in text
 

@@ -21,12 +21,14 @@ from benches.peers import figures, goals, inputs, processes, report, text
 from benches.peers.cases import COST, Case, exact_macs
 from benches.peers.contenders import CONTENDERS, GROUPS, able
 from benches.peers.engines import Task
-from benches.peers.floors import floor, limits
+from benches.peers.floors import floor, limits, machine_of
 from benches.peers.machine import describe, family_name
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
 from benches.peers.throughput import throughput
+from saccade.bench.cost import predict
 from saccade.bench.timing import quartiles
+from saccade.bench.work import Call
 from saccade.reference.random_weights import n15_config
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -347,6 +349,20 @@ def test_the_page_contains_what_was_measured() -> None:
     assert report.PAGE.read_text() == report.page(measured)
 
 
+@pytest.mark.parametrize("slug", ["zen-4", "genuineintel-family-6-model-167"])
+def test_the_cost_model_expects_what_was_measured(slug: str) -> None:
+    (results,) = (results for results in records() if results.slug == slug)
+    config = text.config(CASE)
+    call = Call.of(config, CASE.num_vl_tokens, CASE.steps)
+    names = [name for name in results.names(CASE) if name.startswith("saccade") and "refresh" not in name]
+    assert len(names) >= 3
+    for name in names:
+        machine = machine_of(results, CASE, name)
+        assert machine is not None
+        for work, expected in predict(config, call, text.arithmetic(name), machine).items():
+            assert quartiles(results.seconds(CASE, name, work))[1] == pytest.approx(expected, rel=0.15)
+
+
 def test_a_run_is_kept_under_the_name_of_its_cpu(tmp_path: Path) -> None:
     results = measured(tmp_path / "results.json")
     command.keep(results, tmp_path / "record")
@@ -361,6 +377,7 @@ def test_a_run_is_kept_under_the_name_of_its_cpu(tmp_path: Path) -> None:
     assert [one.path.name for one in kept] == ["other-cpu-family-1.json", "some-cpu.json"]
     (tmp_path / "record" / "some-cpu.md").write_text("## What it shows\n\nSome sentence.\n")
     page = report.page(kept)
+    assert "CPUs measured: Other CPU, family 1; Some CPU. " in page
     assert page.index("## Other CPU, family 1") < page.index("## Some CPU") < page.index("### What it shows")
     assert "| saccade bfloat16 | 400 / 300 | 1600 / 800 |" in page
 
@@ -371,7 +388,7 @@ def test_targets_where_there_are_tiles(tmp_path: Path) -> None:
     rates = {"float32": 1e11, "bfloat16": 2e12, "int8": 4e12}
     results.data["peaks"] = [{"threads": 2, "macs_per_second": {"amx": rates}, "read_bytes_per_second": 2e10}]
     record = results.open(CASE)
-    for name, both in {"saccade-bfloat16": 0.4, "lerobot-bfloat16-pure": 1.2}.items():
+    for name, both in {"saccade-float32": 2.0, "saccade-bfloat16": 0.4, "lerobot-bfloat16-pure": 1.2}.items():
         seconds = {"encode": [0.5 * both], "sample": [0.5 * both]}
         record["contenders"][name] = {"error": 1e-3, "scale": 4.0, "notes": "", "seconds": seconds}
     rows = goals.goals(results).splitlines()
@@ -383,6 +400,10 @@ def test_targets_where_there_are_tiles(tmp_path: Path) -> None:
     assert shortest is not None
     assert 4 * 0.041 < shortest < 4 * 0.041 + 0.12
     assert any("share of the floor" in row and "60 % (75 %)" in row for row in rows)
+    # 156e9 multiply-adds take 1.56 s at 100 GMAC/s.
+    float32 = "| saccade float32, encode + sample, share of the floor | 2 threads | 85 % | 78 % | **no** |"
+    assert float32 in rows
+    assert goals.reached(0.9, 0.85, None) == "yes"
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

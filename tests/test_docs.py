@@ -77,6 +77,14 @@ def test_the_public_classes_have_examples() -> None:
         assert any(test.examples for test in finder.find(public)), f"{public} has no example"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_rows_of_a_table_have_as_many_cells_as_its_head(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        bars = {line: len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}
+        assert len(set(bars.values())) == 1, bars
+
+
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name not in NEED_CHECKPOINTS], ids=page_id)
 def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
     blocks = code_blocks(page, "python")

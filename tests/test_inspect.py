@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 import saccade
 from saccade import _saccade, cli
+from saccade.bench.cost import measured_like
 from saccade.checkpoints import quantize
 from saccade.checkpoints.findings import Counts, Inspection, Part
 from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
@@ -105,6 +106,7 @@ def test_the_report_of_a_checkpoint(base: Path) -> None:
     assert report.machine is not None
     assert report.seconds is not None
     assert report.machine.isa == _saccade.selected_isa()
+    assert report.machine.efficiency_of == measured_like(report.machine.isa).cpu
     for seconds in report.seconds.values():
         assert seconds["encode"] > 0.0
         assert seconds["sample"] > 0.0
@@ -368,7 +370,7 @@ def test_the_command_prints_tables(base: Path, tmp_path: Path, capsys: pytest.Ca
         "GR00T N1.5",
         "action_arm_decoder 4, action_claw_decoder 2",
         "width of an action while denoised  8",
-        "by the cost model",
+        "by the cost model, efficiency as on a ",
         "27 to 30",
         "a random draw",
         "Evidence on",

@@ -54,7 +54,9 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with contextlib.redirect_stdout(printed):
         assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
     assert re.search(
-        r"^- (In these policies|Whether) .* \(no interval; .*; table 1\)\.$", printed.getvalue(), re.M
+        r"^- (In these policies|Whether) .* \(no interval; .*; table 1, `--stages core`\)\.( .*)?$",
+        printed.getvalue(),
+        re.M,
     )
     return out
 

@@ -12,7 +12,7 @@ import pytest
 from answer_tables import FEWER, MORE, rows_of
 
 from saccade.errors import InputError
-from saccade.study.answer.contrasts import CONFIRMATORY, slope
+from saccade.study.answer.contrasts import CONFIRMATORY, difference, in_parts, slope
 from saccade.study.answer.power import power
 from saccade.study.answer.results import changes, confirmed, judged, over_seeds
 from saccade.study.sign_flip import sign_flip
@@ -75,6 +75,33 @@ def test_a_confirmatory_finding_needs_the_corrected_test() -> None:
     assert found.test.p_value < 0.05 < found.corrected
     assert found.finding == "undecided"
     assert replace(found, corrected=None).finding == "more"  # as an exploratory contrast
+
+
+def test_pairs_that_were_added_are_tested_alone() -> None:
+    first, new = [0.3, -0.1, 0.2, 0.1, 0.2, 0.3], [0.1, 0.1, 0.2, 0.1, 0.3, 0.2]
+    rates = {"n-0-long": [0.4] * 12, "n-32-long": [round(0.4 + one, 1) for one in (*first, *new)]}
+    parts = in_parts(difference("n-32-long", "n-0-long"))
+    assert [one.use for one in parts] == ["interval", "test", "estimate"]
+    found = judged(rows_of(rates), ("a", "b"), range(10))
+    results = [over_seeds(found, one) for one in parts]
+    assert [list(one.seeds) for one in results] == [[*range(6)], [*range(6, 12)], [*range(12)]]
+    for one, values in zip(results, (first, new, [*first, *new]), strict=True):
+        assert one.test is not None
+        assert one.test.difference.value == pytest.approx(np.mean(values))
+        assert one.test.p_value == sign_flip(values).p_value
+    assert [one.finding for one in results] == ["undecided", "more", "estimate"]
+    # One difference of the other sign, and the test does not reject.
+    rates["n-32-long"][7] = 0.3
+    found = judged(rows_of(rates), ("a", "b"), range(10))
+    assert over_seeds(found, parts[1]).finding == "undecided"
+    # Equal policies are undecided by the test, whose rule knows nothing of a margin.
+    same = judged(rows_of({"n-0-long": [0.4] * 12, "n-32-long": [0.4] * 12}), ("a", "b"), range(10))
+    assert [over_seeds(same, one).finding for one in parts] == ["small", "undecided", "estimate"]
+    # The test and the estimate wait for all their pairs.
+    some = judged(rows_of({**rates, "n-32-long": rates["n-32-long"][:11]}), ("a", "b"), range(10))
+    results = [over_seeds(some, one) for one in parts]
+    assert [one.finding for one in results] == ["undecided", "not measured", "not measured"]
+    assert [list(one.unpaired) for one in results] == [[], [11], [11]]
 
 
 def test_changes_of_arms_are_those_of_the_same_policies() -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +11,17 @@ import numpy as np
 import pandas as pd
 import pytest
 from answer_tables import CORE, FEWER, MORE, plan_of, provenance_of, rows_of, section_of
-from scipy.stats import spearmanr
 
 from saccade.study.answer import plan as plans
-from saccade.study.answer.results import judged, relations
-from saccade.study.answer.section import predicts, relation_grid, section
+from saccade.study.answer.results import judged
+from saccade.study.answer.section import section
 from saccade.study.answer.study import Answer
 from saccade.study.report import write_report
+from saccade.study.section import points
 from saccade.study.sign_flip import sign_flip
 from saccade.study.table import Provenance, write_provenance
 
-LINK = r"\[table 1\]\(#table-1\)"
+LINK = r"\[table 1\]\(#table-1\), `--stages core`"
 BOUNDS = r"95 % interval [-\d.]+ to [-\d.]+"
 
 
@@ -96,7 +94,7 @@ def test_the_first_two_sentences(
 def test_a_small_effect_that_is_certain_is_called_small() -> None:
     """Rejected, and inside the margin."""
     rates = {"n-0": [0.50] * 10, "n-4": [0.50] * 10, "n-32": [0.54, 0.56] * 5}
-    table = rows_of(rates, 50).assign(validation_loss=0.5)
+    table = rows_of(rates, 50).assign(validation_loss=0.05)
     whole = section(table, provenance_of(50), plan_of(10))
     assert [row[5] for row in whole.grids[0].rows] == ["more"] * 3
     assert whole.answer[0].startswith("In these policies, 32 future tokens help, by less than 10 points: ")
@@ -111,7 +109,7 @@ def test_nothing_is_judged_before_the_core_is_complete() -> None:
     episodes = len(plans.PLAN.seeds)
     known = Provenance("answer", {"tasks": ["a", "b"], "episodes": list(range(episodes))}, 1, 1)
     rates = {name: [0.25] * 12 for name in ("n-0", "n-4", "n-32", "n-4-aligned")}
-    table = rows_of(rates, episodes).assign(validation_loss=0.5)
+    table = rows_of(rates, episodes).assign(validation_loss=0.05)
     last = table[(table["policy"] == "n-32-seed-11") & (table["kind"] == "episodes")].index[-1:]
     partly = section(table.drop(last), known, plans.PLAN)
     assert partly.answer == [
@@ -175,19 +173,96 @@ def test_the_sentence_about_the_cut() -> None:
         ),
     ):
         whole = section_of(CORE, under_the_cut({"n-4": four, "n-32": many}))
-        expected = said.replace("B;", f"{BOUNDS};").replace("L", LINK.replace("1", "4"))
+        link = LINK.replace("1", "4").replace("core", "core,instrument")
+        expected = said.replace("B;", f"{BOUNDS};").replace("L", link)
         assert re.fullmatch(re.escape(begin) + expected, whole.answer[2]), whole.answer[2]
         assert whole.grids[3].heading == "Table 4"
         assert whole.grids[3].columns[1] == "future-unread"
 
 
-def test_the_exploratory_sentence() -> None:
+def test_the_sentence_on_larger_first_weights() -> None:
+    begin = "Exploratory: with larger first weights (*scaled*, where no policy stopped on the plateau), 32 "
     nothing = section_of(CORE).answer[3]
-    assert nothing.startswith(
-        "Not measured: 32 tokens against none, with larger first weights (scaled); 32 tokens against 4, with "
-        "larger first weights (scaled); 32 tokens against a wider head without tokens at the same cost of"
+    assert nothing == (
+        "Not measured: 32 tokens against none or 4, with larger first weights (*scaled*). "
+        "Not tested: 32 tokens against none, with longer training of both."
     )
-    assert nothing.endswith("with two cameras against three.")
+    link = r"\[table 3\]\(#table-3\), `--stages scaled`"
+    for zero, four, many, said in (
+        (
+            *(FEWER, MORE, MORE),
+            rf"tokens against none: more success, 65.0 points \({BOUNDS}; {link}\); 32 against 4: "
+            rf"no difference of 10 points or more, 0.0 points \({BOUNDS}; {link}\)\.",
+        ),
+        (
+            *(MORE, [*MORE[:4], *FEWER[4:6]], FEWER),
+            rf"tokens against none: less success, -65.0 points \({BOUNDS}; {link}\); 32 against 4: "
+            rf"undecided, -41.7 points \({BOUNDS}; 6 training seeds; {link}\)\.",
+        ),
+    ):
+        rates = {"n-0-scaled": zero, "n-4-scaled": four, "n-32-scaled": many}
+        found = section_of({**CORE, **rates}).answer[3]
+        assert re.fullmatch(re.escape(begin) + said + " Not tested: .*", found), found
+    table = rows_of({**CORE, "n-0-scaled": FEWER, "n-32-scaled": MORE}).assign(validation_loss=0.05)
+    table.loc[table["policy"] == "n-0-scaled-seed-1", "validation_loss"] = 0.2
+    said = section(table, provenance_of(), plan_of(8)).answer[3]
+    assert said.startswith("Exploratory: with larger first weights (*scaled*), 32 tokens against none: more")
+
+
+def test_new_pairs_are_tested_alone() -> None:
+    """All six of one sign are needed, and the pooled ones are an estimate whatever their interval is."""
+    first, one_sign = [0.1] * 6, [0.1, 0.2, 0.1, 0.2, 0.1, 0.3]
+    core = {name: [0.1] * 12 for name in ("n-0", "n-4", "n-32")}
+    for new, said, finding, p in (
+        (
+            [0.5, 0.6, 0.7, 0.8, 0.6, 0.5],
+            "decides that 32 tokens help compared with none, 45.0",
+            "more",
+            1 / 32,
+        ),
+        ([0.0] * 6, "decides that 32 tokens hurt compared with none, -16.7", "less", 1 / 32),
+        (
+            [*one_sign[:5], 0.4],
+            "leaves it undecided whether 32 tokens help or hurt compared with none, 1.7",
+            *("undecided", 1),
+        ),
+    ):
+        whole = section_of({**core, "n-0-long": [*first, *one_sign], "n-32-long": [*[0.3] * 6, *new]})
+        text = whole.answer[3]
+        assert f"(1628 steps instead of 1000), the test of the 6 new pairs {said} points (" in text
+        assert re.search(
+            rf"; p = {p:.4f}; training seeds 6 to 11; \[table 4\]\S*, `--stages compute`\)\. All 12 ", text
+        )
+        assert "Its interval does not know that half of the pairs were run because of the others." in text
+        (grid,) = [grid for grid in whole.grids if "p" in grid.columns and grid.heading != "Table 1"]
+        rows = [row for row in grid.rows if row[0].startswith("n-32-long minus n-0-long")]
+        assert [(row[0].split(", ")[1], row[1], row[3], row[4]) for row in rows] == [
+            ("first six", "6", "", "more"),
+            ("new six: tested", "6", f"{p:.4f}", finding),
+            ("all twelve: estimate", "12", "", "estimate"),
+        ]
+        differences = np.array(new) - one_sign
+        assert sign_flip(np.round(differences, 12)).p_value == p
+        assert rows[1][2] == points(sign_flip(np.round(differences, 12)).difference)
+        pooled = sign_flip(np.round([*[0.2] * 6, *differences], 12)).difference
+        assert rows[2][2] == points(pooled)
+        assert f"give an estimate of {100 * pooled.value:.1f} points (95 % interval " in text
+    # With one new pair missing there is neither a test nor an estimate.
+    rates = {**core, "n-0-long": [*first, *one_sign], "n-32-long": [0.3] * 11}
+    whole = section_of(rates)
+    assert "Not tested: 32 tokens against none, with longer training of both." in whole.answer[3]
+    (grid,) = [grid for grid in whole.grids if "policies without tokens at the cost of 32" in grid.caption]
+    assert [row[0].split(", ")[1] for row in grid.rows] == ["first six"]
+
+
+def test_the_other_comparisons_are_counted_and_listed() -> None:
+    nothing = section_of(CORE)
+    assert "Other exploratory comparisons" not in nothing.answer[3]
+    (absent,) = nothing.others
+    assert absent.startswith(
+        "Not measured: 32 tokens against a wider head without tokens at the same cost of"
+    )
+    assert absent.endswith("; 32 tokens with the alignment loss against 32 without; 64 tokens against 32.")
     some = {
         **CORE,
         "n-32-scaled": MORE,
@@ -198,31 +273,39 @@ def test_the_exploratory_sentence() -> None:
         "n-4-patch-8": MORE,
         "n-32-patch-8": FEWER,
     }
-    sentence = section_of(some).answer[3]
-    assert re.fullmatch(
-        r"Exploratory: 32 tokens against 4, with larger first weights \(scaled\): more success, 65.0 points "
-        r"\(B; \[table 3\]\S*\); "
-        r"32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 5\]\S*\); "
-        r"32 tokens against longer training .*: undecided, 15.0 points \(no interval; 4 "
-        r"training seeds; .*\); "
-        r"32 tokens with the alignment loss against without: no difference of 10 points or more, 0.0 points "
-        r"\(B; \[table 4\]\S*\); "
-        r"32 against 4 tokens, with patches of 8 against 16 pixels: a change in favour of 4, -130.0 points "
-        r"\(B; \[table 6\]\S*\); "
-        r"not measured: 32 tokens against none, with larger first weights \(scaled\); "
-        r"32 tokens against none, both trained longer \(.* tested alone in README.md\); "
-        r"32 against 4 tokens, with patches of 32 against 16 pixels; .* without VL self-attention .*; "
-        r".* with four blocks .*; 32 against 4 tokens, with two cameras against three\.".replace(
-            "B;", f"{BOUNDS};"
-        ),
-        sentence,
-    ), sentence
+    whole = section_of(some)
+    assert whole.answer[3].endswith(
+        "Other exploratory comparisons of 32 tokens with fewer or none: 1 in favour of 32, 1 against, 0 "
+        "small and "
+        "1 undecided ([table 5](#table-5), [table 6](#table-6)); of what another backbone or another depth "
+        "of the "
+        "VL self-attention changes in 32 against 4: 0 in favour of 32, 1 against, 0 small and 0 undecided "
+        '([table 6](#table-6)); each is listed under "Other comparisons".'
+    )
+    expected = [
+        r"32 tokens against a wider head .*: more success, 65.0 points \(B; \[table 5\]\S*, `--stages "
+        r"scaled,compute`\)\.",
+        r"32 tokens against longer training .*: undecided, 15.0 points \(no interval; 4 training seeds; "
+        r".*\)\.",
+        r"32 tokens against 4, with patches of 8 pixels: less success, -65.0 points \(B; \[table 6\]\S*, "
+        r"`--stages patch-8`\)\.",
+        r"32 tokens against 4, with patches of 8 instead of 16 pixels: a change in favour of 4, -130.0 "
+        r"points "
+        r"\(B; \[table 6\]\S*, `--stages scaled,patch-8`\)\.",
+        r"Not counted in the answer: 32 tokens with the alignment loss against 32 without: no difference "
+        r"of 10 points "
+        r"or more, 0.0 points \(B; \[table 4\]\S*, `--stages scaled,alignment`\)\.",
+        r"Not measured: 32 tokens with the alignment loss against none; .*; 64 tokens against 32\.",
+    ]
+    assert len(whole.others) == len(expected)
+    for found, pattern in zip(whole.others, expected, strict=True):
+        assert re.fullmatch(pattern.replace("B;", f"{BOUNDS};"), found), found
     other = {**some, "n-0-wide": [1.0] * 8, "n-4-patch-8": FEWER, "n-32-patch-8": MORE}
-    sentence = section_of(other).answer[3]
-    assert "wider head without tokens at the same cost of a chunk: less success, -20.0 points" in sentence
-    assert "8 against 16 pixels: no change of 10 points or more, 0.0 points" in sentence
+    said = section_of(other).others
+    assert "wider head without tokens at the same cost of a chunk: less success, -20.0 points" in said[0]
+    assert "8 instead of 16 pixels: no change of 10 points or more, 0.0 points" in said[3]
     other = {**other, "n-4-scaled": MORE, "n-32-scaled": FEWER}
-    assert "8 against 16 pixels: a change in favour of 32, 130.0 points" in section_of(other).answer[3]
+    assert "8 instead of 16 pixels: a change in favour of 32, 130.0 points" in section_of(other).others[3]
 
 
 def test_later_stages_have_their_tables() -> None:
@@ -245,82 +328,6 @@ def test_later_stages_have_their_tables() -> None:
     assert by_name["(n-32-patch-8 minus n-4-patch-8) minus (n-32-scaled minus n-4-scaled)"][3] == "less"
 
 
-def test_measures_are_related_to_what_a_cut_costs() -> None:
-    plain, cut = (
-        {"n-4": FEWER, "n-32": MORE},
-        {"n-4": FEWER, "n-32": [0.0, 0.3, 0.1, 0.2, 0.4, 0.5, 0.6, 0.8]},
-    )
-    table = rows_of(plain)
-    changed = rows_of(cut)
-    changed = changed[changed["kind"] == "episodes"].assign(arm="future-unread")
-    lost = {
-        (recipe, seed): round(plain[recipe][seed] - cut[recipe][seed], 6)
-        for recipe in plain
-        for seed in range(8)
-    }
-    rng = np.random.default_rng(0)
-    trained = table[table["kind"] == "training"]
-    measured = trained.assign(
-        kind="measures",
-        chunk_change=[
-            3 * lost[row["recipe"], row["training_seed"]] + 1 for row in trained.to_dict("records")
-        ],
-        attention_mass=rng.random(len(trained)),
-        gradient_share=0.5,
-        probe_r2=np.nan,
-    )
-    table = pd.concat([table, changed, measured[measured["policy"] != "n-4-seed-7"]])
-    found = relations(table, judged(table, ("a", "b"), range(10)), ("a", "b"), range(10))
-    assert [(one.measure, one.policies) for one in found] == [
-        ("chunk_change", 15),
-        ("attention_mass", 15),
-        ("gradient_share", 15),
-    ]
-    assert found[0].correlation.value == pytest.approx(1)
-    masses = dict(zip(measured["policy"], measured["attention_mass"], strict=True))
-    pairs = [(masses[f"{recipe}-seed-{seed}"], lost[recipe, seed]) for recipe in plain for seed in range(8)]
-    del pairs[7]
-    expected = spearmanr(*zip(*np.round(pairs, 12), strict=True)).statistic
-    assert found[1].correlation.value == pytest.approx(expected)
-    assert found[1].correlation.low < expected < found[1].correlation.high
-    assert math.isnan(found[2].correlation.value)  # the same for all
-    assert predicts(found[0])
-    assert not predicts(found[2])
-    assert not predicts(replace(found[0], policies=9))
-    complete = pd.concat([table, rows_of({"n-0": FEWER})])
-    whole = section(complete.assign(validation_loss=0.5), provenance_of(), plan_of(8))
-    assert whole.grids[-2].columns[0] == "measure"
-    assert [row[1::2] for row in whole.grids[-2].rows] == [["15", "15"]] * 3
-    assert re.fullmatch(
-        r"Exploratory: of the cheap measures, change of the chunk by the cut \(1.00, 1.00 "
-        r"to 1.00\) is correlated "
-        r"with the success that this cut costs \(rank correlation, 95 % interval over "
-        r"policies of all N together; "
-        r"\[table 5\]\(#table-5\)\); for attention of action rows to future rows \(.* to .*\), share of the "
-        r"gradient through future rows \(the same for all policies, or the cut costs all the same\) this is "
-        r"undecided\. All this holds for small policies, in one simulator, on a and b; it "
-        r"says nothing about GR00T "
-        r"N1.5 itself\.",
-        whole.answer[4],
-    ), whole.answer[4]
-    unknown = complete.assign(chunk_change=np.nan, validation_loss=0.5)
-    said = section(unknown, provenance_of(), plan_of(8)).answer[4]
-    assert said.startswith(
-        "Exploratory: of the cheap measures, none is shown to be correlated with the success"
-    )
-    assert section_of(CORE).answer[4].startswith("Not measured: which cheap measure is correlated with the")
-
-    # Policies of other stages count in the second number only.
-    other = complete[complete["policy"] == "n-32-seed-3"]
-    other = other.assign(stage="numbers", policy="n-16-seed-3", recipe="n-16")
-    table = pd.concat([complete, other]).assign(validation_loss=0.5)
-    grid = section(table, provenance_of(), plan_of(8)).grids[-2]
-    assert [row[1::2] for row in grid.rows] == [["15", "16"]] * 3
-    assert grid.rows[1][2].startswith(f"{expected:.2f} (")
-    alone = relation_grid("", [], found)
-    assert [row[1:4] for row in alone.rows] == [["0", "", "15"]] * 3
-
-
 def test_what_is_measured_has_its_tables() -> None:
     """Means over training seeds by hand; what no policy has is left empty."""
     rows = rows_of({name: [0.5] * 6 for name in ("n-0", "n-4", "n-32", "n-4-aligned")})
@@ -341,12 +348,30 @@ def test_what_is_measured_has_its_tables() -> None:
         for block in ("all", "0"):
             found = share * (1 + 0.1 * seeds) if block == "all" else 9.0
             measured.append(trained.assign(kind="patching", group=group, block=block, share=found))
-    table = pd.concat([rows, *measured]).assign(validation_loss=0.5)
+    table = pd.concat([rows, *measured]).assign(validation_loss=0.05)
     whole = section(table, provenance_of(), plan_of(6))
-    assert [figure.name for figure in whole.figures] == ["success", "losses", "overlap"]
+    assert [(figure.name, figure.table) for figure in whole.figures] == [
+        ("success", ""),
+        ("losses", "Table 2"),
+        ("overlap", whole.grids[-5].heading),
+    ]
     captions = [grid.caption.split(".")[0] for grid in whole.grids]
     assert captions == [f"Table {place}" for place in range(1, len(captions) + 1)]
     maps, removed, sums, patched, progress = whole.grids[-5:]
+    assert sums.note == (
+        "In the core's policies with 32 tokens, removing half of them with their weight changes the chunk "
+        "1.50 "
+        "(1.50 to 1.50) times as much as the sum of their single effects, which explains 0.50 (0.50 to "
+        "0.50) of "
+        "the change; removing all of them 1.50 (1.50 to 1.50) times as much, and the sum explains 0.50 "
+        "(0.50 to "
+        "0.50). So single effects do not add up to that of all tokens, which is larger than their sum."
+    )
+    for ratio, said in ((0.5, "which is smaller than their sum."), (1.0, "of all tokens is undecided.")):
+        other = section(table.assign(ratio_all=ratio), provenance_of(), plan_of(6))
+        assert other.grids[-3].note.endswith(said)
+    no_core = table[~((table["kind"] == "specialise") & (table["recipe"] == "n-32"))]
+    assert not section(no_core, provenance_of(), plan_of(6)).grids[-3].note
     done = {row[0]: row[1] for row in progress.rows}
     assert (done["specialise"], done["patching"], done["measures"]) == ("18", "18", "0")
     assert [row[0] for row in maps.rows] == ["n-4", "n-32", "n-4-aligned"]
@@ -370,7 +395,7 @@ def test_what_is_measured_has_its_tables() -> None:
 
 def test_success_by_task_and_by_loss() -> None:
     """Table 1 and 2 for each task alone, and what success has to do with the held-out loss."""
-    table = rows_of({"n-0": FEWER, "n-4": FEWER, "n-32": MORE}).assign(validation_loss=0.5)
+    table = rows_of({"n-0": FEWER, "n-4": FEWER, "n-32": MORE}).assign(validation_loss=0.05)
     everywhere = (table["kind"] == "episodes") & (table["task"] == "b") & (table["recipe"] == "n-32")
     table.loc[everywhere, "success"] = False
     whole = section(table, provenance_of(), plan_of(8))
@@ -379,6 +404,9 @@ def test_success_by_task_and_by_loss() -> None:
     assert [row[-2].split(" (")[0] for row in tests.rows[:2]] == ["65.0", "65.0"]
     assert [row[-1].split(" (")[0] for row in tests.rows[:2]] == ["-15.0", "-15.0"]
     assert [cell.split(" (")[0] for cell in policies.rows[2][1:4]] == ["40.0", "80.0", "0.0"]
+    assert policies.columns[4:6] == ("held-out loss", "above 0.15")
+    assert [row[5] for row in policies.rows] == ["0 of 8"] * 3
+    assert "plateau" not in whole.answer[0]
     assert "held-out loss" not in whole.answer[4]
     assert [figure.name for figure in whole.figures] == ["success", "losses"]
 
@@ -389,9 +417,30 @@ def test_success_by_task_and_by_loss() -> None:
     table.loc[trained, "validation_loss"] = worse
     assert (
         "Over the policies of the core, success is correlated with the held-out loss (rank correlation "
-        "-1.00, -1.00 to -1.00; second figure), so a difference between arms may be one of how far their "
+        "-1.00, -1.00 to -1.00; figure above [table 2](#table-2), `--stages core`), so a difference "
+        "between arms may be one of how far their "
         "training came."
     ) in section(table, provenance_of(), plan_of(8)).answer[4]
+
+
+def test_policies_on_the_plateau_are_counted() -> None:
+    table = rows_of(CORE).assign(validation_loss=0.05)
+    on_it = {"n-0": range(5), "n-4": [7], "n-32": []}
+    for recipe, seeds in on_it.items():
+        for seed in seeds:
+            table.loc[table["policy"] == f"{recipe}-seed-{seed}", "validation_loss"] = 0.1501
+    whole = section(table, provenance_of(), plan_of(8))
+    link = "[table 2](#table-2), `--stages core`"
+    said = (
+        "of the core's 24 policies stopped on a plateau of their training, with a held-out loss above 0.15: "
+    )
+    assert whole.answer[0].endswith(
+        f" 6 {said}5 of 8 with N = 0, 1 of 8 with N = 4, 0 of 8 with N = 32 ({link})."
+    )
+    assert [row[5] for row in whole.grids[1].rows] == ["5 of 8", "1 of 8", "0 of 8"]
+    table.loc[table["training_seed"] < 4, "validation_loss"] = 0.3
+    table.loc[table["training_seed"] >= 4, "validation_loss"] = 0.15  # not above
+    assert f" Half {said}4 of 8 with N = 0" in section(table, provenance_of(), plan_of(8)).answer[0]
 
 
 def test_nothing_trained() -> None:
@@ -410,14 +459,22 @@ def test_the_report_begins_with_the_answer(tmp_path: Path) -> None:
     plan = plans.PLAN
     episodes = list(plan.seeds)
     rates = {name: [0.25, 0.5] * 6 for name in ("n-0", "n-4", "n-32")}
-    rows = rows_of(rates, len(episodes)).assign(validation_loss=0.5)
+    rows = rows_of(rates, len(episodes)).assign(validation_loss=0.05)
     rows.to_csv(tmp_path / "answer.csv", index=False)
     known = Provenance("answer", {"tasks": ["a", "b"], "episodes": episodes}, 1, 1)
     write_provenance(known, tmp_path / "answer.json")
     page, markdown = (path.read_text(encoding="utf-8") for path in write_report(tmp_path))
     text = markdown.split("### Methods")[0]
     assert re.search(r"### The answer\n\n1\. In these .*\n2\. .*\n3\. .*\n4\. .*\n5\. .*\n\n!\[", text)
-    assert text.rstrip().endswith("saccade study answer --out DIR\nsaccade study report DIR\n```")
+    assert (
+        "\nsaccade study answer --out DIR\nsaccade study report DIR\n```\n\n`--stages NAMES` beside" in text
+    )
+    assert "commit 388bc69 is the last that trains the core's policies to the same weights." in text
+    assert text.count("![") == 1  # the other figures are beside their tables
+    assert re.search(
+        r"#### Table 2\n\n!\[.*\]\(figures/answer-losses.png\)\n\n\*.*\*\n\n\*Table 2\. ", markdown
+    )
+    assert "### Other comparisons\n\n- Not measured: " in markdown
     linked = re.findall(r"\(#(.*?)\)", markdown)
     assert linked
     assert set(linked) == set(re.findall(r'href="#(.*?)"', page))

@@ -7,7 +7,7 @@
 #   .ci/aarch64/run.sh loops      the inner loops of the kernels, judged by llvm-mca, as a table in Markdown
 #   .ci/aarch64/run.sh instructions   instructions a multiply-add of whole linear layers, counted by the emulator
 #   .ci/aarch64/run.sh lint       clippy of the Rust crates; a warning is an error
-#   .ci/aarch64/run.sh check      that it compiles for macOS (ARM) and Windows (x86-64), without their standard libraries
+#   .ci/aarch64/run.sh check      that three crates compile for macOS (ARM) and Windows (x86-64), with sources of the standard library
 #   .ci/aarch64/run.sh test       setup, rust and python
 #
 # CPUS are names of qemu, separated by spaces (default: max). Nothing that is installed is replaced: the compiler is

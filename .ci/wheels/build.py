@@ -125,6 +125,7 @@ def main() -> int:
     partial = wheel.with_suffix(".partial")
     shutil.copyfile(built, partial)
     partial.replace(wheel)
+    wheel.with_suffix(".commit").write_text(commit[:7] + "\n")  # for the page of `test.py`
     subprocess.run([sys.executable, "-m", "auditwheel", "show", str(wheel)], check=True)
     print(f"{wheel}: {wheel.stat().st_size} bytes, commit {commit[:7]}")
     print(f"sha256 {digest(wheel)}")

@@ -162,6 +162,8 @@ def main() -> None:
             {
                 "python": platform.python_version(),
                 "numpy": np.__version__,
+                "cpu": config["cpu"],
+                "family": config["family"],
                 "isa": config["isa"],
                 "available_isas": config["available_isas"],
                 "cross_attention_error": error,

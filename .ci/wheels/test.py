@@ -188,12 +188,10 @@ def try_versions(wheel: Path, work: Path) -> list[list[str]]:
     return rows
 
 
-def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
-    """A row for each instruction set of this CPU, and for each emulated CPU."""
-    python = environment("3.12", work / "cpus", wheel, "numpy")
+def try_cpus(python: Path, available: list[str], work: Path) -> list[list[str]]:
+    """A row for each available instruction set of this CPU, and for each emulated CPU."""
     native: dict[str, Actions] = {}
     portable: Actions = {}
-    available = check(python, work)[0]["available_isas"]
     arms: list[tuple[str, tuple[str, ...], dict[str, str]]] = [
         (f"this CPU, `SACCADE_ISA={isa}`", (), {"SACCADE_ISA": isa}) for isa in available
     ]
@@ -217,7 +215,7 @@ def try_cpus(wheel: Path, work: Path) -> list[list[str]]:
             row += ["", "", "", "", "", f"FAILED: {error}"]
         rows.append(row)
         print("  ", *row, flush=True)
-    rows.append(["qemu Nehalem refuses AVX2", "", "", "", "", refuses_avx2(qemu, work)])
+    rows.append(["qemu Nehalem refuses AVX2", *[""] * 5, refuses_avx2(qemu, work)])
     return rows
 
 
@@ -315,6 +313,12 @@ def of_architecture(folder: Path, name: str) -> Path:
     return wheels[0]
 
 
+def commit_of(wheel: Path) -> str:
+    """The commit that `build.py` made a wheel of, as it wrote beside the wheel."""
+    note = wheel.with_suffix(".commit")
+    return note.read_text().strip() if note.exists() else "unknown"
+
+
 def main() -> int:
     """Runs everything, prints it, and writes the page."""
     parser = argparse.ArgumentParser(
@@ -329,12 +333,18 @@ def main() -> int:
         inside = contents(wheel, work / "unpacked")
         inside_arm = contents(arm_wheel, work / "unpacked-arm")
         megabytes = {key: f"{inside[key] / 1e6:.1f}" for key in ("library", "demo", "wheel")}
+        python = environment("3.12", work / "cpus", wheel, "numpy")
+        here, _ = check(python, work)
         page = PAGE.read_text().format(
+            cpu=f"{here['cpu']}, {here['family']}",
+            commit=commit_of(wheel),
+            arm_commit=commit_of(arm_wheel),
             glibc=inside["glibc"],
             **megabytes,
             versions=table("CPython | NumPy | cross-attention | ", try_versions(wheel, work)),
             cpus=table(
-                "CPU | instruction set | float32 | bfloat16 | int8 | equal bits | ", try_cpus(wheel, work)
+                "CPU | instruction set | float32 | bfloat16 | int8 | equal bits | ",
+                try_cpus(python, here["available_isas"], work),
             ),
             rollouts=table(
                 "CPython | NumPy | mujoco | metaworld | gymnasium | goal | ", try_rollouts(wheel, work)

@@ -49,7 +49,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class MachineRates:
-    """What the CPU can do, measured during the inspection."""
+    """What the CPU can do, measured during the inspection, and what the expected times assume of it."""
 
     isa: str
     num_threads: int
@@ -57,6 +57,8 @@ class MachineRates:
     """Multiply-adds per second by arithmetic."""
     read_bytes_per_second: float
     """Rate of reading from memory."""
+    efficiency_of: str
+    """The CPU on which the shares of these rates that saccade reaches were measured."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._arrays import integer
-from saccade.bench.cost import PRECISIONS, Machine, predict
+from saccade.bench.cost import PRECISIONS, Machine, measured_like, predict
 from saccade.bench.work import Call
 from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
@@ -125,6 +125,7 @@ def expected_times(head: HeadConfig, num_vl_tokens: int) -> tuple[MachineRates, 
         num_threads=machine.num_threads,
         macs_per_second=dict(machine.macs_per_second),
         read_bytes_per_second=machine.read_bytes_per_second,
+        efficiency_of=measured_like(machine.isa).cpu,
     )
     return rates, seconds
 

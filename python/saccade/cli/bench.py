@@ -28,6 +28,7 @@ from saccade.bench.cost import (
     floor,
     floors,
     limit,
+    measured_like,
     predict,
 )
 from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
@@ -159,6 +160,7 @@ def measure(
         "saccade": saccade.__version__,
         "head": name,
         "machine": asdict(machine),
+        "efficiency_of": measured_like(machine.isa).cpu,
         "call": asdict(call),
         "rounds": args.rounds,
         "results": timed(loaded, call, machine, args.rounds),
@@ -342,6 +344,7 @@ def tables(report: dict[str, Any]) -> str:
         f"machine   {machine['isa']}, {machine['num_threads']} threads; peak GMAC/s {peaks}; "
         f"read {machine['read_bytes_per_second'] / 1e9:.1f} GB/s ({reading(machine)}); "
         f"saccade {report['saccade']}",
+        f"model     expected times, efficiency as on {report['efficiency_of']}",
         "",
         f"median (quartiles) of {report['rounds']} rounds, ms",
         f"{'':<20}{'time':>9}{'quartiles':>20}{'GMAC':>9}{'floor':>9}{'of it':>8}{'model':>9}",

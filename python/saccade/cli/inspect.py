@@ -169,7 +169,8 @@ def memory(report: Inspection) -> Section:
         return Section("Memory", columns, rows)
     title = (
         f"Memory, and expected time of a chunk with {report.num_vl_tokens} VL tokens "
-        f"({machine.isa}, {machine.num_threads} threads, by the cost model)"
+        f"({machine.isa}, {machine.num_threads} threads),\n"
+        f"by the cost model, efficiency as on {machine.efficiency_of}"
     )
     return Section(title, [*columns, ">ms, encode", ">ms, sample", ">ms, chunk"], rows)
 

@@ -25,7 +25,12 @@ def new_picture(height: float = 3.2, columns: int = 1) -> tuple[Picture, list[Ax
 
 
 def estimates(
-    labels: Sequence[str], values: Sequence[Estimate], x_label: str, *, reference: float | None = None
+    labels: Sequence[str],
+    values: Sequence[Estimate],
+    x_label: str,
+    *,
+    reference: float | None = None,
+    colour: str = COLOURS[0],
 ) -> Picture:
     """One row per estimate, from top to bottom: the value as a dot, its interval as a line.
 
@@ -34,13 +39,14 @@ def estimates(
         values: NaN values and unknown intervals are left out.
         x_label: Label of the axis, with the unit.
         reference: Position of a dotted vertical line, for "no difference".
+        colour: Of the dots and lines.
     """
     picture, (axes,) = new_picture(height=0.9 + 0.28 * len(labels))
     if reference is not None:
         axes.axvline(reference, color="0.5", linewidth=1, linestyle=":")
     for row, value in enumerate(values):
-        axes.plot([value.low, value.high], [row, row], color=COLOURS[0], linewidth=2)
-        axes.plot([value.value], [row], "o", color=COLOURS[0], markersize=5)
+        axes.plot([value.low, value.high], [row, row], color=colour, linewidth=2)
+        axes.plot([value.value], [row], "o", color=colour, markersize=5)
     axes.set_yticks(range(len(labels)), labels)
     axes.set_ylim(len(labels) - 0.5, -0.5)
     axes.set_xlabel(x_label)

@@ -24,11 +24,13 @@ class SavedPicture:
         caption: As in `section.Figure`.
         file: Its path relative to the report, for the Markdown.
         data: The whole picture as a `data:` URI, for the HTML.
+        table: As in `section.Figure`.
     """
 
     caption: str
     file: str
     data: str
+    table: str = ""
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,8 @@ def draw(directory: Path, name: str, figure: Figure) -> SavedPicture:
             figure.picture.savefig(temporary, dpi=PNG_DOTS_PER_INCH, metadata={"Software": None})
         buffer = io.BytesIO()
         figure.picture.savefig(buffer, format="svg", metadata={"Date": None})
-    return SavedPicture(figure.caption, f"figures/{name}.png", as_uri("image/svg+xml", buffer.getvalue()))
+    svg = as_uri("image/svg+xml", buffer.getvalue())
+    return SavedPicture(figure.caption, f"figures/{name}.png", svg, figure.table)
 
 
 def as_uri(kind: str, content: bytes) -> str:

@@ -25,11 +25,13 @@ class Figure:
         name: Name of its file, unique in its section: lower-case words separated by hyphens.
         caption: Description of the drawing, with units, and of the error bars.
         picture: Drawn by :mod:`saccade.study.figures`.
+        table: Heading of the table that it is drawn above. Empty for a figure that comes before the tables.
     """
 
     name: str
     caption: str
     picture: Picture
+    table: str = ""
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,13 @@ class Grid:
         caption: Description of its numbers.
         columns: Headings.
         rows: One text per column in each row.
+        note: A paragraph below it, or nothing.
     """
 
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
+    note: str = ""
 
     @property
     def heading(self) -> str:
@@ -65,6 +69,8 @@ class Section:
         not_shown: Sentences that say what the study cannot show.
         answer: Sentences that the section begins with, before its figures; for a study with one question.
         commands: Commands that compute the section again, for one with an answer.
+        repeated: Paragraphs below these commands.
+        others: Sentences on comparisons that the answer only counts.
     """
 
     title: str
@@ -75,6 +81,8 @@ class Section:
     not_shown: Sequence[str] = ()
     answer: Sequence[str] = ()
     commands: Sequence[str] = ()
+    repeated: Sequence[str] = ()
+    others: Sequence[str] = ()
 
 
 def number(estimate: Estimate, digits: int) -> str:

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+from saccade.study.answer.plan import LATER_SEEDS, SEEDS
 
 #: A difference of success rates that would matter. Smaller ones count as none.
 MARGIN = 0.10
 CORE = {"n-0": 0, "n-4": 4, "n-32": 32}  # N of the recipes of the confirmatory tests
 #: N of the recipes that the later stages are compared with, and of those with other numbers.
 SCALED = {f"n-{count}-scaled": count for count in (0, 1, 4, 16, 32, 64)}
+LONGER = {"n-0-long": 0, "n-32-long": 32}  # N of the recipes that are trained for longer
+#: The training seeds of `LONGER` that were added because of the others. They are tested alone.
+NEW_SEEDS = SEEDS[len(LATER_SEEDS) :]
+#: What is concluded from a contrast. `interval`: what its interval shows. `test`: what its p value shows.
+#: `estimate`: nothing, since some of its training seeds were run because of the others. The last two need all
+#: their training seeds.
+Use: TypeAlias = Literal["interval", "test", "estimate"]
 
 
 @dataclass(frozen=True)
@@ -24,12 +34,16 @@ class Contrast:
         weights: The weight of each recipe.
         margin: The smallest absolute value that would matter.
         unit: What a value of 1 is 100 of.
+        seeds: The training seeds that it is restricted to; empty for all that are there.
+        use: What is concluded from it. Other ones than `interval` have `seeds`.
     """
 
     name: str
     weights: Mapping[str, float]
     margin: float = MARGIN
     unit: str = "points"
+    seeds: tuple[int, ...] = ()
+    use: Use = "interval"
 
     @property
     def recipes(self) -> tuple[str, ...]:
@@ -53,16 +67,34 @@ def difference(second: str, first: str) -> Contrast:
     return Contrast(f"{second} minus {first}", {second: 1.0, first: -1.0})
 
 
-def interaction(suffix: str) -> Contrast:
-    """What 32 tokens instead of 4 change in policies of another kind, minus the same in those of `SCALED`."""
-    weights = {f"n-32{suffix}": 1.0, f"n-4{suffix}": -1.0, "n-32-scaled": -1.0, "n-4-scaled": 1.0}
-    name = f"(n-32{suffix} minus n-4{suffix}) minus (n-32-scaled minus n-4-scaled)"
-    return Contrast(name, weights)
+def in_parts(contrast: Contrast) -> tuple[Contrast, ...]:
+    """A contrast over the first training seeds, over those of `NEW_SEEDS`, and over both."""
+    parts: tuple[tuple[str, tuple[int, ...], Use], ...] = (
+        ("first six", LATER_SEEDS, "interval"),
+        ("new six: tested", NEW_SEEDS, "test"),
+        ("all twelve: estimate", SEEDS, "estimate"),
+    )
+    return tuple(
+        replace(contrast, name=f"{contrast.name}, {part}", seeds=seeds, use=use) for part, seeds, use in parts
+    )
+
+
+def interaction(contrast: Contrast, reference: Contrast) -> Contrast:
+    """One difference of recipes minus another.
+
+    Example:
+        >>> found = interaction(difference("b", "a"), difference("d", "c"))
+        >>> found.name, found.weights
+        ('(b minus a) minus (d minus c)', {'b': 1.0, 'a': -1.0, 'd': -1.0, 'c': 1.0})
+    """
+    weights = {**contrast.weights, **{name: -weight for name, weight in reference.weights.items()}}
+    return Contrast(f"({contrast.name}) minus ({reference.name})", weights)
 
 
 def within(suffix: str) -> tuple[Contrast, ...]:
     """What 32 tokens instead of 4 change in policies of another kind, alone and against those of `SCALED`."""
-    return difference(f"n-32{suffix}", f"n-4{suffix}"), interaction(suffix)
+    found = difference(f"n-32{suffix}", f"n-4{suffix}")
+    return found, interaction(found, difference("n-32-scaled", "n-4-scaled"))
 
 
 def slope(counts: Mapping[str, int]) -> Contrast:
@@ -93,7 +125,7 @@ def slope(counts: Mapping[str, int]) -> Contrast:
 #: all three.
 CONFIRMATORY = (difference("n-32", "n-0"), difference("n-32", "n-4"), slope(CORE))
 
-#: Everything else, by stage: intervals without a test.
+#: Everything else, by stage: intervals, and one test, of the pairs that were added.
 EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
     "scaled": (
         difference("n-32-scaled", "n-0-scaled"),
@@ -103,6 +135,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-4-scaled", "n-4"),
         difference("n-32-scaled", "n-32"),
         difference("n-4", "n-0"),
+        interaction(difference("n-32-scaled", "n-0-scaled"), difference("n-32", "n-0")),
     ),
     "alignment": (
         difference("n-4-aligned", "n-4-scaled"),
@@ -121,7 +154,8 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-32-scaled", "n-0-long"),
         difference("n-0-wide", "n-0-scaled"),
         difference("n-0-long", "n-0-scaled"),
-        difference("n-32-long", "n-0-long"),
+        *in_parts(difference("n-32-long", "n-0-long")),
+        interaction(difference("n-32-long", "n-0-long"), difference("n-32-scaled", "n-0-scaled")),
     ),
     "patch-32": within("-patch-32"),
     "vlsa": (*within("-vlsa-0"), *within("-vlsa-4")),

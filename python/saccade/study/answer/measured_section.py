@@ -1,4 +1,4 @@
-"""The report's part on policies that are measured and not judged: specialised tokens, patching, latencies.
+"""The report's part on what is measured, not judged: cheap measures, specialised tokens, patching, latencies.
 
 A number is a mean over the training seeds of a recipe, with the interval of `sign_flip`. A seed without the
 number is left out.
@@ -13,9 +13,11 @@ import pandas as pd
 from matplotlib.figure import Figure as Picture
 
 from saccade.study import figures
+from saccade.study.answer.contrasts import CORE
+from saccade.study.answer.measures import MEASURES, NAMES
 from saccade.study.answer.patching import PATCHING
 from saccade.study.answer.results import ordered
-from saccade.study.answer.specialise import KEPT, LEARNED, RANDOM, SIZES, SPECIALISE, WEIGHTS
+from saccade.study.answer.specialise import KEPT, LEARNED, LOST, RANDOM, SIZES, SPECIALISE, WEIGHTS
 from saccade.study.answer.times import TIMES
 from saccade.study.questions.patching_section import ALL, GROUPS
 from saccade.study.section import Figure, Grid, Prose, number
@@ -39,15 +41,20 @@ def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Gri
     prose = Prose("answer_measured")
     pictures: list[Figure] = []
     grids: list[Grid] = []
+    rows = table[table["kind"] == MEASURES]
+    if len(rows):
+        grids.append(measure_grid(prose.line("caption_measures", place), ordered(rows)))
     rows = table[table["kind"] == SPECIALISE]
     if len(rows):
-        rows = ordered(rows)
+        rows, first = ordered(rows), place + len(grids)
         maps = compared(rows[rows["weight"] == KEPT], "overlap")
-        pictures.append(Figure("overlap", prose.line("caption_picture"), overlap_picture(maps)))
+        picture = overlap_picture(maps)
+        pictures.append(Figure("overlap", prose.line("caption_picture"), picture, f"Table {first}"))
+        learned = rows[rows["tokens"] == LEARNED]
         grids += [
-            overlap_grid(prose.line("caption_overlap", place), maps),
-            removal_grid(prose.line("caption_removal", place + 1), rows),
-            sum_grid(prose.line("caption_sums", place + 2), rows[rows["tokens"] == LEARNED]),
+            overlap_grid(prose.line("caption_overlap", first), maps),
+            removal_grid(prose.line("caption_removal", first + 1), rows),
+            sum_grid(prose.line("caption_sums", first + 2), learned, sum_note(prose, learned)),
         ]
     rows = table[table["kind"] == PATCHING]
     if len(rows):
@@ -75,6 +82,15 @@ def recipes_of(rows: pd.DataFrame) -> list[str]:
     return list(dict.fromkeys(rows["recipe"].astype(str)))
 
 
+def measure_grid(caption: str, rows: pd.DataFrame) -> Grid:
+    """The measures of `measures.NAMES`: a row for each recipe."""
+    lines = []
+    for recipe in recipes_of(rows):
+        some = rows[rows["recipe"] == recipe]
+        lines.append([recipe, str(len(some)), *(shown(mean(some[name]), 3) for name in NAMES)])
+    return Grid(caption, ("recipe", "policies", *NAMES.values()), lines)
+
+
 def compared(rows: pd.DataFrame, column: str) -> Compared:
     """A column of `SPECIALISE`, of one weight."""
     found = {}
@@ -90,7 +106,7 @@ def overlap_picture(maps: Compared) -> Picture:
     differences = {recipe: of_recipe[-1] for recipe, of_recipe in maps.items()}
     known = {recipe: one for recipe, one in differences.items() if one is not None}
     label = "overlap of maps, learned minus random tokens"
-    return figures.estimates(list(known), list(known.values()), label, reference=0.0)
+    return figures.estimates(list(known), list(known.values()), label, reference=0.0, colour="black")
 
 
 def overlap_grid(caption: str, maps: Compared) -> Grid:
@@ -117,7 +133,20 @@ def removal_grid(caption: str, rows: pd.DataFrame) -> Grid:
     return Grid(caption, ("recipe", "weight", *COMPARED, "largest effect, of that of all"), lines)
 
 
-def sum_grid(caption: str, rows: pd.DataFrame) -> Grid:
+def sum_note(prose: Prose, rows: pd.DataFrame) -> str:
+    """What `sum_grid` shows of the core's policies with most tokens; nothing if they are not measured.
+
+    Args:
+        prose: The template.
+        rows: Those of learned tokens.
+    """
+    recipe = list(CORE)[-1]
+    some = rows[(rows["recipe"] == recipe) & (rows["weight"] == LOST)]
+    numbers = {f"{name}_{size}": mean(some[f"{name}_{size}"]) for size in ("half", "all") for name in PARTS}
+    return "" if None in numbers.values() else prose.line("sums", CORE[recipe], **numbers)
+
+
+def sum_grid(caption: str, rows: pd.DataFrame, note: str) -> Grid:
     """Whether the changes by learned tokens add up: a row for each recipe and weight."""
     names = {f"{size}: {label}": f"{name}_{size}" for size in SIZES for name, label in PARTS.items()}
     lines = []
@@ -125,7 +154,7 @@ def sum_grid(caption: str, rows: pd.DataFrame) -> Grid:
         for weight in WEIGHTS:
             some = rows[(rows["recipe"] == recipe) & (rows["weight"] == weight)]
             lines.append([recipe, weight, *(shown(mean(some[name])) for name in names.values())])
-    return Grid(caption, ("recipe", "weight", *names), lines)
+    return Grid(caption, ("recipe", "weight", *names), lines, note)
 
 
 def patching_grid(caption: str, rows: pd.DataFrame) -> Grid:

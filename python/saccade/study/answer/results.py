@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-from scipy.stats import rankdata
 
 from saccade.errors import InputError
 from saccade.study.answer.arms import ARMS
 from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, MARGIN, Contrast
+from saccade.study.answer.correlations import correlated
 from saccade.study.answer.measured import MEASURED
-from saccade.study.answer.measures import CUT, MEASURES, NAMES
 from saccade.study.answer.plan import CORE_STAGE, PILOT, Plan
 from saccade.study.answer.times import TIMES
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.sign_flip import SignFlip, sign_flip
-from saccade.study.statistics import CONFIDENCE, Estimate, bootstrap, holm
+from saccade.study.statistics import CONFIDENCE, Estimate, holm
 from saccade.study.table import truths
 
 Float64Array = npt.NDArray[np.float64]
 #: In words: `more` or `less` for a contrast that is not zero, `small` for one within its margin.
-Finding: TypeAlias = Literal["more", "less", "small", "undecided", "not measured"]
+Finding: TypeAlias = Literal["more", "less", "small", "undecided", "not measured", "estimate"]
+#: A policy whose held-out loss is above this counts as one that stopped on the first plateau of its training.
+#: Chosen after the core was seen, whose losses are below 0.13 or above 0.20.
+PLATEAU = 0.15
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,20 @@ class Judged:
     rates: Mapping[str, Mapping[int, float]]
     missing: Sequence[Missing]
 
-    def paired(self, recipes: Sequence[str]) -> tuple[list[int], Float64Array]:
-        """The training seeds that all recipes have, and their rates `(seeds, recipes)`."""
-        have = [set(self.rates.get(recipe, {})) for recipe in recipes]
+    def paired(
+        self, recipes: Sequence[str], among: Collection[int] = ()
+    ) -> tuple[list[int], list[int], Float64Array]:
+        """The training seeds that all recipes have, those that only some have, and rates `(seeds, recipes)`.
+
+        Args:
+            recipes: Their names.
+            among: The training seeds that count; empty for all.
+        """
+        have = [{seed for seed in self.rates.get(one, {}) if not among or seed in among} for one in recipes]
         seeds = sorted(set.intersection(*have))
         rates = [[self.rates[recipe][seed] for recipe in recipes] for seed in seeds]
-        return seeds, np.array(rates, dtype=float).reshape(len(seeds), len(recipes))
+        found = np.array(rates, dtype=float).reshape(len(seeds), len(recipes))
+        return seeds, sorted(set.union(*have) - set(seeds)), found
 
 
 @dataclass(frozen=True)
@@ -72,7 +82,8 @@ class ContrastResult:
         seeds: The training seeds that were used.
         unpaired: Those that some of the recipes have and others lack.
         values: The contrast at each seed.
-        test: The exact test, or None without a seed.
+        test: The exact test, or None without a seed; for a contrast that needs all its training seeds, None
+            without one of them.
         corrected: Its p value after Holm's correction; None if the test is exploratory.
     """
 
@@ -92,10 +103,18 @@ class ContrastResult:
            exploratory contrast, its interval excludes zero.
         3. `small`: the interval is inside the margin on both sides.
         4. `undecided`: anything else, and whatever has no interval.
+
+        A contrast with a test of its own has `more` or `less` if this rejects at the 5 % level, and is
+        `undecided` otherwise. One that is only an `estimate` has no other finding.
         """
         if self.test is None:
             return "not measured"
+        if self.contrast.use == "estimate":
+            return "estimate"
         found, margin = self.test.difference, self.contrast.margin
+        if self.contrast.use == "test":
+            rejected = self.test.p_value <= 1 - CONFIDENCE
+            return ("more" if found.value > 0 else "less") if rejected else "undecided"
         if self.corrected is None:
             return finding(found, margin)
         if self.corrected <= 1 - CONFIDENCE:
@@ -195,6 +214,12 @@ def losses(table: pd.DataFrame, found: Judged) -> Losses:
     return Losses(arrays, correlated(pairs))
 
 
+def stopped(table: pd.DataFrame, recipes: Collection[str]) -> tuple[int, int]:
+    """How many policies of recipes stopped on the plateau of their training, and the number of all."""
+    trained = table[(table["kind"] == "training") & table["recipe"].isin(list(recipes))]
+    return int((trained["validation_loss"] > PLATEAU).sum()), len(trained)
+
+
 def ordered(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows of policies in the order of stage, N, recipe and training seed."""
     stages = [CORE_STAGE, *EXPLORATORY]
@@ -278,80 +303,13 @@ def pilots(table: pd.DataFrame) -> list[Pilot]:
     return found
 
 
-@dataclass(frozen=True)
-class Relation:
-    """How well a measure of policies predicts what a cut does to their success.
-
-    Attributes:
-        measure: Its name in `measures.NAMES`.
-        policies: Number of policies.
-        correlation: Spearman's rank correlation with the success that the cut costs; NaN where one of the two
-            is the same for all policies.
-    """
-
-    measure: str
-    policies: int
-    correlation: Estimate
-
-
-def relations(
-    table: pd.DataFrame,
-    found: Judged,
-    tasks: Sequence[str],
-    seeds: Sequence[int],
-    stages: Sequence[str] = (CORE_STAGE, *EXPLORATORY),
-) -> list[Relation]:
-    """The relations of all measures, over the policies that are measured and judged with and without the cut.
-
-    Args:
-        table, tasks, seeds: As of `judged`.
-        found: The unchanged policies.
-        stages: The stages whose policies are used.
-    """
-    rows = table[table["kind"] == MEASURES]
-    rows = rows[rows["stage"].isin(stages)] if len(rows) else rows
-    if rows.empty:
-        return []
-    cut = judged(table, tasks, seeds, CUT).rates
-    results = []
-    for name in NAMES:
-        pairs = []
-        for _, row in rows[rows[name].notna()].iterrows():
-            recipe, seed = str(row["recipe"]), int(row["training_seed"])
-            if seed in cut.get(recipe, {}) and seed in found.rates.get(recipe, {}):
-                lost = round(found.rates[recipe][seed] - cut[recipe][seed], 12)
-                pairs.append((float(row[name]), lost))
-        if pairs:
-            results.append(Relation(name, len(pairs), correlated(np.array(pairs))))
-    return results
-
-
-def correlated(pairs: Float64Array) -> Estimate:
-    """The rank correlation of `(pairs, 2)` with its bootstrap interval."""
-    return bootstrap(pairs, range(len(pairs)), rank_correlation, vectorized=True)
-
-
-def rank_correlation(pairs: Float64Array) -> Float64Array:
-    """Spearman's correlation of `(..., pairs, 2)`; NaN where a column is constant.
-
-    Example:
-        >>> rank_correlation(np.array([[1.0, 10.0], [2.0, 40.0], [9.0, 30.0]]))
-        array(0.5)
-    """
-    ranks = rankdata(pairs, axis=-2)
-    centred = ranks - ranks.mean(axis=-2, keepdims=True)
-    squares = (centred**2).sum(axis=-2).prod(axis=-1)
-    products = centred.prod(axis=-1).sum(axis=-1)
-    return np.asarray(np.where(squares > 0, products / np.sqrt(np.where(squares > 0, squares, 1)), np.nan))
-
-
 def over_seeds(found: Judged, contrast: Contrast) -> ContrastResult:
     """Tests a contrast over the training seeds for which all its recipes are complete."""
-    seeds, rates = found.paired(contrast.recipes)
-    have = [set(found.rates.get(recipe, {})) for recipe in contrast.recipes]
+    seeds, unpaired, rates = found.paired(contrast.recipes, contrast.seeds)
     values = contrast.of(rates)
-    test = sign_flip(values) if seeds else None
-    return ContrastResult(contrast, seeds, sorted(set.union(*have) - set(seeds)), list(values), test)
+    complete = contrast.use == "interval" or len(seeds) == len(contrast.seeds)
+    test = sign_flip(values) if seeds and complete else None
+    return ContrastResult(contrast, seeds, unpaired, list(values), test)
 
 
 def confirmed(found: Judged) -> list[ContrastResult]:

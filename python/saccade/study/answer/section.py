@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,18 +15,19 @@ from matplotlib.figure import Figure as Picture
 
 from saccade.study import figures
 from saccade.study.answer.arms import ARMS
-from saccade.study.answer.contrasts import CORE, MARGIN, SCALED
+from saccade.study.answer.contrasts import CORE, LONGER, MARGIN, NEW_SEEDS, SCALED
 from saccade.study.answer.measured_section import of_measured
 from saccade.study.answer.measures import CUT, MEASURES, NAMES
 from saccade.study.answer.plan import CORE_STAGE, Plan
+from saccade.study.answer.relations import Relation, relations
 from saccade.study.answer.results import (
+    PLATEAU,
     Change,
     ContrastResult,
     Judged,
     Losses,
     Pilot,
     Progress,
-    Relation,
     changes,
     confirmed,
     explored,
@@ -34,9 +37,9 @@ from saccade.study.answer.results import (
     over_seeds,
     pilots,
     progress,
-    relations,
+    stopped,
 )
-from saccade.study.section import FEWEST, Figure, Grid, Prose, Section, number, points
+from saccade.study.section import Figure, Grid, Prose, Section, number, points
 from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import Estimate, scaled
 from saccade.study.table import Provenance
@@ -56,7 +59,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
     core = next(one for one in stages if one.stage == CORE_STAGE)
     results = found if core.done == core.planned else None
     known = known_facts(plan, found, core, tasks, seeds)
-    pictures, grids = [], list[Grid]()
+    pictures, grids, others_said = [], list[Grid](), list[str]()
     if results is None:
         prose = Prose("answer", **known, places={})
         answer = prose.points("not_judged")
@@ -70,7 +73,6 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         related = relations(table, found, tasks, seeds, [CORE_STAGE])
         names = ["tests", "policies", *others, *by_stage, *([MEASURES] if everywhere else [])]
         places = {name: place for place, name in enumerate(names, start=1)}
-        predictive = [one for one in related if predicts(one)]
         of_core, by_task = losses(table, found), judged_by_task(table, tasks, seeds)
         prose = Prose(
             "answer",
@@ -80,14 +82,15 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
             cuts={one.recipe: one for one in changed if one.arm == CUT},
             contrasts={one.contrast.name: (one, stage) for stage, of in others.items() for one in of},
             related=related,
-            predictive=predictive,
-            others=[one for one in related if one not in predictive],
             of_loss=of_core.correlation,
+            stopped=functools.partial(stopped, table),
+            **functions(plan, others),
         )
-        answer = prose.points("answer")
+        answer, others_said = prose.points("answer"), prose.points("others")
         pictures.append(Figure("success", prose.line("caption_success"), success_picture(found)))
-        pictures.append(Figure("losses", prose.line("caption_losses"), loss_picture(of_core)))
-        grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, mean_losses(table))]
+        caption = prose.line("caption_losses")
+        pictures.append(Figure("losses", caption, loss_picture(of_core), f"Table {places['policies']}"))
+        grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, table)]
         for stage, contrasts in others.items():
             caption = prose.line("caption_contrasts", places[stage], stage)
             grids.append(contrast_grid(caption, contrasts, by_task))
@@ -112,6 +115,8 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         not_shown=prose.points("not_shown"),
         answer=answer,
         commands=COMMANDS,
+        repeated=prose.paragraphs("repeated"),
+        others=others_said,
     )
 
 
@@ -134,17 +139,37 @@ def known_facts(
         "num_seeds": len({one.seed for one in policies}),
         "head": policies[0].training,
         "scaled": next((one.training for one in plan.recipes if one.stage == "scaled"), None),
+        "longer": next((one.training for one in plan.recipes if one.name in LONGER), None),
+        "new_seeds": NEW_SEEDS,
+        "plateau": PLATEAU,
+        "counts": CORE,
         "backbone": policies[0].backbone.training,
         "missing": found.missing,
     }
 
 
-def predicts(related: Relation) -> bool:
-    """Whether a measure is correlated with what the cut costs: its interval excludes zero, over enough
-    policies.
+def functions(plan: Plan, others: Mapping[str, Sequence[ContrastResult]]) -> dict[str, Any]:
+    """The functions of the template.
+
+    Args:
+        plan: The plan of the study.
+        others: The exploratory contrasts by stage.
     """
-    found = related.correlation
-    return related.policies >= FEWEST and (found.low > 0 or found.high < 0)
+
+    def stages_of(recipes: Collection[str]) -> str:
+        """The stages that train recipes, as the command takes them."""
+        return ",".join(dict.fromkeys(one.stage for one in plan.recipes if one.name in recipes))
+
+    def findings(names: Collection[str]) -> Counter[str]:
+        """How often contrasts have each finding."""
+        found = itertools.chain.from_iterable(others.values())
+        return Counter(one.finding for one in found if one.contrast.name in names)
+
+    def stages_with(names: Collection[str]) -> list[str]:
+        """The stages in whose tables contrasts are."""
+        return [stage for stage, of in others.items() if any(one.contrast.name in names for one in of)]
+
+    return {"stages_of": stages_of, "findings": findings, "stages_with": stages_with}
 
 
 def mean_losses(table: pd.DataFrame) -> dict[str, float]:
@@ -159,11 +184,12 @@ def mean_of(rates: Mapping[int, float]) -> Estimate:
 
 
 def success_picture(found: Judged) -> Picture:
-    """Success over N, in the core and with the released scale of the first weights, as far as that is there.
+    """Success over N: in the core, with larger first weights, and with longer training.
 
-    A line for each training seed, and the means with their intervals, filled in the core.
+    What is not there is left out. There is a line for each training seed, and the means with their intervals,
+    filled in the core.
     """
-    plots = {"core": CORE, "larger first weights, scaled (exploratory)": SCALED}
+    plots = {"core": CORE, "scaled (exploratory)": SCALED, "longer (exploratory)": LONGER}
     plots = {title: {one: n for one, n in of.items() if one in found.rates} for title, of in plots.items()}
     plots = {title: counts for title, counts in plots.items() if counts}
     picture, all_axes = figures.new_picture(height=4.0, columns=len(plots))
@@ -171,9 +197,10 @@ def success_picture(found: Judged) -> Picture:
         in_core = counts.keys() <= CORE.keys()
         show_success(axes, {recipe: found.rates[recipe] for recipe in counts}, filled=in_core)
         axes.set_xticks(range(len(counts)), [str(count) for count in counts.values()])
-        axes.set_xlabel("number of future tokens, N")
-        axes.set_ylabel("success, %")
+        axes.set_xlim(-0.5, len(counts) - 0.5)
+        axes.set_xlabel("future tokens, N")
         axes.set_title(title, fontsize="medium")
+    all_axes[0].set_ylabel("success, %")
     return picture
 
 
@@ -209,6 +236,7 @@ def loss_picture(of_core: Losses) -> Picture:
     for (recipe, pairs), marker, fill in zip(of_core.policies.items(), "o^s", fills, strict=False):
         style: dict[str, Any] = {"marker": marker, "facecolors": fill, "edgecolors": "black", "zorder": 3}
         axes.scatter(pairs[:, 0], 100 * pairs[:, 1], s=36, label=f"N = {CORE[recipe]}", **style)
+    axes.axvline(PLATEAU, color="0.5", linewidth=1, linestyle=":")
     axes.set_xlabel("held-out loss")
     axes.set_ylim(0, 100)
     axes.set_ylabel("success, %")
@@ -218,17 +246,18 @@ def loss_picture(of_core: Losses) -> Picture:
     return picture
 
 
-def policy_grid(
-    prose: Prose, found: Judged, by_task: Mapping[str, Judged], losses: Mapping[str, float]
-) -> Grid:
-    """Success of every policy, recipe by recipe, and the means in each task."""
+def policy_grid(prose: Prose, found: Judged, by_task: Mapping[str, Judged], table: pd.DataFrame) -> Grid:
+    """Success of every policy, recipe by recipe, the means in each task, and the held-out losses."""
+    losses = mean_losses(table)
     seeds = sorted({seed for rates in found.rates.values() for seed in rates})
     lines = []
     for recipe, rates in found.rates.items():
         shown = [f"{100 * rates[seed]:.1f}" if seed in rates else "" for seed in seeds]
         means = [points(mean_of(one.rates[recipe])) for one in by_task.values()]
-        lines.append([recipe, points(mean_of(rates)), *means, f"{losses[recipe]:.4f}", *shown])
-    columns = ("recipe", "mean, %", *by_task, "held-out loss", *(f"seed {seed}" for seed in seeds))
+        of_loss = [f"{losses[recipe]:.4f}", "{} of {}".format(*stopped(table, [recipe]))]
+        lines.append([recipe, points(mean_of(rates)), *means, *of_loss, *shown])
+    of_loss = ["held-out loss", f"above {PLATEAU:g}"]
+    columns = ("recipe", "mean, %", *by_task, *of_loss, *(f"seed {seed}" for seed in seeds))
     return Grid(prose.line("caption_policies", 2), columns, lines)
 
 
@@ -246,12 +275,21 @@ def test_grid(prose: Prose, tests: Sequence[ContrastResult], by_task: Mapping[st
 
 
 def contrast_grid(caption: str, results: Sequence[ContrastResult], by_task: Mapping[str, Judged]) -> Grid:
-    """The exploratory contrasts of a stage, together and in each task alone."""
-    lines = [
-        [one.contrast.name, str(len(one.seeds)), percent(one), one.finding, *in_tasks(one, by_task)]
-        for one in results
-    ]
-    return Grid(caption, ("contrast", "pairs", "points (95 % interval)", "finding", *by_task), lines)
+    """The exploratory contrasts of a stage, together and in each task alone; p values if there are tests."""
+    tested = any(one.contrast.use == "test" for one in results)
+    lines = []
+    for one in results:
+        p_values = [p_value(one)] if tested else []
+        numbers = [str(len(one.seeds)), percent(one), *p_values, one.finding]
+        lines.append([one.contrast.name, *numbers, *in_tasks(one, by_task)])
+    p_column = ["p"] if tested else []
+    columns = ("contrast", "pairs", "points (95 % interval)", *p_column, "finding", *by_task)
+    return Grid(caption, columns, lines)
+
+
+def p_value(result: ContrastResult) -> str:
+    """The p value of a contrast with a test of its own; nothing for others."""
+    return f"{result.test.p_value:.4f}" if result.test and result.contrast.use == "test" else ""
 
 
 def in_tasks(result: ContrastResult, by_task: Mapping[str, Judged]) -> list[str]:
@@ -275,12 +313,14 @@ def relation_grid(caption: str, of_core: Sequence[Relation], of_all: Sequence[Re
     lines = []
     for one in of_all:
         shown = [
-            [str(found.policies), number(found.correlation, digits=2)] if found else ["0", ""]
+            [str(found.policies), *(number(each, digits=2) for each in (found.within, found.together))]
+            if found
+            else ["0", "", ""]
             for found in (core.get(one.measure), one)
         ]
         lines.append([NAMES[one.measure], *itertools.chain.from_iterable(shown)])
-    numbers = "rank correlation (95 % interval)"
-    return Grid(caption, ("measure", "of the core", numbers, "of all", numbers), lines)
+    numbers = ("within recipes (95 % interval)", "of all N together")
+    return Grid(caption, ("measure", "of the core", *numbers, "of all", *numbers), lines)
 
 
 def progress_grid(caption: str, stages: Sequence[Progress]) -> Grid:
