@@ -2,8 +2,9 @@
 
 `python studies/answer/reanalysis_stages.py` prints, for each stage that has rows, the check of the data, the
 success and held-out losses of each recipe, and the differences between recipes with their intervals: for both
-tasks together, and for each alone. They are exploratory, so there are no p values. At the end comes the one
-test of these stages, that of the new pairs with more steps. It shares no code with `saccade study answer`.
+tasks together, and for each alone. They are exploratory, so there are no p values. Then come the one
+test of these stages, that of the new pairs with more steps, and the same policies with other numbers of
+Euler steps, the core's among them. It shares no code with `saccade study answer`.
 Differences are in percentage points; the slope is in points per unit of log2(N + 1).
 """
 
@@ -20,22 +21,42 @@ from reanalysis import EPISODES, PLAN, RESULTS, TASKS, Row, expect, integer, int
 Policy = tuple[str, int]  # a recipe and a training seed
 Contrast = tuple[str, dict[str, float]]  # its name, and what the success of each recipe is multiplied by
 
-STAGES = ("scaled", "alignment", "numbers", "compute")
+VLSA, VISION = "vlsa", ("patch-32", "patch-8", "two-cameras")
+STAGES = ("scaled", "alignment", "numbers", "compute", VISION[0], VLSA, *VISION[1:])
+# The arms of other numbers of Euler steps than four, which are those of the arm "plain".
+EULER = ("steps of 1", "steps of 2", "steps of 8")
 COUNTS = (0, 1, 4, 16, 32, 64)
 PARTS = {"both tasks": TASKS, **{task: (task,) for task in TASKS}}
+CORE = ("n-0", "n-4", "n-32")
 BASE = ("n-0-scaled", "n-4-scaled", "n-32-scaled")
 # Columns of a training row that may differ between policies of a stage, beside the results and N.
-VARIED: dict[str, set[str]] = {"scaled": set(), "numbers": set()}
+VARIED: dict[str, set[str]] = {stage: set() for stage in STAGES}
 VARIED["alignment"] = {"alignment_loss", "validation_alignment_loss"}
 VARIED["compute"] = {"width", "steps", "category_std", "language_width", "saccade"}
+VARIED[VLSA] = {"vl_num_layers"}
+# Those that, beside these, may differ between the stage and scaled. A start is a backbone's weights.
+APART: dict[str, set[str]] = {stage: {"stage", "saccade"} for stage in STAGES}
+APART["alignment"] |= {"alignment_weight"}
+APART["patch-32"] |= {"patch_size", "num_vl_tokens", "start_sha256"}
+APART["patch-8"] |= APART["patch-32"]
+APART["two-cameras"] |= {"num_cameras", "num_vl_tokens", "start_sha256", "demonstrations_sha256"}
 # What the end of a recipe's name says of its settings.
 SAID = {"-wide": {"width": 104.0}, "-long": {"steps": 1628.0}, "-aligned": {"alignment_weight": 0.2}}
+SAID["-patch-32"] = {"patch_size": 32.0, "num_vl_tokens": 61.0}
+SAID["-patch-8"] = {"patch_size": 8.0, "num_vl_tokens": 241.0}
+SAID["-two-cameras"] = {"num_cameras": 2.0, "num_vl_tokens": 74.0}
+SAID |= {f"-vlsa-{blocks}": {"vl_num_layers": float(blocks)} for blocks in (0, 4)}
 FIRST_SEEDS, NEW_SEEDS = range(6), range(6, 12)  # of the recipes that end in -long the new ones are tested
 
 
 def minus(a: str, b: str) -> Contrast:
     """The difference of two recipes."""
     return f"{a} - {b}", {a: 1, b: -1}
+
+
+def less(a: Contrast, b: Contrast) -> Contrast:
+    """The difference of two contrasts that have no recipe in common."""
+    return f"({a[0]}) - ({b[0]})", a[1] | {recipe: -weight for recipe, weight in b[1].items()}
 
 
 def slope() -> Contrast:
@@ -51,7 +72,8 @@ def contrasts(stage: str) -> list[Contrast]:
     """The contrasts of a stage."""
     none, four, many = BASE
     if stage == "scaled":
-        return [minus(many, none), minus(many, four), minus(four, none)]
+        pairs = [(many, none), (many, four), (four, none)]
+        return [*(minus(*pair) for pair in pairs), less(minus(many, none), minus("n-32", "n-0"))]
     if stage == "alignment":
         pairs = [("n-32-aligned", many), ("n-4-aligned", four), ("n-32-aligned", "n-4-aligned")]
         return [minus(*pair) for pair in (*pairs, ("n-32-aligned", none))]
@@ -59,8 +81,32 @@ def contrasts(stage: str) -> list[Contrast]:
         pairs = [("n-1-scaled", none), ("n-16-scaled", four), ("n-64-scaled", many)]
         pairs += [("n-64-scaled", none), ("n-64-scaled", "n-1-scaled")]
         return [*(minus(*pair) for pair in pairs), slope()]
-    pairs = [(many, "n-0-wide"), (many, "n-0-long"), ("n-0-wide", none), ("n-0-long", none)]
-    return [minus(*pair) for pair in (*pairs, ("n-32-long", many), ("n-32-long", "n-0-long"))]
+    if stage == "compute":
+        pairs = [(many, "n-0-wide"), (many, "n-0-long"), ("n-0-wide", none), ("n-0-long", none)]
+        pairs += [("n-32-long", many), ("n-32-long", "n-0-long")]
+        longer = less(minus("n-32-long", "n-0-long"), minus(many, none))
+        return [*(minus(*pair) for pair in pairs), longer]
+    found = []
+    for kind in ("vlsa-0", "vlsa-4") if stage == VLSA else (stage,):
+        mine = minus(f"n-32-{kind}", f"n-4-{kind}")
+        found += [mine, less(mine, minus(many, four))]
+        found += [minus(f"n-32-{kind}", many), minus(f"n-4-{kind}", four)]
+    return found
+
+
+def in_arm(recipe: str, arm: str) -> str:
+    """The name of a recipe's policies in an arm; in the arm "plain", it is the recipe's."""
+    return recipe if arm in ("", "plain") else f"{recipe} in {arm}"
+
+
+def euler_contrasts(end: str, arm: str) -> list[Contrast]:
+    """For the recipes with the same end of the name: an arm against plain, and N against N in both."""
+    recipes = {n: f"n-{n}{end}" for n in COUNTS}
+    found = [minus(in_arm(recipe, arm), recipe) for recipe in recipes.values()]
+    for base in (0, 4):
+        there, plain = (minus(in_arm(recipes[32], a), in_arm(recipes[base], a)) for a in (arm, "plain"))
+        found += [there, less(there, plain)]
+    return found
 
 
 def exact_interval(values: Sequence[float], level: float = 0.05) -> tuple[float, float] | None:
@@ -90,8 +136,8 @@ def verified(values: Sequence[float], ends: tuple[float, float], step: float = 1
 
 
 def policy(row: Row) -> Policy:
-    """The recipe and the training seed of a row."""
-    return row["recipe"], integer(row["training_seed"])
+    """The recipe, with the arm if that is not "plain", and the training seed of a row."""
+    return in_arm(row["recipe"], row["arm"]), integer(row["training_seed"])
 
 
 def named(policies: Iterable[Policy]) -> str:
@@ -101,17 +147,20 @@ def named(policies: Iterable[Policy]) -> str:
 
 
 class Table:
-    """The policies of the stages, and how many episodes those solved that ran all of them."""
+    """The policies of core and stages, and how many episodes those solved that ran all of them."""
 
     def __init__(self, rows: list[Row]) -> None:
-        mine = [row for row in rows if row["stage"] in STAGES]
+        mine = [row for row in rows if row["stage"] in ("core", *STAGES)]
         self.trained = [row for row in mine if row["kind"] == "training"]
-        self.episodes = [row for row in mine if row["kind"] == "episodes" and row["arm"] == "plain"]
+        self.episodes = [r for r in mine if r["kind"] == "episodes" and r["arm"] in ("plain", *EULER)]
         wanted = Counter((task, episode) for task in TASKS for episode in range(EPISODES))
         ran = {policy(row): Counter[tuple[str, int]]() for row in (*self.trained, *self.episodes)}
         for row in self.episodes:
             ran[policy(row)][row["task"], integer(row["seed"])] += 1
         self.partial = {one for one, episodes in ran.items() if episodes != wanted}
+        # What a policy did in an arm counts only if it ran all episodes in the arm "plain", too.
+        plain = {policy(row): (row["recipe"], integer(row["training_seed"])) for row in self.episodes}
+        self.partial |= {one for one, same in plain.items() if same in self.partial or same not in ran}
         self.whole = ran.keys() - self.partial
         self.won = Counter((policy(r), r["task"]) for r in self.episodes if r["success"] == "True")
 
@@ -138,6 +187,7 @@ def planned(row: Row) -> bool:
     """Whether a policy's settings are the README's, as far as it and the recipe's name say them."""
     number = integer(row["recipe"].split("-")[1])
     settings: dict[str, float] = {**PLAN, "num_future_tokens": number, "steps": 1000}
+    settings |= {"num_cameras": 3, "num_vl_tokens": 97}
     for end, values in SAID.items():
         settings |= values if row["recipe"].endswith(end) else {}
     width = float(row["width"])
@@ -148,15 +198,16 @@ def planned(row: Row) -> bool:
 
 
 def check_all(table: Table, rows: list[Row]) -> None:
-    """Compare what all these stages share with what the README says of it."""
-    print("Check of the data of all these stages")
+    """Compare what these stages and the core share with what the README says of it."""
+    print("Check of the data of all these stages, and of the core")
     expect("success is True or False", {row["success"] for row in table.episodes} <= {"True", "False"})
     failed = {integer(row["control_steps"]) for row in table.episodes if row["success"] == "False"}
     expect("every failure ran 100 steps", failed <= {100})
     ran = {(integer(row["control_steps"]), integer(row["chunks"])) for row in table.episodes}
     expect("a chunk is 8 steps", all(chunks == math.ceil(steps / 8) for steps, chunks in ran))
-    names = {(row["policy"], "{}-seed-{}".format(*policy(row))) for row in (*table.trained, *table.episodes)}
-    expect("a policy's name is its recipe and seed", all(name == parts for name, parts in names))
+    names = {(r["policy"], r["recipe"], r["training_seed"]) for r in (*table.trained, *table.episodes)}
+    right = all(name == f"{recipe}-seed-{integer(seed)}" for name, recipe, seed in names)
+    expect("a policy's name is its recipe and seed", right)
     hashes = [row["checkpoint_sha256"] for row in rows if row["kind"] == "training"]
     expect(f"{len(hashes)} different checkpoints, with core and pilots", len(set(hashes)) == len(hashes))
     expect("one settings_sha256 in the table", len({row["settings_sha256"] for row in rows}) == 1)
@@ -172,23 +223,24 @@ def check_all(table: Table, rows: list[Row]) -> None:
 def check_stage(table: Table, stage: str, trained: list[Row]) -> None:
     """Compare the policies of one stage with what the README says of it."""
     recipes = {name for _, weights in contrasts(stage) for name in weights}
-    recipes -= set() if stage == "scaled" else set(BASE)
+    recipes -= set(CORE) if stage == "scaled" else set(BASE)
     twelve = {name for name in recipes if stage == "scaled" or name.endswith("-long")}
     wanted = {(name, seed) for name in recipes for seed in range(12 if name in twelve else 6)}
     found = Counter(map(policy, trained))
     missing, others = wanted - set(found), set(found) - wanted
     expect(f"{len(wanted)} policies are there, but for: {named(missing)}", not missing)
     expect(f"each once, and beside them: {named(others)}", not others and set(found.values()) == {1})
-    judged = {policy(row) for row in table.episodes if row["stage"] == stage}
+    judged = {policy(row) for row in table.episodes if row["stage"] == stage and row["arm"] == "plain"}
     expect(f"episodes only of those, but for: {named(judged - set(found))}", judged <= set(found))
     left = table.partial & (judged | set(found))
     expect(f"each ran episodes 0 to 74 of both tasks once; left out: {named(left)}", not left)
     may = RESULTS | VARIED[stage]
     odd = differing(trained, may)
     expect(f"no columns differ that should not, but for: {sorted(odd)}", not odd)
-    may |= {"stage", "saccade"} | ({"alignment_weight"} if stage == "alignment" else set())
+    may |= APART[stage]
     odd = differing([*trained, *(row for row in table.trained if row["stage"] == "scaled")], may)
-    expect(f"nor from scaled, beside the commit, but for: {sorted(odd)}", not odd)
+    apart = sorted(APART[stage] - {"stage"})
+    expect(f"nor from scaled, beside {apart}, but for: {sorted(odd)}", not odd)
     expect("settings are the README's", all(map(planned, trained)))
 
 
@@ -209,10 +261,10 @@ def describe(table: Table, trained: list[Row]) -> None:
         print(f"held-out loss of {len(losses)}: {min(losses):.4f} to {max(losses):.4f}")
 
 
-def differences(table: Table, stage: str) -> None:
+def differences(table: Table, wanted: Sequence[Contrast]) -> None:
     """Print the contrasts whose recipes are there, for both tasks and for each, and check their intervals."""
     right, there = True, {recipe for recipe, _ in table.whole}
-    for name, weights in (contrast for contrast in contrasts(stage) if set(contrast[1]) <= there):
+    for name, weights in (contrast for contrast in wanted if set(contrast[1]) <= there):
         print(f"  {name}: {len(table.seeds(weights))} pairs, training seeds {table.seeds(weights)}")
         for part, tasks in PARTS.items() if table.seeds(weights) else ():
             values = table.values(weights, tasks)
@@ -240,6 +292,39 @@ def test_new(table: Table) -> None:
             print(f"  p = {float(sign_flip(values)):.6f}" if tested else "", [round(v, 2) for v in values])
 
 
+def euler(table: Table, arm: str) -> None:
+    """Print what another number of Euler steps does to the same policies, recipes of one kind together."""
+    mine = [row for row in table.episodes if row["arm"] == arm]
+    print(f"\n{arm} in the same policies, where plain is 4" if mine else f"\n{arm}: no rows")
+    if not mine:
+        return
+    left = {policy(row) for row in mine} & table.partial
+    print(f"  left out, since they did not run all episodes in both arms: {named(left)}")
+    expect(
+        "only of policies that were trained",
+        {r["policy"] for r in mine} <= {r["policy"] for r in table.trained},
+    )
+    plain = {(r["policy"], r["task"], r["seed"]): r for r in table.episodes if r["arm"] == "plain"}
+    pairs = [(row, plain[row["policy"], row["task"], row["seed"]]) for row in mine]
+    for name in ("success", "control_steps"):
+        print(f"  {name} differs in {sum(a[name] != b[name] for a, b in pairs)} of {len(pairs)} episodes")
+    print(
+        f"  commits: {sorted({a['saccade'] for a, _ in pairs})}, plain {sorted({b['saccade'] for _, b in pairs})}"
+    )
+    for end in sorted({"".join(f"-{part}" for part in row["recipe"].split("-")[2:]) for row in mine}):
+        print(f"  recipes n-N{end}")
+        for recipe in (f"n-{n}{end}" for n in COUNTS):
+            seeds = table.seeds([in_arm(recipe, arm)])
+            for which in (arm, "plain") if seeds else ():
+                rates = (
+                    statistics.fmean(table.rate((in_arm(recipe, which), s), tasks) for s in seeds)
+                    for tasks in PARTS.values()
+                )
+                shown = ", ".join(f"{part} {rate:.4f}" for part, rate in zip(PARTS, rates, strict=True))
+                print(f"  {in_arm(recipe, which)}: success of {len(seeds)}: {shown}")
+        differences(table, euler_contrasts(end, arm))
+
+
 def main() -> None:
     """Print everything."""
     with Path(__file__).with_name("answer.csv").open(newline="", encoding="utf-8") as file:
@@ -252,8 +337,10 @@ def main() -> None:
         if trained:
             check_stage(table, stage, trained)
             describe(table, trained)
-            differences(table, stage)
+            differences(table, contrasts(stage))
     test_new(table)
+    for arm in EULER:
+        euler(table, arm)
 
 
 if __name__ == "__main__":
