@@ -305,23 +305,21 @@ def euler(table: Table, arm: str) -> None:
         {r["policy"] for r in mine} <= {r["policy"] for r in table.trained},
     )
     plain = {(r["policy"], r["task"], r["seed"]): r for r in table.episodes if r["arm"] == "plain"}
-    pairs = [(row, plain[row["policy"], row["task"], row["seed"]]) for row in mine]
+    keyed = [(row, (row["policy"], row["task"], row["seed"])) for row in mine]
+    pairs = [(row, plain[episode]) for row, episode in keyed if episode in plain]
     for name in ("success", "control_steps"):
         print(f"  {name} differs in {sum(a[name] != b[name] for a, b in pairs)} of {len(pairs)} episodes")
-    print(
-        f"  commits: {sorted({a['saccade'] for a, _ in pairs})}, plain {sorted({b['saccade'] for _, b in pairs})}"
-    )
+    commits = [sorted({row["saccade"] for row in side}) for side in zip(*pairs, strict=True)]
+    print(f"  commits of the arm and of plain: {commits}")
     for end in sorted({"".join(f"-{part}" for part in row["recipe"].split("-")[2:]) for row in mine}):
         print(f"  recipes n-N{end}")
         for recipe in (f"n-{n}{end}" for n in COUNTS):
             seeds = table.seeds([in_arm(recipe, arm)])
-            for which in (arm, "plain") if seeds else ():
-                rates = (
-                    statistics.fmean(table.rate((in_arm(recipe, which), s), tasks) for s in seeds)
-                    for tasks in PARTS.values()
-                )
-                shown = ", ".join(f"{part} {rate:.4f}" for part, rate in zip(PARTS, rates, strict=True))
-                print(f"  {in_arm(recipe, which)}: success of {len(seeds)}: {shown}")
+            for name in (in_arm(recipe, arm), recipe) if seeds else ():
+                rates = [[table.rate((name, seed), tasks) for seed in seeds] for tasks in PARTS.values()]
+                means = map(statistics.fmean, rates)
+                shown = ", ".join(f"{part} {mean:.4f}" for part, mean in zip(PARTS, means, strict=True))
+                print(f"  {name}: success of {len(seeds)}: {shown}")
         differences(table, euler_contrasts(end, arm))
 
 
