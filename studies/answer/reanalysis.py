@@ -75,7 +75,7 @@ def check(rows: list[Row], trained: list[Row], episodes: list[Row]) -> None:
     expect("36 different checkpoints", len({row["checkpoint_sha256"] for row in trained}) == 36)
     planned = all(float(row[name]) == value for row in trained for name, value in PLAN.items())
     expect("settings are the README's", planned)
-    (backbone,) = (row for row in rows if row["kind"] == "backbone")
+    (backbone,) = (row for row in rows if row["kind"] == row["policy"] == "backbone")
     (recording,) = (row for row in rows if row["kind"] == "recording")
     starts = {row["start_sha256"] for row in trained}
     expect(f"one start for all: {next(iter(starts))[:12]}", len(starts) == 1)
