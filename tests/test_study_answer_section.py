@@ -258,7 +258,7 @@ def test_new_pairs_are_tested_alone() -> None:
 def test_the_other_comparisons_are_counted_and_listed() -> None:
     nothing = section_of(CORE)
     assert "Other exploratory comparisons" not in nothing.answer[3]
-    (absent,) = nothing.others
+    (absent,) = nothing.comparisons
     assert absent.startswith(
         "Not measured: 32 tokens against a wider head without tokens at the same cost of"
     )
@@ -297,15 +297,17 @@ def test_the_other_comparisons_are_counted_and_listed() -> None:
         r"or more, 0.0 points \(B; \[table 4\]\S*, `--stages scaled,alignment`\)\.",
         r"Not measured: 32 tokens with the alignment loss against none; .*; 64 tokens against 32\.",
     ]
-    assert len(whole.others) == len(expected)
-    for found, pattern in zip(whole.others, expected, strict=True):
+    assert len(whole.comparisons) == len(expected)
+    for found, pattern in zip(whole.comparisons, expected, strict=True):
         assert re.fullmatch(pattern.replace("B;", f"{BOUNDS};"), found), found
     other = {**some, "n-0-wide": [1.0] * 8, "n-4-patch-8": FEWER, "n-32-patch-8": MORE}
-    said = section_of(other).others
+    said = section_of(other).comparisons
     assert "wider head without tokens at the same cost of a chunk: less success, -20.0 points" in said[0]
     assert "8 instead of 16 pixels: no change of 10 points or more, 0.0 points" in said[3]
     other = {**other, "n-4-scaled": MORE, "n-32-scaled": FEWER}
-    assert "8 instead of 16 pixels: a change in favour of 32, 130.0 points" in section_of(other).others[3]
+    assert (
+        "8 instead of 16 pixels: a change in favour of 32, 130.0 points" in section_of(other).comparisons[3]
+    )
 
 
 def test_later_stages_have_their_tables() -> None:

@@ -69,8 +69,8 @@ class Section:
         not_shown: Sentences that say what the study cannot show.
         answer: Sentences that the section begins with, before its figures; for a study with one question.
         commands: Commands that compute the section again, for one with an answer.
-        repeated: Paragraphs below these commands.
-        others: Sentences on comparisons that the answer only counts.
+        reproduction: Paragraphs below these commands: what a repetition needs.
+        comparisons: Sentences on comparisons that the answer only counts, and on those not measured.
     """
 
     title: str
@@ -81,8 +81,8 @@ class Section:
     not_shown: Sequence[str] = ()
     answer: Sequence[str] = ()
     commands: Sequence[str] = ()
-    repeated: Sequence[str] = ()
-    others: Sequence[str] = ()
+    reproduction: Sequence[str] = ()
+    comparisons: Sequence[str] = ()
 
 
 def number(estimate: Estimate, digits: int) -> str:

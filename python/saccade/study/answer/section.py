@@ -59,7 +59,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
     core = next(one for one in stages if one.stage == CORE_STAGE)
     results = found if core.done == core.planned else None
     known = known_facts(plan, found, core, tasks, seeds)
-    pictures, grids, others_said = [], list[Grid](), list[str]()
+    pictures, grids, comparisons = [], list[Grid](), list[str]()
     if results is None:
         prose = Prose("answer", **known, places={})
         answer = prose.points("not_judged")
@@ -73,6 +73,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         related = relations(table, found, tasks, seeds, [CORE_STAGE])
         names = ["tests", "policies", *others, *by_stage, *([MEASURES] if everywhere else [])]
         places = {name: place for place, name in enumerate(names, start=1)}
+        contrasts = {one.contrast.name: (one, stage) for stage, of in others.items() for one in of}
         of_core, by_task = losses(table, found), judged_by_task(table, tasks, seeds)
         prose = Prose(
             "answer",
@@ -80,20 +81,20 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
             places=places,
             tests=tests,
             cuts={one.recipe: one for one in changed if one.arm == CUT},
-            contrasts={one.contrast.name: (one, stage) for stage, of in others.items() for one in of},
+            contrasts=contrasts,
             related=related,
             of_loss=of_core.correlation,
             stopped=functools.partial(stopped, table),
-            **functions(plan, others),
+            **functions(plan, contrasts),
         )
-        answer, others_said = prose.points("answer"), prose.points("others")
+        answer, comparisons = prose.points("answer"), prose.points("comparisons")
         pictures.append(Figure("success", prose.line("caption_success"), success_picture(found)))
         caption = prose.line("caption_losses")
         pictures.append(Figure("losses", caption, loss_picture(of_core), f"Table {places['policies']}"))
         grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, table)]
-        for stage, contrasts in others.items():
+        for stage, compared in others.items():
             caption = prose.line("caption_contrasts", places[stage], stage)
-            grids.append(contrast_grid(caption, contrasts, by_task))
+            grids.append(contrast_grid(caption, compared, by_task))
         for stage, of_stage in by_stage.items():
             caption = prose.line("caption_changes", places[stage], stage)
             grids.append(change_grid(caption, of_stage, arms[stage]))
@@ -115,8 +116,8 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         not_shown=prose.points("not_shown"),
         answer=answer,
         commands=COMMANDS,
-        repeated=prose.paragraphs("repeated"),
-        others=others_said,
+        reproduction=prose.paragraphs("reproduction"),
+        comparisons=comparisons,
     )
 
 
@@ -148,12 +149,12 @@ def known_facts(
     }
 
 
-def functions(plan: Plan, others: Mapping[str, Sequence[ContrastResult]]) -> dict[str, Any]:
+def functions(plan: Plan, contrasts: Mapping[str, tuple[ContrastResult, str]]) -> dict[str, Any]:
     """The functions of the template.
 
     Args:
         plan: The plan of the study.
-        others: The exploratory contrasts by stage.
+        contrasts: The exploratory contrasts and their stages, by name.
     """
 
     def stages_of(recipes: Collection[str]) -> str:
@@ -162,12 +163,11 @@ def functions(plan: Plan, others: Mapping[str, Sequence[ContrastResult]]) -> dic
 
     def findings(names: Collection[str]) -> Counter[str]:
         """How often contrasts have each finding."""
-        found = itertools.chain.from_iterable(others.values())
-        return Counter(one.finding for one in found if one.contrast.name in names)
+        return Counter(contrasts[name][0].finding for name in names)
 
     def stages_with(names: Collection[str]) -> list[str]:
         """The stages in whose tables contrasts are."""
-        return [stage for stage, of in others.items() if any(one.contrast.name in names for one in of)]
+        return list(dict.fromkeys(stage for name, (_, stage) in contrasts.items() if name in names))
 
     return {"stages_of": stages_of, "findings": findings, "stages_with": stages_with}
 
