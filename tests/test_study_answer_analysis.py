@@ -12,7 +12,7 @@ import pytest
 from answer_tables import FEWER, MORE, rows_of
 
 from saccade.errors import InputError
-from saccade.study.answer.contrasts import CONFIRMATORY, difference, in_parts, slope
+from saccade.study.answer.contrasts import CONFIRMATORY, EXPLORATORY, difference, in_parts, slope
 from saccade.study.answer.power import power
 from saccade.study.answer.results import changes, confirmed, judged, over_seeds
 from saccade.study.sign_flip import sign_flip
@@ -102,6 +102,18 @@ def test_pairs_that_were_added_are_tested_alone() -> None:
     results = [over_seeds(some, one) for one in parts]
     assert [one.finding for one in results] == ["undecided", "not measured", "not measured"]
     assert [list(one.unpaired) for one in results] == [[], [11], [11]]
+
+
+def test_nothing_is_concluded_from_pairs_that_were_run_because_of_others() -> None:
+    """Whatever holds for one of the policies that are trained for longer holds for a contrast of them."""
+    pairs = {"n-32-long", "n-0-long"}
+    both = [one for one in EXPLORATORY["compute"] if pairs <= set(one.recipes)]
+    assert [(one.use, len(one.seeds)) for one in both] == [
+        ("interval", 6),
+        ("test", 6),
+        ("estimate", 12),
+        ("estimate", 12),
+    ]
 
 
 def test_changes_of_arms_are_those_of_the_same_policies() -> None:

@@ -67,15 +67,17 @@ def difference(second: str, first: str) -> Contrast:
     return Contrast(f"{second} minus {first}", {second: 1.0, first: -1.0})
 
 
+def estimate(contrast: Contrast) -> Contrast:
+    """A contrast over all training seeds. Nothing is concluded from it: some were run because of others."""
+    return replace(contrast, name=f"{contrast.name}, all twelve: estimate", seeds=SEEDS, use="estimate")
+
+
 def in_parts(contrast: Contrast) -> tuple[Contrast, ...]:
     """A contrast over the first training seeds, over those of `NEW_SEEDS`, and over both."""
-    parts: tuple[tuple[str, tuple[int, ...], Use], ...] = (
-        ("first six", LATER_SEEDS, "interval"),
-        ("new six: tested", NEW_SEEDS, "test"),
-        ("all twelve: estimate", SEEDS, "estimate"),
-    )
-    return tuple(
-        replace(contrast, name=f"{contrast.name}, {part}", seeds=seeds, use=use) for part, seeds, use in parts
+    return (
+        replace(contrast, name=f"{contrast.name}, first six", seeds=LATER_SEEDS),
+        replace(contrast, name=f"{contrast.name}, new six: tested", seeds=NEW_SEEDS, use="test"),
+        estimate(contrast),
     )
 
 
@@ -155,7 +157,7 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
         difference("n-0-wide", "n-0-scaled"),
         difference("n-0-long", "n-0-scaled"),
         *in_parts(difference("n-32-long", "n-0-long")),
-        interaction(difference("n-32-long", "n-0-long"), difference("n-32-scaled", "n-0-scaled")),
+        estimate(interaction(difference("n-32-long", "n-0-long"), difference("n-32-scaled", "n-0-scaled"))),
     ),
     "patch-32": within("-patch-32"),
     "vlsa": (*within("-vlsa-0"), *within("-vlsa-4")),
