@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from answer_tables import plan_of, provenance_of, rows_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -19,8 +21,10 @@ from saccade.intervention import Intervention
 from saccade.reference import ActionHead
 from saccade.sim.policy import DEMO_CHECKPOINT
 from saccade.sim.tasks import find_task
-from saccade.study.answer import measures, patching, specialise
+from saccade.study.answer import measures, patching, probes, specialise
+from saccade.study.answer.section import section
 from saccade.study.answer.specialise import KEPT, LEARNED, LOST, RANDOM, WEIGHTS, Removal
+from saccade.study.linear_probes import PROPRIO, VL, Frames
 from saccade.study.questions.patching_section import measured_rows, shares
 from saccade.study.simulator import Simulator
 from saccade.study.table import read_table
@@ -72,6 +76,70 @@ def test_measures_of_the_bundled_policy() -> None:
     assert found["probe_r2"] < 1
     (found,) = measures.measure(str(DEMO_CHECKPOINT), TASKS, range(1))
     assert found["probe_r2"] is None
+
+
+def test_probes_of_the_bundled_policy() -> None:
+    """The same numbers as the mean of `measures` and as those of `saccade study probes`."""
+    rows = probes.measure(str(DEMO_CHECKPOINT), TASKS, range(5))
+    found = {(row["group"], row["block"]): row["r2"] for row in rows}
+    groups = {(group, block) for group in ("state", "future", "action") for block in range(4)}
+    assert found.keys() == {("proprioception", -1), ("vl_embs", -1), *groups}
+    assert all(r2 < 1 for r2 in found.values())
+    (cheap,) = measures.measure(str(DEMO_CHECKPOINT), TASKS, range(5))
+    assert cheap["probe_r2"] == pytest.approx(np.mean([found["future", block] for block in range(4)]))
+    assert probes.measure(str(DEMO_CHECKPOINT), TASKS, range(1)) == []  # fewer episodes than folds
+
+
+def test_probes_find_what_is_there() -> None:
+    """A mean that holds the positions, one that holds one of the two, and one that holds none."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for episode in range(20):
+        positions = {name: np.tile(rng.normal(size=(1, 3)), (4, 1)) for name in probes.POSITIONS}
+        noise = rng.normal(size=(4, 6))
+        inputs = {
+            PROPRIO: noise,
+            VL: np.concatenate(list(positions.values()), axis=1),
+            ("future", 0, "mean"): np.concatenate([positions["goal"], noise], axis=1),
+        }
+        zeros = np.zeros(4, np.int64)
+        frames.append(Frames(zeros + episode, zeros, inputs, positions))
+    found = probes.r2_of_positions(frames, [0] * len(frames))
+    assert found[VL] == pytest.approx(1, abs=0.01)
+    assert found[PROPRIO] < 0.1
+    assert found["future", 0, "mean"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_single_row_is_its_own_mean() -> None:
+    source = Simulator(str(DEMO_CHECKPOINT), TASKS, range(1))
+    recorded = source.recorded(TASKS[0], 0)
+    frames = probes.frames_of_means(source.head(), recorded, ("state", "action"))
+    kept = {("state", block, "all") for block in range(4)} | {("action", block, "mean") for block in range(4)}
+    assert frames.inputs.keys() == {PROPRIO, VL, *kept}
+    assert frames.targets.keys() == set(probes.POSITIONS)
+
+
+def test_probes_have_a_table() -> None:
+    """Means over training seeds, a column for each block; the inputs have a single number."""
+    rows = rows_of({name: [0.5] * 6 for name in ("n-0", "n-4", "n-32")})
+    trained = rows[rows["kind"] == "training"]
+    seeds = trained["training_seed"]
+    places = [("vl_embs", -1, 0.75), ("action", 0, 0.25), ("future", 0, 0.0), ("future", 1, 0.5)]
+    probed = [
+        trained.assign(kind="probes", group=group, block=block, r2=r2 + 0.01 * seeds)
+        for group, block, r2 in places
+    ]
+    probed = [one[(one["num_future_tokens"] > 0) | (one["group"] != "future")] for one in probed]
+    table = pd.concat([rows, *probed]).assign(validation_loss=0.05)
+    grid = section(table, provenance_of(), plan_of(6)).grids[-2]
+    assert grid.columns == ("recipe", "rows", "input", "block 0", "block 1")
+    assert [row[:2] for row in grid.rows] == [
+        ["n-0", "vl_embs"],
+        ["n-0", "action"],
+        *([name, rows] for name in ("n-4", "n-32") for rows in ("vl_embs", "action", "future")),
+    ]
+    assert grid.rows[0][2:] == ["0.78 (0.75 to 0.80)", "", ""]
+    assert [cell.split(" ")[0] for cell in grid.rows[-1][2:]] == ["", "0.03", "0.53"]
 
 
 def test_attention_mass_is_that_of_the_trace() -> None:

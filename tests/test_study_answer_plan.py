@@ -35,6 +35,8 @@ def test_policies_that_are_measured() -> None:
     assert {policy.name for policy in MEASURED["specialise"].policies(plan)} == several
     for stage in ("measures", "patching"):
         assert {policy.name for policy in MEASURED[stage].policies(plan)} == {*several, "n-1-seed-0"}
+    everyone = {policy.name for policy in plan.all_policies(pilots=False)}
+    assert {policy.name for policy in MEASURED["probes"].policies(plan)} == everyone
     known = Answer(plan, ("measures", "specialise"), trained=dict.fromkeys((*several, "n-1-seed-0"), ""))
     assert known.num_cells == 7 + 6
 

@@ -1,4 +1,4 @@
-"""The roofline: what each part of a call reaches, beside what multiply-adds and memory allow.
+"""The roofline: what each part of a call reaches, and what multiply-adds and memory allow.
 
 A part that does `x` multiply-adds for each byte that it reads can do `x` times the memory's bandwidth at
 most, and never more than the peak of its arithmetic. Both axes are logarithmic.

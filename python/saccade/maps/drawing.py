@@ -47,7 +47,7 @@ def show(
         heat: The map, or None.
         most: Value of the strongest colour.
         colours: Colours of the map.
-        region: The part of the picture that the map covers. What lies beside the picture is not drawn.
+        region: The part of the picture that the map covers. What lies outside the picture is not drawn.
     """
     left, right, bottom, _ = extent
     frame = Rectangle((left, 0.0), right - left, bottom, fill=False, linewidth=0.5, clip_on=False)

@@ -104,7 +104,7 @@ class BlankedFrames:
 
 
 def behind(place: Place, height: int, width: int) -> tuple[slice, slice]:
-    """The rows and columns of a frame of this size that a place sees; empty beside the frame.
+    """The rows and columns of a frame of this size that a place sees; empty outside the frame.
 
     Example:
         >>> camera = Camera("front", 0, 4, 4, (0.25, -0.5, 0.75, 1.5))

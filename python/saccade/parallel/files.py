@@ -182,7 +182,7 @@ def relocated(work: Any, places: Mapping[str, Path]) -> Any:
 def _absolute(path: str | Path) -> Path:
     """An absolute path without `..` and links, except that a link to a file keeps its own name.
 
-    A file's name tells its type, and the files beside it belong to it; in the cache of `huggingface_hub` it
+    A file's name tells its type, and the files next to it belong to it; in the cache of `huggingface_hub` it
     is a link to a file without either.
     """
     path = Path(path)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: The parts of which the time is reported, in their order. "wait" is the time in the queue.
 PARTS = ("wait", "inputs", "backbone", "head")
-#: With a backbone of at most so many bytes, each thread computes a batch of its own. Loops are short there:
+#: With a backbone of at most this many bytes, each thread computes a batch of its own. Loops are short there:
 #: threads that share them wait for each other. Measured once by hand, by a program that is not committed, on
 #: two cores of AMD Zen 3, float32: observations a second with two batches of 4 on a thread each, divided by
 #: those with one batch of 8 on two threads, by the size of backbone and head together: 1.17 at 4 MB, 1.10 at

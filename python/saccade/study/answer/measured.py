@@ -1,11 +1,11 @@
-"""The stages that judge no policy, but measure those that are trained and have future tokens."""
+"""The stages that judge no policy, but measure those that are trained."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from saccade.study.answer import measures, patching, specialise
+from saccade.study.answer import measures, patching, probes, specialise
 from saccade.study.answer.plan import Plan, PlannedPolicy
 from saccade.study.cell import Rows
 
@@ -34,4 +34,5 @@ MEASURED = {
     measures.MEASURES: MeasuredStage(measures.measure),
     specialise.SPECIALISE: MeasuredStage(specialise.measure, specialise.FEWEST),
     patching.PATCHING: MeasuredStage(patching.measure),
+    probes.PROBES: MeasuredStage(probes.measure, fewest_tokens=0),
 }

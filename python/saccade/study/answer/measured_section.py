@@ -1,4 +1,4 @@
-"""The report's part on what is measured, not judged: cheap measures, specialised tokens, patching, latencies.
+"""The report's part on what is measured, not judged: cheap measures, single tokens, patching, probes, latencies.
 
 A number is a mean over the training seeds of a recipe, with the interval of `sign_flip`. A seed without the
 number is left out.
@@ -16,6 +16,7 @@ from saccade.study import figures
 from saccade.study.answer.contrasts import CORE
 from saccade.study.answer.measures import MEASURES, NAMES
 from saccade.study.answer.patching import PATCHING
+from saccade.study.answer.probes import PROBES
 from saccade.study.answer.results import ordered
 from saccade.study.answer.specialise import KEPT, LEARNED, LOST, RANDOM, SIZES, SPECIALISE, WEIGHTS
 from saccade.study.answer.times import TIMES
@@ -59,6 +60,9 @@ def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Gri
     rows = table[table["kind"] == PATCHING]
     if len(rows):
         grids.append(patching_grid(prose.line("caption_patching", place + len(grids)), ordered(rows)))
+    rows = table[table["kind"] == PROBES]
+    if len(rows):
+        grids.append(probe_grid(prose.line("caption_probes", place + len(grids)), ordered(rows)))
     rows = table[table["kind"] == TIMES]
     if len(rows):
         cpu = str(rows["cpu"].iloc[0])
@@ -165,6 +169,21 @@ def patching_grid(caption: str, rows: pd.DataFrame) -> Grid:
         of_recipe = together[together["recipe"] == recipe].groupby("group")["share"]
         lines.append([recipe, *(shown(mean(of_recipe.get_group(group))) for group in GROUPS)])
     return Grid(caption, ("recipe", *GROUPS), lines)
+
+
+def probe_grid(caption: str, rows: pd.DataFrame) -> Grid:
+    """R² of probes: a row for each recipe and group of rows, a column for each block and for inputs."""
+    rows = rows.assign(block=pd.to_numeric(rows["block"]).astype(int))
+    blocks = sorted(set(rows["block"]))
+    lines = []
+    for recipe in recipes_of(rows):
+        of_recipe = rows[rows["recipe"] == recipe]
+        for group in dict.fromkeys(of_recipe["group"]):
+            by_block = of_recipe[of_recipe["group"] == group].groupby("block")["r2"]
+            found = {block: mean(values) for block, values in by_block}
+            lines.append([recipe, str(group), *(shown(found.get(block)) for block in blocks)])
+    names = ["input" if block < 0 else f"block {block}" for block in blocks]
+    return Grid(caption, ("recipe", "rows", *names), lines)
 
 
 def time_grid(caption: str, rows: pd.DataFrame) -> Grid:

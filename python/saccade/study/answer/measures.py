@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from saccade.study.answer.probes import frames_of_means, r2_of_positions
 from saccade.study.cell import Rows
-from saccade.study.linear_probes import FOLDS, PROPRIO, VL, Frames, join, probe
+from saccade.study.linear_probes import Frames
 from saccade.study.paths import DIRECT
 from saccade.study.questions.cuts import ARMS as CUTS
 from saccade.study.source import episode_rng
@@ -29,9 +29,9 @@ NAMES = {
     "gradient_share": "share of the gradient through future rows",
     "probe_r2": "R2 of probes of future rows",
 }
+MEAN_ROW = ("future", "mean")  # what its probes read; a single token was never probed
 OBSERVATIONS = 3  # of each episode, for gradients
 PROJECTIONS = 8  # of the actions, for gradients
-DIMENSIONS = 64  # that a probe reads
 
 
 def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
@@ -47,7 +47,8 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
         the action rows, over blocks with self-attention, their heads and the Euler steps. `gradient_share` is
         the share of the derivative of the actions by the vision-language tokens that passes future rows.
         `probe_r2` is the share of the variance within a task, of the positions of object and goal, that a
-        linear probe finds in the mean of the future rows, over blocks; None with fewer episodes than folds.
+        linear probe finds in the mean of the future rows, over blocks; None with fewer episodes than folds,
+        or with a single token.
     """
     from saccade.study.simulator import Simulator
 
@@ -62,10 +63,13 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
             changes.append(float(np.abs(cut - plain).mean()))
             masses.append(attention_mass(head, recorded))
             through.append(gradient_share(source, task, seed))
-            frames.append(future_frames(head, recorded))
+            frames.append(frames_of_means(head, recorded, ("future",)))
             numbers.append(number)
     means = [float(np.mean(values)) for values in (changes, masses, through)]
-    found: list[float | None] = [*means, probed(frames, numbers) if len(frames) >= FOLDS else None]
+    probed = [
+        r2 for (rows, _, tokens), r2 in r2_of_positions(frames, numbers).items() if (rows, tokens) == MEAN_ROW
+    ]
+    found: list[float | None] = [*means, float(np.mean(probed)) if probed else None]
     return [dict(zip(NAMES, found, strict=True))]
 
 
@@ -88,26 +92,3 @@ def gradient_share(source: Simulator, task: str, seed: int) -> float:
     rows = Gradients(source, PROJECTIONS, OBSERVATIONS).of_actions(task, seed)
     (direct,) = [float(row["share"]) for row in rows if row.get("path") == DIRECT and "share" in row]
     return 1.0 - direct
-
-
-def future_frames(head: ActionHead, recorded: Recorded) -> Frames:
-    """What probes of an episode read: the mean future row after each block; and what `probe` asks for."""
-    from saccade.study.questions.probes import frames_of
-
-    frames = frames_of(head, recorded, 0)
-    inputs = {
-        source: values
-        for source, values in frames.inputs.items()
-        if source in (PROPRIO, VL) or source[0::2] == ("future", "mean")
-    }
-    return replace(frames, inputs=inputs)
-
-
-def probed(frames: Sequence[Frames], numbers: Sequence[int]) -> float | None:
-    """The mean R2 over blocks and positions; None if nothing moves."""
-    import threadpoolctl  # type: ignore[import-untyped]
-
-    with threadpoolctl.threadpool_limits(1):
-        rows = probe(join(frames, numbers), DIMENSIONS)
-    found = [row["r2"] for row in rows if row["rows"] == "future" and row["target"] in ("object", "goal")]
-    return float(np.mean(found)) if found else None
