@@ -2,8 +2,8 @@
 
     python studies/answer/other_cpu.py --seeds 0 1 2 --jobs 2
 
-The unchanged policies run the episodes of the table with the same noise. Rounding differs between CPUs, in the
-head and in the pictures, and an episode may end otherwise.
+The unchanged policies run the episodes of the table with the same noise. Rounding differs between CPUs, in
+the head and in the pictures, and an episode may end otherwise.
 """
 
 from __future__ import annotations

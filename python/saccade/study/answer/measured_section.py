@@ -1,4 +1,4 @@
-"""The report's part on what is measured, not judged: cheap measures, single tokens, patching, probes, latencies.
+"""The report's part on what is measured, not judged: measures, single tokens, patching, probes, latencies.
 
 A number is a mean over the training seeds of a recipe, with the interval of `sign_flip`. A seed without the
 number is left out.
