@@ -349,7 +349,7 @@ def test_the_page_contains_what_was_measured() -> None:
     assert report.PAGE.read_text() == report.page(measured)
 
 
-@pytest.mark.parametrize("slug", ["zen-4", "genuineintel-family-6-model-167"])
+@pytest.mark.parametrize("slug", ["zen-4", "zen-5", "genuineintel-family-6-model-167"])
 def test_the_cost_model_expects_what_was_measured(slug: str) -> None:
     (results,) = (results for results in records() if results.slug == slug)
     config = text.config(CASE)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 import saccade
 from saccade import _saccade, cli
-from saccade.bench.cost import measured_like
+from saccade.bench.cost import Machine, measured_like
 from saccade.checkpoints import quantize
 from saccade.checkpoints.findings import Counts, Inspection, Part
 from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
@@ -106,7 +106,9 @@ def test_the_report_of_a_checkpoint(base: Path) -> None:
     assert report.machine is not None
     assert report.seconds is not None
     assert report.machine.isa == _saccade.selected_isa()
-    assert report.machine.efficiency_of == measured_like(report.machine.isa).cpu
+    here = Machine.measured(report.machine.isa, 1)
+    assert here.family
+    assert report.machine.efficiency_of == measured_like(here).cpu
     for seconds in report.seconds.values():
         assert seconds["encode"] > 0.0
         assert seconds["sample"] > 0.0

@@ -37,7 +37,7 @@ def machine_of(results: Results, case: Case, name: str) -> Machine | None:
     bandwidth = results.bandwidth(case.threads)
     if len(known) < len(rates) or bandwidth is None:
         return None
-    return Machine(isa, case.threads, known, bandwidth)
+    return Machine(isa, case.threads, known, bandwidth, family=results.cpu)
 
 
 def works_of(case: Case) -> tuple[Works, Works]:

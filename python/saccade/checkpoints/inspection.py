@@ -125,7 +125,7 @@ def expected_times(head: HeadConfig, num_vl_tokens: int) -> tuple[MachineRates, 
         num_threads=machine.num_threads,
         macs_per_second=dict(machine.macs_per_second),
         read_bytes_per_second=machine.read_bytes_per_second,
-        efficiency_of=measured_like(machine.isa).cpu,
+        efficiency_of=measured_like(machine).cpu,
     )
     return rates, seconds
 

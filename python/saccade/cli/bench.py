@@ -160,7 +160,7 @@ def measure(
         "saccade": saccade.__version__,
         "head": name,
         "machine": asdict(machine),
-        "efficiency_of": measured_like(machine.isa).cpu,
+        "efficiency_of": measured_like(machine).cpu,
         "call": asdict(call),
         "rounds": args.rounds,
         "results": timed(loaded, call, machine, args.rounds),
