@@ -36,6 +36,7 @@ from saccade.errors import InputError
 from saccade.processor import Processor
 from saccade.reference.backbone import BackboneFeatures
 from saccade.sim import demos
+from saccade.sim.allocator import keep_freed_memory
 from saccade.sim.dataset import Samples, describe, load_samples, normalized_actions
 from saccade.sim.frozen import FrozenFeatures, padded, pixel_values
 from saccade.sim.learner import Batch, Learner, new_learner
@@ -375,7 +376,7 @@ def train(
     *,
     start: Path | None = None,
 ) -> PolicyConfig:
-    """Trains a policy, or continues the run in `out`.
+    """Trains a policy, or continues the run in `out`. With glibc, the process then keeps freed memory.
 
     Args:
         demonstrations: directory written by `saccade demos`.
@@ -394,6 +395,7 @@ def train(
     """
     if settings.only == "head" and start is None:
         raise InputError("start: given none, expected a policy, since only the head is trained")
+    keep_freed_memory()
     tasks = demos.recorded_tasks(demonstrations)
     recording = demos.read_settings(demonstrations, tasks)
     config = policy_config(settings, recording, tasks)
