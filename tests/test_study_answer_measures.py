@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import shutil
 from collections.abc import Callable
@@ -24,10 +25,11 @@ from saccade.sim.tasks import find_task
 from saccade.study.answer import measures, patching, probes, specialise
 from saccade.study.answer.section import section
 from saccade.study.answer.specialise import KEPT, LEARNED, LOST, RANDOM, WEIGHTS, Removal
-from saccade.study.linear_probes import PROPRIO, VL, Frames
-from saccade.study.questions.patching_section import measured_rows, shares
+from saccade.study.linear_probes import PROPRIO, VL, Frames, join, probe
+from saccade.study.questions.patching_section import GROUPS, measured_rows, shares
+from saccade.study.questions.probes import frames_of
 from saccade.study.simulator import Simulator
-from saccade.study.table import read_table
+from saccade.study.table import read_table, write_table
 
 TASKS = ("button-press-topdown",)
 
@@ -79,14 +81,19 @@ def test_measures_of_the_bundled_policy() -> None:
 
 
 def test_probes_of_the_bundled_policy() -> None:
-    """The same numbers as the mean of `measures` and as those of `saccade study probes`."""
+    """The same numbers as those of `saccade study probes` on the same episodes."""
     rows = probes.measure(str(DEMO_CHECKPOINT), TASKS, range(5))
     found = {(row["group"], row["block"]): row["r2"] for row in rows}
     groups = {(group, block) for group in ("state", "future", "action") for block in range(4)}
     assert found.keys() == {("proprioception", -1), ("vl_embs", -1), *groups}
-    assert all(r2 < 1 for r2 in found.values())
-    (cheap,) = measures.measure(str(DEMO_CHECKPOINT), TASKS, range(5))
-    assert cheap["probe_r2"] == pytest.approx(np.mean([found["future", block] for block in range(4)]))
+    source = Simulator(str(DEMO_CHECKPOINT), TASKS, range(5))
+    frames = [frames_of(source.head(), source.recorded(TASKS[0], seed), 0) for seed in range(5)]
+    of_study = pd.DataFrame(probe(join(frames, [0] * 5), probes.DIMENSIONS))
+    of_study = of_study[of_study["target"].isin(probes.POSITIONS)]
+    means = of_study.groupby(["rows", "block", "tokens"])["r2"].mean()
+    for group, block in found:
+        tokens = "mean" if group in ("future", "action") else "all"
+        assert found[group, block] == pytest.approx(means[group, block, tokens], abs=1e-6)
     assert probes.measure(str(DEMO_CHECKPOINT), TASKS, range(1)) == []  # fewer episodes than folds
 
 
@@ -110,16 +117,24 @@ def test_probes_find_what_is_there() -> None:
     assert found["future", 0, "mean"] == pytest.approx(0.5, abs=0.1)
 
 
-def test_a_single_row_is_its_own_mean() -> None:
-    source = Simulator(str(DEMO_CHECKPOINT), TASKS, range(1))
-    recorded = source.recorded(TASKS[0], 0)
-    frames = probes.frames_of_means(source.head(), recorded, ("state", "action"))
-    kept = {("state", block, "all") for block in range(4)} | {("action", block, "mean") for block in range(4)}
-    assert frames.inputs.keys() == {PROPRIO, VL, *kept}
-    assert frames.targets.keys() == set(probes.POSITIONS)
+def test_a_single_row_is_its_own_mean(tmp_path: Path) -> None:
+    """That of the state, and the future row of a policy with one token, of which `measures` has none."""
+
+    def changed(name: str, tensor: Tensor) -> Tensor:
+        return tensor[:1] if name == "action_head.future_tokens.weight" else tensor
+
+    one = copy_of_the_demo(tmp_path / "one", changed)
+    config = json.loads((one / "config.json").read_text())
+    config["action_head_cfg"]["num_target_vision_tokens"] = 1
+    (one / "config.json").write_text(json.dumps(config))
+    rows = probes.measure(str(one), TASKS, range(5))
+    assert {row["block"] for row in rows if row["group"] == "future"} == set(range(4))
+    assert {row["block"] for row in rows if row["group"] == "state"} == set(range(4))
+    (cheap,) = measures.measure(str(one), TASKS, range(5))
+    assert cheap["probe_r2"] is None
 
 
-def test_probes_have_a_table() -> None:
+def test_probes_have_a_table(tmp_path: Path) -> None:
     """Means over training seeds, a column for each block; the inputs have a single number."""
     rows = rows_of({name: [0.5] * 6 for name in ("n-0", "n-4", "n-32")})
     trained = rows[rows["kind"] == "training"]
@@ -130,16 +145,19 @@ def test_probes_have_a_table() -> None:
         for group, block, r2 in places
     ]
     probed = [one[(one["num_future_tokens"] > 0) | (one["group"] != "future")] for one in probed]
-    table = pd.concat([rows, *probed]).assign(validation_loss=0.05)
-    grid = section(table, provenance_of(), plan_of(6)).grids[-2]
-    assert grid.columns == ("recipe", "rows", "input", "block 0", "block 1")
-    assert [row[:2] for row in grid.rows] == [
-        ["n-0", "vl_embs"],
-        ["n-0", "action"],
-        *([name, rows] for name in ("n-4", "n-32") for rows in ("vl_embs", "action", "future")),
-    ]
-    assert grid.rows[0][2:] == ["0.78 (0.75 to 0.80)", "", ""]
-    assert [cell.split(" ")[0] for cell in grid.rows[-1][2:]] == ["", "0.03", "0.53"]
+    patched = [trained.assign(kind="patching", group=group, block="all", share=0.5) for group in GROUPS]
+    for more in ([], patched):  # which make the column of blocks one of words
+        table = pd.concat([rows, *probed, *more]).assign(validation_loss=0.05)
+        write_table([dict(row) for _, row in table.iterrows()], tmp_path / "answer.csv")
+        grid = section(read_table(tmp_path / "answer.csv"), provenance_of(), plan_of(6)).grids[-2]
+        assert grid.columns == ("recipe", "policies", "rows", "input", "block 0", "block 1")
+        assert [row[:3] for row in grid.rows] == [
+            ["n-0", "6", "vl_embs"],
+            ["n-0", "6", "action"],
+            *([name, "6", rows] for name in ("n-4", "n-32") for rows in ("vl_embs", "action", "future")),
+        ]
+        assert grid.rows[0][3:] == ["0.78 (0.75 to 0.80)", "", ""]
+        assert [cell.split(" ")[0] for cell in grid.rows[-1][3:]] == ["", "0.03", "0.53"]
 
 
 def test_attention_mass_is_that_of_the_trace() -> None:

@@ -1,7 +1,7 @@
 //! Which weights a product asks memory for while it is made, and in which order: one after the other, or as many streams.
 //!
-//! Some CPUs read DRAM faster as several streams than as one: one thread of a Sapphire Rapids 18.7 instead of 11.6 GB/s. Others read
-//! them as fast as one stream: two threads of a Zen 4 35 GB/s either way. Bits do not depend on it.
+//! Some CPUs read DRAM faster as several streams than as one: one thread of a Sapphire Rapids 18.7 instead of 11.6 GB/s. Others do not: two
+//! threads of a Zen 4 read 35 GB/s either way (medians of five runs). Bits do not depend on it.
 
 use std::ops::Range;
 

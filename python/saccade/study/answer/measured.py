@@ -29,6 +29,7 @@ class MeasuredStage:
                 yield policy
 
 
+FIRST_EPISODES = 10  # of each task, on which they are measured
 #: By name of the stage.
 MEASURED = {
     measures.MEASURES: MeasuredStage(measures.measure),

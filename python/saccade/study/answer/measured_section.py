@@ -14,9 +14,10 @@ from matplotlib.figure import Figure as Picture
 
 from saccade.study import figures
 from saccade.study.answer.contrasts import CORE
+from saccade.study.answer.measured import FIRST_EPISODES
 from saccade.study.answer.measures import MEASURES, NAMES
 from saccade.study.answer.patching import PATCHING
-from saccade.study.answer.probes import PROBES
+from saccade.study.answer.probes import DIMENSIONS, PROBES
 from saccade.study.answer.results import ordered
 from saccade.study.answer.specialise import KEPT, LEARNED, LOST, RANDOM, SIZES, SPECIALISE, WEIGHTS
 from saccade.study.answer.times import TIMES
@@ -62,7 +63,8 @@ def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Gri
         grids.append(patching_grid(prose.line("caption_patching", place + len(grids)), ordered(rows)))
     rows = table[table["kind"] == PROBES]
     if len(rows):
-        grids.append(probe_grid(prose.line("caption_probes", place + len(grids)), ordered(rows)))
+        caption = prose.line("caption_probes", place + len(grids), FIRST_EPISODES, DIMENSIONS)
+        grids.append(probe_grid(caption, ordered(rows)))
     rows = table[table["kind"] == TIMES]
     if len(rows):
         cpu = str(rows["cpu"].iloc[0])
@@ -181,9 +183,10 @@ def probe_grid(caption: str, rows: pd.DataFrame) -> Grid:
         for group in dict.fromkeys(of_recipe["group"]):
             by_block = of_recipe[of_recipe["group"] == group].groupby("block")["r2"]
             found = {block: mean(values) for block, values in by_block}
-            lines.append([recipe, str(group), *(shown(found.get(block)) for block in blocks)])
+            policies = str(of_recipe["policy"].nunique())
+            lines.append([recipe, policies, str(group), *(shown(found.get(block)) for block in blocks)])
     names = ["input" if block < 0 else f"block {block}" for block in blocks]
-    return Grid(caption, ("recipe", "rows", *names), lines)
+    return Grid(caption, ("recipe", "policies", "rows", *names), lines)
 
 
 def time_grid(caption: str, rows: pd.DataFrame) -> Grid:

@@ -29,7 +29,7 @@ NAMES = {
     "gradient_share": "share of the gradient through future rows",
     "probe_r2": "R2 of probes of future rows",
 }
-MEAN_ROW = ("future", "mean")  # what its probes read; a single token was never probed
+MEAN_ROW = ("future", "mean")  # what `probe_r2` is of; a single token has no mean and no number
 OBSERVATIONS = 3  # of each episode, for gradients
 PROJECTIONS = 8  # of the actions, for gradients
 

@@ -31,11 +31,11 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
         tasks, seeds: The episodes, of the unchanged policy.
 
     Returns:
-        A row for each group of rows and each block, `group`, `block` and `r2`: the share of the variance
-        within a task, of the positions of object and goal, that a linear probe finds in the mean of the
-        group's rows after the block, on episodes that it was not fitted to. Block -1 are inputs of the head:
-        the state (`proprioception`) and the image tokens after VL self-attention (`vl_embs`). Nothing with
-        fewer episodes than folds.
+        A row for each group of rows and each block, `group`, `block` and `r2`: R² of a linear probe of the
+        positions of object and goal (the mean of the two) that reads the mean of the group's rows after the
+        block, on episodes that it was not fitted to, of the variance within a task. Block -1 are inputs of
+        the head: the state (`proprioception`) and all image tokens after VL self-attention (`vl_embs`).
+        Nothing with fewer episodes than `FOLDS`, or if nothing moves.
     """
     from saccade.study.simulator import Simulator
 
@@ -47,8 +47,16 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
 
 
 def frames_of_means(head: ActionHead, recorded: Recorded, groups: Collection[str]) -> Frames:
-    """What probes of an episode read: the mean of the rows of each group after each block, and the inputs
-    that `probe` compares them with. A group of a single row has no other mean than that row.
+    """What probes of an episode read and predict.
+
+    Args:
+        head: Head of the policy.
+        recorded: The episode.
+        groups: Groups of rows, of `ROW_GROUPS`.
+
+    Returns:
+        The mean of the rows of each group after each block at the first Euler step, for a group of a single
+        row that row; the inputs that `probe` compares others with; and the positions.
     """
     from saccade.study.questions.probes import frames_of
 
@@ -64,11 +72,14 @@ def frames_of_means(head: ActionHead, recorded: Recorded, groups: Collection[str
 
 
 def r2_of_positions(frames: Sequence[Frames], numbers: Sequence[int]) -> Mapping[Input, float]:
-    """The mean R² over the positions that move, of each input; none with fewer episodes than folds.
+    """The mean R² over the positions that move, of each input.
 
     Args:
         frames: Those of each episode.
-        numbers: The number of its task.
+        numbers: The task number of each episode.
+
+    Returns:
+        By input; empty with fewer episodes than `FOLDS`, or if nothing moves.
     """
     import threadpoolctl  # type: ignore[import-untyped]
 

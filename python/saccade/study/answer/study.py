@@ -20,7 +20,7 @@ from saccade.sim.training_settings import STATE_FILE, features_name
 from saccade.study.answer import plan as plans
 from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
-from saccade.study.answer.measured import MEASURED
+from saccade.study.answer.measured import FIRST_EPISODES, MEASURED
 from saccade.study.answer.plan import CORE_STAGE, PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
 from saccade.study.answer.times import TIMES, latencies
@@ -45,7 +45,6 @@ examples:
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
 SEEDS_TOGETHER = 2  # training seeds of a stage that are trained before they are judged, but for the core
-FIRST_EPISODES = 10  # of each task, for the stages of `MEASURED`
 ALREADY = ("seed", "demonstrations")  # settings of a run that the table has under other names
 #: What `saccade train` writes only to continue, or to be looked at. The rest of a policy's directory is kept.
 NOT_KEPT = (STATE_FILE, "loss.png")
