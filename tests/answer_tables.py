@@ -53,3 +53,6 @@ def section_of(rates: dict[str, list[float]], more: pd.DataFrame | None = None) 
 
 FEWER, MORE = [0.1, 0.2, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2], [0.7, 0.9, 0.8, 0.7, 0.9, 0.8, 0.7, 0.9]
 CORE = {"n-0": FEWER, "n-4": FEWER, "n-32": MORE}
+# Patterns of what a sentence of the report has behind a number.
+LINK = r"\[table 1\]\(#table-1\), `--stages core`"
+BOUNDS = r"95 % interval [-\d.]+ to [-\d.]+"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from answer_tables import CORE, FEWER, MORE, plan_of, provenance_of, rows_of, section_of
+from answer_tables import BOUNDS, CORE, FEWER, LINK, MORE, plan_of, provenance_of, rows_of, section_of
 
 from saccade.study.answer import plan as plans
 from saccade.study.answer.results import judged
@@ -20,9 +20,6 @@ from saccade.study.report import write_report
 from saccade.study.section import points
 from saccade.study.sign_flip import sign_flip
 from saccade.study.table import Provenance, write_provenance
-
-LINK = r"\[table 1\]\(#table-1\), `--stages core`"
-BOUNDS = r"95 % interval [-\d.]+ to [-\d.]+"
 
 
 @pytest.mark.parametrize(
@@ -131,53 +128,6 @@ def test_nothing_is_judged_before_the_core_is_complete() -> None:
         .answer[0]
         .startswith("No result yet: of the 36 policies of the core none is trained")
     )
-
-
-def under_the_cut(rates: dict[str, list[float]]) -> pd.DataFrame:
-    """Episodes of the core's policies under the cut, with these success rates."""
-    table = rows_of(rates)
-    return table[table["kind"] == "episodes"].assign(arm="future-unread")
-
-
-def test_the_sentence_about_the_cut() -> None:
-    assert section_of(CORE).answer[2] == (
-        "Not measured: what the trained policies do when their rows no longer attend to the future tokens."
-    )
-    begin = (
-        "Exploratory: when state and action rows of the trained policies no longer attend to the future "
-        "tokens, those with 32 tokens "
-    )
-    for four, many, said in (
-        (
-            *(MORE, FEWER),
-            r"succeed less often, a change of -65.0 points \(B; L\); those with 4 tokens "
-            r"succeed more often, a "
-            r"change of 65.0 points \(B; L\)\.",
-        ),
-        (
-            *(FEWER, []),
-            r"are not measured; those with 4 tokens show no change of 10 points or more: 0.0 "
-            r"points \(B; L\)\.",
-        ),
-        (
-            *([], [*MORE[:4], *FEWER[4:6]]),
-            r"may succeed more or less often \(undecided\), the change is -23.3 points \(B; 6 "
-            r"training seeds; "
-            r"L\); those with 4 tokens are not measured\.",
-        ),
-        (
-            *([], FEWER[:1]),
-            r"may succeed more or less often \(undecided\), the change is -60.0 points \(no "
-            r"interval; 1 training "
-            r"seed; L\); those with 4 tokens are not measured\.",
-        ),
-    ):
-        whole = section_of(CORE, under_the_cut({"n-4": four, "n-32": many}))
-        link = LINK.replace("1", "4").replace("core", "core,instrument")
-        expected = said.replace("B;", f"{BOUNDS};").replace("L", link)
-        assert re.fullmatch(re.escape(begin) + expected, whole.answer[2]), whole.answer[2]
-        assert whole.grids[3].heading == "Table 4"
-        assert whole.grids[3].columns[1] == "future-unread"
 
 
 def test_the_sentence_on_larger_first_weights() -> None:

@@ -66,8 +66,8 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
     else:
         tests, others = confirmed(found), explored(found)
         changed = changes(table, found, tasks, seeds)
-        arms = {stage: [arm.name for arm in of_stage] for stage, of_stage in ARMS.items()}
-        by_stage = {stage: [one for one in changed if one.arm in arms[stage]] for stage in arms}
+        of_stages = {stage: [arm.name for arm in of_stage] for stage, of_stage in ARMS.items()}
+        by_stage = {stage: [one for one in changed if one.arm in of_stages[stage]] for stage in of_stages}
         by_stage = {stage: of_stage for stage, of_stage in by_stage.items() if of_stage}
         everywhere = relations(table, found, tasks, seeds)
         related = relations(table, found, tasks, seeds, [CORE_STAGE])
@@ -81,6 +81,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
             places=places,
             tests=tests,
             cuts={one.recipe: one for one in changed if one.arm == CUT},
+            arms={(one.recipe, one.arm): one for one in changed},
             contrasts=contrasts,
             related=related,
             of_loss=of_core.correlation,
@@ -97,7 +98,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
             grids.append(contrast_grid(caption, compared, by_task))
         for stage, of_stage in by_stage.items():
             caption = prose.line("caption_changes", places[stage], stage)
-            grids.append(change_grid(caption, of_stage, arms[stage]))
+            grids.append(change_grid(caption, of_stage, of_stages[stage]))
         if everywhere:
             caption = prose.line("caption_relations", places[MEASURES], CUT)
             grids.append(relation_grid(caption, related, everywhere))
