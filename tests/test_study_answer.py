@@ -312,18 +312,28 @@ def test_latencies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert rows["sample_ratio"].iloc[0] == 1
     section = Answer.summarise(table, provenance)
     assert [row[0] for row in section.grids[-2].rows] == ["n-0", "n-4", "n-32"]
-    assert section.grids[-2].rows[0][3] == "1.00 (1.00 to 1.00)"
+    assert section.grids[-2].columns[:3] == ("recipe", "weights", "T_vl")
+    assert section.grids[-2].rows[0][4] == "1.00 (1.00 to 1.00)"
     assert list(section.grids[-1].rows[-1]) == ["times", "3", "4"]
     assert main(["study", "answer", "--stages", "alignment,times", "--out", str(out)]) == 0
     table = read_table(out / "answer.csv")
     rows = table[table["kind"] == "times"]
     assert list(rows["policy"]) == ["n-0-seed-0", "n-4-seed-0", "n-32-seed-0", "n-4-aligned-seed-0"]
-    # Of some policies only the hash is kept: the next one of the recipe is timed, or none.
+    # Of some policies only the hash is kept: the next one of the recipe is timed, or an untrained one.
     for gone in ("n-4-seed-0", "n-4-aligned-seed-0", "n-4-aligned-seed-1"):
         shutil.rmtree(out / "answer" / "policies" / gone)
     assert main(["study", "answer", "--stages", "times", "--out", str(out)]) == 0
     table = read_table(out / "answer.csv")
-    assert list(table[table["kind"] == "times"]["policy"]) == ["n-0-seed-0", "n-32-seed-0", "n-4-seed-1"]
+    rows = table[table["kind"] == "times"].set_index("policy")
+    assert list(rows.index) == ["n-0-seed-0", "n-4-seed-1", "n-32-seed-0", "n-4-aligned-seed-0"]
+    assert list(rows["untrained"]) == [False, False, False, True]
+    assert list(rows["checkpoint_sha256"].isna()) == [False, False, False, True]
+    # It is as large as those that were trained.
+    for size in ("head_bytes", "context_bytes", "num_vl_tokens"):
+        assert rows.loc["n-4-aligned-seed-0", size] == rows.loc["n-4-seed-1", size]
+    section = Answer.summarise(table, read_provenance(out / "answer.json"))
+    weights = [row[:2] for row in section.grids[-2].rows]
+    assert weights == [["n-0", "trained"], ["n-4", "trained"], ["n-32", "trained"], ["n-4-aligned", "first"]]
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:

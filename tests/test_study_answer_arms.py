@@ -71,3 +71,17 @@ def test_the_sentences_about_one_token_and_less_weight() -> None:
     for arms, said in (([one, light], f"{merged} {lighter}"), ([one], merged), ([light], lighter), ([], "")):
         whole = section_of(CORE, pd.concat([of_cut, *arms]))
         assert re.fullmatch(rf".*; those with 4 tokens .*?\)\.\s*{said}", whole.answer[2]), whole.answer[2]
+
+
+def test_the_sentence_about_one_token_with_the_alignment_loss() -> None:
+    """After that about the core, with the stage of its policies."""
+    trained = rows_of({"n-32-aligned-again": FEWER[:6]})
+    episodes = trained[trained["kind"] == "episodes"].assign(arm="1 merged")
+    assert "alignment loss" not in section_of(CORE, pd.concat([trained, episodes])).answer[2]
+    whole = section_of(CORE, pd.concat([under("1 merged", {"n-32": MORE}), trained, episodes]))
+    link = LINK.replace("1", "4").replace("core", "aligned-again,instrument")
+    assert re.search(
+        r"When the same is done to policies with 32 tokens that were trained with the alignment loss, they "
+        rf"show no change of 10 points or more: 0.0 points \({BOUNDS}; 6 training seeds; {link}\)\.$",
+        whole.answer[2],
+    ), whole.answer[2]

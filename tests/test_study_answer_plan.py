@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -72,6 +73,33 @@ def test_phases(monkeypatch: pytest.MonkeyPatch) -> None:
         [("training", "n-4-aligned-seed-1")],
         [("episodes", "n-4-aligned-seed-1", "plain", TASK)],
     ]
+
+
+def test_recipes_and_arms_that_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They limit the policies of every stage and the arms of those that have some, and not what is known."""
+    names = {policy.name for policy in PLAN.all_policies(pilots=True)}
+    some: dict[str, Any] = {"recipes": ("n-0", "n-32"), "arms": ("steps of 2", "1 merged")}
+    known = Answer(PLAN, ("alignment", "instrument", "steps", "measures"), trained=dict.fromkeys(names, ""))
+    study = replace(known, **some)
+    both = [("n-0", 0), ("n-32", 0), ("n-0", 1), ("n-32", 1)]
+    assert [policy.name for policy, _ in study.judged("core")] == [f"{name}-seed-{n}" for name, n in both]
+    assert [(policy.name, arm) for policy, arm in study.judged("instrument")] == [
+        (f"n-32-seed-{seed}", "1 merged") for seed in (0, 1)
+    ]
+    assert [(policy.name, arm) for policy, arm in study.judged("steps")] == [
+        (f"{name}-seed-{seed}", "steps of 2") for name, seed in both
+    ]
+    assert not list(study.judged("alignment"))
+    assert study.num_cells == (2 + 4 + 2) * len(PLAN.tasks)  # the last ones are measured
+    assert study.planned("n-4-aligned-seed-0").recipe.name == "n-4-aligned"
+    parser = argparse.ArgumentParser()
+    Answer.add_arguments(parser)
+    monkeypatch.setattr(graphics, "check", lambda: None)
+    words = ["--recipes", "n-0,n-32", "--arms", "steps-of-2", "1-merged"]
+    parsed = Answer.from_arguments(parser.parse_args(words))
+    assert (parsed.recipes, parsed.arms) == (some["recipes"], some["arms"])
+    assert PLAN.only(()) == PLAN
+    assert known.chosen == PLAN
 
 
 def test_the_arms_of_the_stages_that_train_nothing() -> None:
@@ -191,8 +219,15 @@ def test_plans_that_cannot_be(
     monkeypatch.setattr(graphics, "check", lambda: None)
     assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
     assert (
-        "stages: unknown name cor, expected some of pilot, core, scaled, alignment" in capsys.readouterr().err
+        "--stages: unknown name 'cor', expected one of pilot, core, scaled, alignment"
+        in capsys.readouterr().err
     )
+    for chosen, said in (
+        (["--recipes", "n-5"], "--recipes: unknown name 'n-5', expected one of n-0-pilot, n-32-pilot,"),
+        (["--arms", "plain"], "--arms: unknown name 'plain', expected one of future-unread, future-blind,"),
+    ):
+        assert main(["study", "answer", "--stages", "steps", *chosen, "--out", str(tmp_path / "out")]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_scaled_first_weights_are_the_same_numbers() -> None:

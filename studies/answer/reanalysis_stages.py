@@ -3,8 +3,9 @@
 `python studies/answer/reanalysis_stages.py` prints, for each stage that has rows, the check of the data, the
 success and held-out losses of each recipe, and the differences between recipes with their intervals: for both
 tasks together, and for each alone. They are exploratory, so there are no p values. Then come the one
-test of these stages, that of the new pairs with more steps, and the same policies with other numbers of
-Euler steps, the core's among them. It shares no code with `saccade study answer`.
+test of these stages, that of the new pairs with more steps, and the same policies under arms, the core's
+among them: other numbers of Euler steps, cuts, merged or random tokens and other softmax weights. It shares
+no code with `saccade study answer`.
 Differences are in percentage points; the slope is in points per unit of log2(N + 1).
 """
 
@@ -22,26 +23,30 @@ Policy = tuple[str, int]  # a recipe and a training seed
 Contrast = tuple[str, dict[str, float]]  # its name, and what the success of each recipe is multiplied by
 
 VLSA, VISION = "vlsa", ("patch-32", "patch-8", "two-cameras")
-STAGES = ("scaled", "alignment", "numbers", "compute", VISION[0], VLSA, *VISION[1:])
+STAGES = ("scaled", "alignment", "numbers", "compute", VISION[0], VLSA, *VISION[1:], "aligned-again")
 # The arms of other numbers of Euler steps than four, which are those of the arm "plain".
 EULER = ("steps of 1", "steps of 2", "steps of 8")
+CHANGES = ("future-unread", "future-blind", "rows-blind", "future-redrawn")
+CHANGES += ("1 merged", "4 merged", "mass of 4", "mass of 32")
 COUNTS = (0, 1, 4, 16, 32, 64)
 PARTS = {"both tasks": TASKS, **{task: (task,) for task in TASKS}}
 CORE = ("n-0", "n-4", "n-32")
 BASE = ("n-0-scaled", "n-4-scaled", "n-32-scaled")
 # Columns of a training row that may differ between policies of a stage, beside the results and N.
 VARIED: dict[str, set[str]] = {stage: set() for stage in STAGES}
-VARIED["alignment"] = {"alignment_loss", "validation_alignment_loss"}
+VARIED["alignment"] = VARIED["aligned-again"] = {"alignment_loss", "validation_alignment_loss"}
 VARIED["compute"] = {"width", "steps", "category_std", "language_width", "saccade"}
 VARIED[VLSA] = {"vl_num_layers"}
 # Those that, beside these, may differ between the stage and scaled. A start is a backbone's weights.
 APART: dict[str, set[str]] = {stage: {"stage", "saccade"} for stage in STAGES}
 APART["alignment"] |= {"alignment_weight"}
+APART["aligned-again"] |= {"alignment_weight"}
 APART["patch-32"] |= {"patch_size", "num_vl_tokens", "start_sha256"}
 APART["patch-8"] |= APART["patch-32"]
 APART["two-cameras"] |= {"num_cameras", "num_vl_tokens", "start_sha256", "demonstrations_sha256"}
 # What the end of a recipe's name says of its settings.
 SAID = {"-wide": {"width": 104.0}, "-long": {"steps": 1628.0}, "-aligned": {"alignment_weight": 0.2}}
+SAID["-aligned-again"] = SAID["-aligned"]
 SAID["-patch-32"] = {"patch_size": 32.0, "num_vl_tokens": 61.0}
 SAID["-patch-8"] = {"patch_size": 8.0, "num_vl_tokens": 241.0}
 SAID["-two-cameras"] = {"num_cameras": 2.0, "num_vl_tokens": 74.0}
@@ -77,6 +82,8 @@ def contrasts(stage: str) -> list[Contrast]:
     if stage == "alignment":
         pairs = [("n-32-aligned", many), ("n-4-aligned", four), ("n-32-aligned", "n-4-aligned")]
         return [minus(*pair) for pair in (*pairs, ("n-32-aligned", none))]
+    if stage == "aligned-again":
+        return [minus("n-32-aligned-again", "n-4-aligned-again")]
     if stage == "numbers":
         pairs = [("n-1-scaled", none), ("n-16-scaled", four), ("n-64-scaled", many)]
         pairs += [("n-64-scaled", none), ("n-64-scaled", "n-1-scaled")]
@@ -99,11 +106,13 @@ def in_arm(recipe: str, arm: str) -> str:
     return recipe if arm in ("", "plain") else f"{recipe} in {arm}"
 
 
-def euler_contrasts(end: str, arm: str) -> list[Contrast]:
-    """For the recipes with the same end of the name: an arm against plain, and N against N in both."""
+def arm_contrasts(end: str, arm: str) -> list[Contrast]:
+    """For the recipes with the same end of the name: an arm against plain, and, with another number of Euler
+    steps, N against N in both.
+    """
     recipes = {n: f"n-{n}{end}" for n in COUNTS}
     found = [minus(in_arm(recipe, arm), recipe) for recipe in recipes.values()]
-    for base in (0, 4):
+    for base in (0, 4) if arm in EULER else ():
         there, plain = (minus(in_arm(recipes[32], a), in_arm(recipes[base], a)) for a in (arm, "plain"))
         found += [there, less(there, plain)]
     return found
@@ -152,7 +161,8 @@ class Table:
     def __init__(self, rows: list[Row]) -> None:
         mine = [row for row in rows if row["stage"] in ("core", *STAGES)]
         self.trained = [row for row in mine if row["kind"] == "training"]
-        self.episodes = [r for r in mine if r["kind"] == "episodes" and r["arm"] in ("plain", *EULER)]
+        arms = ("plain", *EULER, *CHANGES)
+        self.episodes = [row for row in mine if row["kind"] == "episodes" and row["arm"] in arms]
         wanted = Counter((task, episode) for task in TASKS for episode in range(EPISODES))
         ran = {policy(row): Counter[tuple[str, int]]() for row in (*self.trained, *self.episodes)}
         for row in self.episodes:
@@ -292,10 +302,14 @@ def test_new(table: Table) -> None:
             print(f"  p = {float(sign_flip(values)):.6f}" if tested else "", [round(v, 2) for v in values])
 
 
-def euler(table: Table, arm: str) -> None:
-    """Print what another number of Euler steps does to the same policies, recipes of one kind together."""
+def under_arm(table: Table, arm: str) -> None:
+    """Print what an arm does to the same policies, recipes of one kind together."""
     mine = [row for row in table.episodes if row["arm"] == arm]
-    print(f"\n{arm} in the same policies, where plain is 4" if mine else f"\n{arm}: no rows")
+    print(
+        f"\n{arm} in the same policies{', where plain is 4' * (arm in EULER)}"
+        if mine
+        else f"\n{arm}: no rows"
+    )
     if not mine:
         return
     left = {policy(row) for row in mine} & table.partial
@@ -320,7 +334,11 @@ def euler(table: Table, arm: str) -> None:
                 means = map(statistics.fmean, rates)
                 shown = ", ".join(f"{part} {mean:.4f}" for part, mean in zip(PARTS, means, strict=True))
                 print(f"  {name}: success of {len(seeds)}: {shown}")
-        differences(table, euler_contrasts(end, arm))
+            ends = Counter((a["success"], b["success"]) for a, b in pairs if a["recipe"] == recipe and seeds)
+            if seeds:
+                won, lost = ends["True", "False"], ends["False", "True"]
+                print(f"  of {ends.total()} episodes {won} succeed in the arm only, {lost} in plain only")
+        differences(table, arm_contrasts(end, arm))
 
 
 def main() -> None:
@@ -337,8 +355,8 @@ def main() -> None:
             describe(table, trained)
             differences(table, contrasts(stage))
     test_new(table)
-    for arm in EULER:
-        euler(table, arm)
+    for arm in (*EULER, *CHANGES):
+        under_arm(table, arm)
 
 
 if __name__ == "__main__":

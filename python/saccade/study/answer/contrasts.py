@@ -163,4 +163,5 @@ EXPLORATORY: dict[str, tuple[Contrast, ...]] = {
     "vlsa": (*within("-vlsa-0"), *within("-vlsa-4")),
     "patch-8": within("-patch-8"),
     "two-cameras": within("-two-cameras"),
+    "aligned-again": (difference("n-32-aligned-again", "n-4-aligned-again"),),
 }

@@ -20,11 +20,12 @@ from saccade.study.answer.patching import PATCHING
 from saccade.study.answer.probes import DIMENSIONS, PROBES
 from saccade.study.answer.results import ordered
 from saccade.study.answer.specialise import KEPT, LEARNED, LOST, RANDOM, SIZES, SPECIALISE, WEIGHTS
-from saccade.study.answer.times import TIMES
+from saccade.study.answer.times import TIMES, UNTRAINED
 from saccade.study.questions.patching_section import ALL, GROUPS
 from saccade.study.section import Figure, Grid, Prose, number
 from saccade.study.sign_flip import sign_flip
 from saccade.study.statistics import Estimate
+from saccade.study.table import truths
 
 #: By recipe: a number with learned tokens, with random ones, and the difference; None where no seed has it.
 Compared: TypeAlias = Mapping[str, tuple[Estimate | None, Estimate | None, Estimate | None]]
@@ -191,12 +192,13 @@ def probe_grid(caption: str, rows: pd.DataFrame) -> Grid:
 
 def time_grid(caption: str, rows: pd.DataFrame) -> Grid:
     """What heads cost: a row for each recipe, milliseconds and ratios to the first."""
+    untrained = truths(rows[UNTRAINED]) if UNTRAINED in rows else rows["recipe"].map(lambda recipe: False)
     lines = []
-    for _, row in rows.iterrows():
-        numbers = [str(int(row["num_vl_tokens"]))]
+    for (_, row), first in zip(rows.iterrows(), untrained, strict=True):
+        numbers = ["first" if first else "trained", str(int(row["num_vl_tokens"]))]
         for part in ("encode", "sample"):
             ratio = Estimate(*(float(row[f"{part}_ratio{end}"]) for end in ("", "_low", "_high")))
             numbers += [f"{row[f'{part}_ms']:.3f}", shown(ratio)]
         lines.append([str(row["recipe"]), *numbers])
-    columns = ("recipe", "T_vl", "encode, ms", "ratio", "sample, ms", "ratio")
+    columns = ("recipe", "weights", "T_vl", "encode, ms", "ratio", "sample, ms", "ratio")
     return Grid(caption, columns, lines)

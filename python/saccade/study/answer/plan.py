@@ -6,7 +6,7 @@ Do not change a number without changing that page.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -195,6 +195,10 @@ class Plan:
                 if seed in recipe.seeds:
                     yield PlannedPolicy(recipe, self.backbone(recipe), seed)
 
+    def only(self, recipes: Collection[str]) -> Plan:
+        """The plan with the recipes of these names alone; with all of them if there are none."""
+        return replace(self, recipes=tuple(one for one in self.recipes if one.name in recipes or not recipes))
+
     def all_policies(self, *, pilots: bool) -> Iterator[PlannedPolicy]:
         """The policies of all stages, with or without those of `PILOT`."""
         for stage in self.stages:
@@ -299,6 +303,8 @@ PLAN = Plan(
         *recipes("vlsa", "-vlsa-4", (4, 32), vl_num_layers=4),
         *recipes("patch-8", "-patch-8", (4, 32), backbone="backbone-patch-8", patch_size=8),
         *recipes("two-cameras", "-two-cameras", (4, 32), backbone="backbone-two-cameras"),
+        # The weights of *alignment*'s policies are gone. These are trained to be changed, see `arms`.
+        *recipes("aligned-again", "-aligned-again", (4, 32), alignment_weight=ALIGNMENT),
     ),
     tasks=TASKS,
     seeds=EPISODES,

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import pandas as pd
 
-from saccade._arguments import add_list
+from saccade._arguments import add_list, check_known
 from saccade._files import checkpoint_identity, sha256_of
 from saccade._json import changed
 from saccade.errors import InputError
@@ -23,7 +23,7 @@ from saccade.study.answer.costs import cost
 from saccade.study.answer.measured import FIRST_EPISODES, MEASURED
 from saccade.study.answer.plan import CORE_STAGE, PILOT, Backbone, Plan, PlannedPolicy, Recording
 from saccade.study.answer.section import section
-from saccade.study.answer.times import TIMES, latencies
+from saccade.study.answer.times import TIMES, UNTRAINED, latencies
 from saccade.study.cell import Cell, Rows
 from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.runs import Planned, read_run, saved_step
@@ -41,6 +41,7 @@ is named, and is no result.
 examples:
   saccade study answer --stages pilot --out out/answer
   saccade study answer --stages core --jobs 2 --out out/answer
+  saccade study answer --stages steps --recipes n-0,n-32 --arms steps-of-2 --out out/answer
   saccade study answer --out out/answer
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
@@ -76,6 +77,8 @@ class Answer(Study):
     Attributes:
         plan: What is trained, and how it is judged.
         stages: The stages that are run, in the order of the plan.
+        recipes: Names of the recipes whose policies are run; empty for all.
+        arms: Names of the arms that are run, in stages that have some; empty for all.
         phase: How many of `phases` are over.
         demos: Directory of each recording, by name; set by `begin`, as are `trainings`.
         trainings: Directory of each backbone and each policy, by name.
@@ -84,6 +87,8 @@ class Answer(Study):
 
     plan: Plan
     stages: tuple[str, ...]
+    recipes: tuple[str, ...] = ()
+    arms: tuple[str, ...] = ()
     phase: int = 0
     demos: Mapping[str, Path] = field(default_factory=dict)
     trainings: Mapping[str, Path] = field(default_factory=dict)
@@ -96,6 +101,12 @@ class Answer(Study):
         parser.epilog = EPILOG
         stages = ", ".join(all_stages(plans.PLAN))
         add_list(parser, "--stages", help=f"stages to run, of {stages} (default: all but {PILOT})")
+        what = "recipes whose policies are run, in all of these stages"
+        add_list(parser, "--recipes", default=(), help=f"{what} (default: those of the plan)")
+        arms = "; ".join(
+            f"{stage}: {', '.join(written(arm.name) for arm in some)}" for stage, some in ARMS.items()
+        )
+        add_list(parser, "--arms", default=(), help=f"arms to run, of {arms} (default: all)")
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Answer:
@@ -104,13 +115,13 @@ class Answer(Study):
 
         known = all_stages(plans.PLAN)
         asked = [stage for stage in known if stage != PILOT] if args.stages is None else args.stages
-        unknown = [stage for stage in asked if stage not in known]
-        if unknown:
-            raise InputError(
-                f"stages: unknown name {', '.join(unknown)}, expected some of {', '.join(known)}"
-            )
+        check_known("--stages", asked, known)
+        check_known("--recipes", args.recipes, [recipe.name for recipe in plans.PLAN.recipes])
+        arms = {written(arm.name): arm.name for some in ARMS.values() for arm in some}
+        check_known("--arms", args.arms, arms)
         graphics.check()
-        return cls(plans.PLAN, tuple(stage for stage in known if stage in asked))
+        stages = tuple(stage for stage in known if stage in asked)
+        return cls(plans.PLAN, stages, args.recipes, tuple(arms[name] for name in args.arms))
 
     def begin(self, out: Path) -> Answer:
         """See `Study`."""
@@ -133,12 +144,17 @@ class Answer(Study):
         }
 
     @property
+    def chosen(self) -> Plan:
+        """The plan with the recipes that are run alone."""
+        return self.plan.only(self.recipes)
+
+    @property
     def phases(self) -> list[Phase]:
         """The phases in their order: a stage is finished before the next one begins.
 
         `SEEDS_TOGETHER` training seeds are trained and judged before the next ones, so that a run which is
-        stopped leaves whole pairs with their episodes; but nothing of the core is judged before all of it is
-        trained.
+        stopped leaves whole pairs with their episodes; but nothing of the core is judged before all of its
+        recipes that are run are trained.
         """
         phases = []
         for stage in self.stages:
@@ -148,7 +164,7 @@ class Answer(Study):
                 phases.append(Phase(stage, EPISODES))
             else:
                 phases += [Phase(stage, kind) for kind in (RECORDING, BACKBONE)]
-                seeds = sorted({policy.seed for policy in self.plan.policies(stage)})
+                seeds = sorted({policy.seed for policy in self.chosen.policies(stage)})
                 together = len(seeds) if stage == CORE_STAGE else SEEDS_TOGETHER
                 for first in range(0, len(seeds), together):
                     some = tuple(seeds[first : first + together])
@@ -169,16 +185,19 @@ class Answer(Study):
         if kind == TIMES:  # one cell for all, which are timed alternately
             timed = self.timed()
             if timed:
-                checkpoints = {name: self.trained[policy.name] for name, policy in timed.items()}
+                checkpoints = {
+                    name: self.trained[policy.name] if self.is_here(policy) else UNTRAINED
+                    for name, policy in timed.items()
+                }
                 yield Cell((TIMES,), {"checkpoints": checkpoints})
             return
         if kind in MEASURED:
-            for policy in MEASURED[kind].policies(self.plan):
+            for policy in MEASURED[kind].policies(self.chosen):
                 if policy.name in self.trained:
                     settings = {"checkpoint": self.trained[policy.name], "episodes": list(self.first_seeds)}
                     yield Cell((kind, policy.name), settings)
             return
-        for policy in self.plan.policies(phase.stage):
+        for policy in self.chosen.policies(phase.stage):
             if not phase.has(policy):
                 continue
             backbone = policy.backbone
@@ -206,22 +225,31 @@ class Answer(Study):
         stopped leaves whole arms.
         """
         if stage not in ARMS:  # those of `MEASURED` have no policies of their own
-            yield from ((policy, PLAIN) for policy in self.plan.policies(stage))
+            yield from ((policy, PLAIN) for policy in self.chosen.policies(stage))
             return
         for arm in ARMS[stage]:
-            for policy in self.plan.all_policies(pilots=False):
+            if self.arms and arm.name not in self.arms:
+                continue
+            for policy in self.chosen.all_policies(pilots=False):
                 if arm.applies(policy.training.num_future_tokens):
                     yield policy, arm.name
 
     def timed(self) -> dict[str, PlannedPolicy]:
-        """The policy of each recipe that is timed, by the recipe's name: the first trained one whose weights
-        are here. Of some policies only the hashes are kept.
+        """The policy of each recipe that is timed, by the recipe's name, in the order of the plan: the first
+        trained one whose weights are here. Of some policies only the hashes are kept; where no weights of a
+        recipe are here, it is the first trained one, which is timed with its first weights.
         """
+        trained = [one for one in self.chosen.all_policies(pilots=False) if one.name in self.trained]
         found: dict[str, PlannedPolicy] = {}
-        for policy in self.plan.all_policies(pilots=False):
-            if policy.name in self.trained and self.trainings[policy.name].is_dir():
-                found.setdefault(policy.recipe.name, policy)
+        for policy in trained:
+            before = found.setdefault(policy.recipe.name, policy)
+            if self.is_here(policy) and not self.is_here(before):
+                found[policy.recipe.name] = policy
         return found
+
+    def is_here(self, policy: PlannedPolicy) -> bool:
+        """Whether the weights of a trained policy are here."""
+        return self.trainings[policy.name].is_dir()
 
     @property
     def first_seeds(self) -> range:
@@ -233,12 +261,12 @@ class Answer(Study):
         """See `Study`. Stages without training count the policies that these stages train, or earlier ones
         have trained.
         """
-        planned = [policy for stage in self.stages for policy in self.plan.policies(stage)]
+        planned = [policy for stage in self.stages for policy in self.chosen.policies(stage)]
         known = {policy.name for policy in planned} | set(self.trained)
         runs = [policy for stage in self.stages for policy, _ in self.judged(stage) if policy.name in known]
         recordings = {policy.recording for policy in planned}
         backbones = {policy.backbone.name for policy in planned}
-        of_policies = [MEASURED[stage].policies(self.plan) for stage in self.stages if stage in MEASURED]
+        of_policies = [MEASURED[stage].policies(self.chosen) for stage in self.stages if stage in MEASURED]
         measured = [one for policies in of_policies for one in policies if one.name in known]
         trained = len(recordings) + len(backbones) + len(planned)
         timed = TIMES in self.stages and bool(planned or self.timed())
@@ -280,7 +308,7 @@ class Answer(Study):
         """
         if self.phases[self.phase].kind not in (EPISODES, *MEASURED, TIMES):
             return ()
-        trained = [one.name for one in self.plan.all_policies(pilots=True) if one.name in self.trained]
+        trained = [one.name for one in self.chosen.all_policies(pilots=True) if one.name in self.trained]
         return tuple(self.trainings[name] for name in trained if self.trainings[name].is_dir())
 
     def measure(self, cell: Cell) -> Rows:
@@ -304,9 +332,9 @@ class Answer(Study):
 
     def time(self) -> Rows:
         """Latencies of a policy of each recipe, timed alternately."""
-        timed = list(self.timed().values())
-        found = latencies([self.finished(policy.name) for policy in timed])
-        return [{**policy.columns, **row} for policy, row in zip(timed, found, strict=True)]
+        timed = self.timed().values()
+        directories = [self.finished(one.name) if self.is_here(one) else None for one in timed]
+        return latencies(list(zip(timed, directories, strict=True)), self.plan)
 
     def planned(self, name: str) -> PlannedPolicy:
         """A policy of the plan by its name."""
@@ -428,6 +456,16 @@ class Answer(Study):
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
         return section(table, provenance, plans.PLAN)
+
+
+def written(arm: str) -> str:
+    """The name of an arm on the command line, where a space separates names.
+
+    Example:
+        >>> written("steps of 2")
+        'steps-of-2'
+    """
+    return arm.replace(" ", "-")
 
 
 def all_stages(plan: Plan) -> tuple[str, ...]:
