@@ -123,8 +123,10 @@ mod tests {
         assert!(genoa.has_fast_bf16_dot() && !genoa.wants_streams());
         let turin = cpu(Vendor::Amd, 26, 2);
         assert!(turin.has_fast_bf16_dot());
-        let sapphire = cpu(Vendor::Intel, 6, 0x8f);
-        assert!(!sapphire.has_fast_bf16_dot() && sapphire.wants_streams());
+        for model in [0x8f, 0xcf] {
+            let rapids = cpu(Vendor::Intel, 6, model);
+            assert!(!rapids.has_fast_bf16_dot() && rapids.wants_streams());
+        }
         let report = CpuReport::of(&genoa, Err(Refusal::NotThere));
         assert_eq!(report.family, "Zen 4 (AuthenticAMD, family 25, model 17)");
         assert_eq!(report.rates, "Zen 4, measured");
@@ -147,7 +149,7 @@ mod tests {
                 report.family,
                 format!("{name} (GenuineIntel, family 6, model {model})")
             );
-            assert_eq!(report.rates, format!("Sapphire Rapids, {newest}"));
+            assert_eq!(report.rates, format!("Emerald Rapids, {newest}"));
             assert_eq!(report.tiles, "yes");
         }
         let zen6 = cpu(Vendor::Amd, 26, 0x50);
