@@ -349,12 +349,14 @@ def test_the_page_contains_what_was_measured() -> None:
     assert report.PAGE.read_text() == report.page(measured)
 
 
-@pytest.mark.parametrize("slug", ["zen-4", "zen-5", "genuineintel-family-6-model-167"])
+@pytest.mark.parametrize("slug", ["zen-4", "zen-5", "emerald-rapids", "genuineintel-family-6-model-167"])
 def test_the_cost_model_expects_what_was_measured(slug: str) -> None:
     (results,) = (results for results in records() if results.slug == slug)
     config = text.config(CASE)
     call = Call.of(config, CASE.num_vl_tokens, CASE.steps)
     names = [name for name in results.names(CASE) if name.startswith("saccade") and "refresh" not in name]
+    if slug == "emerald-rapids":
+        names.remove("saccade-int8-avx2")  # faster than expected, as EMERALD_RAPIDS says
     assert len(names) >= 3
     for name in names:
         machine = machine_of(results, CASE, name)
