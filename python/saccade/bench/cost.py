@@ -119,7 +119,7 @@ ZEN_5 = Measured(
 
 #: From `benches/peers/results/emerald-rapids.json` (2 cores, AVX-512 without AMX) and, for attention and the
 #: rest, one run of the same command. The record is within 15 % of the expected times but for int8 with AVX2,
-#: whose `sample` takes 0.81 of them. Since then bfloat16 has got about 1.05 times as fast.
+#: whose `sample` takes 0.81 of them.
 EMERALD_RAPIDS = Measured(
     "an Emerald Rapids with AVX-512",
     {
