@@ -355,14 +355,16 @@ def test_the_cost_model_expects_what_was_measured(slug: str) -> None:
     config = text.config(CASE)
     call = Call.of(config, CASE.num_vl_tokens, CASE.steps)
     names = [name for name in results.names(CASE) if name.startswith("saccade") and "refresh" not in name]
-    if slug == "emerald-rapids":
-        names.remove("saccade-int8-avx2")  # faster than expected, as EMERALD_RAPIDS says
     assert len(names) >= 3
     for name in names:
         machine = machine_of(results, CASE, name)
         assert machine is not None
+        # `EMERALD_RAPIDS` says so: faster than expected.
+        exception = (slug, name) == ("emerald-rapids", "saccade-int8-avx2")
         for work, expected in predict(config, call, text.arithmetic(name), machine).items():
-            assert quartiles(results.seconds(CASE, name, work))[1] == pytest.approx(expected, rel=0.15)
+            assert quartiles(results.seconds(CASE, name, work))[1] == pytest.approx(
+                0.84 * expected if exception else expected, rel=0.05 if exception else 0.15
+            )
 
 
 def test_a_run_is_kept_under_the_name_of_its_cpu(tmp_path: Path) -> None:

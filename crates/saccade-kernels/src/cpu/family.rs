@@ -29,7 +29,7 @@ pub(crate) struct Rates {
 }
 
 /// Measured by a prototype, before saccade had tiles: `docs/instruction-sets.md`. The others were measured by `make bench-peers`, but for
-/// VDPBF16PS where another product is used.
+/// VDPBF16PS on Intel, where `avx512` does not use it.
 const SAPPHIRE_RAPIDS: Rates = Rates {
     float32: 145.0,
     bf16_dot: 76.0,

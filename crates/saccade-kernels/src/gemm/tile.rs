@@ -28,8 +28,6 @@ pub(super) trait Step<S: Simd> {
     const PART_STEPS: usize;
     /// Rows of the largest tile.
     const TILE_ROWS: usize;
-    /// Vectors of a row of it, at most 3.
-    const TILE_VECTORS: usize = S::Vector::TILE_VECTORS;
     /// Steps of a turn of the innermost loop. What counts steps and finds rows takes ports from the products on Intel: with one step a turn,
     /// 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more. Not
     /// measured alone on AMD.
@@ -101,7 +99,7 @@ pub(super) use float_sums;
 /// The sizes of a product with these steps: a panel as wide as the largest tile, rows one by one.
 pub(super) fn shape<S: Simd, P: Step<S>>() -> Shape {
     Shape {
-        columns: P::TILE_VECTORS * S::Vector::LANES,
+        columns: S::Vector::TILE_VECTORS * S::Vector::LANES,
         tile_rows: P::TILE_ROWS,
         row_group: 1,
         rows_beyond: 0,
@@ -114,12 +112,12 @@ pub(super) fn shape<S: Simd, P: Step<S>>() -> Shape {
 /// As there, with panels of `TILE_VECTORS` vectors of words of `P::STEP` elements; called within [`Simd::run`] of `S`.
 #[inline(always)]
 pub(super) unsafe fn multiply<S: Simd, P: Step<S>>(block: &Block<'_>) {
-    const { assert!(P::TILE_VECTORS <= 3 && P::TILE_ROWS <= 13) }
+    const { assert!(S::Vector::TILE_VECTORS <= 3) }
     // 128 outputs are 8 vectors of AVX-512, not the 9 of three whole panels: a head of width 128 took 0.93 of the time on one thread of a Zen 4.
     let used = block.needed.div_ceil(S::Vector::LANES);
     // SAFETY: the caller's promise.
     unsafe {
-        match (P::TILE_VECTORS, used) {
+        match (S::Vector::TILE_VECTORS, used) {
             (1, _) => panel_rows::<S, S::Vector, P, 1, 1>(block),
             (2, 1) => panel_rows::<S, S::Vector, P, 2, 1>(block),
             (2, _) => panel_rows::<S, S::Vector, P, 2, 2>(block),
@@ -177,11 +175,6 @@ unsafe fn panel_rows<S: Simd<Vector = V>, V: Vector, P: Step<S>, const NV: usize
                     6 if P::TILE_ROWS >= 6 => tile_part::<S, V, P, NV, UV, 6>(block, &part, &tile),
                     7 if P::TILE_ROWS >= 7 => tile_part::<S, V, P, NV, UV, 7>(block, &part, &tile),
                     8 if P::TILE_ROWS >= 8 => tile_part::<S, V, P, NV, UV, 8>(block, &part, &tile),
-                    9 if P::TILE_ROWS >= 9 => tile_part::<S, V, P, NV, UV, 9>(block, &part, &tile),
-                    10 if P::TILE_ROWS >= 10 => tile_part::<S, V, P, NV, UV, 10>(block, &part, &tile),
-                    11 if P::TILE_ROWS >= 11 => tile_part::<S, V, P, NV, UV, 11>(block, &part, &tile),
-                    12 if P::TILE_ROWS >= 12 => tile_part::<S, V, P, NV, UV, 12>(block, &part, &tile),
-                    13 if P::TILE_ROWS >= 13 => tile_part::<S, V, P, NV, UV, 13>(block, &part, &tile),
                     rows => unreachable!("a tile of {rows} rows"),
                 }
             }

@@ -33,9 +33,6 @@ pub(crate) unsafe trait Vector: Copy {
     const TILE_ROWS: usize;
     /// Vectors of a row of that tile: at most 3 where linear layers are made of these vectors, 4 where only attention is.
     const TILE_VECTORS: usize;
-    /// Rows and vectors of that tile where factors are widened in registers first. That takes a register more, and an instruction for each vector
-    /// and step.
-    const WIDENED_TILE: (usize, usize) = (Self::TILE_ROWS - 1, Self::TILE_VECTORS);
     /// As many lanes of i32.
     type Ints: Copy;
     /// Up to where [`Self::dot_bytes`] takes unsigned bytes.

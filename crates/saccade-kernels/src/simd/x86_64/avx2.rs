@@ -65,8 +65,6 @@ unsafe impl Vector for __m256 {
     const LANES: usize = 8;
     const TILE_ROWS: usize = 6;
     const TILE_VECTORS: usize = 2;
-    // Shares of the FMA peak at 296 x 2048 x 1536 on Zen 4: 6 and 5 rows 0.70 and 0.88, since 6 spill.
-    const WIDENED_TILE: (usize, usize) = (5, 2);
     type Ints = __m256i;
     // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates. The other ways out cost more: 7 bits in the weights
     // lose as much (0.018 of the result instead of 0.011; this way, 0.017), 16-bit products take the time of float32.

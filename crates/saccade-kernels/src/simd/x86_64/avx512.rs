@@ -106,10 +106,6 @@ unsafe impl Vector for __m512 {
     const LANES: usize = 16;
     const TILE_ROWS: usize = 8;
     const TILE_VECTORS: usize = 3;
-    // On Intel, widening a vector takes a place from a multiply-add: one in 8 with 7 rows, one in 14 with 13. Best of ten runs by turns on an
-    // Emerald Rapids, bfloat16, 49 and 296 rows: (13, 2) is 1.02 to 1.05 times as fast as (7, 3) on one thread, 0.97 to 1.06 times on two. Not
-    // measured on AMD, where widening has units of its own; on a Zen 4, (7, 3) reached 0.97 of the FMA peak and (8, 3), which spills, 0.77.
-    const WIDENED_TILE: (usize, usize) = (13, 2);
     type Ints = __m512i;
     // As with AVX2.
     const MAX_BYTE: u8 = 129;
