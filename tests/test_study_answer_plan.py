@@ -95,7 +95,7 @@ def test_recipes_and_arms_that_are_chosen(monkeypatch: pytest.MonkeyPatch) -> No
     parser = argparse.ArgumentParser()
     Answer.add_arguments(parser)
     monkeypatch.setattr(graphics, "check", lambda: None)
-    words = ["--recipes", "n-0,n-32", "--arms", "steps-of-2", "1-merged"]
+    words = ["--stages", "instrument,steps", "--recipes", "n-0,n-32", "--arms", "steps-of-2", "1-merged"]
     parsed = Answer.from_arguments(parser.parse_args(words))
     assert (parsed.recipes, parsed.arms) == (some["recipes"], some["arms"])
     assert PLAN.only(()) == PLAN
@@ -225,8 +225,37 @@ def test_plans_that_cannot_be(
     for chosen, said in (
         (["--recipes", "n-5"], "--recipes: unknown name 'n-5', expected one of n-0-pilot, n-32-pilot,"),
         (["--arms", "plain"], "--arms: unknown name 'plain', expected one of future-unread, future-blind,"),
+        (
+            ["--arms", "1-merged"],
+            "--arms: 1-merged is in none of the stages steps, expected one of steps-of-1, steps-of-2,",
+        ),
+        (
+            ["--recipes", "n-0-pilot"],
+            "--recipes: n-0-pilot is in none of the stages steps, expected one of n-0,",
+        ),
+        (
+            ["--stages", "instrument", "--recipes", "n-0"],
+            "--recipes: n-0 is in none of the stages instrument, expected one of n-4, n-32,",
+        ),
+        (
+            ["--stages", "instrument", "--arms", "mass-of-4", "--recipes", "n-4"],
+            "--recipes: n-4 is in none of the stages instrument, expected one of n-32,",
+        ),
+        (
+            ["--stages", "alignment", "--recipes", "n-4"],
+            "--recipes: n-4 is in none of the stages alignment, expected one of n-4-aligned, n-32-aligned\n",
+        ),
+        (
+            ["--stages", "core", "--arms", "steps-of-2"],
+            "--arms: steps-of-2 is in none of the stages core, expected none\n",
+        ),
+        (
+            ["--stages", "core", "--recipes", "n-0"],
+            "--recipes: n-4, n-32 is missing, expected all or none of the core's\n",
+        ),
     ):
-        assert main(["study", "answer", "--stages", "steps", *chosen, "--out", str(tmp_path / "out")]) == 2
+        words = ["--stages", "steps", *chosen, "--out", str(tmp_path / "out")]
+        assert main(["study", "answer", *words]) == 2
         assert said in capsys.readouterr().err
 
 

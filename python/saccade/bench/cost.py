@@ -2,7 +2,7 @@
 
 The floor of a part is the longer of two times: its multiply-adds at the CPU's peak rate in the arithmetic of
 the part, and reading its weights at the memory's bandwidth. The expected time divides the floor by the share
-of it that the kernels reach, as measured on a Zen 4, a Zen 5, an Emerald Rapids without AMX and a Xeon with AMX.
+of it that the kernels reach, as measured on a Zen 4, a Zen 5, and on Xeons with AMX and without.
 """
 
 from __future__ import annotations
@@ -117,9 +117,9 @@ ZEN_5 = Measured(
     },
 )
 
-#: From `benches/peers/results/emerald-rapids.json` (2 cores, AVX-512 without AMX); attention and the rest from
-#: one run of `saccade bench --version n1.5 --profile`. The record is within 15 % of the expected times, but
-#: for int8 with AVX2, which takes 0.81 (`sample`) and 0.87 of them.
+#: From `benches/peers/results/emerald-rapids.json` (2 cores, AVX-512 without AMX); attention and the rest
+#: from one run of `saccade bench --version n1.5 --profile`. The record is within 15 % of what is expected, but
+#: for int8 with AVX2, which takes 0.81 (`sample`) and 0.87 of that.
 EMERALD_RAPIDS = Measured(
     "an Emerald Rapids with AVX-512",
     {

@@ -12,11 +12,11 @@ from typing import Any, ClassVar
 
 import pandas as pd
 
-from saccade._arguments import add_list, check_known
 from saccade._files import checkpoint_identity, sha256_of
 from saccade._json import changed
 from saccade.errors import InputError
 from saccade.sim.training_settings import STATE_FILE, features_name
+from saccade.study.answer import choice
 from saccade.study.answer import plan as plans
 from saccade.study.answer.arms import ARMS, find_arm, judge
 from saccade.study.answer.costs import cost
@@ -25,7 +25,6 @@ from saccade.study.answer.plan import CORE_STAGE, PILOT, Backbone, Plan, Planned
 from saccade.study.answer.section import section
 from saccade.study.answer.times import TIMES, UNTRAINED, latencies
 from saccade.study.cell import Cell, Rows
-from saccade.study.questions.sweeps_results import PLAIN
 from saccade.study.runs import Planned, read_run, saved_step
 from saccade.study.section import Section
 from saccade.study.study import Study
@@ -99,29 +98,16 @@ class Answer(Study):
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """See `Study`."""
         parser.epilog = EPILOG
-        stages = ", ".join(all_stages(plans.PLAN))
-        add_list(parser, "--stages", help=f"stages to run, of {stages} (default: all but {PILOT})")
-        what = "recipes whose policies are run, in all of these stages"
-        add_list(parser, "--recipes", default=(), help=f"{what} (default: those of the plan)")
-        arms = "; ".join(
-            f"{stage}: {', '.join(written(arm.name) for arm in some)}" for stage, some in ARMS.items()
-        )
-        add_list(parser, "--arms", default=(), help=f"arms to run, of {arms} (default: all)")
+        choice.add_arguments(parser, plans.PLAN)
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Answer:
         """See `Study`."""
         from saccade.sim import graphics
 
-        known = all_stages(plans.PLAN)
-        asked = [stage for stage in known if stage != PILOT] if args.stages is None else args.stages
-        check_known("--stages", asked, known)
-        check_known("--recipes", args.recipes, [recipe.name for recipe in plans.PLAN.recipes])
-        arms = {written(arm.name): arm.name for some in ARMS.values() for arm in some}
-        check_known("--arms", args.arms, arms)
+        chosen = choice.choose(args, plans.PLAN)
         graphics.check()
-        stages = tuple(stage for stage in known if stage in asked)
-        return cls(plans.PLAN, stages, args.recipes, tuple(arms[name] for name in args.arms))
+        return cls(plans.PLAN, *chosen)
 
     def begin(self, out: Path) -> Answer:
         """See `Study`."""
@@ -153,8 +139,8 @@ class Answer(Study):
         """The phases in their order: a stage is finished before the next one begins.
 
         `SEEDS_TOGETHER` training seeds are trained and judged before the next ones, so that a run which is
-        stopped leaves whole pairs with their episodes; but nothing of the core is judged before all of its
-        recipes that are run are trained.
+        stopped leaves whole pairs with their episodes; but nothing of the core is judged before all of it is
+        trained.
         """
         phases = []
         for stage in self.stages:
@@ -221,18 +207,8 @@ class Answer(Study):
                 yield from (Cell((EPISODES, policy.name, arm, task), settings) for task in self.plan.tasks)
 
     def judged(self, stage: str) -> Iterator[tuple[PlannedPolicy, str]]:
-        """The policies and arms of a stage, trained or not. They run arm by arm, so that a run which is
-        stopped leaves whole arms.
-        """
-        if stage not in ARMS:  # those of `MEASURED` have no policies of their own
-            yield from ((policy, PLAIN) for policy in self.chosen.policies(stage))
-            return
-        for arm in ARMS[stage]:
-            if self.arms and arm.name not in self.arms:
-                continue
-            for policy in self.chosen.all_policies(pilots=False):
-                if arm.applies(policy.training.num_future_tokens):
-                    yield policy, arm.name
+        """The policies and arms of a stage that are run, see `choice.judged`."""
+        return choice.judged(stage, self.chosen, self.arms)
 
     def timed(self) -> dict[str, PlannedPolicy]:
         """The policy of each recipe that is timed, by the recipe's name, in the order of the plan: the first
@@ -456,21 +432,6 @@ class Answer(Study):
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
         """See `Study`."""
         return section(table, provenance, plans.PLAN)
-
-
-def written(arm: str) -> str:
-    """The name of an arm on the command line, where a space separates names.
-
-    Example:
-        >>> written("steps of 2")
-        'steps-of-2'
-    """
-    return arm.replace(" ", "-")
-
-
-def all_stages(plan: Plan) -> tuple[str, ...]:
-    """The stages of a plan, those that train policies and those that do not, in the order they run in."""
-    return (*plan.stages, *ARMS, *MEASURED, TIMES)
 
 
 def described(recording: Recording) -> dict[str, Any]:
