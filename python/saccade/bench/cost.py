@@ -118,8 +118,8 @@ ZEN_5 = Measured(
 )
 
 #: From `benches/peers/results/emerald-rapids.json` (2 cores, AVX-512 without AMX); attention and the rest
-#: from one run of `saccade bench --version n1.5 --profile`. The record is within 15 % of what is expected, but
-#: for int8 with AVX2, which takes 0.81 (`sample`) and 0.87 of that.
+#: from one run of `saccade bench --version n1.5 --profile`. The record is within 15 % of the expected times,
+#: but for int8 with AVX2, which takes 0.81 (`sample`) and 0.87 of them.
 EMERALD_RAPIDS = Measured(
     "an Emerald Rapids with AVX-512",
     {
