@@ -16,6 +16,8 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+#: The share of what its multiply-adds alone could do that every loop should reach.
+LEAST = 0.9
 #: Instruction -> multiply-adds of one.
 INSTRUCTIONS = {"fmla": 4, "bfmmla": 16, "bfdot": 8, "sdot": 16, "usmmla": 32}
 #: The CPUs, and what each lacks.
@@ -99,19 +101,26 @@ def largest(loops: list[Loop]) -> list[Loop]:
     return [best[place] for place in sorted(best)]
 
 
-def main() -> None:
-    """Prints the table."""
+def main() -> int:
+    """Prints the table. The exit status is 1 if an instruction has no loop, or a loop less than `LEAST`."""
     columns = ["instruction", "of", "multiply-adds", "instructions", "instructions a multiply-add", *CPUS]
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
-    for loop in largest(loops_of(Path(sys.argv[1]).read_text())):
+    loops = largest(loops_of(Path(sys.argv[1]).read_text()))
+    wrong = [f"no loop of {kind}" for kind in INSTRUCTIONS if kind not in {loop.kind for loop in loops}]
+    for loop in loops:
         count = len(loop.multiply_adds) * INSTRUCTIONS[loop.kind]
         row = [f"`{loop.kind}`", "attention" if loop.in_attention else "weights", str(count)]
         row += [str(len(loop.instructions)), f"{len(loop.instructions) / count:.3f}"]
         for cpu, lacks in CPUS.items():
             share = cycles(loop.multiply_adds, cpu) / cycles(loop.instructions, cpu)
             row.append("" if loop.kind in lacks else f"{100 * share:.0f} %")
+            if loop.kind not in lacks and share < LEAST:
+                wrong.append(f"{loop.kind} on {cpu}: {share:.2f} of it, expected at least {LEAST}")
         print(f"| {' | '.join(row)} |")
+    for what in wrong:
+        print(f"aarch64: {what}", file=sys.stderr)
+    return 1 if wrong else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -239,20 +239,43 @@ unsafe fn tile_part<S: Simd, P: Step<S>, const NV: usize, const MR: usize>(
                 }
                 P::multiply_add(&mut sums, &last_x, 0, weights);
             }
-            for (group, sums) in sums.iter_mut().enumerate() {
-                let rows = P::ROW_GROUP.min(tile.rows - group * P::ROW_GROUP);
-                let to = tile.sums.add(group * P::ROW_GROUP * COLUMNS);
-                for (v, sum) in sums.iter_mut().enumerate() {
-                    if first != 0 {
-                        *sum = P::add(P::load(to, v, rows), *sum);
+            // Groups by name: if a loop found them by number, the sums would be in memory, and stored there again in every step.
+            macro_rules! keep {
+                ($($group:literal)*) => {$(
+                    if $group < MR {
+                        let rows = P::ROW_GROUP.min(tile.rows - $group * P::ROW_GROUP);
+                        let to = tile.sums.add($group * P::ROW_GROUP * COLUMNS);
+                        keep_sums::<S, P, NV>(sums[$group], to, rows, first != 0);
                     }
-                    P::store(*sum, to, v, rows);
-                }
+                )*};
             }
+            keep!(0 1 2 3 4 5 6);
             first = end;
             if first >= part.end {
                 return;
             }
+        }
+    }
+}
+
+/// Stores the sums of a group of `rows` rows, or adds them to what is there.
+///
+/// # Safety
+/// As [`Step::load`].
+#[inline(always)]
+unsafe fn keep_sums<S: Simd, P: Step<S>, const NV: usize>(
+    sums: [P::Sum; NV],
+    to: *mut u32,
+    rows: usize,
+    adds: bool,
+) {
+    // SAFETY: the caller's promise.
+    unsafe {
+        for (v, mut sum) in sums.into_iter().enumerate() {
+            if adds {
+                sum = P::add(P::load(to, v, rows), sum);
+            }
+            P::store(sum, to, v, rows);
         }
     }
 }
