@@ -40,10 +40,11 @@ VARIED[VLSA] = {"vl_num_layers"}
 # Those that, beside these, may differ between the stage and scaled. A start is a backbone's weights.
 APART: dict[str, set[str]] = {stage: {"stage", "saccade"} for stage in STAGES}
 APART["alignment"] |= {"alignment_weight"}
-APART["aligned-again"] |= {"alignment_weight"}
+APART["aligned-again"] |= {"alignment_weight", "cpu"}  # an Intel
 APART["patch-32"] |= {"patch_size", "num_vl_tokens", "start_sha256"}
 APART["patch-8"] |= APART["patch-32"]
 APART["two-cameras"] |= {"num_cameras", "num_vl_tokens", "start_sha256", "demonstrations_sha256"}
+APART["two-cameras"] |= {"recording", "cpu"}  # demonstrations of their own, on an Intel
 # What the end of a recipe's name says of its settings.
 SAID = {"-wide": {"width": 104.0}, "-long": {"steps": 1628.0}, "-aligned": {"alignment_weight": 0.2}}
 SAID["-aligned-again"] = SAID["-aligned"]
