@@ -49,9 +49,9 @@ def latencies(timed: Sequence[tuple[PlannedPolicy, Path | None]], plan: Plan) ->
 def write_untrained(policy: PlannedPolicy, recording: Recording, directory: Path) -> None:
     """Writes a policy of the plan with its first weights, as a run of `saccade train` that made no step.
 
-    Its head takes the time of the trained one, since no operation depends on the values: n-32-aligned with its
-    first weights took 0.99 times as long as n-32-aligned-again, which has the same settings and was trained. It
-    has no statistics of demonstrations, so it cannot act.
+    Its head takes the time of the trained one, since no operation depends on the values: n-32-aligned with
+    its first weights took 0.99 times as long as n-32-aligned-again, which has the same settings and was
+    trained. It has no statistics of demonstrations, so it cannot act.
 
     Args:
         policy: The policy.
