@@ -121,7 +121,7 @@ ZEN_5 = Measured(
 #: from one run of `saccade bench --version n1.5 --profile`. The record is within 15 % of the expected times,
 #: but for int8 with AVX2, which takes 0.81 (`sample`) and 0.87 of them.
 EMERALD_RAPIDS = Measured(
-    "an Emerald Rapids with AVX-512",
+    "a Xeon without AMX",
     {
         "float32": Efficiency(few_rows=0.82, many_rows=0.85, attention=0.46, rest=0.01),
         "bfloat16": Efficiency(few_rows=0.81, many_rows=0.83, attention=0.47, rest=0.015),
