@@ -5,8 +5,8 @@ use std::hint::black_box;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use saccade_benches::random::Random;
 use saccade_kernels::{
-    Arithmetic, Element, Isa, Matrix, PackedKeyValues, PackedLinear, Rows, RowsMut, WeightRef, gelu_tanh,
-    layer_norm, relu, silu,
+    Arithmetic, Element, Isa, Matrix, PackedKeyValues, PackedLinear, Rows, RowsMut, WeightRef, gelu_erf,
+    gelu_tanh, layer_norm, relu, silu,
 };
 
 const ROWS: usize = 49;
@@ -36,20 +36,24 @@ fn norms(criterion: &mut Criterion) {
 fn activations(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("activations");
     group.throughput(Throughput::Elements((ROWS * WIDTH) as u64));
-    let x = Random::new(4).vec(ROWS * WIDTH, 4.0);
-    let mut values = x.clone();
-    for isa in Isa::available() {
-        for (name, activation) in [
-            ("gelu_tanh", gelu_tanh as fn(Isa, &mut [f32])),
-            ("silu", silu),
-            ("relu", relu),
-        ] {
-            group.bench_function(format!("{name}, {isa}"), |bencher| {
-                bencher.iter(|| {
-                    values.copy_from_slice(&x);
-                    activation(isa, black_box(&mut values));
+    // Outliers of trained models are large, and must not take longer.
+    for (size, scale) in [("", 4.0), (" of large values", 40.0)] {
+        let x = Random::new(4).vec(ROWS * WIDTH, scale);
+        let mut values = x.clone();
+        for isa in Isa::available() {
+            for (name, activation) in [
+                ("gelu_tanh", gelu_tanh as fn(Isa, &mut [f32])),
+                ("gelu_erf", gelu_erf),
+                ("silu", silu),
+                ("relu", relu),
+            ] {
+                group.bench_function(format!("{name}{size}, {isa}"), |bencher| {
+                    bencher.iter(|| {
+                        values.copy_from_slice(&x);
+                        activation(isa, black_box(&mut values));
+                    });
                 });
-            });
+            }
         }
     }
 }

@@ -11,9 +11,23 @@ use super::Vector;
 #[inline(always)]
 unsafe fn exp_vector<V: Vector>(x: V) -> V {
     // SAFETY: the caller's promise.
+    unsafe { exp_from(x, -105.0) }
+}
+
+/// The least `x` whose exponential is added to 1, where it is nothing. Those of smaller ones are denormals: GELU of a vector with a 10 took 91
+/// instead of 5.6 ns, 133 instead of 12 with AVX2 (Emerald Rapids).
+const LEAST_BESIDE_ONE: f32 = -87.0;
+
+/// `exp(max(x, least))`, as [`exp_vector`].
+///
+/// # Safety
+/// The CPU has the instruction set of `V`.
+#[inline(always)]
+unsafe fn exp_from<V: Vector>(x: V, least: f32) -> V {
+    // SAFETY: the caller's promise.
     unsafe {
-        // Beyond these the result is 0 or infinity, and the whole part stays small. The second operand wins if it is NaN.
-        let x = V::splat(-105.0).max(V::splat(89.0).min(x));
+        // Above 89 the result is infinity, below -105 it is 0, and the whole part stays small. The second operand wins if it is NaN.
+        let x = V::splat(least).max(V::splat(89.0).min(x));
         // x = n ln 2 + r, |r| <= ln 2 / 2; ln 2 in two parts, of which n times the first is exact (Cody and Waite).
         let n = x.mul(V::splat(std::f32::consts::LOG2_E)).round();
         let r = n.fma(V::splat(-0.693_359_4), x);
@@ -40,7 +54,7 @@ unsafe fn silu_vector<V: Vector>(x: V) -> V {
     unsafe {
         // Below, the result is -0, as it is in the limit; -inf would give inf / inf.
         let x = V::splat(-200.0).max(x);
-        let e = exp_vector(V::splat(0.0).sub(x));
+        let e = exp_from(V::splat(0.0).sub(x), LEAST_BESIDE_ONE);
         x.div(V::splat(1.0).add(e))
     }
 }
@@ -61,7 +75,7 @@ unsafe fn gelu_tanh_vector<V: Vector>(x: V) -> V {
         // Below, the result is -0, as it is in the limit; -inf would give inf / inf.
         let x = V::splat(-30.0).max(x);
         let factor = x.mul(x).fma(V::splat(CUBIC), V::splat(LINEAR));
-        let e = exp_vector(x.mul(factor));
+        let e = exp_from(x.mul(factor), LEAST_BESIDE_ONE);
         x.div(V::splat(1.0).add(e))
     }
 }
@@ -99,14 +113,17 @@ unsafe fn gelu_erf_vector<V: Vector>(x: V) -> V {
     // SAFETY: the caller's promise.
     unsafe {
         let zero = V::splat(0.0);
-        // Beyond, the exponential is 0; infinity would give inf * 0. The second operand wins if it is NaN.
+        // Infinity would give inf * 0. The second operand wins if it is NaN.
         let a = V::splat(14.6).min(x.max(zero.sub(x)));
         let t = V::splat(1.0).div(a.fma(V::splat(0.4), V::splat(1.0)));
         let mut p = V::splat(P[0]);
         for &coefficient in &P[1..] {
             p = p.fma(t, V::splat(coefficient));
         }
-        let e = exp_vector(a.mul(a).mul(V::splat(-0.5)));
+        // Nothing from here on, without denormals.
+        let least = V::splat(-80.0);
+        let exponent = least.max(a.mul(a).mul(V::splat(-0.5)));
+        let e = exp_vector(exponent).replace_where(exponent.sub(least), zero);
         let tail = p.mul(t).mul(e);
         zero.sub(a).fma(tail, zero.max(x))
     }
