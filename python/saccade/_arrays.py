@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
     Tensor: TypeAlias = torch.Tensor
 
+#: Compared with in every call of a control loop: a type such as `np.float32` would be made a dtype each time.
+FLOAT32 = np.dtype(np.float32)
+INT64 = np.dtype(np.int64)
+
 #: No head has as many tokens. A larger range is refused, since it would be slow to write out.
 LARGEST_RANGE = 1 << 20
 
@@ -52,7 +56,7 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
         value = _from_torch(name, value, "floating point")
     array = _asarray(name, value)
     # The case of a control loop. The rest takes a microsecond or two, as long as all other checks of a call.
-    if array.dtype == np.float32 and array.flags.carray:
+    if array.dtype == FLOAT32 and array.flags.carray:
         return cast("Float32Array", array)
     # bfloat16 of the ml_dtypes package is of kind "V".
     if array.dtype.kind != "f" and array.dtype.name != "bfloat16":
@@ -180,7 +184,7 @@ def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
         array = _asarray(name, value)
     except ShapeError as error:
         raise InputError(str(error)) from None
-    if array.dtype == np.int64 and array.flags.carray:
+    if array.dtype == INT64 and array.flags.carray:
         return cast("npt.NDArray[np.int64]", array)
     if array.dtype.kind not in "iu":
         raise InputError(f"{name}: expected an integer or an array of integers, got {_shown(value, array)}")
@@ -284,11 +288,11 @@ def result(shape: tuple[int, ...], out: ArrayLike | None) -> Float32Array:
         array = _torch_memory("out", out)
     if not isinstance(array, np.ndarray):
         raise DtypeError(f"out: expected a float32 array, got {type(out).__name__}")
-    if array.dtype != np.float32:
+    if array.dtype != FLOAT32:
         raise DtypeError(f"out: expected float32, got {array.dtype}")
     if array.shape != shape:
         raise ShapeError(f"out: expected {shape}, got {array.shape}")
-    if not (array.flags.c_contiguous and array.flags.writeable and array.flags.aligned):
+    if not array.flags.carray:  # C-contiguous, writable and aligned
         raise InputError("out: expected a writable, C-contiguous array")
     return array
 
@@ -302,6 +306,9 @@ def does_not_fit(what: str, shape: tuple[int, ...]) -> MemoryError:
 
 def apart(array: Float32Array, output: Float32Array) -> Float32Array:
     """``array``, or a copy of it if it may share memory with the output."""
+    # The case of a control loop: two arrays, each with its own memory.
+    if array.base is None and output.base is None and array is not output:
+        return array
     return array.copy() if np.may_share_memory(array, output) else array
 
 

@@ -129,9 +129,9 @@ def plain_chunking(
 
 def plain_interventions(given: Intervention | Sequence[Intervention] | None) -> list[dict[str, Any]]:
     """Interventions as dicts whose mappings are lists of items."""
+    return [_plain(one) for one in as_interventions(given)]
 
-    def plain(one: Any) -> dict[str, Any]:
-        patches = [(place, *item) for place, groups in (one.patch or {}).items() for item in groups.items()]
-        return {**vars(one), "key_bias": list((one.key_bias or {}).items()), "patch": patches}
 
-    return [plain(one) for one in as_interventions(given)]
+def _plain(one: Any) -> dict[str, Any]:
+    patches = [(place, *item) for place, groups in (one.patch or {}).items() for item in groups.items()]
+    return {**vars(one), "key_bias": list((one.key_bias or {}).items()), "patch": patches}

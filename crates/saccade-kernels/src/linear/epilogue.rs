@@ -60,7 +60,9 @@ pub(super) struct Int8<'a> {
     pub apart: Option<&'a [MaybeUninit<f32>]>,
 }
 
-impl Kernel for Finish<'_> {
+// By reference: a copy is read in wider words than it was just written in, and waits for them. A layer of 3 x 8 x 32 took 247 instead of 201 ns,
+// one of 16 x 128 x 128 3.56 instead of 3.38 us (Emerald Rapids).
+impl Kernel for &Finish<'_> {
     type Output = ();
 
     #[inline(always)]

@@ -395,7 +395,7 @@ impl PackedLinear {
             });
         }
         let columns_of = first..first + columns;
-        self.isa.run(Finish {
+        self.isa.run(&Finish {
             epilogue: call.epilogue,
             sums,
             columns,
