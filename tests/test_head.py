@@ -182,9 +182,19 @@ def test_out(head: saccade.ActionHead, context: saccade.Context, tiny: Released)
     tensor = torch.zeros(2, 6, 5)
     assert head.sample(context, tiny.state, 1, noise=tiny.noise, out=tensor) is tensor
     np.testing.assert_array_equal(tensor.numpy(), expected)
-    in_place = tiny.noise.copy()
-    head.sample(context, tiny.state, 1, noise=in_place, out=in_place)
-    np.testing.assert_array_equal(in_place, expected)
+
+
+def test_out_in_the_memory_of_the_noise(
+    head: saccade.ActionHead, context: saccade.Context, tiny: Released
+) -> None:
+    expected = head.sample(context, tiny.state, 1, noise=tiny.noise)
+    for share in (np.asarray, np.ndarray.view, torch.from_numpy):
+        in_place = tiny.noise.copy()
+        head.sample(context, tiny.state, 1, noise=in_place, out=share(in_place))
+        np.testing.assert_array_equal(in_place, expected)
+        in_place = tiny.noise.copy()
+        head.sample(context, tiny.state, 1, noise=share(in_place), out=in_place)
+        np.testing.assert_array_equal(in_place, expected)
 
 
 def test_context(head: saccade.ActionHead, tiny: Released) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     Tensor: TypeAlias = torch.Tensor
 
-#: Compared with in every call of a control loop: a type such as `np.float32` would be made a dtype each time.
+#: As dtypes: a comparison with the type `np.float32` makes a dtype each time.
 FLOAT32 = np.dtype(np.float32)
 INT64 = np.dtype(np.int64)
 
@@ -306,8 +306,8 @@ def does_not_fit(what: str, shape: tuple[int, ...]) -> MemoryError:
 
 def apart(array: Float32Array, output: Float32Array) -> Float32Array:
     """``array``, or a copy of it if it may share memory with the output."""
-    # The case of a control loop: two arrays, each with its own memory.
-    if array.base is None and output.base is None and array is not output:
+    # The case of a control loop: two arrays, each of which owns its memory.
+    if array is not output and array.flags.owndata and output.flags.owndata:
         return array
     return array.copy() if np.may_share_memory(array, output) else array
 

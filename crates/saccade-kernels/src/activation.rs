@@ -257,6 +257,32 @@ mod tests {
     }
 
     #[test]
+    fn the_tail_of_gelu_by_erf_ends() {
+        for isa in Isa::available() {
+            // The second from erfc of the C library.
+            let mut x = [-12.7, -12.0, -12.64];
+            gelu_erf(isa, &mut x);
+            assert_eq!(x[0], 0.0, "{isa}");
+            assert!((x[1] / -2.131_779e-32 - 1.0).abs() < 0.01, "{isa}: {:e}", x[1]);
+            assert!(x[2] < 0.0, "{isa}: {:e}", x[2]);
+        }
+    }
+
+    /// No result is a denormal, but of inputs that nearly are.
+    #[test]
+    fn activations_make_no_denormals() {
+        let x: Vec<f32> = sweep().into_iter().filter(|x| x.abs() > 1e-18).collect();
+        for isa in Isa::available() {
+            for f in [gelu_tanh, gelu_erf, silu] {
+                let mut y = x.clone();
+                f(isa, &mut y);
+                let denormal = y.iter().position(|y| y.is_subnormal());
+                assert_eq!(denormal.map(|at| x[at]), None, "{isa}");
+            }
+        }
+    }
+
+    #[test]
     fn accuracy_of_silu() {
         let bounds = Bounds {
             from: -87.0,

@@ -60,8 +60,8 @@ pub(super) struct Int8<'a> {
     pub apart: Option<&'a [MaybeUninit<f32>]>,
 }
 
-// By reference: a copy is read in wider words than it was just written in, and waits for them. A layer of 3 x 8 x 32 took 247 instead of 201 ns,
-// one of 16 x 128 x 128 3.56 instead of 3.38 us (Emerald Rapids).
+// By reference: by value it would be copied in vectors just after it was stored in words, and store forwarding would fail. A float32 layer of 3
+// rows, 8 inputs and 32 outputs took 247 instead of 201 ns, one of 16, 128 and 128 3.56 instead of 3.38 us (AVX-512, Emerald Rapids).
 impl Kernel for &Finish<'_> {
     type Output = ();
 
