@@ -98,7 +98,7 @@ pub fn relu(isa: Isa, x: &mut [f32]) {
     map::<Relu>(isa, x);
 }
 
-/// `exp(x)`, in place, as the softmax of [`attention`](crate::attention()) computes it.
+/// `exp(x)`, in place, as the activations compute it.
 ///
 /// Within 2 ULP where the exact value is a normal number, within `3e-45` below. 0 at `-inf`, infinity above 88.73, NaN at NaN.
 ///
