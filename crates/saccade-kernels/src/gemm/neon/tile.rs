@@ -249,6 +249,7 @@ unsafe fn tile_part<S: Simd, P: Step<S>, const NV: usize, const MR: usize>(
                     }
                 )*};
             }
+            const { assert!(MR <= 7, "each group is named") }
             keep!(0 1 2 3 4 5 6);
             first = end;
             if first >= part.end {
