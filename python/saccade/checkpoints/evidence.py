@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from saccade.checkpoints.description import Description
 from saccade.checkpoints.findings import Embodiment, Part, PartResemblance, Resemblance, TokenStatistics
 from saccade.checkpoints.initialisation import NORMAL_STD
-from saccade.robots import EMBODIMENTS
+from saccade.robots import N15_IDS
 
 #: Embodiments that NVIDIA's published N1.5 checkpoint was trained with.
 PRETRAINED = ("gr1", "agibot_genie1", "oxe_droid")
@@ -79,7 +79,7 @@ def from_noise(
             )
     if version == "n1.5" and len(embodiments) == 32:
         for name in PRETRAINED:
-            entry = embodiments[EMBODIMENTS[name]]
+            entry = embodiments[N15_IDS[name]]
             if entry.looks == "zero":
                 continue
             side = "for" if entry.looks == "as initialised" else "against"

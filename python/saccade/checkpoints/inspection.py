@@ -20,19 +20,8 @@ from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError, SaccadeError
 from saccade.hub import resolve
-from saccade.robots import EMBODIMENTS, read_json
-
-#: Embodiments of N1.7, as lerobot and Isaac-GR00T number them.
-N17_EMBODIMENTS = {
-    "simpler_env_google": 0,
-    "simpler_env_widowx": 1,
-    "libero_sim": 2,
-    "new_embodiment": 10,
-    "oxe_droid_relative_eef_relative_joint": 24,
-    "real_g1_relative_eef_relative_joints": 25,
-    "real_r1_pro_sharpa_relative_eef": 26,
-    "xdof_relative_eef_relative_joint": 27,
-}
+from saccade.robots import read_json
+from saccade.robots.embodiments import IDS
 
 
 def inspect(
@@ -147,7 +136,7 @@ def _embodiment_names(description: Description) -> dict[int, list[str]]:
     path = Path(description.source)
     first = description.files[0].path if description.files else path
     folder = path if path.is_dir() else Path(first).parent
-    known = {"n1.7": N17_EMBODIMENTS, "n1.6": {}}.get(description.version, EMBODIMENTS)
+    known = IDS[description.version]
     names: dict[int, list[str]] = {}
     for name, index in (_mapping(folder) or known).items():
         names.setdefault(index, []).append(name)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from saccade._arrays import integer
 from saccade.errors import CheckpointError, InputError
+from saccade.robots.data_configs import DataConfig
 from saccade.robots.groups import Group, Robot, Statistics
 
-#: The statistics that a mode needs.
-STATISTICS = {"min_max": ("min", "max"), "q99": ("q01", "q99"), "mean_std": ("mean", "std")}
-ALL_STATISTICS = frozenset(name for names in STATISTICS.values() for name in names)
+#: The statistics that a mode needs. The other modes need none.
+STATISTICS = {
+    "min_max": ("min", "max"),
+    "q99": ("q01", "q99"),
+    "mean_std": ("mean", "std"),
+    "scale": ("min", "max"),
+}
 
 #: The engine's limit of the width of a head.
 MOST_WIDTH = 1 << 20
@@ -35,38 +39,15 @@ class Options:
     embodiment: str | int | None
     state_dim: int | None
     action_dim: int | None
-    state_keys: tuple[str, ...] | None
-    action_keys: tuple[str, ...] | None
-    modes: str | Mapping[str, str] | None
+    data_config: DataConfig | None
 
-    def refuse_keys(self, where: str) -> None:
-        """Raises InputError if keys or modes are given, although the checkpoint contains them."""
-        given = [name for name in ("state_keys", "action_keys", "modes") if getattr(self, name) is not None]
-        if given:
-            raise InputError(f"{', '.join(given)}: expected None, because {where} contains them")
-
-    def choose(self, tags: Sequence[str], ids: Mapping[str, int], where: str) -> str:
-        """The tag of the requested embodiment.
-
-        An id may be given for the only robot there is, if it has none: a fine-tune may name a robot that the
-        released code does not know. The id then selects the head's embodiment.
-
-        Raises:
-            InputError: It is not there, or several are and none is requested.
-        """
-        wanted = self.embodiment
-        listed = ", ".join(f"{tag} ({ids[tag]})" if tag in ids else tag for tag in tags)
-        if wanted is None:
-            found = list(tags) if len(tags) == 1 else []
-        elif isinstance(wanted, str):
-            found = [tag for tag in tags if tag == wanted]
-        else:
-            asked = integer("embodiment", wanted, least=0)
-            alone = len(tags) == 1
-            found = [tag for tag in tags if ids.get(tag, asked if alone else None) == asked]
-        if len(found) != 1:
-            raise InputError(f"embodiment: expected one of those in {where} ({listed}), got {wanted!r}")
-        return found[0]
+    def refuse_data_config(self, where: str) -> None:
+        """Raises InputError if a data config is given, although the checkpoint contains all that it says."""
+        if self.data_config is not None:
+            raise InputError(
+                f"data_config: expected None, because {where} contains keys, order and modes; data configs "
+                "are for GR00T N1 and N1.5"
+            )
 
     def check_only(self, found: str | None, found_id: int | None, where: str) -> None:
         """Raises InputError if another embodiment is requested than the only one that there is."""
@@ -89,41 +70,52 @@ class Builder:
     def group(self, key: str, statistics: Any, mode: str, **switches: Any) -> Group | None:
         """A group of this mode; None if there is a problem, which is recorded.
 
-        ``switches`` are the remaining fields of :class:`Group`.
+        Only the statistics that the mode needs are looked at. The others may be anything.
+
+        Args:
+            key: Its name.
+            statistics: Statistics by name.
+            mode: One of `STATISTICS`.
+            **switches: The remaining fields of :class:`Group`; ``size`` is that of the statistics by default.
         """
         if not isinstance(statistics, Mapping):
             self.problems.append(f"{key}: no statistics")
             return None
-        names = STATISTICS.get(mode, ())
-        found = {
-            name: self._row(key, name, statistics[name]) for name in statistics if name in ALL_STATISTICS
-        }
-        sizes = {values.shape for values in found.values() if values is not None}
-        missing = [name for name in names if name not in found]
+        names = STATISTICS[mode]
+        missing = [name for name in names if statistics.get(name) is None]
         if missing:
             self.problems.append(f"{key}: {mode} needs {' and '.join(missing)}")
-        if len(sizes) != 1:
-            self.problems.append(f"{key}: expected statistics of one shape, got {sorted(sizes)}")
-        if missing or len(sizes) != 1 or any(values is None for values in found.values()):
             return None
-        size = sizes.pop()[-1]
-        if not names:
-            return Group(key, size, mode, **switches)
-        first, second = (found[name] for name in names)
-        assert first is not None
-        assert second is not None
-        if mode == "mean_std":
-            moving = second != 0
-        else:
+        first, second = (self._row(key, name, statistics[name]) for name in names)
+        if first is None or second is None:
+            return None
+        if first.shape != second.shape:
+            self.problems.append(
+                f"{key}: expected {' and '.join(names)} of one shape, got {first.shape} and {second.shape}"
+            )
+            return None
+        if mode == "scale":
+            first, second = np.zeros_like(first), np.maximum(np.abs(first), np.abs(second))
+        return self.scaled(key, mode, first, second, **switches)
+
+    def scaled(self, key: str, mode: str, first: Statistics, second: Statistics, **switches: Any) -> Group:
+        """A group with these statistics, after checking that they are in order."""
+        below, above = STATISTICS[mode] if mode != "scale" else ("0", "the largest bound")
+        has_bounds = mode in ("min_max", "q99")
+        if not has_bounds:
+            below = "0"
+        start = first if has_bounds else np.zeros_like(first)
+        if has_bounds:
             moving = ~np.isclose(second, first) if self.is_close else second != first
-        below = "0" if mode == "mean_std" else names[0]
-        if (second < (0 if mode == "mean_std" else first)).any():
-            self.problems.append(f"{key}: {names[1]} is below {below}")
-        spans = second if mode == "mean_std" else second - first
-        if (moving & (spans < LEAST)).any():
-            self.problems.append(f"{key}: {names[1]} is less than {LEAST:g} above {below}")
-        keeps = mode == "mean_std" or (mode == "q99" and not self.is_close)
-        return Group(key, size, mode, first, second, moving, keeps, **switches)
+        else:
+            moving = second != 0
+        if (second < start).any():
+            self.problems.append(f"{key}: {above} is below {below}")
+        if (moving & (second - start < LEAST)).any():
+            self.problems.append(f"{key}: {above} is less than {LEAST:g} above {below}")
+        switches.setdefault("size", first.shape[-1])
+        switches.setdefault("keeps_constant", mode == "mean_std" or (mode == "q99" and not self.is_close))
+        return Group(key=key, mode=mode, first=first, second=second, moving=moving, **switches)
 
     def _row(self, key: str, name: str, values: Any) -> Statistics | None:
         """One statistic; None if there is a problem, which is recorded."""
@@ -137,7 +129,16 @@ class Builder:
             return None
         return row
 
-    def check(self, groups: Iterable[Group | None]) -> tuple[Group, ...]:
+    def refuse_unknown(self, what: str, values: Mapping[str, Any], known: Collection[str]) -> None:
+        """Records keys that are not known, unless they say nothing: null, empty or false."""
+        for name, value in values.items():
+            is_empty = value is None or value is False or value in ("", [], {})
+            if name not in known and not is_empty:
+                self.problems.append(
+                    f"{what}: {name} ({value!r:.60}) is not known, and may change what the checkpoint computes"
+                )
+
+    def check(self, groups: Iterable[Group | None] = ()) -> tuple[Group, ...]:
         """The groups.
 
         Raises:
@@ -146,6 +147,16 @@ class Builder:
         if self.problems:
             raise CheckpointError(f"{self.where}: " + "; ".join(dict.fromkeys(self.problems)))
         return tuple(group for group in groups if group is not None)
+
+
+def width_of(statistics: Any) -> int | None:
+    """Number of values that statistics are of, whichever of them there are; None if there are none."""
+    values = list(statistics.values()) if isinstance(statistics, Mapping) else []
+    rows = [row for row in values if isinstance(row, (list, tuple)) and row]
+    if not rows:
+        return None
+    first = rows[0][0]
+    return len(first) if isinstance(first, (list, tuple)) else len(rows[0])
 
 
 def finished(
@@ -157,6 +168,7 @@ def finished(
     action: tuple[Group, ...],
     dims: Dims,
     cuts_state: bool = True,
+    hint: str = "",
     **more: Any,
 ) -> Robot:
     """The robot, after checking that the widths of robot and head fit.
@@ -168,6 +180,7 @@ def finished(
         state, action: Groups.
         dims: The widths that the file says the head has.
         cuts_state: Whether a state that is too wide is cut off.
+        hint: What to do about a robot that is too wide, for messages.
         **more: The remaining fields of :class:`Robot`.
 
     Raises:
@@ -190,6 +203,7 @@ def finished(
     if widths[1] > found[1]:
         raise CheckpointError(
             f"{where}: the robot's action has {widths[1]} numbers, the head's only {found[1]} (action_dim)"
+            f"{hint}"
         )
     return Robot(embodiment, embodiment_id, state, action, found[0], found[1], **more)
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from saccade._arrays import integer
 from saccade.robots.building import Builder, Dims, Options, finished
+from saccade.robots.embodiments import N15_IDS
 from saccade.robots.groups import Robot
-from saccade.robots.isaac_metadata import EMBODIMENTS
 
 
 def flat_robot(values: Any, options: Options, where: str, dims: Dims) -> Robot:
@@ -19,7 +19,7 @@ def flat_robot(values: Any, options: Options, where: str, dims: Dims) -> Robot:
     Raises:
         CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
     """
-    options.refuse_keys(where)
+    options.refuse_data_config(where)
     builder = Builder(where, np.float32)
     groups = []
     for kind, other in (("state", "observation.state"), ("action", "action")):
@@ -30,8 +30,7 @@ def flat_robot(values: Any, options: Options, where: str, dims: Dims) -> Robot:
     # The statistics do not name a robot, so the request does.
     tag, embodiment_id, asked = None, None, options.embodiment
     if isinstance(asked, str):
-        tag, embodiment_id = asked, EMBODIMENTS.get(asked)
+        tag, embodiment_id = asked, N15_IDS.get(asked)
     elif asked is not None:
         embodiment_id = integer("embodiment", asked, least=0)
-    options.check_only(tag, embodiment_id, where)
     return finished(where, options, tag, embodiment_id, (state,), (action,), dims)

@@ -1,26 +1,56 @@
-"""Statistics of Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``."""
+"""Statistics of Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``, read by a data config.
+
+The rules are those of the released transforms: a rotation is converted first and then normalised, bounds of a
+converted rotation are fixed, and keys that the data config does not use are not looked at.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from saccade.errors import InputError
+from saccade.errors import CheckpointError, InputError
 from saccade.robots.building import Builder, Dims, Options, finished
-from saccade.robots.groups import MODES, Group, Robot
+from saccade.robots.data_configs import RELEASED, DataConfig
+from saccade.robots.embodiments import N15_IDS, choose
+from saccade.robots.groups import Conversion, Group, Robot
+from saccade.robots.rotations import BOUNDS, SIZES
 
-#: Embodiments of GR00T N1 and N1.5: their names in the released code, and their ids.
-EMBODIMENTS = {
-    "new_embodiment": 31,
-    "agibot_genie1": 26,
-    "genie1_gripper": 26,
-    "gr1": 24,
-    "oxe_droid": 17,
-    "unitree_g1": 3,
-    "so100": 2,
-}
+#: Robots whose published files have keys that no data config uses together.
+NEEDS_DATA_CONFIG = ("gr1",)
+
+#: What an entry of a robot contains, and the entry of a key.
+ENTRY = ("statistics", "modalities", "embodiment_tag")
+KEY_ENTRY = ("absolute", "rotation_type", "shape", "continuous")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One robot of ``metadata.json``.
+
+    Attributes:
+        where: The file and the tag, for messages.
+        tag: The robot's tag.
+        statistics, modalities: By ``"state"`` or ``"action"``, and key.
+    """
+
+    where: str
+    tag: str
+    statistics: Mapping[str, Mapping[str, Any]]
+    modalities: Mapping[str, Mapping[str, Any]]
+
+    def keys(self, kind: str) -> list[str]:
+        """The keys of the state or the action, in the order of the file."""
+        return list(self.modalities.get(kind) or {})
+
+    def is_rotation(self, kind: str, key: str) -> bool:
+        """Whether the file says that a key is a rotation."""
+        about = (self.modalities.get(kind) or {}).get(key)
+        return isinstance(about, Mapping) and about.get("rotation_type") is not None
 
 
 def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims: Dims) -> Robot:
@@ -29,57 +59,175 @@ def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims
     Raises:
         CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
     """
-    tag = options.choose(list(values), EMBODIMENTS, where)
-    builder = Builder(f"{where}: {tag}", np.float32)
-    entry = values[tag]
-    made: dict[str, list[Group | None]] = {}
-    for kind, chosen in (("state", options.state_keys), ("action", options.action_keys)):
-        statistics, modalities = entry["statistics"].get(kind, {}), entry["modalities"].get(kind, {})
-        keys = list(statistics) if chosen is None else [key.removeprefix(f"{kind}.") for key in chosen]
-        unknown = [key for key in keys if key not in statistics]
-        if unknown:
-            listed = ", ".join(statistics)
-            raise InputError(f"{kind}_keys: expected keys in {where} ({listed}), got {', '.join(unknown)}")
-        made[kind] = []
-        for key in keys:
-            about = modalities.get(key)
-            mode = _mode(options.modes, kind, key, about if isinstance(about, Mapping) else {}, builder)
-            # N1.5 clips values that it scales by quantiles.
-            made[kind].append(builder.group(key, statistics[key], mode, clips=mode == "q99"))
-    _check_modes(
-        options.modes, {f"{kind}.{key}" for kind in made for key in entry["statistics"].get(kind, {})}
+    found = choose(options.embodiment, list(values), N15_IDS, "n1.5", where)
+    entry = _entry(values, found, where)
+    config = options.data_config or _whole_file(entry)
+    state, action = groups_of(entry, config)
+    given = options.data_config
+    return finished(
+        where,
+        options,
+        entry.tag,
+        N15_IDS.get(str(values[found].get("embodiment_tag", found))),
+        state,
+        action,
+        dims,
+        hint="" if given is not None else fitting_hint(entry),
+        action_horizon=None if given is None else len(given.action_indices),
+        denoised_horizon=None if given is None else len(given.action_indices),
+        state_history=None if given is None else len(given.observation_indices),
+        data_config=None if given is None else asdict(given),
     )
-    for kind, groups in made.items():
-        if not groups:
-            builder.problems.append(f"no statistics of the {kind}")
-    checked = builder.check(group for groups in made.values() for group in groups)
-    state, action = checked[: len(made["state"])], checked[len(made["state"]) :]
-    return finished(where, options, tag, EMBODIMENTS.get(tag), state, action, dims)
 
 
-def _mode(
-    modes: str | Mapping[str, str] | None,
-    kind: str,
-    key: str,
-    about: Mapping[str, Any],
-    builder: Builder,
-) -> str:
-    """How a key is normalised."""
-    given = modes if isinstance(modes, str) else (modes or {}).get(f"{kind}.{key}")
-    if given is None and about.get("rotation_type") is not None:
-        builder.problems.append(
-            f"{kind}.{key} is a rotation ({about['rotation_type']}), which a data config may convert to "
-            f"another representation; if yours does not, pass modes={{'{kind}.{key}': 'min_max'}}"
+def groups_of(entry: Entry, config: DataConfig) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
+    """The groups of state and action that a data config makes of a robot.
+
+    Raises:
+        CheckpointError: The file does not fit the data config. The message lists every problem.
+    """
+    builder = Builder(entry.where, np.float32)
+    made = {
+        kind: [_group(builder, entry, kind, key, config) for key in config.keys(kind)]
+        for kind in ("state", "action")
+    }
+    cameras = entry.modalities.get("video") or {}
+    lacking = [key for key in config.keys("video") if key not in cameras]
+    if lacking:
+        builder.problems.append(f"video: no {', '.join(lacking)}; there are {', '.join(cameras) or 'none'}")
+    checked = builder.check([*made["state"], *made["action"]])
+    return checked[: len(made["state"])], checked[len(made["state"]) :]
+
+
+def fitting_hint(entry: Entry) -> str:
+    """For messages: the released data configs whose keys the file has."""
+    names = fitting(entry)
+    if not names:
+        return (
+            "; no released data config fits this file: pass data_config= with the JSON of the one it was "
+            "trained with"
         )
-        return "none"
-    mode = given or ("min_max" if about.get("continuous", True) else "binary")
-    if mode not in MODES or (mode == "sin_cos" and kind == "action"):
-        expected = ", ".join(name for name in MODES if kind == "state" or name != "sin_cos")
-        raise InputError(f"modes: {kind}.{key}: expected one of {expected}, got {mode!r}")
-    return mode
+    return f"; pass data_config= with the one it was trained with. These fit the file: {', '.join(names)}"
 
 
-def _check_modes(modes: str | Mapping[str, str] | None, keys: set[str]) -> None:
-    unknown = [] if modes is None or isinstance(modes, str) else [key for key in modes if key not in keys]
-    if unknown:
-        raise InputError(f"modes: expected keys among {', '.join(sorted(keys))}, got {', '.join(unknown)}")
+def fitting(entry: Entry) -> list[str]:
+    """The names of the released data configs that fit a robot."""
+    found = []
+    for name, config in RELEASED.items():
+        try:
+            groups_of(entry, config)
+        except CheckpointError:
+            continue
+        found.append(name)
+    return found
+
+
+def _entry(values: Mapping[str, Any], tag: str, where: str) -> Entry:
+    entry = values[tag]
+    builder = Builder(f"{where}: {tag}", np.float32)
+    for kind in ("state", "action"):
+        for part in ("statistics", "modalities"):
+            if not isinstance(entry[part].get(kind), Mapping):
+                builder.problems.append(f"no {part} of the {kind}")
+    builder.refuse_unknown("the robot", entry, ENTRY)
+    builder.check()
+    return Entry(builder.where, tag, entry["statistics"], entry["modalities"])
+
+
+def _whole_file(entry: Entry) -> DataConfig:
+    """All keys in the order of the file, for a checkpoint without a data config.
+
+    Raises:
+        InputError: The robot cannot do without one.
+    """
+    reasons = [f"{entry.tag!r} has more keys than a policy uses"] if entry.tag in NEEDS_DATA_CONFIG else []
+    keys = {kind: entry.keys(kind) for kind in ("video", "state", "action")}
+    turned = [
+        f"{kind}.{key}" for kind in ("state", "action") for key in keys[kind] if entry.is_rotation(kind, key)
+    ]
+    if turned:
+        reasons.append(f"{', '.join(turned)} may be converted to another representation")
+    if reasons:
+        raise InputError(
+            f"data_config: expected one for {entry.where}, got None: {'; '.join(reasons)}{fitting_hint(entry)}"
+        )
+    warnings.warn(
+        f"{entry.where}: no data config is given, so all keys are used, in the order of the file, with their "
+        "minimum and maximum (discrete ones: binary). A checkpoint of GR00T N1 or N1.5 does not say which "
+        "data config it was trained with: pass data_config= to be certain",
+        stacklevel=2,
+    )
+
+    def modes(kind: str) -> dict[str, str]:
+        about = entry.modalities[kind]
+        return {
+            f"{kind}.{key}": "min_max" if about[key].get("continuous", True) else "binary"
+            for key in keys[kind]
+        }
+
+    names = {kind: tuple(f"{kind}.{key}" for key in found) for kind, found in keys.items()}
+    return DataConfig(
+        names["video"], names["state"], names["action"], (), (0,), (0,), modes("state"), modes("action"), {}
+    )
+
+
+def _group(builder: Builder, entry: Entry, kind: str, key: str, config: DataConfig) -> Group | None:
+    """The group of one key; None if there is a problem, which is recorded."""
+    full = f"{kind}.{key}"
+    about = entry.modalities[kind].get(key)
+    if not isinstance(about, Mapping):
+        builder.problems.append(f"{full}: not in the file, which has {', '.join(entry.keys(kind)) or 'none'}")
+        return None
+    builder.refuse_unknown(full, about, KEY_ENTRY)
+    shape = about.get("shape")
+    if not isinstance(shape, list) or len(shape) != 1 or type(shape[0]) is not int or shape[0] < 1:
+        builder.problems.append(f"{full}: expected a shape of one positive number, got {shape!r:.60}")
+        return None
+    size: int = shape[0]
+    mode = (config.state_modes if kind == "state" else config.action_modes).get(full, "none")
+    conversion = None
+    if full in config.target_rotations:
+        conversion, problem = _conversion(about, config.target_rotations[full], mode, size, kind)
+        if problem is not None:
+            builder.problems.append(f"{full}: {problem}")
+            return None
+    if not about.get("continuous", True) and mode not in ("binary", "none") and conversion is None:
+        builder.problems.append(f"{full}: discrete, so expected mode binary or none, got {mode}")
+        return None
+    if mode in ("binary", "sin_cos", "none"):
+        return Group(key, size, mode, conversion=conversion)
+    if conversion is not None:
+        bound = np.full(SIZES[conversion.head], BOUNDS[conversion.head], np.float32)
+        return builder.scaled(key, mode, -bound, bound, size=size, conversion=conversion)
+    # N1.5 clips values that it scales by quantiles.
+    group = builder.group(key, entry.statistics[kind].get(key), mode, clips=mode == "q99")
+    if group is not None and group.size != size:
+        builder.problems.append(f"{full}: {size} numbers, but statistics of {group.size}")
+    return group
+
+
+def _conversion(
+    about: Mapping[str, Any], target: str, mode: str, size: int, kind: str
+) -> tuple[Conversion | None, str | None]:
+    """How a rotation is converted, None if it need not be; and what is wrong, or None."""
+    source = about.get("rotation_type")
+    if source is None:
+        return None, f"to be converted to {target}, but the file does not say which rotation it is"
+    if source not in SIZES:
+        return None, f"expected a rotation_type among {', '.join(SIZES)}, got {source!r:.60}"
+    if size != SIZES[source]:
+        return None, f"expected {SIZES[source]} numbers for {source}, got {size}"
+    if source == target:
+        return None, None
+    if source.startswith("euler") and target.startswith("euler"):
+        return None, f"{source} cannot be converted to another order of Euler angles, {target}"
+    if mode != "none" and (mode != "min_max" or not about.get("absolute", True)):
+        return None, (
+            f"a rotation that is converted takes min_max if it is absolute, or no mode; got {mode} and absolute "
+            f"{about.get('absolute', True)}"
+        )
+    # A state may also become six numbers or twice as many; an action has as many as the robot.
+    allowed = (size,) if kind == "action" else (size, 2 * size, 6)
+    if SIZES[target] not in allowed:
+        return None, f"{source} of {size} numbers cannot become {target} of {SIZES[target]}"
+    return Conversion(source, target), None

@@ -3,17 +3,89 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, Options, finished, size_of
-from saccade.robots.groups import Group, Robot
+from saccade.robots.building import Builder, Options, finished, width_of
+from saccade.robots.embodiments import IDS, choose
+from saccade.robots.groups import Group, Reference, Robot
+from saccade.robots.rotations import POSES
+
+#: Versions by the class of the processor.
+CLASSES = {"Gr00tN1d6Processor": "n1.6", "Gr00tN1d7Processor": "n1.7"}
+
+#: Arguments of the processors. ``saccade.Processor`` reads those of images and words.
+OPTIONS = (
+    "modality_configs",
+    "image_crop_size",
+    "image_target_size",
+    "use_albumentations",
+    "random_rotation_angle",
+    "color_jitter_params",
+    "shortest_image_edge",
+    "crop_fraction",
+    "model_name",
+    "model_type",
+    "formalize_language",
+    "max_state_dim",
+    "max_action_dim",
+    "max_action_horizon",
+    "use_percentiles",
+    "clip_outliers",
+    "apply_sincos_state_encoding",
+    "use_relative_action",
+    "extra_augmentation_config",
+    "transformers_loading_kwargs",
+)
+#: Those that only N1.7 has. ``use_mean_std`` is never read, and ``state_dropout_prob`` by training only.
+N17_OPTIONS = ("letter_box_transform", "use_mean_std", "exclude_state", "state_dropout_prob")
+
+#: Fields of a modality config, and of one of its action configs with the values that are known.
+MODALITY = (
+    "delta_indices",
+    "modality_keys",
+    "sin_cos_embedding_keys",
+    "mean_std_embedding_keys",
+    "action_configs",
+)
+ACTION = {
+    "rep": ("RELATIVE", "DELTA", "ABSOLUTE"),
+    "type": ("EEF", "NON_EEF"),
+    "format": ("DEFAULT", *POSES),
+    "state_key": None,
+}
+#: ``rl_info`` may stand beside them; the released policy drops it.
+MODALITIES = ("video", "state", "action", "language", "rl_info")
+
+#: The released defaults of widths and of the longest chunk.
+DEFAULT_DIM = 29
+DEFAULT_HORIZON = {"n1.6": 40, "n1.7": 50}
+
+
+@dataclass(frozen=True)
+class Modality:
+    """What a processor says of the state or of the action of one robot.
+
+    Attributes:
+        keys: Keys in order.
+        steps: Number of states of an observation, or of actions of a chunk.
+        sin_cos, mean_std: Keys that are treated so.
+        references: For actions, what a key is relative to.
+    """
+
+    keys: tuple[str, ...]
+    steps: int
+    sin_cos: tuple[str, ...]
+    mean_std: tuple[str, ...]
+    references: Mapping[str, Reference]
 
 
 def processor_robot(
     where: str,
+    version: str | None,
     kwargs: Mapping[str, Any],
     statistics: Mapping[str, Any],
     ids: Mapping[str, Any],
@@ -23,91 +95,257 @@ def processor_robot(
 
     Args:
         where: The file, for messages.
+        version: ``"n1.6"`` or ``"n1.7"``; None if the files do not say.
         kwargs: The ``processor_kwargs`` of ``processor_config.json``.
         statistics: The contents of ``statistics.json``: statistics by tag, modality and key.
-        ids: The contents of ``embodiment_id.json``.
+        ids: The contents of ``embodiment_id.json``, or nothing. The released table adds tags that it lacks.
         options: What was requested.
 
     Raises:
         CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
     """
-    options.refuse_keys(where)
+    options.refuse_data_config(where)
     configs = kwargs.get("modality_configs")
     if not isinstance(configs, Mapping) or not configs:
         raise CheckpointError(f"{where}: no modality_configs")
-    known = {tag: number for tag, number in ids.items() if type(number) is int}
+    known = {**IDS.get(version or "", {}), **{tag: n for tag, n in ids.items() if type(n) is int}}
     tags = [tag for tag in configs if tag in statistics]
     if not tags:
         raise CheckpointError(
             f"{where}: statistics of {', '.join(statistics) or 'nothing'}, groups of {', '.join(configs)}"
         )
-    tag = options.choose(tags, known, where)
-    if kwargs.get("use_tactile"):
-        raise CheckpointError(f"{where}: use_tactile: tactile states are not supported")
+    tag = choose(options.embodiment, tags, known, version, where)
     builder = Builder(f"{where}: {tag}", np.float64, is_close=True)
+    if kwargs.get("use_tactile"):
+        builder.problems.append("use_tactile: tactile states are not supported")
+    builder.refuse_unknown(
+        "processor_kwargs", kwargs, OPTIONS if version == "n1.6" else (*OPTIONS, *N17_OPTIONS, "use_tactile")
+    )
+    switches = {name: _switch(builder, kwargs, name, default) for name, default in SWITCHES.items()}
     config, numbers = configs[tag], statistics[tag]
-    about_state, about_action = (_modality(config, kind, builder) for kind in ("state", "action"))
-    state = [
-        _group(builder, key, _entry(numbers, "state", key), about_state, kwargs, is_state=True)
-        for key in about_state["modality_keys"]
-    ]
-    action = _action_groups(builder, about_action, numbers, kwargs, state)
-    groups = builder.check([*state, *action])
-    steps = about_action.get("delta_indices")
+    builder.refuse_unknown("modality_configs", config, MODALITIES)
+    state = modality(builder, config, "state", relative=False)
+    action = modality(builder, config, "action", relative=switches["use_relative_action"])
+    if version != "n1.6":
+        _check_horizons(builder, kwargs, configs, version)
+    builder.check()
+    groups = [_state_group(builder, key, numbers, state, switches) for key in state.keys]
+    sizes = {one.key: one.size for one in groups if one is not None}
+    actions = [_action_group(builder, key, numbers, action, switches, sizes) for key in action.keys]
+    checked = builder.check([*groups, *actions])
+    dims = [kwargs.get(name, DEFAULT_DIM) for name in ("max_state_dim", "max_action_dim")]
+    for name, dim in zip(("max_state_dim", "max_action_dim"), dims, strict=True):
+        if type(dim) is not int or dim < 1:
+            raise CheckpointError(f"{where}: {name}: expected a positive integer, got {dim!r:.60}")
     return finished(
         where,
         options,
         tag,
         known.get(tag),
-        groups[: len(state)],
-        groups[len(state) :],
-        (size_of(kwargs.get("max_state_dim")), size_of(kwargs.get("max_action_dim"))),
+        checked[: len(groups)],
+        checked[len(groups) :],
+        (dims[0], dims[1]),
         cuts_state=False,
-        action_horizon=len(steps) if isinstance(steps, list) and steps else None,
-        zero_state=bool(kwargs.get("exclude_state") or about_state.get("exclude_state")),
+        action_horizon=action.steps,
+        state_history=state.steps,
+        zero_state=switches["exclude_state"],
     )
 
 
-def _action_groups(
-    builder: Builder,
-    about: Mapping[str, Any],
-    numbers: Any,
-    kwargs: Mapping[str, Any],
-    state: list[Group | None],
-) -> list[Group | None]:
-    """The groups of the action, absolute or relative to groups of the state."""
-    found: list[Group | None] = []
-    keys = about["modality_keys"]
-    configs = about.get("action_configs") or [{}] * len(keys)
-    if len(configs) != len(keys):
-        builder.problems.append("action: expected one of action_configs for each of modality_keys")
-    sizes = {one.key: one.size for one in state if one is not None}
-    for key, config in zip(keys, configs, strict=False):
-        reference = None
-        if kwargs.get("use_relative_action") and str(config.get("rep")).lower() == "relative":
-            if str(config.get("type")).lower() != "non_eef":
-                builder.problems.append(f"action.{key}: relative poses of an end effector are not supported")
-            reference = config.get("state_key") or key
-        # Relative actions have statistics of their own, and never use quantiles.
-        entry = _entry(numbers, "action" if reference is None else "relative_action", key)
-        group = _group(builder, key, entry, about, kwargs, is_state=False, reference=reference)
-        found.append(group)
-        if reference is not None and group is not None and sizes.get(reference) != group.size:
-            builder.problems.append(
-                f"action.{key}: {group.size} numbers relative to state.{reference}, which has "
-                f"{sizes.get(reference, 'no')}"
-            )
-    return found
+#: Options that are on or off, with the released defaults.
+SWITCHES = {
+    "use_percentiles": False,
+    "clip_outliers": True,
+    "apply_sincos_state_encoding": False,
+    "use_relative_action": False,
+    "exclude_state": False,
+}
 
 
-def _modality(config: Any, kind: str, builder: Builder) -> Mapping[str, Any]:
-    """What ``modality_configs`` contain of the state or the action."""
+def _switch(builder: Builder, kwargs: Mapping[str, Any], name: str, default: bool) -> bool:
+    value = kwargs.get(name, default)
+    if value is not None and not isinstance(value, bool):
+        builder.problems.append(f"{name}: expected true or false, got {value!r:.60}")
+    return bool(value)
+
+
+def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modality:
+    """What ``modality_configs`` contain of the state or the action; problems are recorded.
+
+    Args:
+        builder: Where problems are recorded.
+        config: The modality configs of a robot.
+        kind: ``"state"`` or ``"action"``.
+        relative: Whether ``RELATIVE`` actions are converted at all.
+
+    Raises:
+        CheckpointError: There is nothing to read.
+    """
     found = config.get(kind) if isinstance(config, Mapping) else None
     keys = found.get("modality_keys") if isinstance(found, Mapping) else None
     if not isinstance(keys, list) or not keys or not all(isinstance(key, str) for key in keys):
         raise CheckpointError(f"{builder.where}: {kind}: no modality_keys")
     assert isinstance(found, Mapping)
+    if len(set(keys)) != len(keys):
+        builder.problems.append(f"{kind}: expected distinct modality_keys, got {', '.join(keys)}")
+    builder.refuse_unknown(kind, found, MODALITY)
+    steps = found.get("delta_indices")
+    if not isinstance(steps, list) or not steps or not all(type(step) is int for step in steps):
+        builder.problems.append(f"{kind}: expected delta_indices, a list of integers, got {steps!r:.60}")
+        steps = [0]
+    chosen = []
+    for name in ("sin_cos_embedding_keys", "mean_std_embedding_keys"):
+        names = found.get(name) or []
+        if not isinstance(names, list) or not all(isinstance(key, str) for key in names):
+            builder.problems.append(f"{kind}: {name}: expected a list of keys, got {names!r:.60}")
+            names = []
+        chosen.append(tuple(names))
+    references = _references(builder, kind, keys, found.get("action_configs"), relative)
+    return Modality(tuple(keys), len(steps), chosen[0], chosen[1], references)
+
+
+def _references(
+    builder: Builder, kind: str, keys: list[str], configs: Any, relative: bool
+) -> dict[str, Reference]:
+    """What each relative key is relative to. Type and format matter for keys that are converted only."""
+    if configs is None:
+        return {}
+    if not isinstance(configs, list) or len(configs) != len(keys):
+        builder.problems.append(f"{kind}: expected one of action_configs for each of modality_keys")
+        return {}
+    found = {}
+    for key, config in zip(keys, configs, strict=True):
+        where = f"{kind}.{key}"
+        if not isinstance(config, Mapping):
+            builder.problems.append(f"{where}: expected an action config, got {config!r:.60}")
+            continue
+        builder.refuse_unknown(where, config, ACTION)
+        names = {}
+        for name, allowed in ACTION.items():
+            value = config.get(name)
+            names[name] = value.upper() if isinstance(value, str) and allowed is not None else value
+            if allowed is not None and names[name] not in allowed:
+                builder.problems.append(
+                    f"{where}: {name}: expected one of {', '.join(allowed)}, got {value!r:.60}"
+                )
+        if names["rep"] != "RELATIVE" or not relative:
+            continue
+        state_key = config.get("state_key") or key
+        is_pose = names["type"] == "EEF"
+        form = names["format"]
+        if is_pose and form == "DEFAULT":
+            builder.problems.append(
+                f"{where}: format DEFAULT of a relative EEF is a 4 x 4 matrix, which the released policy does "
+                "not return either"
+            )
+        elif not is_pose and form in POSES:
+            builder.problems.append(f"{where}: format {form} is for type EEF, got {names['type']}")
+        elif not isinstance(state_key, str):
+            builder.problems.append(f"{where}: state_key: expected text, got {state_key!r:.60}")
+        else:
+            found[key] = Reference(state_key, form if is_pose else None)
     return found
+
+
+def check_reference(builder: Builder, group: Group, sizes: Mapping[str, int]) -> None:
+    """Records what is wrong with what a group is relative to.
+
+    Args:
+        builder: Where problems are recorded.
+        group: A group of the action with a reference.
+        sizes: Width of each part of the state.
+    """
+    assert group.reference is not None
+    pose, key = group.reference.pose, group.reference.key
+    if pose is not None and group.size != POSES[pose][0]:
+        builder.problems.append(
+            f"action.{group.key}: expected {POSES[pose][0]} numbers of a pose {pose}, got {group.size}"
+        )
+    elif sizes.get(key) != group.size:
+        builder.problems.append(
+            f"action.{group.key}: {group.size} numbers relative to state.{key}, which has {sizes.get(key, 'no')}"
+        )
+
+
+def _state_group(
+    builder: Builder, key: str, numbers: Any, about: Modality, switches: Mapping[str, bool]
+) -> Group | None:
+    statistics = _entry(numbers, "state", key)
+    if switches["apply_sincos_state_encoding"] and key in about.sin_cos:
+        size = width_of(statistics)
+        if size is None:
+            builder.problems.append(f"{key}: no statistics, of which the width is read")
+            return None
+        return Group(key, size, "sin_cos")
+    if key in about.mean_std:
+        return builder.group(key, statistics, "mean_std", returns_constant=True)
+    return builder.group(
+        key,
+        _bounds(statistics, switches["use_percentiles"]),
+        "min_max",
+        clips=switches["clip_outliers"],
+        clips_back=True,
+    )
+
+
+def _action_group(
+    builder: Builder,
+    key: str,
+    numbers: Any,
+    about: Modality,
+    switches: Mapping[str, bool],
+    sizes: Mapping[str, int],
+) -> Group | None:
+    """A group of the action, absolute or relative to a group of the state."""
+    reference = about.references.get(key)
+    statistics = _entry(numbers, "action", key)
+    width = width_of(statistics)
+    if width is None:
+        # The released code reads the width of a relative key from these as well.
+        builder.problems.append(f"{key}: no statistics of the absolute action")
+        return None
+    if reference is not None:
+        statistics = _entry(numbers, "relative_action", key)
+    # Actions for training are clipped in every mode.
+    clips = switches["clip_outliers"]
+    if key in about.mean_std:
+        group = builder.group(
+            key, statistics, "mean_std", clips=clips, returns_constant=True, reference=reference
+        )
+    else:
+        # Relative actions never use quantiles.
+        uses_quantiles = switches["use_percentiles"] and reference is None
+        bounds = _bounds(statistics, uses_quantiles)
+        group = builder.group(key, bounds, "min_max", clips=clips, clips_back=True, reference=reference)
+    if group is None:
+        return None
+    if group.size != width:
+        builder.problems.append(f"action.{key}: {width} numbers, but relative statistics of {group.size}")
+    assert group.first is not None
+    if group.first.ndim == 2 and len(group.first) not in (1, about.steps):
+        builder.problems.append(
+            f"action.{key}: expected statistics of {about.steps} steps, as delta_indices has, got "
+            f"{len(group.first)}"
+        )
+    if reference is not None:
+        check_reference(builder, group, sizes)
+    return _single_row(group)
+
+
+def _single_row(group: Group) -> Group:
+    """A group whose statistics of one step are those of every step."""
+    if group.first is None or group.first.ndim == 1 or len(group.first) > 1:
+        return group
+    assert group.second is not None
+    assert group.moving is not None
+    return replace(group, first=group.first[0], second=group.second[0], moving=group.moving[0])
+
+
+def _bounds(statistics: Any, uses_quantiles: bool) -> Any:
+    """Statistics whose bounds are called ``min`` and ``max``."""
+    if not uses_quantiles or not isinstance(statistics, Mapping):
+        return statistics
+    return {"min": statistics.get("q01"), "max": statistics.get("q99")}
 
 
 def _entry(numbers: Any, kind: str, key: str) -> Any:
@@ -115,31 +353,17 @@ def _entry(numbers: Any, kind: str, key: str) -> Any:
     return found.get(key) if isinstance(found, Mapping) else None
 
 
-def _group(
-    builder: Builder,
-    key: str,
-    statistics: Any,
-    about: Mapping[str, Any],
-    kwargs: Mapping[str, Any],
-    *,
-    is_state: bool,
-    reference: str | None = None,
-) -> Group | None:
-    """One group of the state or the action."""
-    if (
-        is_state
-        and kwargs.get("apply_sincos_state_encoding")
-        and key in (about.get("sin_cos_embedding_keys") or ())
-    ):
-        return builder.group(key, statistics, "sin_cos")
-    clips = kwargs.get("clip_outliers") is not False
-    if key in (about.get("mean_std_embedding_keys") or ()):
-        # Actions are clipped in every mode, states only if they are scaled by bounds.
-        return builder.group(
-            key, statistics, "mean_std", clips=clips and not is_state, clips_back=True, reference=reference
-        )
-    uses_quantiles = kwargs.get("use_percentiles") and reference is None
-    bounds = {"min": "q01", "max": "q99"} if uses_quantiles else {"min": "min", "max": "max"}
-    if isinstance(statistics, Mapping):
-        statistics = {name: statistics.get(stored) for name, stored in bounds.items()}
-    return builder.group(key, statistics, "min_max", clips=clips, clips_back=True, reference=reference)
+def _check_horizons(
+    builder: Builder, kwargs: Mapping[str, Any], configs: Mapping[str, Any], version: str | None
+) -> None:
+    """N1.7 refuses a processor in which any robot has a longer chunk than ``max_action_horizon``."""
+    most = kwargs.get("max_action_horizon", DEFAULT_HORIZON.get(version or "", None))
+    if most is None:
+        return
+    for tag, config in configs.items():
+        action = config.get("action") if isinstance(config, Mapping) else None
+        steps = action.get("delta_indices") if isinstance(action, Mapping) else None
+        if isinstance(steps, list) and type(most) is int and len(steps) > most:
+            builder.problems.append(
+                f"{tag} has chunks of {len(steps)} actions, expected at most {most} (max_action_horizon)"
+            )

@@ -1,22 +1,39 @@
-"""Statistics of lerobot: ``policy_preprocessor.json``, ``policy_postprocessor.json`` and files they name."""
+"""Statistics of lerobot's groot policies: how its processors normalise states and decode actions.
+
+lerobot always uses min-max. Bounds are a constant only if they are equal in float32. Isaac-GR00T's rules for
+the same statistics (``isclose``, means, sines) do not apply here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, Dims, Options, finished, size_of
-from saccade.robots.files import read_json, read_small_tensors
+from saccade.robots.building import Builder, Options, finished, size_of, width_of
+from saccade.robots.embodiments import N17_IDS
 from saccade.robots.groups import Group, Robot
-from saccade.robots.isaac_processor import processor_robot
+from saccade.robots.isaac_processor import Modality, check_reference, modality
+from saccade.robots.lerobot_pipeline import DECODE, Pipeline, read_pipeline
 
-#: Registered names of the steps that normalise, and of those that turn actions into the robot's units.
-PACK_STEPS = ("groot_pack_inputs", "groot_n1_7_pack_inputs")
-UNPACK_STEPS = ("groot_action_unpack_unnormalize", "groot_n1_7_action_decode")
+STATE, ACTION = "observation.state", "action"
+
+#: LIBERO's gripper is the last of at least so many numbers.
+LIBERO_WIDTH = 7
+
+#: The ids of lerobot's own tables, where a step has none.
+N15_MAPPING = {
+    "new_embodiment": 31,
+    "oxe_droid": 17,
+    "agibot_genie1": 26,
+    "gr1": 24,
+    "so100": 2,
+    "unitree_g1": 3,
+}
 
 
 def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Options) -> Robot | None:
@@ -25,110 +42,224 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     Raises:
         FileNotFoundError, CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
     """
-    where = str(folder / "policy_preprocessor.json")
-    pack = _step(preprocessor, PACK_STEPS)
-    if pack is None:
+    pipeline = read_pipeline(folder, preprocessor)
+    if pipeline is None:
         return None
-    options.refuse_keys(where)
-    after = folder / "policy_postprocessor.json"
-    unpack = _step(read_json(after) if after.is_file() else {}, UNPACK_STEPS)
-    if unpack is None:
-        raise CheckpointError(f"{after}: no step of GR00T that turns actions into the robot's units")
-    taking, giving = _config(pack), _config(unpack)
-    ids = {tag: number for tag, number in taking.get("embodiment_mapping", {}).items() if type(number) is int}
+    options.refuse_data_config(pipeline.where)
+    taking, giving = pipeline.pack.config, pipeline.unpack.config
     tag = str(taking.get("embodiment_tag", "new_embodiment"))
-    embodiment_id = ids.get(tag, 0)  # as lerobot does with an unknown tag
-    options.check_only(tag, embodiment_id, where)
-    dims = (size_of(taking.get("max_state_dim")), size_of(taking.get("max_action_dim")))
-    for name in ("libero_gripper_action", "action_decode_transform"):
-        if giving.get(name):
-            raise CheckpointError(
-                f"{after}: {name} ({giving[name]}) is not supported: it changes the gripper"
-            )
-    if taking.get("raw_stats") and taking.get("modality_config"):
-        kwargs = _processor_kwargs(tag, taking, giving, dims)
-        return processor_robot(where, kwargs, {tag: taking["raw_stats"]}, ids, options)
-    builder = Builder(where, np.float32)
-    is_n17 = str(pack["registry_name"]).startswith("groot_n1_7")
-    clips = is_n17 and taking.get("clip_outliers", True)
-    state, action = builder.check(_groups(builder, folder, pack, unpack, bool(clips)))
-    return finished(where, options, tag, embodiment_id, (state,), (action,), dims)
-
-
-def _processor_kwargs(
-    tag: str, taking: Mapping[str, Any], giving: Mapping[str, Any], dims: Dims
-) -> dict[str, Any]:
-    """The steps of N1.7 as the arguments of Isaac-GR00T's processor."""
-    return {
-        **{name: taking.get(name) for name in ("use_percentiles", "clip_outliers")},
-        "use_relative_action": giving.get("use_relative_action", False),
-        "modality_configs": {tag: taking["modality_config"]},
-        "max_state_dim": dims[0],
-        "max_action_dim": dims[1],
-    }
-
-
-def _groups(
-    builder: Builder, folder: Path, pack: Mapping[str, Any], unpack: Mapping[str, Any], clips: bool
-) -> list[Group | None]:
-    """A group for the whole state, and one for the whole action."""
-    taking, giving = _config(pack), _config(unpack)
-    statistics = [_statistics(folder, step) for step in (pack, unpack)]
-    features = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
-    sizes = (
-        _feature(features.get("input_features"), "observation.state"),
-        size_of(giving.get("env_action_dim")) or _feature(features.get("output_features"), "action"),
+    embodiment_id = _mapping(pipeline).get(tag, 0)  # as lerobot does with an unknown tag
+    options.check_only(tag, embodiment_id, pipeline.where)
+    builder = Builder(pipeline.where, np.float32)
+    native = pipeline.unpack.name == DECODE
+    state = _state_groups(builder, pipeline)
+    if native:
+        action = _native_groups(builder, pipeline, state)
+    else:
+        action = _flat_groups(builder, pipeline)
+    width = sum(group.size for group in action)
+    cut = size_of(giving.get("env_action_dim")) or pipeline.feature("output_features", ACTION)
+    if cut is not None and cut < width:
+        action, width = _cut(builder, action, cut), cut
+    gripper = _libero(builder, pipeline, action, native)
+    offsets = pipeline.offsets(width)
+    state_width = sum(group.size for group in state)
+    if offsets is not None and state_width < width:
+        builder.problems.append(
+            f"the state of {state_width} numbers is added to actions of {width}, expected at least as many"
+        )
+    builder.check()
+    rows, trained = pipeline.rows
+    return finished(
+        pipeline.where,
+        options,
+        tag,
+        embodiment_id,
+        state,
+        action,
+        (size_of(taking.get("max_state_dim")), size_of(taking.get("max_action_dim"))),
+        cuts_state=not pipeline.is_n17,
+        action_horizon=rows,
+        trained_horizon=trained,
+        offsets=offsets,
+        gripper=gripper,
     )
-    groups: list[Group | None] = []
-    for found, config, key, size in zip(
-        statistics, (taking, giving), ("observation.state", "action"), sizes, strict=True
-    ):
-        name = key.rpartition(".")[2]
-        group: Group | None = None
-        if config.get("normalize_min_max", True) and key in found:
-            clips_back = bool(config.get("clip_normalized_action"))
-            group = builder.group(name, found[key], "min_max", clips=clips, clips_back=clips_back)
-            if group is not None and size is not None and group.size != size:
-                builder.problems.append(f"{name}: {size} numbers, but statistics of {group.size}")
-        elif size is None:
-            builder.problems.append(f"{name}: not normalised, and of unknown size")
-        else:
-            group = Group(name, size, "none")
-        groups.append(group)
-    return groups
 
 
-def _step(values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any] | None:
-    """The step of a pipeline whose registered name begins with one of ``names``."""
-    steps = values.get("steps")
-    for step in steps if isinstance(steps, list) else []:
-        if isinstance(step, Mapping) and str(step.get("registry_name", "")).startswith(names):
-            return step
+def _mapping(pipeline: Pipeline) -> dict[str, int]:
+    given = pipeline.pack.config.get("embodiment_mapping")
+    if isinstance(given, Mapping):
+        return {tag: number for tag, number in given.items() if type(number) is int}
+    return dict(N17_IDS) if pipeline.is_n17 else dict(N15_MAPPING)
+
+
+def _state_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
+    """The state: one group, or with a raw checkpoint's statistics one for each of its keys."""
+    config = pipeline.pack.config
+    found = pipeline.pack.statistics.get(STATE)
+    scaled = (not pipeline.is_n17 or config.get("normalize_min_max", True)) and found is not None
+    size = pipeline.feature("input_features", STATE)
+    if size is None and found is not None:
+        size = max((np.size(row) for name, row in found.items() if name in ("min", "max")), default=None)
+    if size is None:
+        builder.problems.append("state: of unknown size, since config.json has no observation.state")
+        return ()
+    parts = _parts(pipeline, size)
+    if not scaled:
+        return tuple(Group(key, width, "none") for key, width in parts)
+    assert found is not None
+    low, high = (_fitted(builder, STATE, found, name, size, fill) for name, fill in (("min", 0), ("max", 1)))
+    clips = bool(pipeline.is_n17 and config.get("clip_outliers", True))
+    groups, start = [], 0
+    for key, width in parts:
+        part = slice(start, start + width)
+        groups.append(builder.scaled(key, "min_max", low[part], high[part], clips=clips))
+        start += width
+    return tuple(groups)
+
+
+def _parts(pipeline: Pipeline, size: int) -> list[tuple[str, int]]:
+    """Keys of the state and their widths, if a raw checkpoint's statistics say so."""
+    raw, about = pipeline.pack.config.get("raw_stats"), pipeline.pack.config.get("modality_config")
+    keys = about.get("state", {}).get("modality_keys") if isinstance(about, Mapping) else None
+    numbers = raw.get("state") if isinstance(raw, Mapping) else None
+    if not isinstance(keys, list) or not isinstance(numbers, Mapping):
+        return [("state", size)]
+    widths = [width_of(numbers.get(key)) for key in keys]
+    if None in widths or sum(width or 0 for width in widths) != size:
+        return [("state", size)]
+    return [(str(key), width or 0) for key, width in zip(keys, widths, strict=True)]
+
+
+def _flat_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
+    """The action as one group."""
+    config, statistics = pipeline.unpack.config, pipeline.unpack.statistics
+    found = statistics.get(ACTION)
+    size = pipeline.feature("output_features", ACTION)
+    given = size_of(config.get("env_action_dim"))
+    if given is not None and pipeline.is_n17:
+        size = given if size is None else min(size, given)
+    if size is None and found is not None:
+        size = max((np.size(row) for name, row in found.items() if name in ("min", "max")), default=None)
+    if size is None:
+        builder.problems.append("action: of unknown size, since config.json has no action")
+        return ()
+    if not statistics or (pipeline.is_n17 and not config.get("normalize_min_max", True)):
+        return (Group("action", size, "none"),)
+    if found is None:  # statistics of other features only
+        low, high = np.zeros(size, np.float32), np.ones(size, np.float32)
+    else:
+        low, high = (_fitted(builder, ACTION, found, name, size, 0) for name in ("min", "max"))
+    clips_back = bool(pipeline.is_n17 and config.get("clip_normalized_action"))
+    return (builder.scaled("action", "min_max", low, high, clips=pipeline.is_n17, clips_back=clips_back),)
+
+
+def _native_groups(
+    builder: Builder, pipeline: Pipeline, state: tuple[Group, ...]
+) -> tuple[Group, ...]:
+    """The groups of a raw checkpoint's statistics."""
+    config = pipeline.unpack.config
+    raw, about = config.get("raw_stats"), config.get("modality_config")
+    if not isinstance(raw, Mapping) or not isinstance(about, Mapping):
+        builder.problems.append(f"{DECODE}: no raw_stats and modality_config")
+        builder.check()
+    assert isinstance(raw, Mapping)
+    action = modality(builder, about, "action", relative=bool(config.get("use_relative_action")))
+    sizes = {group.key: group.size for group in state}
+    groups = [_native_group(builder, key, raw, action, bool(config.get("use_percentiles"))) for key in action.keys]
+    for group in groups:
+        if group is not None and group.reference is not None:
+            check_reference(builder, group, sizes)
+            if group.reference.pose == "XYZ_ROTVEC":
+                builder.problems.append(f"action.{group.key}: lerobot has no relative poses XYZ_ROTVEC")
+    return builder.check(groups)
+
+
+def _native_group(
+    builder: Builder, key: str, raw: Mapping[str, Any], about: Modality, uses_quantiles: bool
+) -> Group | None:
+    reference = about.references.get(key)
+    kind = "action" if reference is None else "relative_action"
+    numbers, absolute = raw.get(kind), raw.get("action")
+    found = numbers.get(key) if isinstance(numbers, Mapping) else None
+    width = width_of(absolute.get(key) if isinstance(absolute, Mapping) else None)
+    # Relative actions never use quantiles.
+    low, high = ("q01", "q99") if uses_quantiles and reference is None else ("min", "max")
+    if isinstance(found, Mapping):
+        found = {"min": found.get(low), "max": found.get(high)}
+    group = builder.group(key, found, "min_max", clips=True, clips_back=True, reference=reference)
+    if group is not None and group.size != width:
+        builder.problems.append(f"action.{key}: {width} numbers, but statistics of {group.size}")
+    return group
+
+
+def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group, ...]:
+    """The groups of the first ``width`` numbers of an action."""
+    found, left = [], width
+    for group in groups:
+        size = min(group.size, left)
+        left -= size
+        if size == group.size:
+            found.append(group)
+        elif size > 0 and group.reference is not None:
+            builder.problems.append(f"action.{group.key}: cut to {size} of {group.size} numbers (env_action_dim)")
+        elif size > 0 and group.mode == "none":
+            found.append(replace(group, size=size))
+        elif size > 0:
+            assert group.first is not None
+            assert group.second is not None
+            assert group.moving is not None
+            found.append(
+                replace(
+                    group,
+                    size=size,
+                    first=group.first[..., :size],
+                    second=group.second[..., :size],
+                    moving=group.moving[..., :size],
+                )
+            )
+    return tuple(found)
+
+
+def _libero(
+    builder: Builder, pipeline: Pipeline, action: tuple[Group, ...], native: bool
+) -> int | None:
+    """The number that LIBERO's rule applies to. ``config.json`` decides, whatever the steps say."""
+    if not pipeline.is_n17:
+        return None
+    config = pipeline.config
+    wanted = config.get("action_decode_transform", "auto")
+    if wanted == "auto":
+        wanted = "libero" if config.get("embodiment_tag", "new_embodiment") == "libero_sim" else None
+    if wanted in (None, "", "none"):
+        return None
+    if wanted != "libero":
+        builder.problems.append(
+            f"config.json: action_decode_transform: expected auto, none or libero, got {wanted!r:.60}"
+        )
+        return None
+    width = sum(group.size for group in action)
+    if not native:
+        return width - 1 if width >= LIBERO_WIDTH else None
+    start = 0
+    for group in action:
+        if group.key == "gripper" and group.size == 1:
+            return start
+        start += group.size
+    builder.problems.append("libero: expected a group gripper of one number among the actions")
     return None
 
 
-def _config(step: Mapping[str, Any]) -> Mapping[str, Any]:
-    config = step.get("config")
-    return config if isinstance(config, Mapping) else {}
-
-
-def _feature(features: Any, key: str) -> int | None:
-    """Width of a feature in ``config.json``."""
-    shape = features.get(key, {}).get("shape") if isinstance(features, Mapping) else None
-    return size_of(shape[-1]) if isinstance(shape, list) and shape else None
-
-
-def _statistics(folder: Path, step: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Statistics by key in the file that a step names."""
-    name = step.get("state_file")
-    if name is None:
-        return {}
-    if not isinstance(name, str) or not name or Path(name).name != name:
-        raise CheckpointError(
-            f"{folder}: state_file: expected the name of a file in this folder, got {name!r}"
-        )
-    found: dict[str, dict[str, Any]] = {}
-    for full, values in read_small_tensors(folder / name).items():
-        key, _, statistic = full.rpartition(".")
-        found.setdefault(key, {})[statistic] = values
-    return found
+def _fitted(
+    builder: Builder, key: str, statistics: Mapping[str, Any], name: str, size: int, fill: float
+) -> npt.NDArray[np.float32]:
+    """A bound as a row of ``size`` float32, cut or filled up as lerobot does."""
+    given = statistics.get(name)
+    default = 0.0 if name == "min" else 1.0
+    row = np.full(size, default, np.float32) if given is None else np.ravel(np.asarray(given, np.float32))
+    fitted = np.full(size, fill, np.float32)
+    fitted[: min(size, len(row))] = row[:size]
+    if not np.isfinite(fitted).all():
+        builder.problems.append(f"{key}: expected {name} to be a row of finite numbers")
+        return np.full(size, default, np.float32)
+    return fitted

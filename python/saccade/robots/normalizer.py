@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,8 @@ import numpy as np
 from saccade._arrays import Array, ArrayLike, Float32Array, float32, integer, is_torch, like_features
 from saccade.errors import InputError, ShapeError
 from saccade.robots.building import Options
+from saccade.robots.data_configs import DataConfigLike
+from saccade.robots.data_configs import data_config as read_data_config
 from saccade.robots.groups import Group, Robot
 from saccade.robots.reading import read
 
@@ -43,50 +45,46 @@ class Normalizer(Robot):
         source: str | os.PathLike[str] | Mapping[str, Any],
         embodiment: str | int | None = None,
         *,
+        data_config: DataConfigLike | None = None,
         state_dim: int | None = None,
         action_dim: int | None = None,
-        state_keys: Sequence[str] | None = None,
-        action_keys: Sequence[str] | None = None,
-        modes: str | Mapping[str, str] | None = None,
     ) -> Normalizer:
         """Reads the statistics of a checkpoint.
 
         These layouts are tried in this order:
 
         - lerobot: ``policy_preprocessor.json``, ``policy_postprocessor.json`` and the ``.safetensors`` files
-          that they name. Min-max; for N1.7 also with the groups and relative actions of Isaac-GR00T.
-        - Isaac-GR00T N1.6 and N1.7: ``processor_config.json``, ``statistics.json``, ``embodiment_id.json``.
-        - Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``. The checkpoint does not contain the keys
-          of the data config, their order and their modes. The default is all keys in the order of the file,
-          min-max for continuous keys and binary for others.
-        - A mapping or a JSON file: the contents of any of these files, or ``{"state": {"min": ..., "max":
+          that they name. Every step is applied, or refused by its name.
+        - Isaac-GR00T N1.6 and N1.7: ``processor_config.json``, ``statistics.json``, ``embodiment_id.json``,
+          in the checkpoint's folder or in ``processor/``.
+        - Isaac-GR00T N1 and N1.5: ``experiment_cfg/metadata.json``. The checkpoint does not contain the data
+          config that it was trained with.
+        - A mapping or a JSON file: the contents of ``metadata.json``, or ``{"state": {"min": ..., "max":
           ...}, "action": ...}``, or the same with ``"mean"`` and ``"std"``.
 
         Args:
             source: The directory or id of a checkpoint, one of these files, or a mapping.
-            embodiment: Tag or id of the robot. Required if the statistics are of several robots.
+            embodiment: Tag or id of the robot, or the name that the release has for the tag. Required if the
+                statistics are of several robots.
+            data_config: N1 and N1.5: the data config of the checkpoint, by the name that Isaac-GR00T gives
+                it, as the path of a JSON file, or as a mapping; see ``docs/robots.md``. It says which keys
+                are used, in which order, and how. Default: all keys in the order of the file, min-max
+                (discrete ones: binary), with a warning. Required for ``gr1``, and where a key is a rotation.
             state_dim: Width of the head's state. Default: as in the checkpoint, else the width of the robot's
                 state.
             action_dim: Width of the head's actions. Default: likewise.
-            state_keys: The keys of the state in their order. For ``metadata.json`` only, as the next two.
-            action_keys: The keys of the action in their order.
-            modes: How to normalise: one of ``"min_max"``, ``"q99"``, ``"mean_std"``, ``"binary"``,
-                ``"sin_cos"`` (states only) and ``"none"``, for all keys or by key (``"state.left_arm"``).
-                Required for a key that is a rotation, because the data configs of Isaac-GR00T may convert
-                rotations to another representation, which is not supported here.
 
         Raises:
-            FileNotFoundError: ``source`` does not exist.
-            CheckpointError: There are no statistics, or they are damaged. The message lists every problem.
+            FileNotFoundError: ``source`` or the file of ``data_config`` does not exist.
+            CheckpointError: There are no statistics, they are damaged, or something in the files is not known
+                and could change the answer. The message lists every problem.
             InputError: An option does not fit the statistics.
         """
         options = Options(
             embodiment,
             None if state_dim is None else integer("state_dim", state_dim),
             None if action_dim is None else integer("action_dim", action_dim),
-            _key_names("state_keys", state_keys),
-            _key_names("action_keys", action_keys),
-            _checked_modes(modes),
+            None if data_config is None else read_data_config(data_config),
         )
         return cls(**vars(read(source, options)))
 
@@ -173,7 +171,7 @@ class Normalizer(Robot):
         if self.action_horizon is not None and values.ndim > 1:
             values = values[..., : self.action_horizon, :]
         robot = _mapped(values, self.action_groups, Group.to_robot)
-        return like_features(robot + self._reference(state, robot), is_torch(actions))
+        return like_features(self._absolute(robot, state), is_torch(actions))
 
     def unactions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
         """The inverse of :meth:`actions`, for training.
@@ -202,18 +200,63 @@ class Normalizer(Robot):
         return self._to_head(actions, state, groups)
 
     def _to_head(self, actions: ArrayLike, state: ArrayLike | None, groups: tuple[Group, ...]) -> Array:
-        values = self._robot("actions", actions, groups)
-        values = values - self._reference(state, values)
+        values = self._relative(self._robot("actions", actions, groups), state)
         normalised = padded(_mapped(values, groups, Group.to_head), self.action_dim)
         return like_features(normalised, is_torch(actions))
 
-    def _reference(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array:
-        """What is added to the robot's actions: the state for relative groups, else zero."""
-        relative = [group for group in self.action_groups if group.reference is not None]
-        if not relative:
+    @property
+    def _needs_state(self) -> bool:
+        return self.offsets is not None or any(group.reference is not None for group in self.action_groups)
+
+    def _absolute(self, actions: Float32Array, state: ArrayLike | None) -> Float32Array:
+        """Actions after the steps that follow the normalisation: references, LIBERO's gripper, offsets."""
+        latest = self._latest(state, actions) if self._needs_state else None
+        if latest is not None:
+            actions = self._by_reference(Group.absolute, actions, latest)
+        if self.gripper is not None:
+            actions = actions.copy()
+            actions[..., self.gripper] = -np.sign(2 * actions[..., self.gripper] - 1)
+        return actions if latest is None else actions + self._offset(latest)
+
+    def _relative(self, actions: Float32Array, state: ArrayLike | None) -> Float32Array:
+        """The inverse of :meth:`_absolute`. A gripper that is open or closed gives 0 or 1."""
+        latest = self._latest(state, actions) if self._needs_state else None
+        if latest is not None:
+            actions = actions - self._offset(latest)
+        if self.gripper is not None:
+            actions = actions.copy()
+            actions[..., self.gripper] = (1 - actions[..., self.gripper]) / 2
+        return actions if latest is None else self._by_reference(Group.relative, actions, latest)
+
+    def _by_reference(
+        self,
+        convert: Callable[[Group, Float32Array, Float32Array], Float32Array],
+        actions: Float32Array,
+        latest: Float32Array,
+    ) -> Float32Array:
+        """Applies `Group.absolute` or `Group.relative` to the groups that have a reference."""
+        if all(group.reference is None for group in self.action_groups):
+            return actions
+        states, parts = self.state_slices, []
+        for group, where in zip(self.action_groups, self.action_slices.values(), strict=True):
+            part = actions[..., where]
+            if group.reference is not None:
+                reference = latest[..., states[group.reference.key]][..., : group.size]
+                part = convert(group, reference, part)
+            parts.append(part)
+        return np.concatenate(parts, axis=-1)
+
+    def _offset(self, latest: Float32Array) -> Float32Array:
+        """What lerobot's generic step adds to the action."""
+        if self.offsets is None:
             return np.zeros(self.action_width, np.float32)
+        return np.where(self.offsets, latest[..., : self.action_width], np.float32(0))
+
+    def _latest(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array:
+        """The newest state, with axes of length one for the samples and steps of ``actions``."""
         if state is None:
-            keys = ", ".join(group.key for group in relative)
+            relative = [group.key for group in self.action_groups if group.reference is not None]
+            keys = ", ".join(relative) or "this robot"
             raise InputError(
                 f"state: expected the robot's state, because the actions of {keys} are relative to it, got "
                 "None"
@@ -225,16 +268,8 @@ class Normalizer(Robot):
             raise ShapeError(
                 f"state: expected a shape that fits actions of shape {actions.shape}, got {latest.shape}"
             )
-        where = self.state_slices
-        parts = [
-            np.zeros((*latest.shape[:-1], group.size), np.float32)
-            if group.reference is None
-            else latest[..., where[group.reference]]
-            for group in self.action_groups
-        ]
-        joined = np.concatenate(parts, axis=-1)
-        steps = (1,) * (actions.ndim - joined.ndim)
-        return joined.reshape(*joined.shape[:-1], *steps, self.action_width)
+        steps = (1,) * (actions.ndim - latest.ndim)
+        return latest.reshape(*latest.shape[:-1], *steps, self.state_width)
 
     def _robot(self, name: str, given: ArrayLike, groups: tuple[Group, ...]) -> Float32Array:
         """An array in the robot's units, after checking its width."""
@@ -301,18 +336,3 @@ def _finite(name: str, given: ArrayLike) -> Float32Array:
     if not np.isfinite(values).all():
         raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
     return values
-
-
-def _checked_modes(modes: str | Mapping[str, str] | None) -> str | Mapping[str, str] | None:
-    if modes is not None and not isinstance(modes, (str, Mapping)):
-        raise InputError(f"modes: expected a name, or names by key, got {type(modes).__name__}")
-    return modes
-
-
-def _key_names(name: str, given: Sequence[str] | None) -> tuple[str, ...] | None:
-    if given is None:
-        return None
-    keys = () if isinstance(given, str) else tuple(given)
-    if not keys or len(set(keys)) != len(keys) or not all(isinstance(key, str) for key in keys):
-        raise InputError(f"{name}: expected distinct names, at least one, got {given!r}")
-    return keys

@@ -14,8 +14,14 @@ from saccade.robots.files import read_json
 from saccade.robots.flat import flat_robot
 from saccade.robots.groups import Robot
 from saccade.robots.isaac_metadata import metadata_robot
-from saccade.robots.isaac_processor import processor_robot
+from saccade.robots.isaac_processor import CLASSES, processor_robot
 from saccade.robots.lerobot import lerobot_robot
+
+#: Where a training leaves the processor's files, if not beside the weights.
+PROCESSOR_FOLDER = "processor"
+
+#: Versions by ``model_type`` of ``config.json``.
+MODEL_TYPES = {"Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
 
 
 def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -> Robot:
@@ -34,32 +40,59 @@ def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -
         raise CheckpointError(f"{where}: statistics of an unknown form ({error!r})") from error
 
 
+def processor_folder(folder: Path) -> Path:
+    """The folder of N1.6's and N1.7's processor: the checkpoint's, or ``processor/`` in it.
+
+    The released N1.7 looks into ``processor/`` only if the checkpoint's own folder has no
+    ``processor_config.json``. N1.6 leaves its files at the same places.
+    """
+    below = folder / PROCESSOR_FOLDER
+    at_root = (folder / "processor_config.json").is_file()
+    return below if not at_root and (below / "processor_config.json").is_file() else folder
+
+
+def processor_version(folder: Path, values: Mapping[str, Any]) -> str | None:
+    """The version of a processor: by its class, else by the checkpoint's ``model_type``; or None."""
+    named = CLASSES.get(str(values.get("processor_class")))
+    if named is not None or not (folder / "config.json").is_file():
+        return named
+    return MODEL_TYPES.get(str(read_json(folder / "config.json").get("model_type")))
+
+
 def _from_path(path: Path, options: Options) -> Robot:
     """The robot of one file, or of the first of `FILES` in a directory that has statistics."""
     if not os.path.isdir(path):  # noqa: PTH112 (Path.is_dir raises OSError if a name is too long)
         return _from_values(read_json(path), options, str(path))
     for name, reader in FILES.items():
-        if (path / name).is_file():
-            found = reader(path, read_json(path / name), options)
+        folder = processor_folder(path) if reader is _processor else path
+        if (folder / name).is_file():
+            found = reader(path, read_json(folder / name), options)
             if found is not None:
                 return found
-    raise CheckpointError(f"{path}: no statistics of states and actions; looked for {', '.join(FILES)}")
+    listed = ", ".join([*FILES, f"{PROCESSOR_FOLDER}/processor_config.json"])
+    raise CheckpointError(f"{path}: no statistics of states and actions; looked for {listed}")
 
 
-def _processor(folder: Path, values: Mapping[str, Any], options: Options) -> Robot | None:
+def _processor(path: Path, values: Mapping[str, Any], options: Options) -> Robot | None:
     """Isaac-GR00T N1.6 and N1.7. The processor of another transformers model has no ``processor_kwargs``."""
     if "processor_kwargs" not in values:
         return None
-    where = str(folder / "processor_config.json")
+    folder = processor_folder(path)
     ids = read_json(folder / "embodiment_id.json") if (folder / "embodiment_id.json").is_file() else {}
-    statistics = read_json(folder / "statistics.json")
-    return processor_robot(where, values["processor_kwargs"], statistics, ids, options)
+    return processor_robot(
+        str(folder / "processor_config.json"),
+        processor_version(path, values),
+        values["processor_kwargs"],
+        read_json(folder / "statistics.json"),
+        ids,
+        options,
+    )
 
 
-def _metadata(folder: Path, values: Mapping[str, Any], options: Options) -> Robot:
+def _metadata(path: Path, values: Mapping[str, Any], options: Options) -> Robot:
     """Isaac-GR00T N1 and N1.5. The widths of the head are in the config."""
-    where = str(folder / "experiment_cfg" / "metadata.json")
-    config = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
+    where = str(path / "experiment_cfg" / "metadata.json")
+    config = read_json(path / "config.json") if (path / "config.json").is_file() else {}
     return _from_values(values, options, where, _dims(config))
 
 

@@ -1,0 +1,133 @@
+"""Embodiment tags: the released tables of ids, and how a request names a robot.
+
+Ids belong to a release. ``robocasa_panda_omron`` is 13 in N1.6 and 10 in N1.7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from saccade._arrays import integer
+from saccade.errors import InputError
+
+#: Isaac-GR00T N1 and N1.5. ``genie1_gripper`` is an old name of ``agibot_genie1``.
+N15_IDS = {
+    "new_embodiment": 31,
+    "agibot_genie1": 26,
+    "genie1_gripper": 26,
+    "gr1": 24,
+    "oxe_droid": 17,
+}
+
+N16_IDS = {
+    "oxe_google": 0,
+    "oxe_widowx": 1,
+    "libero_panda": 2,
+    "unitree_g1": 8,
+    "new_embodiment": 10,
+    "robocasa_panda_omron": 13,
+    "oxe_droid": 16,
+    "gr1": 20,
+    "behavior_r1_pro": 24,
+}
+
+N17_IDS = {
+    "simpler_env_google": 0,
+    "simpler_env_widowx": 1,
+    "libero_sim": 2,
+    "new_embodiment": 10,
+    "robocasa_panda_omron": 10,
+    "robocasa_gr1_tabletop": 10,
+    "unitree_g1_sonic": 11,
+    "oxe_droid_relative_eef_relative_joint": 24,
+    "real_g1_relative_eef_relative_joints": 25,
+    "unitree_g1_full_body_with_waist_height_nav_cmd": 25,
+    "real_r1_pro_sharpa_relative_eef": 26,
+    "real_r1_pro_sharpa_relative_eef_human": 26,
+    "real_r1_pro_sharpa_relative_eef_maxinsights": 26,
+    "real_r1_pro_sharpa_relative_eef_mecka": 26,
+    "xdof_relative_eef_relative_joint": 27,
+    "xdof_relative_eef_relative_joint_subtask": 27,
+}
+
+#: Released ids by version of the model.
+IDS: Mapping[str, Mapping[str, int]] = {"n1": N15_IDS, "n1.5": N15_IDS, "n1.6": N16_IDS, "n1.7": N17_IDS}
+
+#: Names of N1.7 that differ from their tag in more than case. A name takes precedence over a tag:
+#: ``unitree_g1`` is another robot in N1.6.
+N17_NAMES = {
+    "xdof": "xdof_relative_eef_relative_joint",
+    "xdof_subtask": "xdof_relative_eef_relative_joint_subtask",
+    "real_g1": "real_g1_relative_eef_relative_joints",
+    "real_r1_pro_sharpa": "real_r1_pro_sharpa_relative_eef",
+    "real_r1_pro_sharpa_human": "real_r1_pro_sharpa_relative_eef_human",
+    "real_r1_pro_sharpa_maxinsights": "real_r1_pro_sharpa_relative_eef_maxinsights",
+    "real_r1_pro_sharpa_mecka": "real_r1_pro_sharpa_relative_eef_mecka",
+    "unitree_g1": "unitree_g1_full_body_with_waist_height_nav_cmd",
+    "libero_panda": "libero_sim",
+}
+
+
+def resolved(text: str, version: str | None, tags: Iterable[str]) -> str:
+    """The tag that a text names, as the release resolves it: without case, names before tags.
+
+    Args:
+        text: A tag, or a name of the release.
+        version: ``"n1"`` to ``"n1.7"``; None if it is not known.
+        tags: The tags of a checkpoint. One that no release has is found by its exact text.
+
+    Returns:
+        A tag, which need not be one of ``tags``; or ``text`` unchanged.
+
+    Example:
+        >>> resolved(" XDOF ", "n1.7", ()), resolved("GR1", "n1.6", ()), resolved("my_arm", "n1.6", ())
+        ('xdof_relative_eef_relative_joint', 'gr1', 'my_arm')
+    """
+    known = IDS.get(version or "", {})
+    plain = text.strip().lower()
+    named = N17_NAMES.get(plain) if version == "n1.7" else None
+    if named is not None:
+        return named
+    if plain in known:
+        return plain
+    listed = list(tags)
+    return text if text in listed else text.strip()
+
+
+def choose(
+    wanted: str | int | None,
+    tags: Iterable[str],
+    ids: Mapping[str, int],
+    version: str | None,
+    where: str,
+    hint: str = "",
+) -> str:
+    """The tag of the requested robot.
+
+    Args:
+        wanted: A tag, a name of the release, an id, or None for the only robot. An id may be given for the
+            only robot if that has none: a fine-tune may name a robot that the released code does not know.
+            The id then selects the head's embodiment.
+        tags: The tags that have statistics.
+        ids: Ids by tag.
+        version: As in `resolved`.
+        where: The file, for messages.
+        hint: More for the message.
+
+    Raises:
+        InputError: It is not there, or there are several and None was given.
+    """
+    listed = list(tags)
+    if wanted is None:
+        found = listed if len(listed) == 1 else []
+    elif isinstance(wanted, str):
+        tag = resolved(wanted, version, listed)
+        found = [tag] if tag in listed else []
+    else:
+        asked = integer("embodiment", wanted, least=0)
+        alone = len(listed) == 1
+        found = [tag for tag in listed if ids.get(tag, asked if alone else None) == asked]
+    if len(found) != 1:
+        shown = ", ".join(f"{tag} ({ids[tag]})" if tag in ids else tag for tag in listed)
+        raise InputError(f"embodiment: expected one of those in {where} ({shown}), got {wanted!r}{hint}")
+    return found[0]
