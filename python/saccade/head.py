@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import saccade._saccade as _saccade
 from saccade._arrays import (
@@ -40,7 +40,6 @@ from saccade.options import (
     plain_chunking,
     plain_interventions,
 )
-from saccade.policy import Policy
 from saccade.robots import Normalizer
 from saccade.trace import Record, Trace, check_record
 
@@ -72,6 +71,9 @@ class ActionHead:
         >>> head.sample(context, state, embodiment_id=0, seed=7, num_samples=4).shape
         (2, 4, 16, 4)
     """
+
+    #: Set by `saccade.policy`: policies know heads, and heads do not know policies.
+    make_policy: ClassVar[Callable[..., Any]]
 
     def __init__(
         self,
@@ -532,8 +534,10 @@ class ActionHead:
         self,
         normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment: str | int | None = None,
-    ) -> Policy:
-        """A policy that takes the robot's state and returns the robot's actions, both in the robot's units.
+    ) -> Any:
+        """A :class:`saccade.Policy` of this head, without a backbone.
+
+        It takes the robot's state and returns the robot's actions, both in the robot's units.
 
         Args:
             normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from.
@@ -543,7 +547,7 @@ class ActionHead:
         Raises:
             FileNotFoundError, CheckpointError, InputError: As :class:`saccade.Policy`.
         """
-        return Policy(self, normalizer, embodiment)
+        return self.make_policy(self, normalizer, embodiment)
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._source is None:

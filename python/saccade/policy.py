@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,14 +15,17 @@ from saccade.backbone_features import BackboneFeatures
 from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.context import Context
-from saccade.dialects import CameraSources, Reading, Requirements, StateReading, read, read_state
+from saccade.dialects import ObservationSources, Reading, Requirements, StateReading, read, read_state
 from saccade.errors import InputError
+from saccade.head import ActionHead
 from saccade.options import PolicyOptions, SampleOptions
 from saccade.policy_context import PolicyContext, encoded
 from saccade.policy_example import example_observation
-from saccade.policy_head import Head, embodiment_of
+from saccade.policy_head import Head, check_steps, embodiment_of
+from saccade.policy_loading import load as load_parts
 from saccade.processor import Preprocessing, Processor
-from saccade.robots import Normalizer, padded
+from saccade.robots import DataConfigLike, Normalizer, padded
+from saccade.robots.embodiments import resolved
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -53,7 +55,7 @@ class Policy:
             statistics do not contain the id, an id given here selects the head's embodiment.
         backbone: The backbone, or None.
         processor: The processor of the backbone's inputs, or None.
-        cameras: What the checkpoint says about cameras and language.
+        sources: What the checkpoint says about observations.
 
     Attributes:
         head: The action head.
@@ -88,7 +90,7 @@ class Policy:
         *,
         backbone: Backbone | None = None,
         processor: Processor | None = None,
-        cameras: CameraSources | None = None,
+        sources: ObservationSources | None = None,
     ) -> None:
         config = head.config
         if not isinstance(normalizer, Normalizer):
@@ -101,7 +103,7 @@ class Policy:
             normalizer = Normalizer.load(
                 source, embodiment, state_dim=config.state_dim, action_dim=config.encoder_action_dim
             )
-        elif isinstance(embodiment, str) and embodiment != normalizer.embodiment:
+        elif isinstance(embodiment, str) and not _is_named(embodiment, config.version, normalizer.embodiment):
             raise InputError(
                 f"embodiment: expected that of the normalizer, {normalizer.embodiment!r}, got {embodiment!r}"
             )
@@ -111,19 +113,18 @@ class Policy:
                 f"{config.action_dim}, as this head has them, got states of width {normalizer.state_dim} "
                 f"and actions of width {normalizer.action_width}"
             )
+        check_steps(head, normalizer)
         self.head = head
         self.normalizer = normalizer
         self.embodiment_id = embodiment_of(head, normalizer, embodiment)
         self.backbone = backbone
         self.processor = processor
-        known = CameraSources() if cameras is None else cameras
+        known = ObservationSources() if sources is None else sources
         self.requirements = Requirements(
             embodiment=normalizer.embodiment,
-            cameras=known.cameras,
             state=tuple((group.key, group.size) for group in normalizer.state_groups),
             state_history=config.state_history,
-            video_horizon=known.video_horizon,
-            language_keys=() if known.language_key is None else (known.language_key,),
+            **vars(known),
         )
 
     @classmethod
@@ -138,6 +139,9 @@ class Policy:
         num_threads: int | None = None,
         normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         cameras: Sequence[str] | None = None,
+        data_config: DataConfigLike | None = None,
+        action_horizon: int | None = None,
+        processor_options: Mapping[str, Any] | None = None,
     ) -> Policy:
         """Loads a whole checkpoint: backbone, action head, tokenizer, processor and statistics.
 
@@ -154,12 +158,17 @@ class Policy:
             precision: How backbone and head compute, as for :meth:`saccade.ActionHead.load`: one name for
                 both, or ``{"backbone": name, "head": name}``.
             num_threads: Number of threads, as for :meth:`saccade.ActionHead.load`.
-            normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from. Needed
-                where the data config of an N1.5 fine-tune differs from its ``metadata.json`` in keys, order
-                or modes.
-            cameras: The names of the cameras in the order of the prompt. Default: those of the checkpoint.
-                Needed where the data config of an N1.5 fine-tune uses some of the data set's cameras, or
-                another order than ``metadata.json``.
+            normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from. Default:
+                the checkpoint.
+            cameras: The names of the cameras in the order of the prompt. Default: those of the data config or
+                the checkpoint.
+            data_config: GR00T N1 and N1.5: the data config that the checkpoint was trained with, as for
+                :meth:`saccade.Normalizer.load`. The head denoises as many actions as it has
+                ``action_indices``.
+            action_horizon: Number of actions that the head denoises, for a fine-tune that was trained with
+                another number than its config says.
+            processor_options: Options of the checkpoint's processor to replace, such as
+                ``{"letter_box_transform": True}``; see :meth:`saccade.Processor.load`.
 
         Raises:
             FileNotFoundError: ``source``, a file of the checkpoint or the tokenizer does not exist.
@@ -173,8 +182,7 @@ class Policy:
             ...     policy = saccade.Policy.load(checkpoint, embodiment="new_embodiment", precision="int8")
             ...     return policy.act(policy.example_observation(), seed=0)
         """
-        # By its name, because heads make policies too, and modules do not import each other in a circle.
-        parts = importlib.import_module("saccade.policy_loading").load(
+        parts = load_parts(
             source,
             embodiment=embodiment,
             preprocessing=preprocessing,
@@ -183,6 +191,9 @@ class Policy:
             num_threads=num_threads,
             normalizer=normalizer,
             cameras=cameras,
+            data_config=data_config,
+            action_horizon=action_horizon,
+            processor_options=processor_options,
         )
         return cls(
             parts.head,
@@ -190,7 +201,7 @@ class Policy:
             parts.embodiment,
             backbone=parts.backbone,
             processor=parts.processor,
-            cameras=parts.cameras,
+            sources=parts.sources,
         )
 
     def act(
@@ -495,3 +506,12 @@ def _listed(observation: Observations) -> list[Observation | Reading]:
 def _batched(array: Float32Array, axes: int, reading: StateReading) -> Float32Array:
     """An array with a batch axis, which it may lack if the observation does."""
     return array[None] if not reading.is_batched and array.ndim == axes - 1 else array
+
+
+def _is_named(name: str, version: str, embodiment: str | None) -> bool:
+    """Whether a name is that of a robot, as its release resolves it."""
+    return resolved(name, version, () if embodiment is None else (embodiment,)) == embodiment
+
+
+# A head makes a policy of itself, and knows nothing of policies.
+ActionHead.make_policy = Policy

@@ -59,12 +59,43 @@ def embodiment_of(head: Head, normalizer: Normalizer, embodiment: str | int | No
     chosen = requested_id(normalizer, embodiment)
     if chosen is None and len(head.embodiment_ids) == 1:
         chosen = head.embodiment_ids[0]
+    listed = ", ".join(map(str, head.embodiment_ids))
+    if chosen is None:
+        raise InputError(
+            f"embodiment: the files do not say which of the head's embodiments {normalizer.embodiment!r} is: "
+            f"pass its id, one of {listed}"
+        )
     if chosen not in head.embodiment_ids:
-        listed = ", ".join(map(str, head.embodiment_ids))
         raise InputError(
             f"embodiment: expected the id of one of the head's embodiments ({listed}), got {chosen}"
         )
     return chosen
+
+
+def check_steps(head: Head, normalizer: Normalizer) -> None:
+    """Checks that a head denoises and takes as many steps as the robot needs.
+
+    Raises:
+        InputError: It does not.
+    """
+    config = head.config
+    needed, least = normalizer.denoised_horizon, normalizer.action_horizon
+    if needed is not None and config.action_horizon != needed:
+        raise InputError(
+            f"action_horizon: expected a head that denoises {needed} actions, as the data config has, got "
+            f"{config.action_horizon}: load it with action_horizon={needed}"
+        )
+    if least is not None and normalizer.trained_horizon is None and config.action_horizon < least:
+        raise InputError(
+            f"normalizer: expected chunks of at most {config.action_horizon} actions, which this head denoises, "
+            f"got {least}"
+        )
+    history = normalizer.state_history
+    if history is not None and history != config.state_history:
+        raise InputError(
+            f"normalizer: expected {config.state_history} states in an observation, which this head takes, got "
+            f"{history}"
+        )
 
 
 def requested_id(normalizer: Normalizer, embodiment: str | int | None) -> int | None:

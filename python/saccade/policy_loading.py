@@ -12,14 +12,14 @@ import saccade._saccade as _saccade
 from saccade.backbone import Backbone
 from saccade.checkpoints.description import open_published
 from saccade.config import HeadConfig
-from saccade.dialects import Camera, CameraSources, camera_sources
+from saccade.dialects import Camera, ObservationSources, observation_sources
 from saccade.errors import CheckpointError, InputError
 from saccade.head import ActionHead
 from saccade.hub import resolve
-from saccade.options import precisions_of_parts
+from saccade.options import optional_integer, precisions_of_parts
 from saccade.policy_head import requested_id
 from saccade.processor import Preprocessing, Processor
-from saccade.robots import Normalizer
+from saccade.robots import DataConfigLike, Normalizer
 
 #: What the names of a part's tensors begin with, in NVIDIA's and in lerobot's checkpoints.
 HEAD = ("action_head.", "_groot_model.action_head.")
@@ -32,10 +32,10 @@ class Parts:
 
     head: ActionHead
     normalizer: Normalizer
-    embodiment: str | int | None
+    embodiment: int | None
     backbone: Backbone
     processor: Processor
-    cameras: CameraSources
+    sources: ObservationSources
 
 
 def load(
@@ -48,6 +48,9 @@ def load(
     num_threads: int | None,
     normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None,
     cameras: Sequence[str] | None,
+    data_config: DataConfigLike | None,
+    action_horizon: int | None,
+    processor_options: Mapping[str, Any] | None,
 ) -> Parts:
     """The parts of a whole checkpoint; see :meth:`saccade.Policy.load`.
 
@@ -57,27 +60,50 @@ def load(
     path = resolve(source)
     check_whole(path)
     config = HeadConfig(**open_published(path).config())
-    if not isinstance(normalizer, Normalizer):
+    if isinstance(normalizer, Normalizer):
+        if data_config is not None:
+            raise InputError("data_config: expected None with a Normalizer, which has its own")
+    else:
         normalizer = Normalizer.load(
             path if normalizer is None else normalizer,
             embodiment,
+            data_config=data_config,
             state_dim=config.state_dim,
             action_dim=config.encoder_action_dim,
         )
-    found = camera_sources(path, normalizer.embodiment)
+    horizon = _horizon(normalizer, action_horizon)
+    found = observation_sources(path, normalizer.embodiment, normalizer.data_config)
     if cameras is not None:
-        found = replace(found, cameras=_chosen(cameras, found))
-    processor = Processor.load(path, preprocessing=preprocessing, tokenizer=tokenizer)
+        found = replace(found, cameras=_chosen(cameras, found), takes_extra_cameras=False)
+    processor = Processor.load(
+        path, preprocessing=preprocessing, tokenizer=tokenizer, options=processor_options
+    )
     chosen = requested_id(normalizer, embodiment)
     # The larger part first: what loading needs for a while then adds to less.
     backbone = Backbone.load(path, precision=precisions["backbone"], num_threads=num_threads)
     head = ActionHead.load(
         path,
         embodiment_ids=None if chosen is None else [chosen],
+        action_horizon=horizon,
         precision=precisions["head"],
         num_threads=num_threads,
     )
-    return Parts(head, normalizer, embodiment, backbone, processor, found)
+    return Parts(head, normalizer, chosen, backbone, processor, found)
+
+
+def _horizon(normalizer: Normalizer, requested: int | None) -> int | None:
+    """Number of actions that the head denoises; None for those of its config.
+
+    Raises:
+        InputError: The data config has another number than was requested.
+    """
+    asked = optional_integer("action_horizon", requested)
+    said = normalizer.denoised_horizon
+    if asked is not None and said is not None and asked != said:
+        raise InputError(
+            f"action_horizon: expected {said}, the number of action_indices of the data config, got {asked}"
+        )
+    return said if asked is None else asked
 
 
 def check_whole(path: Path) -> None:
@@ -105,7 +131,7 @@ def check_whole(path: Path) -> None:
     )
 
 
-def _chosen(names: Sequence[str], found: CameraSources) -> tuple[Camera, ...]:
+def _chosen(names: Sequence[str], found: ObservationSources) -> tuple[Camera, ...]:
     """Cameras by name, with the sizes that the checkpoint says.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade.backbone_config import BackboneConfig
-from saccade.dialects import Requirements, camera_sources
+from saccade.dialects import Requirements, observation_sources
 from saccade.errors import SaccadeError
 from saccade.processor import Processor
 from saccade.robots import Normalizer, read_json

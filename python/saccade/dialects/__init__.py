@@ -9,17 +9,17 @@ from saccade.dialects.checks import view_places
 from saccade.dialects.dialects import DIALECTS, read, read_state
 from saccade.dialects.reading import Dialect, Reading, StateReading
 from saccade.dialects.requirements import Camera, Requirements
-from saccade.dialects.sources import CameraSources, camera_sources
+from saccade.dialects.sources import ObservationSources, observation_sources
 
 __all__ = [
     "DIALECTS",
     "Camera",
-    "CameraSources",
+    "ObservationSources",
     "Dialect",
     "Reading",
     "Requirements",
     "StateReading",
-    "camera_sources",
+    "observation_sources",
     "read",
     "read_state",
     "view_places",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from saccade._arrays import Float32Array
 from saccade.errors import InputError, ShapeError
 from saccade.robots import rotations
+from saccade.robots.data_configs import DataConfig
 
 #: The ways to normalise a group.
 MODES = ("min_max", "q99", "mean_std", "scale", "binary", "sin_cos", "none")
@@ -209,7 +209,7 @@ class Robot:
             lerobot's ``absolute_actions_processor``. None for none.
         gripper: The number of the action that becomes ``-sign(2 g - 1)``, as LIBERO's gripper has it in
             lerobot; or None.
-        data_config: The data config of N1 and N1.5 that was given, as a mapping; or None.
+        data_config: The data config of N1 and N1.5, or None.
     """
 
     embodiment: str | None
@@ -225,4 +225,4 @@ class Robot:
     zero_state: bool = False
     offsets: npt.NDArray[np.bool_] | None = None
     gripper: int | None = None
-    data_config: Mapping[str, Any] | None = None
+    data_config: DataConfig | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims
         action_horizon=None if given is None else len(given.action_indices),
         denoised_horizon=None if given is None else len(given.action_indices),
         state_history=None if given is None else len(given.observation_indices),
-        data_config=None if given is None else asdict(given),
+        data_config=given,
     )
 
 

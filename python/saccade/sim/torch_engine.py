@@ -17,7 +17,7 @@ import saccade
 from saccade._arrays import ArrayLike, Float32Array
 from saccade.backbone_inputs import BackboneInputs
 from saccade.config import HeadConfig
-from saccade.dialects import camera_sources
+from saccade.dialects import observation_sources
 from saccade.processor import Processor
 from saccade.reference import ActionHead, Backbone
 from saccade.robots import Normalizer
@@ -126,7 +126,7 @@ def load_policy(checkpoint: Path, num_threads: int | None = None) -> saccade.Pol
         normalizer,
         backbone=TorchBackbone(checkpoint),  # type: ignore[arg-type]
         processor=Processor.load(checkpoint),
-        cameras=camera_sources(checkpoint, normalizer.embodiment),
+        sources=observation_sources(checkpoint, normalizer.embodiment, normalizer.data_config),
     )
 
 
