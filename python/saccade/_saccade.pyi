@@ -71,6 +71,7 @@ class ActionHead:
         source: str,
         config: str | None,
         embodiment_ids: list[int] | None,
+        action_horizon: int | None,
         precision: str,
         num_threads: int | None,
     ) -> ActionHead: ...

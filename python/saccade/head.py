@@ -53,6 +53,11 @@ class ActionHead:
     A head is immutable: any number of threads may call it at the same time. The result of an observation has
     the same bits in any batch, with any ``num_samples`` and with any number of threads.
 
+    A checkpoint of GR00T-H may contain ``dropout_prob_by_embodiment``, ``(num_embodiments,)``: how often its
+    training set the state of each embodiment to zero. As in the released code, the states of embodiments with
+    an entry above 0.999 are set to zero here too, so they have no effect. The other entries act in training
+    only. The tensor is ignored if the config says that ``state_dropout_prob_per_embodiment`` is null or empty.
+
     Example:
         The head of the bundled demo policy, on the features of two observations:
 
@@ -93,6 +98,7 @@ class ActionHead:
         *,
         config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment_ids: Sequence[int] | None = None,
+        action_horizon: int | None = None,
         precision: str = "float32",
         num_threads: int | None = None,
     ) -> ActionHead:
@@ -111,6 +117,11 @@ class ActionHead:
                 Default: the ``config.json`` in the directory of the weights. A config that lerobot wrote does
                 not contain the sizes of the head, so they are read from the shapes of the tensors.
             embodiment_ids: Load the layers of these embodiments only. Ids keep their numbers. Default: all.
+            action_horizon: Number of actions that the head denoises, in place of the config's
+                ``action_horizon``. At most ``max_positions`` if the head adds positions to the actions. For
+                fine-tunes whose config gives another number than they were trained with. Default: that of the
+                config. The ``config.json`` of a lerobot policy has none, so it is that of the published model
+                that lerobot starts from: 16 for N1.5, 40 for N1.7, whatever ``chunk_size`` is.
             precision: How the head computes. The residual stream, norms, softmax and all sums of floating
                 point products are float32 at every precision.
 
@@ -138,11 +149,13 @@ class ActionHead:
         path = os.fspath(resolve(source))
         config_text = None if config is None else to_json(config)
         ids = optional_integers("embodiment_ids", embodiment_ids)
+        horizon = optional_integer("action_horizon", action_horizon)
         threads = optional_integer("num_threads", num_threads)
-        head = _saccade.ActionHead.load(path, config_text, ids, precision, threads)
+        head = _saccade.ActionHead.load(path, config_text, ids, horizon, precision, threads)
         options = {
             "config": config_text,
             "embodiment_ids": ids,
+            "action_horizon": horizon,
             "precision": precision,
             "num_threads": threads,
         }
@@ -170,7 +183,7 @@ class ActionHead:
                 a released head), as NumPy arrays or torch CPU tensors. float32 and bfloat16 are kept, float16
                 is widened to float32, which is exact. All tensors that the config asks for must be present.
                 Others are refused, except those that only training uses (``task_log_sigma.*``,
-                ``mask_token``, ``dropout_prob_by_embodiment``).
+                ``mask_token``) and ``dropout_prob_by_embodiment`` (see the class).
             config: The config of the head or of a whole checkpoint, as for :meth:`load`.
             embodiment_ids, precision, num_threads: As for :meth:`load`.
 

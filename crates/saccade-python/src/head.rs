@@ -28,12 +28,14 @@ impl ActionHead {
         source: PathBuf,
         config: Option<String>,
         embodiment_ids: Option<Vec<i64>>,
+        action_horizon: Option<usize>,
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = LoadOptions::default()
             .with_config(config)
             .with_embodiment_ids(embodiment_ids)
+            .with_action_horizon(action_horizon)
             .with_precision(precision.parse().map_err(raise)?)
             .with_num_threads(num_threads);
         call(py, || saccade::ActionHead::load(&source, &options)).map(Self)

@@ -37,6 +37,7 @@ from saccade.reference.layers import (
     VlSelfAttention,
     token_table,
 )
+from saccade.reference.state_dropout import STATE_DROPOUT, check_probabilities, drops_states, seen_state
 from saccade.reference.training import TimeDistribution, flow_matching_error, hold_unused, is_unused
 from saccade.trace import Trace
 
@@ -52,13 +53,15 @@ class ActionHead(nn.Module):
     The head computes in the dtype of its parameters (`.double()` for float64) and is differentiable. Inputs
     may be NumPy arrays and are converted to that dtype. Wrap calls in `torch.no_grad()` if no gradient is
     needed. A new head has the initial distribution of the released code. Unlike the released training, there
-    is no dropout, and states are neither dropped nor made noisy.
+    is no dropout, and states are not made noisy, nor dropped except by `dropout_prob_by_embodiment`.
 
     Args:
         config: sizes and switches.
         time_distribution: the distribution of `sample_time`.
-        unused: names of parameters that only the released training uses (`task_log_sigma.NAME`, `mask_token`,
-            `dropout_prob_by_embodiment`). They are kept, so that a checkpoint stays complete.
+        unused: names of parameters that only the released training uses (`task_log_sigma.NAME`,
+            `mask_token`). They are kept, so that a checkpoint stays complete.
+        has_state_dropout: whether there is `dropout_prob_by_embodiment`, `(num_embodiments,)`, zeros at
+            first. The states of embodiments with an entry above 0.999 are set to zero.
 
     Example:
         >>> from saccade.reference import random_weights
@@ -76,6 +79,7 @@ class ActionHead(nn.Module):
     """
 
     mask_token: nn.Parameter  # if it is among `unused`
+    dropout_prob_by_embodiment: Tensor  # with `has_state_dropout`
 
     def __init__(
         self,
@@ -83,6 +87,7 @@ class ActionHead(nn.Module):
         *,
         time_distribution: TimeDistribution | None = None,
         unused: Iterable[str] = (),
+        has_state_dropout: bool = False,
     ) -> None:
         super().__init__()
         self.config = config
@@ -103,6 +108,9 @@ class ActionHead(nn.Module):
             self.position_embedding = token_table(config.max_positions, width)
         for name in unused:
             hold_unused(self, name, config)
+        self.drops_states = has_state_dropout
+        if has_state_dropout:
+            self.register_buffer(STATE_DROPOUT, torch.zeros(config.num_embodiments))
 
     @classmethod
     def load(
@@ -128,15 +136,21 @@ class ActionHead(nn.Module):
                 message lists all of them.
         """
         checkpoint = loading.described(source, config)
-        whole = checkpoint.head_config
+        whole, names = checkpoint.head_config, loading.tensor_names(checkpoint)
+        has_state_dropout = STATE_DROPOUT in names
+        drops = drops_states(whole, has_state_dropout)
         with torch.device("meta"):  # no memory and no time for an initialisation that is replaced
             head = cls(
                 HeadConfig.from_dict(whole),
                 time_distribution=TimeDistribution.from_dict(whole),
-                unused=filter(is_unused, loading.tensor_names(checkpoint)),
+                unused=filter(is_unused, names),
+                has_state_dropout=has_state_dropout,
             )
         shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
         head.load_state_dict(loading.read_tensors(checkpoint, shapes, dtype), assign=True)
+        head.drops_states = drops
+        if drops:
+            check_probabilities(head.dropout_prob_by_embodiment)
         return head
 
     @property
@@ -232,6 +246,8 @@ class ActionHead(nn.Module):
         state = state.flatten(1)[:, None]  # (B, 1, history * state_dim)
         embodiment_id = as_embodiment(embodiment_id, batch, config.num_embodiments, self.device)
         timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
+        if self.drops_states:
+            state = seen_state(state, self.dropout_prob_by_embodiment, embodiment_id)
 
         state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
         tokens = self.learned_tokens if run.future_tokens is None else run.future_tokens  # (N, width)

@@ -12,7 +12,6 @@ from saccade.config import HeadConfig
 from saccade.reference.layers import TABLE_STD
 
 MASK_TOKEN = "mask_token"  # N1.6: replaces a state that training drops
-DROPOUT_PROB = "dropout_prob_by_embodiment"  # probability of dropping the state, in a fine-tune of N1.7
 LOG_SIGMA = "task_log_sigma."  # the fork: learned weights of its decoders' losses
 
 
@@ -67,15 +66,13 @@ def flow_matching_error(
 
 def is_unused(name: str) -> bool:
     """Whether only the released training uses a checkpoint's parameter of this name."""
-    return name in (MASK_TOKEN, DROPOUT_PROB) or name.startswith(LOG_SIGMA)
+    return name == MASK_TOKEN or name.startswith(LOG_SIGMA)
 
 
 def hold_unused(head: nn.Module, name: str, config: HeadConfig) -> None:
     """Adds a parameter that only the released training uses to a head, with that code's initial value."""
     if name == MASK_TOKEN:
         head.register_parameter(MASK_TOKEN, nn.Parameter(TABLE_STD * torch.randn(1, 1, config.width)))
-    elif name == DROPOUT_PROB:
-        head.register_buffer(DROPOUT_PROB, torch.zeros(config.num_embodiments))
     else:
         sigmas = getattr(head, "task_log_sigma", nn.ParameterDict())
         sigmas[name.removeprefix(LOG_SIGMA)] = nn.Parameter(torch.zeros(()))

@@ -3,6 +3,8 @@
 //! The keys in JSON are the released ones (`input_embedding_dim`, `num_target_vision_tokens`); the fields of [`HeadConfig`] have the names that
 //! are used everywhere else.
 
+use crate::error::{Error, Result};
+
 /// The sizes and switches of an action head.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
@@ -85,6 +87,29 @@ impl HeadConfig {
     #[must_use]
     pub fn is_cross(&self, index: usize) -> bool {
         !self.interleave_self_attention || index.is_multiple_of(2)
+    }
+
+    /// This config with another number of actions in a chunk.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for none, and for more than the position table has rows or than any config may ask for.
+    pub(crate) fn with_action_horizon(self, action_horizon: usize) -> Result<Self> {
+        let (limit, what) = match self.add_pos_embed {
+            true => (
+                self.max_positions,
+                " (max_seq_len, the rows of the position table)",
+            ),
+            false => (MAX_SIZE as usize, ""),
+        };
+        if !(1..=limit).contains(&action_horizon) {
+            return Err(Error::Input(format!(
+                "action_horizon: expected 1 to {limit}{what}, got {action_horizon}"
+            )));
+        }
+        Ok(Self {
+            action_horizon,
+            ..self
+        })
     }
 
     /// How cross-attention blocks take masks: `"none"` ignores them, `"alternate"` is the rule of `attend_text_every_n_blocks`.

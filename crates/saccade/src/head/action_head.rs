@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use saccade_kernels::Isa;
 
 use super::layers::HeadLayers;
+use super::state_dropout::StateDropout;
 use super::workspace::Workspace;
 use crate::array::Array;
 use crate::config::{HeadConfig, Reads};
@@ -14,6 +15,10 @@ use crate::precision::Precision;
 use crate::workspaces::Workspaces;
 
 /// A loaded action head. Immutable; serves any number of threads at once.
+///
+/// A checkpoint of GR00T-H may hold `dropout_prob_by_embodiment`, how often its training set the state of each embodiment to zero. The states
+/// of embodiments for which it always did so (above 0.999) are set to zero here too, as the released class does; the other entries act in
+/// training only.
 pub struct ActionHead {
     pub(super) config: HeadConfig,
     pub(super) engine: Engine,
@@ -21,6 +26,7 @@ pub struct ActionHead {
     pub(super) id: u64,
     pub(super) embodiment_ids: Vec<usize>,
     pub(super) layers: HeadLayers,
+    pub(super) state_dropout: StateDropout,
     nbytes: usize,
     workspaces: Workspaces<Workspace>,
 }
@@ -32,6 +38,7 @@ impl ActionHead {
         engine: Engine,
         embodiment_ids: Vec<usize>,
         layers: HeadLayers,
+        state_dropout: StateDropout,
         nbytes: usize,
     ) -> Self {
         Self {
@@ -40,6 +47,7 @@ impl ActionHead {
             id: next_id(),
             embodiment_ids,
             layers,
+            state_dropout,
             nbytes,
             workspaces: Workspaces::new(),
         }

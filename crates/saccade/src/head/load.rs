@@ -8,7 +8,8 @@ use saccade_checkpoint::spec::{self, Problem};
 use super::action_head::ActionHead;
 use super::embodiments::{Embodiments, chosen_embodiments};
 use super::layers::HeadLayers;
-use super::plan::{is_unused, reading_order, tensor_specs};
+use super::plan::{is_unused, reading_order, specs_of};
+use super::state_dropout::{STATE_DROPOUT, StateDropout, reads_state_dropout};
 use crate::config::HeadConfig;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
@@ -32,6 +33,8 @@ pub struct LoadOptions {
     pub config: Option<String>,
     /// Keep only these embodiments; default all.
     pub embodiment_ids: Option<Vec<i64>>,
+    /// Actions in a chunk, in place of the config's `action_horizon`; at most as many as the position table has rows.
+    pub action_horizon: Option<usize>,
     /// What is computed in what.
     pub precision: Precision,
     /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
@@ -57,6 +60,15 @@ impl LoadOptions {
         }
     }
 
+    /// With this number of actions in a chunk.
+    #[must_use]
+    pub fn with_action_horizon(self, action_horizon: impl Into<Option<usize>>) -> Self {
+        Self {
+            action_horizon: action_horizon.into(),
+            ..self
+        }
+    }
+
     /// With this precision.
     #[must_use]
     pub fn with_precision(self, precision: Precision) -> Self {
@@ -71,6 +83,14 @@ impl LoadOptions {
             ..self
         }
     }
+
+    /// The head's config with the chunk that was asked for.
+    fn chunk_of(&self, config: HeadConfig) -> Result<HeadConfig> {
+        match self.action_horizon {
+            Some(action_horizon) => config.with_action_horizon(action_horizon),
+            None => Ok(config),
+        }
+    }
 }
 
 impl ActionHead {
@@ -81,7 +101,8 @@ impl ActionHead {
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
-        let published = Published::open(source, options.config.as_deref())?;
+        let mut published = Published::open(source, options.config.as_deref())?;
+        published.config = options.chunk_of(published.config)?;
         let embodiment_ids = chosen_embodiments(
             options.embodiment_ids.as_deref(),
             published.kept_embodiments()?.as_deref(),
@@ -92,6 +113,7 @@ impl ActionHead {
             "source",
             published.nbytes(options.precision, embodiment_ids.len())?,
         )?;
+        let drops_states = reads_state_dropout(&published.config_json, published.has(STATE_DROPOUT))?;
         let Published {
             checkpoint,
             prefix,
@@ -100,7 +122,7 @@ impl ActionHead {
         } = published;
         let wanted = reading_order(&config, &embodiment_ids)?;
         FileSource::read_ahead(&checkpoint, prefix, wanted, |tensors| {
-            Self::build(tensors, engine, config, embodiment_ids)
+            Self::build(tensors, engine, config, embodiment_ids, drops_states)
         })
     }
 
@@ -114,13 +136,14 @@ impl ActionHead {
     /// [`Error::Memory`].
     pub fn from_tensors(tensors: &TensorViews<'_>, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
-        let config = options.config.as_deref().ok_or_else(|| {
+        let given_config = options.config.as_deref().ok_or_else(|| {
             Error::Input("config: expected one, since tensors in memory bring none".to_owned())
         })?;
-        let config = HeadConfig::from_json(config)?;
+        let config = options.chunk_of(HeadConfig::from_json(given_config)?)?;
         let embodiment_ids =
             chosen_embodiments(options.embodiment_ids.as_deref(), None, config.num_embodiments)?;
-        let problems = memory::problems(tensors, &tensor_specs(&config)?, |name, shape| {
+        let has = |name: &str| tensors.contains_key(name);
+        let problems = memory::problems(tensors, &specs_of(&config, has)?, |name, shape| {
             is_unused(&config, name, shape)
         });
         if !problems.is_empty() {
@@ -132,7 +155,9 @@ impl ActionHead {
                 Error::Checkpoint(message)
             });
         }
-        Self::build(&MemorySource::new(tensors), engine, config, embodiment_ids)
+        let drops_states = reads_state_dropout(given_config, has(STATE_DROPOUT))?;
+        let source = MemorySource::new(tensors);
+        Self::build(&source, engine, config, embodiment_ids, drops_states)
     }
 
     fn build(
@@ -140,11 +165,17 @@ impl ActionHead {
         engine: Engine,
         config: HeadConfig,
         embodiment_ids: Vec<usize>,
+        drops_states: bool,
     ) -> Result<Self> {
         let builder = Builder::new(source, engine);
         let embodiments = Embodiments {
             ids: &embodiment_ids,
             count: config.num_embodiments,
+        };
+        // First, since it is small and may be refused.
+        let state_dropout = match drops_states {
+            true => StateDropout::read(&builder.weights(), config.num_embodiments)?,
+            false => StateDropout::none(),
         };
         let layers = HeadLayers::new(&builder.weights(), &config, embodiments)?;
         Ok(Self::new(
@@ -152,6 +183,7 @@ impl ActionHead {
             engine,
             embodiment_ids,
             layers,
+            state_dropout,
             builder.nbytes(),
         ))
     }

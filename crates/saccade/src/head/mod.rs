@@ -15,6 +15,7 @@ pub(crate) mod load;
 pub(crate) mod plan;
 mod published;
 pub(crate) mod sample;
+pub(crate) mod state_dropout;
 #[cfg(test)]
 mod tests;
 mod trace;

@@ -5,6 +5,7 @@ use saccade_kernels::Isa;
 
 use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
+use super::state_dropout::STATE_DROPOUT;
 use crate::config::HeadConfig;
 use crate::engine::Engine;
 use crate::error::Result;
@@ -23,6 +24,18 @@ pub fn tensor_shapes(config: &HeadConfig) -> Result<Vec<(String, Vec<usize>)>> {
         .filter(|tensor| !tensor.shape.contains(&0))
         .map(|tensor| (tensor.name, tensor.shape))
         .collect())
+}
+
+/// The tensors that must fit a head of this config where `has` finds them: those that it needs, and what it reads if it is there.
+///
+/// # Errors
+/// As [`tensor_shapes`].
+pub(crate) fn specs_of(config: &HeadConfig, has: impl Fn(&str) -> bool) -> Result<Vec<TensorSpec>> {
+    let mut specs = tensor_specs(config)?;
+    if has(STATE_DROPOUT) {
+        specs.push(TensorSpec::plain(STATE_DROPOUT, &[config.num_embodiments]));
+    }
+    Ok(specs)
 }
 
 /// Every tensor that a checkpoint of a head of this config must hold, by its name without a prefix.
@@ -58,11 +71,10 @@ fn plan(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
 }
 
 /// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
-/// logarithms of loss weights, what N1.6 puts in place of a state that it hides, how often N1.7 hides one.
+/// logarithms of loss weights, and what N1.6 puts in place of a state that it hides.
 pub(crate) fn is_unused(config: &HeadConfig, name: &str, shape: &[usize]) -> bool {
     match name {
         "mask_token" => shape == [1, 1, config.width],
-        "dropout_prob_by_embodiment" => shape == [config.num_embodiments],
         _ => name.starts_with("task_log_sigma.") && shape.iter().all(|&size| size == 1),
     }
 }

@@ -4,7 +4,7 @@ use saccade_checkpoint::spec;
 
 use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
-use super::plan::{is_unused, tensor_specs};
+use super::plan::{is_unused, specs_of};
 use crate::engine::Engine;
 use crate::error::{Error, Result};
 use crate::nn::sizer::Sizer;
@@ -20,13 +20,18 @@ impl Published {
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
     pub fn check(&self) -> Result<()> {
         let is_unused = |name: &str, shape: &[usize]| is_unused(&self.config, name, shape);
-        let expected = tensor_specs(&self.config)?;
+        let expected = specs_of(&self.config, |name| self.has(name))?;
         let problems = self.checkpoint.problems(self.prefix, &expected, is_unused);
         if problems.is_empty() {
             return Ok(());
         }
         let listed = spec::list(&problems, "the config");
         Err(Error::Checkpoint(format!("source: {listed}")))
+    }
+
+    /// Whether the head has a tensor `name`, without the prefix.
+    pub(super) fn has(&self, name: &str) -> bool {
+        self.checkpoint.shape(&format!("{}{name}", self.prefix)).is_some()
     }
 
     /// What [`ActionHead::nbytes`](crate::ActionHead::nbytes) would be with this number of embodiments.

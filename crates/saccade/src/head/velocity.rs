@@ -75,15 +75,17 @@ impl ActionHead {
         })
     }
 
-    /// One state row for each batch element, to `workspace.state (batch, width)`.
+    /// One state row for each batch element, to `workspace.state (batch, width)`; of zeros for embodiments whose state does not act.
     pub(super) fn encode_state(&self, state: &[f32], workspace: &mut Workspace) -> Result<()> {
         let Workspace {
             embodiment_ids,
+            seen_state,
             state_hidden,
             state: encoded,
             linear,
             ..
         } = workspace;
+        let state = self.state_dropout.seen(embodiment_ids, state, seen_state)?;
         let encoder = &self.layers.state_encoder;
         encoder.apply(self.engine, embodiment_ids, state, state_hidden, encoded, linear)?;
         Ok(())

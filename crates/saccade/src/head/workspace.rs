@@ -11,6 +11,8 @@ pub(crate) struct Workspace {
     pub dit: DitBuffers,
     /// By batch element.
     pub embodiment_ids: Vec<usize>,
+    /// States of which some are set to zero, `(batch, state_history * state_dim)`.
+    pub seen_state: Activations,
     /// The state encoder's hidden layer, `(batch, hidden_dim)`.
     pub state_hidden: Activations,
     /// State rows, `(batch, width)`.
@@ -41,6 +43,7 @@ impl Workspace {
             encode: EncodeBuffers::new(),
             dit: DitBuffers::new(),
             embodiment_ids: Vec::new(),
+            seen_state: Activations::new(),
             state_hidden: Activations::new(),
             state: Activations::new(),
             x: Activations::new(),

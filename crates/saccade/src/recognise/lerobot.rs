@@ -71,8 +71,7 @@ impl CheckpointLayout for Lerobot {
         if clues.has_head_config {
             return Ok(sizes::complete(clues.config.head(), version, &clues.tensors));
         }
-        let chunk = chunk_of_processors(clues.directory);
-        let mut head = from_tensors(clues.config.top(), version, &clues.tensors, chunk)?;
+        let mut head = from_tensors(clues.config.top(), version, &clues.tensors)?;
         if let Some(own) = own_config(clues.directory)? {
             head.insert(OWN_KEY.to_owned(), own);
         }
@@ -106,17 +105,15 @@ impl CheckpointLayout for Fork {
 const DIT_HEAD_DIM: usize = 48;
 const VL_HEAD_DIM: usize = 64;
 
-/// Actions in a chunk of the published models.
+/// Actions that a model denoises. lerobot keeps the number of the model that a policy was made from, and nothing that it saves holds it:
+/// `chunk_size`, and the `action_horizon` of its processors (which may be `chunk_size` again, or the most that Isaac-GR00T's processor
+/// takes), say what is trained and cut, not what is denoised. These are the published models'; a fine-tune by Isaac-GR00T keeps them too,
+/// since its trainer takes the model's config from where it starts.
 const N15_HORIZON: u64 = 16;
 const N17_HORIZON: u64 = 40;
 
 /// The head's config where the file holds none of it: sizes from the tensors, the rest as the published models of that version have it.
-fn from_tensors(
-    policy: &Object,
-    version: Version,
-    tensors: &HeadShapes<'_>,
-    chunk: Option<u64>,
-) -> Result<Object> {
+fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> Result<Object> {
     let number = |key: &str| policy.get(key).and_then(Value::as_u64);
     let sizes = proved(version, tensors);
     let mut head = Map::new();
@@ -138,14 +135,11 @@ fn from_tensors(
         set("use_alternate_vl_dit", json!(true));
         set("attend_text_every_n_blocks", json!(2));
         set("state_history_length", json!(state.history));
-        // Whatever the policy's chunk_size: it cuts what the model returns.
-        set("action_horizon", json!(chunk.unwrap_or(N17_HORIZON)));
+        set("action_horizon", json!(N17_HORIZON));
     } else {
         let tokens = tensors.size(FUTURE_TOKENS, 2, 0).unwrap_or(0);
         set("num_target_vision_tokens", json!(tokens));
-        // lerobot trains chunks of at most the published model's rows, and only where that is what the model has.
-        let horizon = number("chunk_size").unwrap_or(N15_HORIZON).min(N15_HORIZON);
-        set("action_horizon", json!(horizon));
+        set("action_horizon", json!(N15_HORIZON));
     }
     add_decoders(&mut head, tensors);
     let action_dim = number("max_action_dim").map(|dim| widened(version, dim, 32));
@@ -263,20 +257,6 @@ fn widened(version: Version, dim: u64, default: u64) -> u64 {
         Version::N17 if dim == default => 132,
         _ => dim,
     }
-}
-
-/// Actions in a chunk by the config of lerobot's processors; its newest policies take them from the model that they were made from.
-fn chunk_of_processors(directory: &Path) -> Option<u64> {
-    let text = read_text(
-        "policy_preprocessor.json",
-        &directory.join("policy_preprocessor.json"),
-    )
-    .ok()?;
-    let processors: Value = serde_json::from_str(&text).ok()?;
-    let steps = processors.get("steps")?.as_array()?;
-    steps
-        .iter()
-        .find_map(|step| step.get("config")?.get("action_horizon")?.as_u64())
 }
 
 /// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with keys that it does not know.

@@ -9,6 +9,7 @@ use saccade_checkpoint::{CheckpointWriter, Dtype, PlannedTensor};
 use crate::error::{Error, Result};
 use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
+use crate::head::state_dropout::STATE_DROPOUT;
 use crate::ops::check_interrupted;
 use crate::recognise::kept::{KEPT_EMBODIMENTS, kept_embodiments};
 use crate::rewrite::float::Float;
@@ -23,7 +24,8 @@ pub struct ConvertOptions {
     /// Keep only these embodiments; default all. They keep their ids: the slices of the others become zero, and the files' metadata list
     /// those that were kept.
     pub embodiment_ids: Option<Vec<i64>>,
-    /// The type of all floating-point tensors; default the one that each has. int8 and its scales stay.
+    /// The type of all floating-point tensors; default the one that each has. int8 and its scales stay, and so do the
+    /// probabilities of dropping a state, since one that is rounded up to 1 would act.
     pub dtype: Option<Float>,
 }
 
@@ -170,12 +172,13 @@ fn plan(
 /// The types of tensor `name` before and after, if they differ.
 fn change(source: &SourceCheckpoint, name: &str, options: &ConvertOptions) -> Result<Option<(Float, Float)>> {
     let from = Float::of(source.checkpoint.dtype(name)?);
+    let is_state_dropout = name.strip_prefix(source.prefix) == Some(STATE_DROPOUT);
     let is_scale = name
         .strip_suffix(SCALE_SUFFIX)
         .is_some_and(|scaled| matches!(source.checkpoint.dtype(scaled), Ok(Dtype::I8)));
     Ok(from
         .zip(options.dtype)
-        .filter(|(from, to)| from != to && !is_scale))
+        .filter(|(from, to)| from != to && !is_scale && !is_state_dropout))
 }
 
 /// What was lost in converting.
