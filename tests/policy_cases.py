@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import saccade
 from saccade import BackboneInputs, Policy
-from saccade.dialects import CameraSources, camera_sources
+from saccade.dialects import ObservationSources, observation_sources
 
 #: The id that stands for an image token, and how many there are of a view.
 IMAGE, TOKENS = 300, 4
@@ -67,10 +67,10 @@ def head(layout: str) -> saccade.ActionHead:
     return saccade.ActionHead.load(whole_checkpoints.whole(layout))
 
 
-def policy(layout: str, cameras: CameraSources | None = None) -> Policy:
+def policy(layout: str, sources: ObservationSources | None = None) -> Policy:
     """A policy with the head, the statistics and the cameras of a whole checkpoint, and stand-ins."""
     folder = whole_checkpoints.whole(layout)
-    found = camera_sources(folder, whole_checkpoints.EMBODIMENT) if cameras is None else cameras
+    found = observation_sources(folder, whole_checkpoints.EMBODIMENT) if sources is None else sources
     backbone: Any = StandInBackbone(head(layout).config.context_dim)
     processor: Any = StandInProcessor()
     return Policy(
@@ -78,5 +78,5 @@ def policy(layout: str, cameras: CameraSources | None = None) -> Policy:
         embodiment=whole_checkpoints.EMBODIMENT,
         backbone=backbone,
         processor=processor,
-        cameras=found,
+        sources=found,
     )

@@ -15,7 +15,7 @@ from policy_cases import policy
 from whole_checkpoints import HEIGHT, WIDTH
 
 from saccade import InputError, Policy, SaccadeError
-from saccade.dialects import CameraSources
+from saccade.dialects import ObservationSources
 from saccade.frames import read_frames
 
 STATE = {"arm": [0.1, -0.2, 0.3, 0.4, 0.5], "hand": [0.0, 1.0]}
@@ -81,14 +81,14 @@ def test_folders_of_folders_are_episodes(isaac: Policy, tmp_path: Path) -> None:
 
 
 def test_without_known_cameras_every_picture_is_a_view(tmp_path: Path) -> None:
-    any_camera = policy("nvidia", CameraSources())
+    any_camera = policy("nvidia", ObservationSources())
     folder = write_moment(tmp_path, names=("left.jpg", "above.png"))
     (moment,) = read_frames(folder, any_camera)
     assert list(moment.observation["video"]) == ["above", "left"]
 
 
 def test_a_picture_stands_for_all_frames_of_its_camera(tmp_path: Path) -> None:
-    both = policy("n16", CameraSources(video_horizon=2))
+    both = policy("n16", ObservationSources(video_horizon=2))
     (moment,) = read_frames(write_moment(tmp_path, names=["front.png"]), both)
     frames = moment.observation["video"]["front"]
     assert frames.shape == (1, 2, HEIGHT, WIDTH, 3)

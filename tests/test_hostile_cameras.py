@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from saccade import CheckpointError
-from saccade.dialects import CameraSources, camera_sources
+from saccade.dialects import ObservationSources, observation_sources
 from saccade.dialects.sources import FILES
 
 KEYS = st.sampled_from(
@@ -38,10 +38,10 @@ def test_any_json_is_cameras_or_an_error(
     (tmp_path / "config.json").write_text(json.dumps(config))
     for embodiment in ("robot", None):
         try:
-            found = camera_sources(tmp_path, embodiment)
+            found = observation_sources(tmp_path, embodiment)
         except CheckpointError:
             continue
-        assert isinstance(found, CameraSources)
+        assert isinstance(found, ObservationSources)
         for camera in found.cameras or ():
             assert isinstance(camera.name, str)
             assert camera.height is None or camera.height > 0

@@ -14,7 +14,7 @@ from policy_cases import policy
 
 import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
-from saccade.dialects import CameraSources, read
+from saccade.dialects import ObservationSources, read
 
 Observation = dict[str, Any]
 
@@ -159,7 +159,7 @@ def test_what_was_read_stands_for_the_observation() -> None:
 
 
 def test_what_was_read_for_another_policy_is_refused() -> None:
-    made, other = policy("nvidia"), policy("nvidia", CameraSources())
+    made, other = policy("nvidia"), policy("nvidia", ObservationSources())
     given = nested(made)
     reading = read(given, made.requirements)
     context = made.encode(given)
@@ -230,7 +230,7 @@ def test_float_frames_become_uint8_as_in_lerobot() -> None:
 
 
 def test_frames_along_time_come_before_cameras() -> None:
-    made = policy("n17", CameraSources(None, 2, None))
+    made = policy("n17", ObservationSources(None, 2, None))
     video = np.random.default_rng(0).integers(0, 256, (2, 2, 8, 8, 3), np.uint8)
     given = nested(policy("n17"))
     given["video"] = {"a": video[:1], "b": video[1:]}
@@ -243,7 +243,7 @@ def test_frames_along_time_come_before_cameras() -> None:
 
 
 def test_unnamed_cameras_keep_their_order_or_are_sorted() -> None:
-    made = policy("isaac", CameraSources())
+    made = policy("isaac", ObservationSources())
     given = nested(policy("isaac"))
     given["video"] = dict.fromkeys(("z", "a"), given["video"]["wrist"])
     assert list(read(given, made.requirements).frames[0]) == ["z", "a"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benches.backbone.setup import INSTRUCTION_TEXT
 from benches.checkpoints import n15
 from benches.peers.cases import WORKS, Case
-from saccade.dialects import CameraSources
+from saccade.dialects import ObservationSources
 
 if TYPE_CHECKING:
     import saccade
@@ -63,7 +63,7 @@ def with_views(policy: saccade.Policy, views: int) -> saccade.Policy:
         policy.normalizer,
         backbone=policy.backbone,
         processor=policy.processor,
-        cameras=CameraSources(needs.cameras[:views], needs.video_horizon, needs.language_key),
+        cameras=ObservationSources(needs.cameras[:views], needs.video_horizon, needs.language_key),
     )
 
 
