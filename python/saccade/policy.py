@@ -123,7 +123,7 @@ class Policy:
             state=tuple((group.key, group.size) for group in normalizer.state_groups),
             state_history=config.state_history,
             video_horizon=known.video_horizon,
-            language_key=known.language_key,
+            language_keys=() if known.language_key is None else (known.language_key,),
         )
 
     @classmethod

@@ -95,7 +95,7 @@ def robots_of(source: Path, state_history: int) -> list[RobotFindings]:
             state=tuple((group.key, group.size) for group in normalizer.state_groups),
             state_history=state_history,
             video_horizon=cameras.video_horizon,
-            language_key=cameras.language_key,
+            language_keys=() if cameras.language_key is None else (cameras.language_key,),
         )
         actions = tuple((group.key, group.size) for group in normalizer.action_groups)
         found.append(RobotFindings(tag, normalizer.embodiment_id, needs, actions, None))
