@@ -145,11 +145,11 @@ def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requ
         ShapeError, DtypeError, InputError: It does not fit or is not finite.
     """
     width = sum(size for _, size in parts)
+    shape_of(name, state, needs)
+    numbers = _floating(name, on_cpu(name, state, needs), needs)
     try:
-        values = float32(name, _floating(name, on_cpu(name, state, needs), needs))
-    except ShapeError:
-        raise needs.shape_error(name, f"an array (..., {width})", type(state).__name__) from None
-    except DtypeError:
+        values = float32(name, numbers)
+    except (DtypeError, ShapeError):
         got = getattr(state, "dtype", type(state).__name__)
         raise needs.dtype_error(name, NUMBERS, got) from None
     if values.ndim != axes or values.shape[-1] != width or 0 in values.shape:
@@ -162,13 +162,10 @@ def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requ
 def _floating(name: str, state: Any, needs: Requirements) -> Any:
     """Integers as float32; anything else as it is, to be checked by `float32`."""
     if is_torch(state):
-        if state.is_floating_point() or state.is_complex():
+        if state.is_floating_point() or state.is_complex() or state.is_sparse:
             return state
-        try:
-            state = state.numpy()
-        except (RuntimeError, TypeError):  # not dense
-            raise DtypeError(name) from None
-    found = state if isinstance(state, np.ndarray) else _array(name, state)
+        state = state.numpy()
+    found = np.asarray(state)
     if found.dtype.kind not in "iu":
         return found
     converted = found.astype(np.float32)
@@ -177,13 +174,6 @@ def _floating(name: str, state: Any, needs: Requirements) -> Any:
     if wrong.size:
         raise needs.dtype_error(name, NUMBERS, f"{found.dtype} {wrong.flat[0]}")
     return converted
-
-
-def _array(name: str, state: Any) -> np.ndarray[Any, Any]:
-    try:
-        return np.asarray(state)
-    except (OverflowError, RuntimeError, TypeError, ValueError):
-        raise ShapeError(name) from None
 
 
 def _not_finite(values: Float32Array, parts: StateParts) -> str:
