@@ -52,7 +52,7 @@ class MemoryPolicy:
         self.backbone = SimpleNamespace(nbytes=self.nbytes)
         self.normalizer = SimpleNamespace(state_groups=GROUPS, action_groups=GROUPS, action_horizon=HORIZON)
         self.requirements = Requirements(
-            "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_key="annotation.task"
+            "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_keys=("annotation.task",)
         )
 
     def inputs(self, reading: Reading) -> list[Any]:

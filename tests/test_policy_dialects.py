@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -197,17 +199,23 @@ def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() 
     for task, expected in (
         (["a", ""], ["a", None]),
         ("a", ["a", "a"]),
+        (["a"], ["a", "a"]),
         (None, [None, None]),
     ):
         processor.seen.clear()
-        made.act(given | {"task": task}, seed=0)
+        with contextlib.ExitStack() as stack:
+            if None in expected:
+                stack.enter_context(pytest.warns(UserWarning, match="task: .*released default"))
+            made.act(given | {"task": task}, seed=0)
         assert processor.seen == [(text, False) for text in expected]
     # Sorted by name, whatever the order of the observation.
     assert made.inputs(given)[0].view_names == ("front", "wrist")
     isaac = policy("isaac")
     observation = flat(nested(isaac))
     del observation["annotation.human.action.task_description"]
-    assert read(observation, isaac.requirements).instructions == (None,)
+    with pytest.warns(UserWarning, match="released default is used") as warned:
+        assert read(observation, isaac.requirements).instructions == (None,)
+    assert [Path(warning.filename).name for warning in warned] == [Path(__file__).name]
     observation["task"] = ["go"]
     assert read(observation, isaac.requirements).instructions == ("go",)
 
@@ -293,12 +301,7 @@ def change(part: str, key: str, value: Callable[[Any], Any]) -> Callable[[Observ
 @pytest.mark.parametrize(
     ("broken", "error", "message"),
     [
-        (without("video", "front"), InputError, "expected cameras wrist, front, got wrist"),
-        (
-            change("video", "top", lambda _: np.zeros((1, 1, 40, 48, 3), np.uint8)),
-            InputError,
-            "wrist, front, top",
-        ),
+        (without("video", "front"), InputError, "video.front: expected cameras wrist, front, got wrist"),
         (
             change("video", "front", lambda found: found[..., :2]),
             ShapeError,
@@ -311,22 +314,32 @@ def change(part: str, key: str, value: Callable[[Any], Any]) -> Callable[[Observ
         (change("video", "front", lambda found: found.tolist()), DtypeError, "got list"),
         (change("video", "front", lambda found: found.repeat(2, axis=0)), ShapeError, "front 2"),
         (change("video", "front", lambda found: found.repeat(2, axis=1)), ShapeError, "time axis"),
-        (without("state", "hand"), InputError, "expected hand too, got arm"),
+        (without("state", "hand"), InputError, "state.hand: expected hand too, got arm"),
         (change("state", "arm", lambda found: found[..., :4]), ShapeError, "the last of 5"),
         (change("state", "arm", lambda found: found[0]), ShapeError, r"arm \(1, 5\), hand \(1, 1, 2\)"),
-        (change("state", "arm", lambda found: found.astype(np.int64)), DtypeError, "got int64"),
-        (change("state", "arm", lambda found: found * np.nan), InputError, "NaN or infinity"),
+        (
+            change("state", "arm", lambda found: np.full(found.shape, 2**24 + 1)),
+            DtypeError,
+            "got int64 16777217",
+        ),
+        (change("state", "arm", lambda found: found > 0), DtypeError, "state.arm: expected floating point"),
+        (change("state", "arm", lambda found: [[[1], [1, 2]]]), ShapeError, "state.arm: expected an array"),
+        (
+            change("state", "arm", lambda found: found * [1, 1, np.nan, 1, np.inf]),
+            InputError,
+            "state.arm: expected finite numbers, got NaN or infinity in columns 2, 4",
+        ),
         (change("state", "arm", lambda found: found.repeat(2, axis=1)), ShapeError, "1 along the time axis"),
         (change("state", "arm", lambda found: "zero"), ShapeError, "(batch, time, width)"),
         (change("language", "other", lambda _: [["b"]]), InputError, "expected one instruction"),
-        (lambda given: given.update(language={"a": [["b"], ["c"]]}), ShapeError, "language 2"),
+        (lambda given: given.update(language={"a": [["b"], ["c"]]}), ShapeError, "language.a 2"),
         (lambda given: given.update(language={"a": [["b", "c"]]}), InputError, "one instruction for each"),
         (lambda given: given.update(language={"a": [[5]]}), InputError, "got 5"),
         (lambda given: given.update(language={"a": [["\ud800"]]}), InputError, "valid Unicode"),
         (
-            lambda given: given.pop("language"),
+            lambda given: given.update(language="go"),
             InputError,
-            "language: expected a mapping of names, got nothing",
+            "language: expected a mapping of names, got str",
         ),
         (lambda given: given.pop("video"), InputError, "video: expected a mapping of names, got nothing"),
         (lambda given: given.update(state=[1.0]), InputError, "state: expected a mapping of names, got list"),
@@ -348,17 +361,27 @@ def test_lerobots_form_is_checked_too() -> None:
     cameras = r"front \(40 x 48\), wrist \(40 x 48\)"
     needs = rf"; embodiment 'new_embodiment' needs cameras {cameras}; state keys state \(7\)"
     for changes, error, message in (
-        ({"observation.images.top": given["observation.images.front"]}, InputError, "front, wrist, top"),
         ({"observation.images.front": given["observation.images.front"][:1]}, ShapeError, "front 1"),
-        ({"observation.images.front": given["observation.images.front"][0]}, ShapeError, "of 4 axes"),
+        ({"observation.images.front": given["observation.images.front"][0]}, ShapeError, "front 1"),
+        (
+            {"observation.images.front": given["observation.images.front"][:, :1]},
+            ShapeError,
+            "3, height, width",
+        ),
         ({"observation.images.front": given["observation.images.front"][..., ::2]}, ShapeError, "40 x 24"),
         ({"observation.images.front": given["observation.images.front"].long()}, DtypeError, "got int64"),
         ({"observation.images.front": torch.zeros(2, 3, 40, 48, device="meta")}, DtypeError, "on meta"),
         ({"observation.images.front": "front.png"}, DtypeError, "got str"),
         ({"observation.state": given["observation.state"][:, :6]}, ShapeError, "the last of 7"),
-        ({"observation.state": given["observation.state"].long()}, DtypeError, "got torch.int64"),
+        ({"observation.state": given["observation.state"].bool()}, DtypeError, "got torch.bool"),
+        (
+            {"observation.state": given["observation.state"] * np.nan},
+            InputError,
+            "columns 0, 1, 2, 3, 4, 5, 6",
+        ),
         ({"observation.state": None}, InputError, "expected the state, 7 numbers"),
-        ({"task": ["a"]}, ShapeError, "task 1"),
+        ({"task": ["a", "b", "c"]}, ShapeError, "task 3"),
+        ({"task": ["a", 0]}, InputError, "got 0"),
         ({"task": ["a", 1]}, InputError, "got 1"),
         ({"task": 5}, InputError, "got 5"),
     ):

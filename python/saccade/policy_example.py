@@ -36,7 +36,7 @@ def example_observation(needs: Requirements, normalizer: Normalizer, seed: int) 
     return {
         "video": video,
         "state": state,
-        "language": {needs.language_key or LANGUAGE_KEY: [[INSTRUCTION]]},
+        "language": {key: [[INSTRUCTION]] for key in needs.language_keys or (LANGUAGE_KEY,)},
     }
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade.backbone import Backbone
-from saccade.checkpoints.description import open_published
 from saccade.config import HeadConfig
 from saccade.dialects import Camera, ObservationSources, observation_sources
 from saccade.errors import CheckpointError, InputError
@@ -59,7 +58,7 @@ def load(
     precisions = precisions_of_parts(precision)
     path = resolve(source)
     check_whole(path)
-    config = HeadConfig(**open_published(path).config())
+    config = HeadConfig(**_saccade.Published.open(os.fspath(path), None).config())
     if isinstance(normalizer, Normalizer):
         if data_config is not None:
             raise InputError("data_config: expected None with a Normalizer, which has its own")

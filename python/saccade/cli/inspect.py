@@ -215,7 +215,7 @@ def robots(found: Sequence[RobotFindings]) -> Section:
                 "" if robot.embodiment_id is None else str(robot.embodiment_id),
                 cameras,
                 ", ".join(f"{key} {width}" for key, width in needs.state),
-                needs.language_key or "not named",
+                "any annotation" if needs.any_annotation else ", ".join(needs.language_keys) or "not named",
                 ", ".join(f"{key} {width}" for key, width in robot.actions),
             ]
         )

@@ -7,9 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import Float32Array, UInt8Array
-from saccade.dialects.checks import as_text, check_batch, check_cameras, check_frames, check_state, views
+from saccade._arrays import Float32Array, UInt8Array, float32
+from saccade.dialects.checks import (
+    as_text,
+    check_batch,
+    check_frames,
+    check_horizons,
+    check_state,
+    find_cameras,
+    shape_of,
+    views,
+)
 from saccade.dialects.requirements import Requirements
+from saccade.errors import InputError
 
 
 def read_frames(
@@ -23,29 +33,29 @@ def read_frames(
         is_batched: Whether there is a batch axis.
         needs: What the robot needs.
     """
-    cameras = check_cameras(prefix, given, needs, sort=False)
+    cameras = find_cameras(prefix, given, needs, sort=False)
     frames = {}
-    for camera in cameras:
-        name = f"{prefix}{camera.name}"
-        found = check_frames(name, given[camera.name], 5 if is_batched else 4, camera, needs)
-        frames[camera.name] = found if is_batched else found[None]
+    for camera, found in cameras:
+        checked = check_frames(prefix + found, given[found], (5,) if is_batched else (4,), camera, needs)
+        frames[camera.name] = checked if is_batched else checked[None]
     horizons = {name: found.shape[1] for name, found in frames.items()}
-    expected = needs.video_horizon
-    if len(set(horizons.values())) != 1 or expected not in (None, *horizons.values()):
-        listed = ", ".join(f"{name} {horizon}" for name, horizon in horizons.items())
-        wanted = "as many of every camera" if expected is None else expected
-        raise needs.shape_error(f"{prefix}*: frames along the time axis", str(wanted), listed)
+    check_horizons(prefix, horizons, needs.video_horizon, needs)
     check_batch({f"{prefix}{name}": len(found) for name, found in frames.items()}, needs)
-    return views(cameras, frames)
+    return views([camera for camera, _ in cameras], frames)
 
 
 def is_batched(prefix: str, state: Mapping[str, Any], needs: Requirements) -> bool:
-    """Whether the state has a batch axis, as Isaac-GR00T decides it: ``(batch, time, width)``."""
-    axes = {getattr(value, "ndim", np.ndim(value)) for value in state.values()}
+    """Whether the state has a batch axis: ``(batch, time, width)``.
+
+    As Isaac-GR00T decides it, but by the parts that the robot needs. N1.5 looks at others too, and then fails
+    if one of them lacks the axis.
+    """
+    shapes = {key: shape_of(prefix + key, value, needs) for key, value in state.items()}
+    axes = {len(shape) for shape in shapes.values()}
     if len(axes) != 1 or not axes <= {2, 3}:
-        shapes = ", ".join(f"{key} {np.shape(value)}" for key, value in state.items())
+        listed = ", ".join(f"{key} {shape}" for key, shape in shapes.items())
         raise needs.shape_error(
-            f"{prefix}*", "(batch, time, width) everywhere, or (time, width) everywhere", shapes or "none"
+            f"{prefix}*", "(batch, time, width) everywhere, or (time, width) everywhere", listed or "none"
         )
     return axes == {3}
 
@@ -61,12 +71,13 @@ def read_state(prefix: str, given: Mapping[str, Any], needs: Requirements) -> tu
     """
     missing = [key for key, _ in needs.state if key not in given]
     if missing:
-        raise needs.input_error(f"{prefix}*", f"{', '.join(missing)} too", ", ".join(given) or "none")
+        keys = ", ".join(prefix + key for key in missing)
+        raise needs.input_error(keys, f"{', '.join(missing)} too", ", ".join(given) or "none")
     chosen = {key: given[key] for key, _ in needs.state}
     batched = is_batched(prefix, chosen, needs)
     parts = {}
     for key, width in needs.state:
-        part = check_state(f"{prefix}{key}", chosen[key], 3 if batched else 2, width, needs)
+        part = check_state(prefix + key, chosen[key], 3 if batched else 2, [(key, width)], needs)
         parts[key] = part if batched else part[None]
         if parts[key].shape[1] != needs.state_history:
             raise needs.shape_error(
@@ -76,22 +87,20 @@ def read_state(prefix: str, given: Mapping[str, Any], needs: Requirements) -> tu
     return np.concatenate(list(parts.values()), axis=-1), batched
 
 
-def read_texts(name: str, given: Any, is_batched: bool, needs: Requirements) -> tuple[tuple[str, ...], bool]:
-    """The instruction of each observation, and whether all were given as plain strings in a batch.
+def read_texts(name: str, rows: Any, needs: Requirements) -> tuple[tuple[str, ...], bool]:
+    """The instruction of each row, and whether all were given as plain strings.
 
     Args:
         name: The key, for messages.
-        given: With a batch, a string or a list of one string for each row. Otherwise a string or a list of
-            one string. Lists may be tuples or arrays.
-        is_batched: Whether the observation has a batch axis.
+        rows: A list, tuple or array with a string, or a list of one string, for each row.
         needs: What the robot needs.
     """
-    rows = _listed(given) if is_batched else [given]
-    if not isinstance(rows, list):
-        raise needs.input_error(name, "one instruction for each row of the batch", repr(given))
+    given = listed(rows)
+    if not isinstance(given, list):
+        raise needs.input_error(name, "one instruction for each row of the batch", repr(rows))
     found, plain = [], []
-    for row in rows:
-        text = _listed(row)
+    for row in given:
+        text = listed(row)
         plain.append(not isinstance(text, list))
         if isinstance(text, list):
             if len(text) != 1:
@@ -99,12 +108,12 @@ def read_texts(name: str, given: Any, is_batched: bool, needs: Requirements) -> 
             text = text[0]
         found.append(as_text(name, text, needs))
     if len(set(plain)) > 1:
-        raise needs.input_error(name, "strings only, or lists of one string only", repr(given))
-    return tuple(found), is_batched and all(plain)
+        raise needs.input_error(name, "strings only, or lists of one string only", repr(rows))
+    return tuple(found), all(plain)
 
 
-def _listed(value: Any) -> Any:
-    """Lists, tuples and arrays as a list; anything else unchanged."""
+def listed(value: Any) -> Any:
+    """Lists, tuples and arrays as a list; anything else, and an array without axes, as what it is."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     return list(value) if isinstance(value, (list, tuple)) else value
@@ -117,9 +126,6 @@ def answer(parts: Mapping[str, Float32Array], prefix: str, is_batched: bool) -> 
 
 def joined(answer: Any, prefix: str, keys: tuple[str, ...], needs: str) -> Any:
     """The inverse of `answer`: one array. Anything but a mapping is returned unchanged."""
-    from saccade._arrays import float32
-    from saccade.errors import InputError
-
     if not isinstance(answer, Mapping):
         return answer
     missing = [prefix + key for key in keys if prefix + key not in answer]

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from saccade._arrays import Float32Array
 from saccade.dialects import isaac
-from saccade.dialects.checks import check_batch
+from saccade.dialects.checks import check_batch, default_instructions
 from saccade.dialects.reading import Reading, StateReading
 from saccade.dialects.requirements import Requirements
 
-PREFIXES = ("video.", "state.", "annotation.")
+ANNOTATION = "annotation"
+PREFIXES = ("video.", "state.", f"{ANNOTATION}.")
 
-#: What a checkpoint may call the instruction that some simulators send under another name.
+#: The name of an instruction in some checkpoints, and the one that simulators send, which then counts.
 TASK, COARSE = "task", "annotation.human.coarse_action"
 
 
@@ -57,16 +60,65 @@ def _below(observation: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 def _language(
     observation: Mapping[str, Any], state: StateReading, needs: Requirements
 ) -> tuple[tuple[str | None, ...], bool]:
-    """The instructions, and whether they are plain; without one, N1.5's default."""
-    known = needs.language_key
-    if known is None:
-        keys = [key for key in observation if key.startswith("annotation.") or key == TASK]
-    else:
-        keys = [key for key in (known, COARSE if known == TASK else known) if key in observation][:1]
-    if len(keys) > 1:
-        raise needs.input_error("annotation.*", "one instruction", ", ".join(keys))
-    if keys:
-        return isaac.read_texts(keys[0], observation[keys[0]], state.is_batched, needs)
-    if known is not None:
-        raise needs.input_error(known, "an instruction", "none")
-    return (None,) * len(state), False
+    """The instructions, and whether they are plain; without one, the released default."""
+    keys = _language_keys(observation, needs)
+    if not keys:
+        name = needs.language_key if needs.language_key and not needs.any_annotation else "annotation.*"
+        return default_instructions(name, len(state), needs), False
+    texts = {key: _texts(key, observation[key], state.is_batched, needs) for key in keys}
+    check_batch({"state": len(state), **{key: len(found) for key, (found, _) in texts.items()}}, needs)
+    return texts[keys[0]]
+
+
+def _language_keys(observation: Mapping[str, Any], needs: Requirements) -> list[str]:
+    """The keys of words, that of the instruction first; none if there are no words at all.
+
+    N1.5 takes any key that contains "annotation", and fails if there are two. N1.7 wants every configured
+    key.
+    """
+    given = [key for key in observation if ANNOTATION in key]
+    if TASK in observation and not (given and needs.any_annotation):
+        given.append(TASK)
+    if needs.any_annotation or not needs.language_keys:
+        if len(given) > 1:
+            raise needs.input_error("annotation.*", "one instruction", ", ".join(given))
+        return given
+    found: list[str] = []
+    missing: list[str] = []
+    for key in needs.language_keys:
+        name = COARSE if key == TASK and COARSE in observation else key
+        (found if name in observation else missing).append(name)
+    if missing and (found or given or needs.requires_language):
+        raise needs.input_error(", ".join(missing), "an instruction", ", ".join(given) or "none")
+    return found
+
+
+def _texts(name: str, given: Any, is_batched: bool, needs: Requirements) -> tuple[tuple[str, ...], bool]:
+    """The instruction of each row of one key, and whether N1.5's prompt contains them as they are."""
+    has_one_form = bool(needs.language_keys) and not needs.any_annotation
+    rows = given
+    if has_one_form:
+        # N1.7 flattens arrays of any shape, and takes a string for one row.
+        if isinstance(given, np.ndarray):
+            rows = given.reshape(-1)
+        elif isinstance(given, str):
+            rows = [given]
+    elif not is_batched:
+        # N1.5 adds a batch axis to lists and to arrays that have an axis, and to nothing else.
+        if isinstance(given, np.ndarray) and given.ndim == 0:
+            rows = given.reshape(1)
+        elif not isinstance(given, tuple):
+            rows = [[given] if isinstance(given, str) else given]
+    texts, is_plain = isaac.read_texts(name, _numbers_as_text(rows), needs)
+    return texts, is_plain and not has_one_form
+
+
+def _numbers_as_text(rows: Any) -> Any:
+    """Rows with the numbers after the first as text: the releases look at the first row only."""
+    found = isaac.listed(rows)
+    if not isinstance(found, list):
+        return rows
+    return [
+        str(row) if place and isinstance(row, (int, float, np.number)) else row
+        for place, row in enumerate(found)
+    ]

@@ -7,7 +7,7 @@ from typing import Any
 
 from saccade._arrays import Float32Array
 from saccade.dialects import isaac
-from saccade.dialects.checks import check_batch
+from saccade.dialects.checks import check_batch, default_instructions
 from saccade.dialects.reading import Reading, StateReading
 from saccade.dialects.requirements import Requirements
 
@@ -29,7 +29,7 @@ class IsaacNested:
     def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
         """See :class:`saccade.dialects.Dialect`."""
         frames = isaac.read_frames("video.", _part(observation, "video", needs), state.is_batched, needs)
-        texts, _ = _language(_part(observation, "language", needs), state.is_batched, needs)
+        texts = _language(observation, state, needs)
         check_batch({"state": len(state), "video": len(frames), "language": len(texts)}, needs)
         # Isaac-GR00T's nested form always wraps the instruction.
         return Reading(self, needs, state.is_batched, False, state.state, frames, texts, is_plain=False)
@@ -53,16 +53,32 @@ def _part(observation: Mapping[str, Any], name: str, needs: Requirements) -> Map
     if not isinstance(part, Mapping):
         got = "nothing" if part is None else type(part).__name__
         raise needs.input_error(name, "a mapping of names", got)
+    if not all(isinstance(key, str) for key in part):
+        raise needs.input_error(name, "strings as keys", repr(list(part)))
     return part
 
 
 def _language(
-    given: Mapping[str, Any], is_batched: bool, needs: Requirements
-) -> tuple[tuple[str, ...], bool]:
-    key = needs.language_key
-    if key not in given and len(given) == 1 and key is None:
-        key = next(iter(given))
-    if key is None or key not in given:
-        expected = "one instruction" if key is None else f"the key {key}"
-        raise needs.input_error("language", expected, ", ".join(given) or "none")
-    return isaac.read_texts(f"language.{key}", given[key], is_batched, needs)
+    observation: Mapping[str, Any], state: StateReading, needs: Requirements
+) -> tuple[str | None, ...]:
+    """The instructions: those of the first configured key, or of the only key if none is configured.
+
+    Every configured key must be there, as in N1.7, unless there are no words at all.
+    """
+    given = {} if observation.get("language") is None else _part(observation, "language", needs)
+    is_free = needs.any_annotation or not needs.language_keys
+    if is_free and len(given) > 1:
+        raise needs.input_error("language", "one instruction", ", ".join(given))
+    keys = tuple(given) if is_free else needs.language_keys
+    if not given:
+        return default_instructions(f"language.{keys[0]}" if keys else "language", len(state), needs)
+    missing = [key for key in keys if key not in given]
+    if missing:
+        names = ", ".join(f"language.{key}" for key in missing)
+        raise needs.input_error(names, f"the key {missing[0]}", ", ".join(given))
+    texts = {}
+    for key in keys:
+        rows = given[key] if state.is_batched else [given[key]]
+        texts[f"language.{key}"], _ = isaac.read_texts(f"language.{key}", rows, needs)
+    check_batch({"state": len(state), **{name: len(found) for name, found in texts.items()}}, needs)
+    return texts[f"language.{keys[0]}"]

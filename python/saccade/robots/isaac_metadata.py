@@ -6,13 +6,13 @@ converted rotation are fixed, and keys that the data config does not use are not
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from saccade._warning import warn
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.building import Builder, Dims, Options, finished
 from saccade.robots.data_configs import RELEASED, DataConfig
@@ -151,11 +151,10 @@ def _whole_file(entry: Entry) -> DataConfig:
         raise InputError(
             f"data_config: expected one for {entry.where}, got None: {'; '.join(reasons)}{fitting_hint(entry)}"
         )
-    warnings.warn(
+    warn(
         f"{entry.where}: no data config is given, so all keys are used, in the order of the file, with their "
         "minimum and maximum (discrete ones: binary). A checkpoint of GR00T N1 or N1.5 does not say which "
-        "data config it was trained with: pass data_config= to be certain",
-        stacklevel=2,
+        "data config it was trained with: pass data_config= to be certain"
     )
 
     def modes(kind: str) -> dict[str, str]:

@@ -88,12 +88,12 @@ def _of_policy(policy: Policy) -> Configs:
         "video": [camera.name for camera in needs.cameras or ()],
         "state": [group.key for group in normalizer.state_groups],
         "action": [group.key for group in normalizer.action_groups],
-        "language": [needs.language_key or LANGUAGE_KEY],
+        "language": list(needs.language_keys) or [LANGUAGE_KEY],
     }
     steps = {
-        "video": range(1 - (needs.video_horizon or 1), 1),
-        "state": range(1 - needs.state_history, 1),
-        "action": range(horizon),
+        "video": needs.observation_indices or range(1 - (needs.video_horizon or 1), 1),
+        "state": needs.observation_indices or range(1 - needs.state_history, 1),
+        "action": needs.action_indices or range(horizon),
         "language": range(1),
     }
     return {
