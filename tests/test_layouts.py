@@ -108,23 +108,41 @@ def test_sizes_that_lerobots_config_lacks_come_from_the_tensors(tmp_path: Path) 
     assert found == saccade.HeadConfig.from_dict(config)
 
 
-@pytest.mark.parametrize(("chunk_size", "horizon"), [(50, 16), (16, 16), (8, 8)])
-def test_lerobot_trains_at_most_sixteen_actions(tmp_path: Path, chunk_size: int, horizon: int) -> None:
-    folder = layouts.write(tmp_path / "policy", "lerobot")
-    change_config(folder, lambda config: config.update(chunk_size=chunk_size))
+HORIZONS: Json = json.loads((Path(__file__).parent / "data" / "lerobot_horizons.json").read_text())
+
+
+@pytest.mark.parametrize("case", HORIZONS)
+def test_lerobots_head_denoises_what_lerobots_model_denoises(tmp_path: Path, case: str) -> None:
+    """Neither `chunk_size` nor the pack step says it: they say what is trained and returned."""
+    found, layout = HORIZONS[case], "lerobot-n17" if case.startswith("n17") else "lerobot"
+    widths = {key: found["pack"][key] for key in ("max_state_dim", "max_action_dim")}
+    config = layout_heads.head_config(layout) | widths
+    if layout == "lerobot":
+        config["action_dim"] = widths["max_action_dim"]
+    folder = layouts.write(tmp_path / "policy", layout, config=config)
+    change_config(folder, lambda policy: policy.update(found["config"]))
+    change_pack(folder, found["pack"])
+    head = saccade.ActionHead.load(folder, embodiment_ids=[31])
+    assert head.config.action_horizon == found["head_horizon"]
+
+
+@pytest.mark.parametrize(("layout", "horizon"), [("lerobot", 16), ("fork", 16), ("lerobot-n17", 40)])
+def test_no_chunk_of_lerobots_changes_its_head(tmp_path: Path, layout: str, horizon: int) -> None:
+    folder = layouts.write(tmp_path / "policy", layout)
+    for chunk in (1, 8, 16, 50, 64):
+        change_config(folder, lambda config, chunk=chunk: config.update(chunk_size=chunk))
+        change_pack(folder, {"action_horizon": chunk, "valid_action_horizon": chunk})
+        assert describe(folder).config.action_horizon == horizon
+    (folder / "policy_preprocessor.json").write_text("{")
     assert describe(folder).config.action_horizon == horizon
 
 
-def test_lerobots_n17_takes_its_chunk_from_the_model_not_from_chunk_size(tmp_path: Path) -> None:
-    folder = layouts.write(tmp_path / "policy", "lerobot-n17")
-    change_config(folder, lambda config: config.update(chunk_size=10))
-    assert describe(folder).config.action_horizon == 40
-    processors = json.loads((folder / "policy_preprocessor.json").read_text())
-    processors["steps"][2]["config"]["action_horizon"] = 50
-    (folder / "policy_preprocessor.json").write_text(json.dumps(processors))
-    assert describe(folder).config.action_horizon == 50
-    (folder / "policy_preprocessor.json").write_text("{")
-    assert describe(folder).config.action_horizon == 40
+def change_pack(folder: Path, change: Json) -> None:
+    """Changes the config of the pack step of lerobot's preprocessor."""
+    path = folder / "policy_preprocessor.json"
+    processors = json.loads(path.read_text())
+    processors["steps"][2]["config"] |= change
+    path.write_text(json.dumps(processors))
 
 
 def test_n15_as_it_was_first_published_has_no_future_tokens(tmp_path: Path) -> None:

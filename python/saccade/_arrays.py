@@ -65,6 +65,30 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
         return np.require(array, np.float32, ["C", "A"])
 
 
+def exact_float32(name: str, value: ArrayLike) -> Float32Array:
+    """As `float32`, for numbers in a robot's units: integers are taken if float32 holds them exactly.
+
+    Raises:
+        DtypeError, ShapeError: As `float32`; or float32 does not hold an integer.
+    """
+    if is_torch(value):
+        if value.is_floating_point() or value.is_complex() or value.is_sparse:  # type: ignore[union-attr]
+            return float32(name, value)
+        value = _torch_memory(name, value.detach())  # type: ignore[union-attr]
+    array = _asarray(name, value)
+    if array.dtype.kind not in "iu":
+        return float32(name, array)
+    converted = array.astype(np.float32)
+    # As Python's numbers, which compare integers and floats exactly.
+    wrong = array[converted.astype(object) != array.astype(object)]
+    if wrong.size:
+        raise DtypeError(
+            f"{name}: expected numbers that float32 holds exactly, got {array.dtype} {wrong.flat[0]}: convert "
+            "with astype(np.float32)"
+        )
+    return np.require(converted, np.float32, ["C", "A"])
+
+
 def frame(name: str, value: ArrayLike) -> npt.NDArray[Any]:
     """A camera frame as a C-contiguous array of uint8, float32 or float64, copied only if it must be.
 

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from saccade._arrays import Float32Array, UInt8Array, float32, is_torch
+from saccade._arrays import Float32Array, UInt8Array, exact_float32, is_torch
 from saccade._warning import warn
 from saccade.dialects.requirements import Camera, Requirements
 from saccade.errors import DtypeError, ShapeError
@@ -146,9 +146,8 @@ def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requ
     """
     width = sum(size for _, size in parts)
     shape_of(name, state, needs)
-    numbers = _floating(name, on_cpu(name, state, needs), needs)
     try:
-        values = float32(name, numbers)
+        values = exact_float32(name, on_cpu(name, state, needs))
     except (DtypeError, ShapeError):
         got = getattr(state, "dtype", type(state).__name__)
         raise needs.dtype_error(name, NUMBERS, got) from None
@@ -157,23 +156,6 @@ def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requ
     if not np.isfinite(values).all():
         raise needs.input_error(name, "finite numbers", f"NaN or infinity in {_not_finite(values, parts)}")
     return values
-
-
-def _floating(name: str, state: Any, needs: Requirements) -> Any:
-    """Integers as float32; anything else as it is, to be checked by `float32`."""
-    if is_torch(state):
-        if state.is_floating_point() or state.is_complex() or state.is_sparse:
-            return state
-        state = state.numpy()
-    found = np.asarray(state)
-    if found.dtype.kind not in "iu":
-        return found
-    converted = found.astype(np.float32)
-    # As Python's numbers, which compare integers and floats exactly.
-    wrong = found[converted.astype(object) != found.astype(object)]
-    if wrong.size:
-        raise needs.dtype_error(name, NUMBERS, f"{found.dtype} {wrong.flat[0]}")
-    return converted
 
 
 def _not_finite(values: Float32Array, parts: StateParts) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import Array, ArrayLike, Float32Array, float32, integer, is_torch, like_features
+from saccade._arrays import Array, ArrayLike, Float32Array, exact_float32, float32, integer, is_torch, like_features
 from saccade.errors import InputError, ShapeError
 from saccade.robots.building import Options
 from saccade.robots.data_configs import DataConfigLike
@@ -273,7 +273,7 @@ class Normalizer(Robot):
 
     def _robot(self, name: str, given: ArrayLike, groups: tuple[Group, ...]) -> Float32Array:
         """An array in the robot's units, after checking its width."""
-        values = _finite(name, given)
+        values = exact_float32(name, given)
         width = sum(group.size for group in groups)
         if values.ndim < 1 or values.shape[-1] != width:
             parts = ", ".join(f"{group.key} {group.size}" for group in groups)
@@ -282,6 +282,9 @@ class Normalizer(Robot):
                 f"{name}: the Normalizer{robot} expected (..., {width}) in the robot's units ({parts}), "
                 f"got {values.shape}"
             )
+        if not np.isfinite(values).all():
+            wrong = [key for key, where in _slices(groups).items() if not np.isfinite(values[..., where]).all()]
+            raise InputError(f"{name}: expected finite numbers, got NaN or infinity in {', '.join(wrong)}")
         return values
 
     def _head(self, name: str, given: ArrayLike, groups: tuple[Group, ...]) -> Float32Array:
