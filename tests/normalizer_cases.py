@@ -64,7 +64,7 @@ def metadata(tag: str = "new_embodiment", **about: Any) -> dict[str, Any]:
                 for kind, keys in sizes.items()
             },
             "modalities": {
-                "video": {},
+                "video": {"front": {"resolution": [64, 48], "channels": 3, "fps": 30.0}},
                 **{
                     kind: {
                         key: {**modality, "shape": [size], **about.get(key, {})} for key, size in keys.items()
@@ -74,6 +74,33 @@ def metadata(tag: str = "new_embodiment", **about: Any) -> dict[str, Any]:
             },
             "embodiment_tag": tag,
         }
+    }
+
+
+def data_config(
+    state_modes: str | dict[str, str] = "min_max",
+    action_modes: str | dict[str, str] = "min_max",
+    **changes: Any,
+) -> dict[str, Any]:
+    """A data config of the robot of `metadata`, with modes for all keys or by key."""
+    keys = ("arm", "gripper")
+
+    def modes(kind: str, given: str | dict[str, str]) -> dict[str, str]:
+        if isinstance(given, dict):
+            return given
+        return {} if given == "none" else {f"{kind}.{key}": given for key in keys}
+
+    return {
+        "video_keys": ["video.front"],
+        "state_keys": [f"state.{key}" for key in keys],
+        "action_keys": [f"action.{key}" for key in keys],
+        "language_keys": ["annotation.human.task_description"],
+        "observation_indices": [0],
+        "action_indices": list(range(16)),
+        "state_modes": modes("state", state_modes),
+        "action_modes": modes("action", action_modes),
+        "target_rotations": {},
+        **changes,
     }
 
 

@@ -45,5 +45,5 @@ def test_any_json_is_cameras_or_an_error(
         for camera in found.cameras or ():
             assert isinstance(camera.name, str)
             assert camera.height is None or camera.height > 0
-        assert found.language_key is None or isinstance(found.language_key, str)
+        assert all(isinstance(key, str) for key in found.language_keys)
         str(found)

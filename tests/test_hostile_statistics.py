@@ -35,7 +35,7 @@ FILES = [
     ("n17", "statistics.json"),
     ("n17", "embodiment_id.json"),
 ]
-EMBODIMENTS = {"nvidia": "gr1", "n17": "libero_sim"}
+EMBODIMENTS = {"nvidia": "new_embodiment", "n17": "libero_sim"}
 
 JUNK: list[Any] = [
     *(None, True, False, 0, -1, 1, 3, 2**31, 2**64, -(2**63), 10**400, 0.5, 1e308),
@@ -137,7 +137,7 @@ def test_a_head_is_not_as_wide_as_a_file_likes(
     config["action_head_cfg"][key] = width
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(saccade.CheckpointError, match=r"_dim: expected at most 1048576, got"):
-        saccade.Normalizer.load(folder, "gr1")
+        saccade.Normalizer.load(folder, "new_embodiment")
 
 
 def terabytes(path: Path) -> None:

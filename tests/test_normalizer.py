@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from normalizer_cases import as_array, draw, metadata, row
+from normalizer_cases import as_array, data_config, draw, metadata, row
 from published import sidecars
 from safetensors.numpy import save_file
 
@@ -61,11 +61,20 @@ def test_there_and_back(groups: list[tuple[int, str]], seed: int, padding: int) 
     entry = {"state": statistics, "action": statistics}
     modes = {f"{kind}.{name}": mode for kind in entry for name, (_, mode) in zip(names, groups, strict=True)}
     total = sum(size for size, _ in groups)
+    about = {
+        kind: {name: {"shape": [size]} for name, (size, _) in zip(names, groups, strict=True)}
+        for kind in entry
+    }
     normalizer = Normalizer.load(
-        {"robot": {"statistics": entry, "modalities": {}}},
+        {"robot": {"statistics": entry, "modalities": {**about, "video": {"front": {}}}}},
+        data_config=data_config(
+            {key: mode for key, mode in modes.items() if key.startswith("state.")},
+            {key: mode for key, mode in modes.items() if key.startswith("action.")},
+            state_keys=[f"state.{name}" for name in names],
+            action_keys=[f"action.{name}" for name in names],
+        ),
         state_dim=total + padding,
         action_dim=total + padding,
-        modes=modes,
     )
     low, high = (
         np.concatenate([np.array(statistics[name][bound]) for name in names]) for bound in ("q01", "q99")
@@ -102,8 +111,12 @@ def test_arrays_of_every_kind() -> None:
     found = normalizer.state(torch.from_numpy(state))
     assert isinstance(found, torch.Tensor)
     assert np.array_equal(found.numpy(), expected)
+    integers = np.array([[1, -2, 3]])
+    assert np.array_equal(as_array(normalizer.state(integers)), as_array(normalizer.state(1.0 * integers)))
+    with pytest.raises(saccade.DtypeError, match=r"state: .* holds exactly, got int64 16777217: .*astype"):
+        normalizer.state(np.array([[1, 2, 2**24 + 1]]))
     with pytest.raises(saccade.DtypeError, match="state"):
-        normalizer.state(np.ones((1, 3), np.int64))
+        normalizer.state(np.ones((1, 3), bool))
     before = state.copy()
     expected[:] = 0
     assert np.array_equal(state, before)
@@ -122,7 +135,7 @@ def test_a_state_of_the_wrong_width_names_the_robot_and_its_parts() -> None:
             normalizer.state(values)
     with pytest.raises(saccade.ShapeError, match=r"actions: the Normalizer expected \(\.\.\., at least 4\)"):
         normalizer.actions(np.zeros((1, 16, 3)))
-    with pytest.raises(saccade.InputError, match="state: expected finite numbers"):
+    with pytest.raises(saccade.InputError, match=r"state: expected finite numbers, .* in arm"):
         normalizer.state(np.array([[0.0, np.nan, 0, 0, 0]]))
 
 

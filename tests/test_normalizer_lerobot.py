@@ -14,9 +14,10 @@ import layouts
 import numpy as np
 import pytest
 import torch
-from normalizer_cases import as_array, draw, edit, load_processor, processor, step_config
+from normalizer_cases import as_array, draw, edit, step_config
 from published import sidecars
 
+import saccade
 from saccade import Normalizer
 
 
@@ -117,8 +118,19 @@ def test_a_tag_that_lerobot_does_not_know_is_embodiment_0(tmp_path: Path) -> Non
     assert Normalizer.load(tmp_path).embodiment_id == 0
 
 
-def test_without_min_max_lerobot_leaves_the_numbers_alone(tmp_path: Path) -> None:
+def test_n15_ignores_normalize_min_max(tmp_path: Path) -> None:
+    """lerobot 0.4.4 and 0.5.1 replace the option when they load a policy."""
     sidecars(tmp_path, "lerobot")
+    plain, state = Normalizer.load(tmp_path), draw(2, 7)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        edit(tmp_path / name, lambda values: step_config(values).update(normalize_min_max=False))
+    found = Normalizer.load(tmp_path)
+    assert np.array_equal(as_array(found.state(state)), as_array(plain.state(state)))
+    assert np.array_equal(as_array(found.actions(draw(2, 3, 8))), as_array(plain.actions(draw(2, 3, 8))))
+
+
+def test_without_min_max_n17_leaves_the_numbers_alone(tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot-n17")
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         edit(tmp_path / name, lambda values: step_config(values).update(normalize_min_max=False))
     normalizer, state = Normalizer.load(tmp_path), draw(2, 7)
@@ -136,18 +148,27 @@ def test_lerobot_after_0_5_1_clips_states(tmp_path: Path) -> None:
     assert normalizer.embodiment_id == layouts.N17_EMBODIMENTS["new_embodiment"]
 
 
-def test_a_lerobot_checkpoint_with_isaacs_groups_is_read_like_isaacs(tmp_path: Path) -> None:
-    config, statistics = processor(use_percentiles=True)
-    isaac = load_processor(tmp_path / "isaac", config, statistics)
-    sidecars(tmp_path / "lerobot", "lerobot-n17")
-    edit(
-        tmp_path / "lerobot" / "policy_preprocessor.json",
-        lambda values: step_config(values).update(
-            raw_stats=statistics["robot"],
-            modality_config=config["processor_kwargs"]["modality_configs"]["robot"],
-            use_percentiles=True,
-        ),
-    )
-    lerobot = Normalizer.load(tmp_path / "lerobot")
-    assert np.array_equal(as_array(lerobot.state(draw(3, 4)))[:, :9], as_array(isaac.state(draw(3, 4))))
-    assert np.array_equal(as_array(lerobot.actions(draw(3, 4, 8))), as_array(isaac.actions(draw(3, 4, 8))))
+@pytest.mark.parametrize("file", ["policy_preprocessor.json", "policy_postprocessor.json"])
+@pytest.mark.parametrize(
+    "step",
+    [
+        {"registry_name": "so101_action_representation_decode_v2", "config": {}},
+        {"class": "my_robot.steps.Invert", "config": {}},
+    ],
+)
+def test_a_step_that_is_not_known_is_refused_by_name(step: dict[str, Any], file: str, tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot-n17")
+    edit(tmp_path / file, lambda values: values["steps"].append(step))
+    name = step.get("registry_name") or step.get("class")
+    with pytest.raises(saccade.CheckpointError, match=f"{file}: the step '{name}' is not known"):
+        Normalizer.load(tmp_path)
+
+
+def test_an_option_that_is_not_known_is_refused_unless_it_is_off(tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot-n17")
+    path = tmp_path / "policy_postprocessor.json"
+    edit(path, lambda values: step_config(values).update(mirror=False, twist=None, shift=[]))
+    Normalizer.load(tmp_path)
+    edit(path, lambda values: step_config(values).update(mirror=True))
+    with pytest.raises(saccade.CheckpointError, match=r"mirror \(True\) is not known"):
+        Normalizer.load(tmp_path)

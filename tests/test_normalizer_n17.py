@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from normalizer_cases import as_array, draw, load_processor, processor, row
 from published import sidecars
+from released import DATA
 
 import saccade
 from saccade import Normalizer
@@ -60,7 +61,7 @@ def test_n17_mean_and_deviation_and_sine_and_cosine_by_key(tmp_path: Path) -> No
     expected = chunk[..., :3] * np.array(arm["std"]) + np.array(arm["mean"])
     expected[..., 1] = chunk[..., 1]  # no deviation: as it is
     assert np.allclose(as_array(normalizer.actions(chunk))[..., :3], expected, atol=1e-6)
-    with pytest.raises(saccade.InputError, match="mode 'sin_cos'"):
+    with pytest.raises(saccade.InputError, match="got 'sin_cos'"):
         normalizer.unstate(found)
 
 
@@ -111,13 +112,51 @@ def test_statistics_of_each_step_need_their_steps(tmp_path: Path) -> None:
 
 
 def test_what_n17_can_say_and_is_not_supported(tmp_path: Path) -> None:
-    pose = {**RELATIVE, "type": "EEF", "format": "XYZ_ROT6D"}
-    config, statistics = processor(action={"action_configs": [pose, ABSOLUTE]}, use_relative_action=True)
-    statistics["robot"]["relative_action"] = {"arm": row(3, 0)}
-    with pytest.raises(saccade.CheckpointError, match=r"action\.arm: relative poses of an end effector"):
-        load_processor(tmp_path, config, statistics)
     with pytest.raises(saccade.CheckpointError, match="tactile"):
         load_processor(tmp_path, *processor(use_tactile=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"surprise": 1}, r"processor_kwargs: surprise \(1\) is not known"),
+        ({"state": {"pass_through_keys": ["arm"]}}, "state: pass_through_keys"),
+        ({"state": {"exclude_state": True}}, "state: exclude_state"),
+        ({"state": {"delta_indices": None}}, "state: expected delta_indices"),
+        ({"action": {"action_configs": [ABSOLUTE]}}, "expected one of action_configs for each"),
+        ({"action": {"action_configs": [{**ABSOLUTE, "normalization_type": "skip"}, ABSOLUTE]}},
+         "action.arm: normalization_type"),
+        ({"action": {"action_configs": [{**ABSOLUTE, "rep": "REL_XYZ_ROT6D"}, ABSOLUTE]}},
+         "action.arm: rep: expected one of RELATIVE, DELTA, ABSOLUTE, got 'REL_XYZ_ROT6D'"),
+        ({"use_percentiles": "yes"}, "use_percentiles: expected true or false"),
+        ({"max_state_dim": None}, "max_state_dim: expected a positive integer"),
+    ],
+)  # fmt: skip
+def test_what_is_not_known_is_refused_by_name(changes: dict[str, Any], problem: str, tmp_path: Path) -> None:
+    with pytest.raises(saccade.CheckpointError, match=problem):
+        load_processor(tmp_path, *processor(**changes))
+
+
+def test_what_is_not_known_may_be_off(tmp_path: Path) -> None:
+    off: dict[str, Any] = {"surprise": None, "twist": False, "names": [], "state": {"pass_through_keys": []}}
+    load_processor(tmp_path, *processor(**off))
+
+
+def test_processor_files_may_lie_in_processor(tmp_path: Path) -> None:
+    config, statistics = processor()
+    plain = load_processor(tmp_path / "plain", config, statistics)
+    load_processor(tmp_path / "other" / "processor", config, statistics)
+    found = Normalizer.load(tmp_path / "other")
+    assert np.array_equal(as_array(found.state(draw(2, 4))), as_array(plain.state(draw(2, 4))))
+    assert found.embodiment_id == plain.embodiment_id == 5
+
+
+def test_a_robot_is_named_as_its_release_names_it(tmp_path: Path) -> None:
+    folder = DATA / "robots" / "n16_n17" / "04-n17-bimanual-rot6d"
+    for name in ("XDOF", " xdof ", "xdof_relative_eef_relative_joint", 27):
+        assert Normalizer.load(folder, name).embodiment == "xdof_relative_eef_relative_joint"
+    with pytest.raises(saccade.InputError, match=r"expected one of those in .*, got 'UNITREE_G1'"):
+        Normalizer.load(folder, "UNITREE_G1")
 
 
 def test_a_head_trained_without_a_state_gets_zeros(tmp_path: Path) -> None:

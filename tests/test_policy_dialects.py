@@ -238,7 +238,7 @@ def test_float_frames_become_uint8_as_in_lerobot() -> None:
 
 
 def test_frames_along_time_come_before_cameras() -> None:
-    made = policy("n17", ObservationSources(None, 2, None))
+    made = policy("n17", ObservationSources(None, 2))
     video = np.random.default_rng(0).integers(0, 256, (2, 2, 8, 8, 3), np.uint8)
     given = nested(policy("n17"))
     given["video"] = {"a": video[:1], "b": video[1:]}

@@ -1,4 +1,4 @@
-"""Robots of the released code: the released numbers, or the released refusal, for every case of tests/data/robots."""
+"""Robots of the released code, tests/data/robots: the released numbers, or the released refusal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import saccade
 DATA = released.DATA / "robots"
 
 #: The released numbers, as the fixtures were checked.
-TOLERANCE = {"rtol": 1e-5, "atol": 1e-5}
+TOLERANCE = 1e-5
 
 
 def cases(*kinds: str) -> list[Any]:
@@ -43,11 +43,17 @@ def state_of(normalizer: saccade.Normalizer, tensors: dict[str, npt.NDArray[Any]
     return np.concatenate([tensors[f"state.{group.key}"] for group in normalizer.state_groups], axis=-1)
 
 
+def same(found: Any, expected: npt.NDArray[Any], key: str = "") -> None:
+    np.testing.assert_allclose(np.asarray(found), expected, rtol=TOLERANCE, atol=TOLERANCE, err_msg=key)
+
+
 def is_taken(case: dict[str, Any]) -> bool:
     return not case.get("refuses")
 
 
-@pytest.mark.parametrize("folder", [one for one in cases("n15", "n16_n17") if is_taken(case_of(one.values[0]))])
+@pytest.mark.parametrize(
+    "folder", [one for one in cases("n15", "n16_n17") if is_taken(case_of(one.values[0]))]
+)
 def test_isaac_gr00t(folder: Path) -> None:
     case, tensors = case_of(folder), load_file(folder / "case.safetensors")
     normalizer = load(folder, case)
@@ -57,10 +63,10 @@ def test_isaac_gr00t(folder: Path) -> None:
         groups = getattr(normalizer, f"{kind}_groups")
         assert [[group.key, group.size] for group in groups] == case["expects"][kind]
     state = state_of(normalizer, tensors)
-    np.testing.assert_allclose(normalizer.state(state), tensors["head.state"], **TOLERANCE)
+    same(normalizer.state(state), tensors["head.state"])
     actions = np.asarray(normalizer.actions(tensors["head.actions"], state))
     for key, where in normalizer.action_slices.items():
-        np.testing.assert_allclose(actions[..., where], tensors[f"out.{key}"], err_msg=key, **TOLERANCE)
+        same(actions[..., where], tensors[f"out.{key}"], key)
 
 
 @pytest.mark.parametrize("folder", cases("lerobot"))
@@ -70,14 +76,12 @@ def test_lerobot(folder: Path) -> None:
     assert normalizer.embodiment_id == case["embodiment_id"]
     assert normalizer.action_horizon == case["horizon"]
     state = tensors["observation.state"]
-    np.testing.assert_allclose(normalizer.state(state), tensors["head.state"], **TOLERANCE)
+    same(normalizer.state(state), tensors["head.state"])
     actions = normalizer.actions(tensors["head.actions"], state)
-    np.testing.assert_allclose(actions, tensors["out.action"], **TOLERANCE)
+    same(actions, tensors["out.action"])
 
 
-@pytest.mark.parametrize(
-    "folder", [one for one in cases("n15") if not is_taken(case_of(one.values[0]))]
-)
+@pytest.mark.parametrize("folder", [one for one in cases("n15") if not is_taken(case_of(one.values[0]))])
 def test_what_n15_refuses(folder: Path) -> None:
     case = case_of(folder)
     if case["stage"] == "load":

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -12,20 +15,22 @@ from saccade.robots import rotations
 AXES = {"r": "X", "p": "Y", "y": "Z"}
 
 
-def random(count: int = 50) -> Rotation:
+def random(count: int = 50) -> Any:
     return Rotation.random(count, random_state=np.random.RandomState(5))
 
 
-def numbers(rotation: Rotation, name: str) -> np.ndarray:
+def numbers(rotation: Any, name: str) -> npt.NDArray[Any]:
     """What SciPy makes of rotations in one representation."""
     if name == "quaternion":
         found = rotation.as_quat(scalar_first=True)
-        return np.where(found[:, :1] < 0, -found, found)
-    if name == "axis_angle":
-        return rotation.as_rotvec()
-    if name == "rotation_6d":
-        return rotation.as_matrix()[:, :2].reshape(-1, 6)
-    return rotation.as_euler("".join(AXES[letter] for letter in name.removeprefix("euler_angles_")))
+        found = np.where(found[:, :1] < 0, -found, found)
+    elif name == "axis_angle":
+        found = rotation.as_rotvec()
+    elif name == "rotation_6d":
+        found = rotation.as_matrix()[:, :2].reshape(-1, 6)
+    else:
+        found = rotation.as_euler("".join(AXES[letter] for letter in name.removeprefix("euler_angles_")))
+    return np.asarray(found)
 
 
 @pytest.mark.parametrize("source", rotations.SIZES)
@@ -71,7 +76,7 @@ def test_relative_poses(form: str, name: str) -> None:
     reference, step = random(), Rotation.random(50, random_state=np.random.RandomState(6))
     place, offset = np.random.default_rng(0).standard_normal((2, 50, 3))
 
-    def pose(position: np.ndarray, rotation: Rotation) -> np.ndarray:
+    def pose(position: npt.NDArray[Any], rotation: Any) -> npt.NDArray[Any]:
         return np.concatenate([position, numbers(rotation, name)], axis=-1)
 
     absolute = pose(reference.apply(offset) + place, reference * step)

@@ -63,7 +63,7 @@ def with_views(policy: saccade.Policy, views: int) -> saccade.Policy:
         policy.normalizer,
         backbone=policy.backbone,
         processor=policy.processor,
-        cameras=ObservationSources(needs.cameras[:views], needs.video_horizon, needs.language_key),
+        sources=ObservationSources(needs.cameras[:views], needs.video_horizon, needs.language_keys),
     )
 
 

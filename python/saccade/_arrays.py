@@ -83,8 +83,8 @@ def exact_float32(name: str, value: ArrayLike) -> Float32Array:
     wrong = array[converted.astype(object) != array.astype(object)]
     if wrong.size:
         raise DtypeError(
-            f"{name}: expected numbers that float32 holds exactly, got {array.dtype} {wrong.flat[0]}: convert "
-            "with astype(np.float32)"
+            f"{name}: expected numbers that float32 holds exactly, got {array.dtype} {wrong.flat[0]}: "
+            "convert with astype(np.float32)"
         )
     return np.require(converted, np.float32, ["C", "A"])
 

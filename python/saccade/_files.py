@@ -85,7 +85,13 @@ def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
     companions = [
-        directory / name for name in ("config.json", "tokenizer.json", "experiment_cfg/metadata.json")
+        directory / name
+        for name in (
+            "config.json",
+            "tokenizer.json",
+            "experiment_cfg/metadata.json",
+            "experiment_cfg/data_config.json",
+        )
     ]
     return {
         "name": checkpoint.resolve().name,

@@ -60,7 +60,6 @@ class LoadOptions(TypedDict, total=False):
     """How a head is loaded: the keyword arguments of :meth:`saccade.ActionHead.load` except the config."""
 
     embodiment_ids: Sequence[int] | None
-    action_horizon: int | None
     precision: str
     num_threads: int | None
 

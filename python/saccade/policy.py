@@ -158,8 +158,8 @@ class Policy:
             precision: How backbone and head compute, as for :meth:`saccade.ActionHead.load`: one name for
                 both, or ``{"backbone": name, "head": name}``.
             num_threads: Number of threads, as for :meth:`saccade.ActionHead.load`.
-            normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from. Default:
-                the checkpoint.
+            normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from.
+                Default: the checkpoint.
             cameras: The names of the cameras in the order of the prompt. Default: those of the data config or
                 the checkpoint.
             data_config: GR00T N1 and N1.5: the data config that the checkpoint was trained with, as for

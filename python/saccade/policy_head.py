@@ -87,14 +87,14 @@ def check_steps(head: Head, normalizer: Normalizer) -> None:
         )
     if least is not None and normalizer.trained_horizon is None and config.action_horizon < least:
         raise InputError(
-            f"normalizer: expected chunks of at most {config.action_horizon} actions, which this head denoises, "
-            f"got {least}"
+            f"normalizer: expected chunks of at most {config.action_horizon} actions, which this head "
+            f"denoises, got {least}"
         )
     history = normalizer.state_history
     if history is not None and history != config.state_history:
         raise InputError(
-            f"normalizer: expected {config.state_history} states in an observation, which this head takes, got "
-            f"{history}"
+            f"normalizer: expected {config.state_history} states in an observation, which this head takes, "
+            f"got {history}"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,8 @@ from saccade.backbone_config import BackboneConfig
 from saccade.dialects import Requirements, observation_sources
 from saccade.errors import SaccadeError
 from saccade.processor import Processor
-from saccade.robots import Normalizer, read_json
+from saccade.robots import DataConfigLike, Normalizer, read_json
+from saccade.robots.reading import OWN_DATA_CONFIG, processor_folder
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 
@@ -31,6 +33,10 @@ class RobotFindings:
     """Key and width of each part of the action."""
     problem: str | None
     """Why the statistics cannot be used as they are."""
+    warning: str | None
+    """What is not known about them, although they can be used."""
+    data_config: str | None
+    """The data config that was given, as text; None for none, or where the files say it."""
 
 
 @dataclass(frozen=True)
@@ -74,39 +80,48 @@ def backbone_of(source: Path, config: str | None) -> BackboneFindings:
     )
 
 
-def robots_of(source: Path, state_history: int) -> list[RobotFindings]:
+def robots_of(
+    source: Path, state_history: int, data_config: DataConfigLike | None = None
+) -> list[RobotFindings]:
     """The robots whose statistics a checkpoint holds, with what an observation of each must contain.
 
     Args:
         source: The checkpoint.
         state_history: Number of states that its head takes.
+        data_config: As for :meth:`saccade.Normalizer.load`; used for the robots of N1 and N1.5.
     """
-    found = []
-    for tag in _tags(source):
+    return [_robot_of(source, tag, state_history, data_config) for tag in _tags(source)]
+
+
+def _robot_of(
+    source: Path, tag: str | None, state_history: int, data_config: DataConfigLike | None
+) -> RobotFindings:
+    """One robot: what can be used, or why not."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         try:
-            normalizer = Normalizer.load(source, tag)
-            cameras = camera_sources(source, normalizer.embodiment)
+            normalizer = Normalizer.load(source, tag, data_config=data_config)
+            sources = observation_sources(source, normalizer.embodiment, normalizer.data_config)
         except (SaccadeError, FileNotFoundError) as error:
-            found.append(RobotFindings(tag, None, None, (), str(error)))
-            continue
-        needs = Requirements(
-            embodiment=normalizer.embodiment,
-            cameras=cameras.cameras,
-            state=tuple((group.key, group.size) for group in normalizer.state_groups),
-            state_history=state_history,
-            video_horizon=cameras.video_horizon,
-            language_keys=() if cameras.language_key is None else (cameras.language_key,),
-        )
-        actions = tuple((group.key, group.size) for group in normalizer.action_groups)
-        found.append(RobotFindings(tag, normalizer.embodiment_id, needs, actions, None))
-    return found
+            return RobotFindings(tag, None, None, (), str(error), None, None)
+    needs = Requirements(
+        embodiment=normalizer.embodiment,
+        state=tuple((group.key, group.size) for group in normalizer.state_groups),
+        state_history=normalizer.state_history or state_history,
+        **vars(sources),
+    )
+    actions = tuple((group.key, group.size) for group in normalizer.action_groups)
+    warning = str(told[0].message) if told else None
+    named = None if normalizer.data_config is None else str(data_config or OWN_DATA_CONFIG)
+    return RobotFindings(tag, normalizer.embodiment_id, needs, actions, None, warning, named)
 
 
 def _tags(source: Path) -> list[str | None]:
     """The tags of the robots, from the first file that has statistics; None for robots without a tag."""
     for name, tags in TAGS.items():
+        folder = processor_folder(source) if name == "processor_config.json" else source
         try:
-            values = read_json(source / name)
+            values = read_json(folder / name)
             found = tags(values)
         except (OSError, SaccadeError, AttributeError, TypeError, ValueError):
             continue

@@ -14,8 +14,8 @@ from saccade.dialects.sources import ObservationSources, observation_sources
 __all__ = [
     "DIALECTS",
     "Camera",
-    "ObservationSources",
     "Dialect",
+    "ObservationSources",
     "Reading",
     "Requirements",
     "StateReading",

@@ -166,9 +166,7 @@ def _names(given: Any) -> list[str]:
 #: Files of a checkpoint that name cameras, in the order in which they are tried: that of the statistics.
 FILES: dict[
     str,
-    Callable[
-        [Path, Mapping[str, Any], str | None, DataConfig | None], ObservationSources | None
-    ],
+    Callable[[Path, Mapping[str, Any], str | None, DataConfig | None], ObservationSources | None],
 ] = {
     "policy_preprocessor.json": _lerobot,
     "processor_config.json": _processor,

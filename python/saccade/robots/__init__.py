@@ -1,9 +1,9 @@
 """Robots: the statistics of their states and actions, and the normalizer that uses them.
 
 `reading` finds the statistics of a checkpoint and chooses their layout. Each layout has a file of its own:
-`isaac_metadata` (Isaac-GR00T N1 and N1.5, with `data_configs`), `isaac_processor` (Isaac-GR00T N1.6 and N1.7),
-`lerobot` (with `lerobot_pipeline`) and `flat` (a mapping). `embodiments` has the tags and ids of each release.
-`groups` has the arithmetic, `rotations` that of rotations and poses.
+`isaac_metadata` (Isaac-GR00T N1 and N1.5, with `data_configs`), `isaac_processor` (Isaac-GR00T N1.6 and
+N1.7), `lerobot` (with `lerobot_pipeline`) and `flat` (a mapping). `embodiments` has the tags and ids of each
+release. `groups` has the arithmetic, `rotations` that of rotations and poses.
 """
 
 from saccade.robots.data_configs import RELEASED, DataConfig, DataConfigLike, data_config

@@ -135,7 +135,7 @@ class Builder:
             is_empty = value is None or value is False or value in ("", [], {})
             if name not in known and not is_empty:
                 self.problems.append(
-                    f"{what}: {name} ({value!r:.60}) is not known, and may change what the checkpoint computes"
+                    f"{what}: {name} ({value!r:.60}) is not known, and may change the robot's actions"
                 )
 
     def check(self, groups: Iterable[Group | None] = ()) -> tuple[Group, ...]:

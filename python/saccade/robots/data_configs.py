@@ -1,7 +1,7 @@
 """Data configs of Isaac-GR00T N1 and N1.5: which keys a policy uses, in which order, and how.
 
-A checkpoint of N1.5 does not contain its data config. It is passed by the name that the released code gives it,
-or as a JSON file or mapping with the fields of `DataConfig`.
+A checkpoint of N1.5 does not contain its data config. It is passed by the name that the released code gives
+it, or as a JSON file or mapping with the fields of `DataConfig`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -89,9 +90,9 @@ def data_config(given: DataConfigLike) -> DataConfig:
         values = read_json(Path(name))
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"data_config: expected a released name ({', '.join(RELEASED)}) or a JSON file, got {name!r}. The "
-            "released code also takes a Python class of yours (module:Class): write its keys, indices, modes "
-            "and target rotations to a JSON file; docs/robots.md shows the form"
+            f"data_config: expected a released name ({', '.join(RELEASED)}) or a JSON file, got {name!r}. "
+            "The released code also takes a Python class of yours (module:Class): write its keys, indices, "
+            "modes and target rotations to a JSON file; docs/robots.md shows the form"
         ) from None
     except CheckpointError as error:
         raise CheckpointError(f"data_config: {error}") from None
@@ -111,7 +112,7 @@ def _from_mapping(values: Mapping[str, Any], where: str) -> DataConfig:
         problems += _mapping_problems(values)
     if problems:
         raise InputError(f"{where}: " + "; ".join(problems))
-    taken = {
+    taken: dict[str, Any] = {
         name: dict(values[name]) if isinstance(values[name], Mapping) else tuple(values[name])
         for name in names
     }
@@ -139,7 +140,7 @@ def _index_problems(name: str, given: Any) -> list[str]:
         return [f"{name}: expected integers, got {given!r:.100}"]
     if name == "action_indices":
         return []
-    steps = {after - before for before, after in zip(given, given[1:], strict=False)}
+    steps = {after - before for before, after in pairwise(given)}
     if len(steps) > 1 or any(step < 1 for step in steps) or given[-1] != 0:
         return [f"{name}: expected ascending, evenly spaced integers up to 0, got {list(given)!r:.100}"]
     return []

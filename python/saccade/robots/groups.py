@@ -50,8 +50,8 @@ class Group:
         size: Number of values that the robot has for it.
         mode: One of ``"min_max"``, ``"q99"``, ``"mean_std"``, ``"scale"``, ``"binary"``, ``"sin_cos"`` and
             ``"none"``.
-        first: Minimum, 1 % quantile or mean; ``(width,)``, or ``(horizon, width)`` if each step of a chunk has
-            its own. Zero for ``"scale"``. None if the mode needs no statistics.
+        first: Minimum, 1 % quantile or mean; ``(width,)``, or ``(horizon, width)`` if each step of a chunk
+            has its own. Zero for ``"scale"``. None if the mode needs no statistics.
         second: Maximum, 99 % quantile, standard deviation or scale, shaped as ``first``.
         moving: True where the statistics define a scale. The other dimensions are constant.
         keeps_constant: Whether constant dimensions go to the head unchanged. Otherwise the head gets 0.

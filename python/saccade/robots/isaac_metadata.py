@@ -149,7 +149,8 @@ def _whole_file(entry: Entry) -> DataConfig:
         reasons.append(f"{', '.join(turned)} may be converted to another representation")
     if reasons:
         raise InputError(
-            f"data_config: expected one for {entry.where}, got None: {'; '.join(reasons)}{fitting_hint(entry)}"
+            f"data_config: expected one for {entry.where}, got None: {'; '.join(reasons)}"
+            f"{fitting_hint(entry)}"
         )
     warn(
         f"{entry.where}: no data config is given, so all keys are used, in the order of the file, with their "
@@ -222,8 +223,8 @@ def _conversion(
         return None, f"{source} cannot be converted to another order of Euler angles, {target}"
     if mode != "none" and (mode != "min_max" or not about.get("absolute", True)):
         return None, (
-            f"a rotation that is converted takes min_max if it is absolute, or no mode; got {mode} and absolute "
-            f"{about.get('absolute', True)}"
+            f"a rotation that is converted takes min_max if it is absolute, or no mode; got {mode} and "
+            f"absolute {about.get('absolute', True)}"
         )
     # A state may also become six numbers or twice as many; an action has as many as the robot.
     allowed = (size,) if kind == "action" else (size, 2 * size, 6)

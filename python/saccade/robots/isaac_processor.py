@@ -235,8 +235,8 @@ def _references(
         form = names["format"]
         if is_pose and form == "DEFAULT":
             builder.problems.append(
-                f"{where}: format DEFAULT of a relative EEF is a 4 x 4 matrix, which the released policy does "
-                "not return either"
+                f"{where}: format DEFAULT of a relative EEF is a 4 x 4 matrix, which the released policy "
+                "does not return either"
             )
         elif not is_pose and form in POSES:
             builder.problems.append(f"{where}: format {form} is for type EEF, got {names['type']}")
@@ -263,7 +263,8 @@ def check_reference(builder: Builder, group: Group, sizes: Mapping[str, int]) ->
         )
     elif sizes.get(key) != group.size:
         builder.problems.append(
-            f"action.{group.key}: {group.size} numbers relative to state.{key}, which has {sizes.get(key, 'no')}"
+            f"action.{group.key}: {group.size} numbers relative to state.{key}, which has "
+            f"{sizes.get(key, 'no')}"
         )
 
 
@@ -357,7 +358,7 @@ def _check_horizons(
     builder: Builder, kwargs: Mapping[str, Any], configs: Mapping[str, Any], version: str | None
 ) -> None:
     """N1.7 refuses a processor in which any robot has a longer chunk than ``max_action_horizon``."""
-    most = kwargs.get("max_action_horizon", DEFAULT_HORIZON.get(version or "", None))
+    most = kwargs.get("max_action_horizon", DEFAULT_HORIZON.get(version or ""))
     if most is None:
         return
     for tag, config in configs.items():

@@ -53,10 +53,7 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     builder = Builder(pipeline.where, np.float32)
     native = pipeline.unpack.name == DECODE
     state = _state_groups(builder, pipeline)
-    if native:
-        action = _native_groups(builder, pipeline, state)
-    else:
-        action = _flat_groups(builder, pipeline)
+    action = _native_groups(builder, pipeline, state) if native else _flat_groups(builder, pipeline)
     width = sum(group.size for group in action)
     cut = size_of(giving.get("env_action_dim")) or pipeline.feature("output_features", ACTION)
     if cut is not None and cut < width:
@@ -154,9 +151,7 @@ def _flat_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
     return (builder.scaled("action", "min_max", low, high, clips=pipeline.is_n17, clips_back=clips_back),)
 
 
-def _native_groups(
-    builder: Builder, pipeline: Pipeline, state: tuple[Group, ...]
-) -> tuple[Group, ...]:
+def _native_groups(builder: Builder, pipeline: Pipeline, state: tuple[Group, ...]) -> tuple[Group, ...]:
     """The groups of a raw checkpoint's statistics."""
     config = pipeline.unpack.config
     raw, about = config.get("raw_stats"), config.get("modality_config")
@@ -166,7 +161,9 @@ def _native_groups(
     assert isinstance(raw, Mapping)
     action = modality(builder, about, "action", relative=bool(config.get("use_relative_action")))
     sizes = {group.key: group.size for group in state}
-    groups = [_native_group(builder, key, raw, action, bool(config.get("use_percentiles"))) for key in action.keys]
+    groups = [
+        _native_group(builder, key, raw, action, bool(config.get("use_percentiles"))) for key in action.keys
+    ]
     for group in groups:
         if group is not None and group.reference is not None:
             check_reference(builder, group, sizes)
@@ -202,7 +199,9 @@ def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group
         if size == group.size:
             found.append(group)
         elif size > 0 and group.reference is not None:
-            builder.problems.append(f"action.{group.key}: cut to {size} of {group.size} numbers (env_action_dim)")
+            builder.problems.append(
+                f"action.{group.key}: cut to {size} of {group.size} numbers (env_action_dim)"
+            )
         elif size > 0 and group.mode == "none":
             found.append(replace(group, size=size))
         elif size > 0:
@@ -221,9 +220,7 @@ def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group
     return tuple(found)
 
 
-def _libero(
-    builder: Builder, pipeline: Pipeline, action: tuple[Group, ...], native: bool
-) -> int | None:
+def _libero(builder: Builder, pipeline: Pipeline, action: tuple[Group, ...], native: bool) -> int | None:
     """The number that LIBERO's rule applies to. ``config.json`` decides, whatever the steps say."""
     if not pipeline.is_n17:
         return None

@@ -221,9 +221,7 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
     if len(packs) != 1:
         builder.problems.append(f"expected one of {PACK_N15} and {PACK_N17}, got {len(packs)}")
     if len(unpacks) != 1:
-        ends.problems.append(
-            f"expected one of {UNPACK_N15}, {UNPACK_N17} and {DECODE}, got {len(unpacks)}"
-        )
+        ends.problems.append(f"expected one of {UNPACK_N15}, {UNPACK_N17} and {DECODE}, got {len(unpacks)}")
     builder.check()
     ends.check()
     pack, unpack = packs[0], unpacks[0]
@@ -255,7 +253,9 @@ def _check_order(
         given = step.config.get("rename_map") or {}
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given.values()):
             builder.problems.append(f"{RENAME}: rename_map: expected names, got {given!r:.100}")
-    if any(steps_after.index(step) < steps_after.index(unpack) for step in steps_after if step.name == ABSOLUTE):
+    if any(
+        steps_after.index(step) < steps_after.index(unpack) for step in steps_after if step.name == ABSOLUTE
+    ):
         ends.problems.append(f"expected {ABSOLUTE} after {unpack.name}")
     config = pack.config
     if config.get("language_key", "task") != "task":

@@ -9,7 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import Array, ArrayLike, Float32Array, exact_float32, float32, integer, is_torch, like_features
+from saccade._arrays import (
+    Array,
+    ArrayLike,
+    Float32Array,
+    exact_float32,
+    float32,
+    integer,
+    is_torch,
+    like_features,
+)
 from saccade.errors import InputError, ShapeError
 from saccade.robots.building import Options
 from saccade.robots.data_configs import DataConfigLike
@@ -283,7 +292,9 @@ class Normalizer(Robot):
                 f"got {values.shape}"
             )
         if not np.isfinite(values).all():
-            wrong = [key for key, where in _slices(groups).items() if not np.isfinite(values[..., where]).all()]
+            wrong = [
+                key for key, where in _slices(groups).items() if not np.isfinite(values[..., where]).all()
+            ]
             raise InputError(f"{name}: expected finite numbers, got NaN or infinity in {', '.join(wrong)}")
         return values
 

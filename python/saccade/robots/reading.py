@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from saccade.errors import CheckpointError
 from saccade.hub import resolve
 from saccade.robots.building import Dims, Options, size_of
+from saccade.robots.data_configs import data_config
 from saccade.robots.files import read_json
 from saccade.robots.flat import flat_robot
 from saccade.robots.groups import Robot
@@ -19,6 +21,9 @@ from saccade.robots.lerobot import lerobot_robot
 
 #: Where a training leaves the processor's files, if not beside the weights.
 PROCESSOR_FOLDER = "processor"
+
+#: The data config of a policy that saccade trained. Checkpoints of the released code have no such file.
+OWN_DATA_CONFIG = "experiment_cfg/data_config.json"
 
 #: Versions by ``model_type`` of ``config.json``.
 MODEL_TYPES = {"Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
@@ -92,6 +97,9 @@ def _processor(path: Path, values: Mapping[str, Any], options: Options) -> Robot
 def _metadata(path: Path, values: Mapping[str, Any], options: Options) -> Robot:
     """Isaac-GR00T N1 and N1.5. The widths of the head are in the config."""
     where = str(path / "experiment_cfg" / "metadata.json")
+    own = path / OWN_DATA_CONFIG
+    if options.data_config is None and own.is_file():
+        options = replace(options, data_config=data_config(own))
     config = read_json(path / "config.json") if (path / "config.json").is_file() else {}
     return _from_values(values, options, where, _dims(config))
 

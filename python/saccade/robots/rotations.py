@@ -1,8 +1,8 @@
 """Rotations in the representations of Isaac-GR00T, and poses relative to another pose.
 
-Everything goes through rotation matrices ``(..., 3, 3)`` that act on column vectors, in float64. The formulas
-are those of pytorch3d 0.7.6, which GR00T N1 and N1.5 use, and of SciPy's ``Rotation``, which N1.6 and N1.7 use.
-Both agree where both have the representation.
+Everything goes through rotation matrices ``(..., 3, 3)`` that act on column vectors, in float64. The
+formulas are those of pytorch3d 0.7.6, which GR00T N1 and N1.5 use, and of SciPy's ``Rotation``, which N1.6
+and N1.7 use. Both agree where both have the representation.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def converted(values: npt.NDArray[Any], source: str, target: str) -> Float64Arra
         source, target: Keys of `SIZES`.
 
     Returns:
-        ``(..., SIZES[target])`` float64. NaN where the numbers are no rotation, such as a quaternion of zeros.
+        ``(..., SIZES[target])`` float64. NaN where the numbers are no rotation, such as a quaternion of
+        zeros.
 
     Example:
         A quarter turn about z:

@@ -19,7 +19,7 @@ from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.intervention import Intervention
 from saccade.policy_head import Head
 from saccade.processor import Processor
-from saccade.sim.settings import CONFIG_FILE, FILES, GROUPS, SimulationConfig
+from saccade.sim.settings import CONFIG_FILE, FILES, GROUPS, LANGUAGE_KEY, SimulationConfig
 from saccade.sim.tasks import find_task
 
 #: One intervention, several that act together, or none.
@@ -27,7 +27,6 @@ Interventions: TypeAlias = Intervention | Sequence[Intervention] | None
 
 DEMO_CHECKPOINT = Path(__file__).parent / "demo"
 ENGINES = ("rust", "torch")
-LANGUAGE_KEY = "annotation.human.action.task_description"
 
 
 def load_whole(checkpoint: Path, engine: str = "rust", num_threads: int | None = None) -> saccade.Policy:

@@ -22,6 +22,10 @@ from saccade.sim.cameras import Camera
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
 TOKENIZER_FILE, METADATA_FILE = "tokenizer.json", "experiment_cfg/metadata.json"
+DATA_CONFIG_FILE = "experiment_cfg/data_config.json"
+
+#: The key of the instruction: Isaac-GR00T's usual one.
+LANGUAGE_KEY = "annotation.human.action.task_description"
 #: Every file of a policy.
 FILES = (CONFIG_FILE, TENSOR_FILE, TOKENIZER_FILE, METADATA_FILE)
 
@@ -133,7 +137,11 @@ class PolicyConfig:
         """What the policy's states and actions are normalised by."""
         head = self.head_config
         return Normalizer.load(
-            self.metadata(), EMBODIMENT, state_dim=head.state_dim, action_dim=head.action_dim
+            self.metadata(),
+            EMBODIMENT,
+            data_config=self.data_config(),
+            state_dim=head.state_dim,
+            action_dim=head.action_dim,
         )
 
     def processor(self) -> Processor:
@@ -175,10 +183,26 @@ class PolicyConfig:
         video = {camera.name: about for camera in self.simulation.cameras}
         return metadata(EMBODIMENT, self.statistics, GROUPS, video)
 
+    def data_config(self) -> dict[str, Any]:
+        """The content of `experiment_cfg/data_config.json`: every group and camera, scaled by its bounds."""
+        keys = {kind: [f"{kind}.{name}" for name in GROUPS] for kind in ("state", "action")}
+        return {
+            "video_keys": [f"video.{camera.name}" for camera in self.simulation.cameras],
+            "state_keys": keys["state"],
+            "action_keys": keys["action"],
+            "language_keys": [LANGUAGE_KEY],
+            "observation_indices": [0],
+            "action_indices": list(range(self.head["action_horizon"])),
+            "state_modes": dict.fromkeys(keys["state"], "min_max"),
+            "action_modes": dict.fromkeys(keys["action"], "min_max"),
+            "target_rotations": {},
+        }
+
     def write(self, folder: Path) -> None:
         """Writes all files of the policy except its weights."""
         (folder / METADATA_FILE).parent.mkdir(parents=True, exist_ok=True)
         write_json(folder / METADATA_FILE, self.metadata())
+        write_json(folder / DATA_CONFIG_FILE, self.data_config())
         write_json(folder / TOKENIZER_FILE, tokenizer(published_ids=False, words=self.words))
         write_json(folder / CONFIG_FILE, self.to_dict())
 
