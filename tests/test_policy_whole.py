@@ -18,7 +18,6 @@ import whole_checkpoints
 from safetensors.torch import load_file, save_file
 from whole_checkpoints import EMBODIMENT, whole
 
-import saccade
 from saccade import CheckpointError, InputError, Policy, PolicyContext
 
 Observation = dict[str, Any]

@@ -168,14 +168,16 @@ def _to_quaternion(matrix: Float64Array) -> Float64Array:
     chosen = np.take_along_axis(candidates, largest, axis=-2)[..., 0, :]
     with np.errstate(invalid="ignore"):
         unit = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
-    return np.where(unit[..., :1] < 0, -unit, unit)
+    positive: Float64Array = np.where(unit[..., :1] < 0, -unit, unit)
+    return positive
 
 
 def _half_sine(angle: Float64Array) -> Float64Array:
     """sin(t / 2) / t."""
     small = angle < SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
-    return np.where(small, 0.5 - angle * angle / 48, np.sin(safe / 2) / safe)
+    found: Float64Array = np.where(small, 0.5 - angle * angle / 48, np.sin(safe / 2) / safe)
+    return found
 
 
 def _about(axis: int, angle: Float64Array) -> Float64Array:
