@@ -91,6 +91,27 @@ AFTER: Mapping[str, tuple[str, ...]] = {
     DEVICE: ("device", "float_dtype"),
 }
 
+#: Keys of ``config.json`` of all releases. lerobot refuses others.
+CONFIG = frozenset(
+    """
+    type action_decode_transform balance_dataset_weights balance_trajectory_weights base_model_path batch_size
+    chunk_size dataloader_num_workers dataset_paths device embodiment_tag image_size input_features license
+    lora_alpha lora_dropout lora_full_model lora_rank max_action_dim max_state_dim max_steps model_params_fp32
+    n_action_steps n_obs_steps normalization_mapping num_inference_timesteps optimizer_betas optimizer_eps
+    optimizer_lr optimizer_weight_decay output_dir output_features pretrained_path pretrained_revision private
+    push_to_hub relative_exclude_joints repo_id report_to resume rtc_ramp_rate save_steps tags
+    tokenizer_assets_repo tune_diffusion_model tune_llm tune_projector tune_top_llm_layers tune_visual tune_vlln
+    use_amp use_bf16 use_flash_attention use_peft use_relative_actions video_backend warmup_ratio
+    """.split()
+)
+#: Keys of forks with several action decoders, which the head reads.
+CONFIG_OF_FORKS = frozenset(
+    """
+    use_multi_action_heads split_arm_heads num_target_vision_tokens action_arm_dim action_claw_dim
+    action_left_arm_dim action_right_arm_dim
+    """.split()
+)
+
 #: lerobot replaces these of N1.5 by N1.7's when it loads a policy.
 MIGRATED = {"chunk_size": (50, 40), "n_action_steps": (50, 40)}
 #: Rows of a chunk of the published models.
@@ -233,6 +254,9 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
     builder.check()
     ends.check()
     config = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
+    policy = Builder(str(folder / "config.json"), np.float32)
+    policy.refuse_unknown("the policy", config, CONFIG | CONFIG_OF_FORKS)
+    policy.check()
     merged = {old: new for one in rename for old, new in one.items()}
     return Pipeline(where, config, pack, unpack, merged, offsets)
 
