@@ -98,7 +98,7 @@ def test_it_prints_tables_and_says_what_it_assumed(capsys: pytest.CaptureFixture
         (["--state", "{text}"], "cannot be read as JSON"),
         (["--state", "{words}"], "expected lists of numbers"),
         (["--state", "{short}"], r"state: expected 7 numbers (arm (5), hand (2)), got 1"),
-        (["--state", "{part}"], "state.*: expected hand too, got arm"),
+        (["--state", "{part}"], "state.hand: expected hand too, got arm"),
         (["--embodiment", "walker"], "got 'walker'"),
         (["--tokenizer", "missing"], "missing"),
     ],

@@ -143,7 +143,7 @@ def broken(folder: Path, kind: str) -> dict[str, Any]:
         ("size", rf"dir: video.front: expected frames of {HEIGHT} x {WIDTH} pixels, got 3 x 2"),
         ("text", r"dir/front.png: cannot be read as a picture"),
         ("state", r"dir: state: expected 7 numbers \(arm \(5\), hand \(2\)\), got 1"),
-        ("part", r"dir: state.\*: expected hand too, got arm"),
+        ("part", r"dir: state.hand: expected hand too, got arm"),
         ("huge", r"dir/state.json: expected lists of numbers"),
     ],
 )
