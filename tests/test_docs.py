@@ -32,7 +32,7 @@ PAGES = [
 ]
 #: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
 NEED_CHECKPOINTS = (
-    *("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md"),
+    *("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md", "robots.md"),
     *("frames.md", "protocol.md"),
 )
 MODULES = sorted(
@@ -166,8 +166,11 @@ def test_architecture_names_every_folder_and_nothing_that_is_not_there() -> None
     assert [str(path) for path in sorted(named) if not (ROOT / path).exists()] == []
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
     files = [Path(name) for name in listed.stdout.split("\0") if name]
-    # The folders of a study hold what its commands wrote.
-    folders = {file.parent for file in files if file.parts[0] != "studies"} - {Path()}
+    # The folders of a study hold what its commands wrote, and each case of a robot has one of its own.
+    cases = Path("tests/data/robots")
+    folders = {
+        file.parent for file in files if file.parts[0] != "studies" and not file.is_relative_to(cases)
+    } - {Path()}
     assert [str(folder) for folder in sorted(folders - named)] == []
 
 

@@ -14,7 +14,7 @@ from published import published
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 TOKENIZER = Path(__file__).resolve().parent / "data" / "backbone" / "tiny_tokenizer.json"
-PAGES = ("lerobot", "nvidia", "fork", "resize", "processor", "policy", "frames", "protocol")
+PAGES = ("lerobot", "nvidia", "fork", "resize", "processor", "policy", "frames", "protocol", "robots")
 #: Names on the pages, and the layouts of these checkpoints.
 CHECKPOINTS = {
     "GR00T-N1.5-3B": "nvidia",

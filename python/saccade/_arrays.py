@@ -78,15 +78,23 @@ def exact_float32(name: str, value: ArrayLike) -> Float32Array:
     array = _asarray(name, value)
     if array.dtype.kind not in "iu":
         return float32(name, array)
-    converted = array.astype(np.float32)
-    # As Python's numbers, which compare integers and floats exactly.
-    wrong = array[converted.astype(object) != array.astype(object)]
-    if wrong.size:
+    wrong = inexact(array)
+    if wrong is not None:
         raise DtypeError(
-            f"{name}: expected numbers that float32 holds exactly, got {array.dtype} {wrong.flat[0]}: "
-            "convert with astype(np.float32)"
+            f"{name}: expected numbers that float32 holds exactly, got {array.dtype} {wrong}: convert with "
+            "astype(np.float32)"
         )
-    return np.require(converted, np.float32, ["C", "A"])
+    return np.require(array, np.float32, ["C", "A"])
+
+
+def inexact(integers: Any) -> int | None:
+    """The first of an array's integers that float32 does not hold exactly, or None."""
+    array = np.asarray(integers)
+    if array.dtype.kind not in "iu":
+        return None
+    # As Python's numbers, which compare integers and floats exactly.
+    wrong = array[array.astype(np.float32).astype(object) != array.astype(object)]
+    return int(wrong.flat[0]) if wrong.size else None
 
 
 def frame(name: str, value: ArrayLike) -> npt.NDArray[Any]:

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from saccade._arrays import Float32Array, UInt8Array, exact_float32, is_torch
+from saccade._arrays import Float32Array, UInt8Array, exact_float32, inexact, is_torch
 from saccade._warning import warn
 from saccade.dialects.requirements import Camera, Requirements
 from saccade.errors import DtypeError, ShapeError
@@ -149,8 +149,9 @@ def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requ
     try:
         values = exact_float32(name, on_cpu(name, state, needs))
     except (DtypeError, ShapeError):
+        wrong = inexact(state)
         got = getattr(state, "dtype", type(state).__name__)
-        raise needs.dtype_error(name, NUMBERS, got) from None
+        raise needs.dtype_error(name, NUMBERS, got if wrong is None else f"{got} {wrong}") from None
     if values.ndim != axes or values.shape[-1] != width or 0 in values.shape:
         raise needs.shape_error(name, f"{axes} axes, the last of {width}", f"shape {values.shape}")
     if not np.isfinite(values).all():

@@ -85,7 +85,8 @@ def _lerobot(
     cameras = ordered or tuple(Camera(name) for name in names)
     return ObservationSources(
         cameras=cameras or None,
-        video_horizon=size_of(pack.get("video_horizon")) or 1,
+        # N1.7 without a horizon takes every frame that there is.
+        video_horizon=size_of(pack.get("video_horizon")) or (None if pipeline.is_n17 else 1),
         language_keys=(pack.get("language_key") or "task",),
         takes_extra_cameras=not ordered,
         rename_map=tuple(pipeline.rename_map.items()),

@@ -100,16 +100,17 @@ CONFIG = frozenset(
     n_action_steps n_obs_steps normalization_mapping num_inference_timesteps optimizer_betas optimizer_eps
     optimizer_lr optimizer_weight_decay output_dir output_features pretrained_path pretrained_revision private
     push_to_hub relative_exclude_joints repo_id report_to resume rtc_ramp_rate save_steps tags
-    tokenizer_assets_repo tune_diffusion_model tune_llm tune_projector tune_top_llm_layers tune_visual tune_vlln
-    use_amp use_bf16 use_flash_attention use_peft use_relative_actions video_backend warmup_ratio
-    """.split()
+    tokenizer_assets_repo tune_diffusion_model tune_llm tune_projector tune_top_llm_layers tune_visual
+    tune_vlln use_amp use_bf16 use_flash_attention use_peft use_relative_actions video_backend warmup_ratio
+    """.split()  # noqa: SIM905
 )
-#: Keys of forks with several action decoders, which the head reads.
-CONFIG_OF_FORKS = frozenset(
+#: Keys that saccade reads besides: sizes of a part of the model, and several action decoders, of forks.
+CONFIG_OF_PARTS = frozenset(
     """
-    use_multi_action_heads split_arm_heads num_target_vision_tokens action_arm_dim action_claw_dim
-    action_left_arm_dim action_right_arm_dim
-    """.split()
+    action_head_cfg backbone_cfg eagle_config text_config vision_config select_layer use_multi_action_heads
+    split_arm_heads num_target_vision_tokens action_arm_dim action_claw_dim action_left_arm_dim
+    action_right_arm_dim
+    """.split()  # noqa: SIM905
 )
 
 #: lerobot replaces these of N1.5 by N1.7's when it loads a policy.
@@ -255,7 +256,7 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
     ends.check()
     config = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
     policy = Builder(str(folder / "config.json"), np.float32)
-    policy.refuse_unknown("the policy", config, CONFIG | CONFIG_OF_FORKS)
+    policy.refuse_unknown("the policy", config, CONFIG | CONFIG_OF_PARTS)
     policy.check()
     merged = {old: new for one in rename for old, new in one.items()}
     return Pipeline(where, config, pack, unpack, merged, offsets)

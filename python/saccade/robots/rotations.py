@@ -47,8 +47,8 @@ def converted(values: npt.NDArray[Any], source: str, target: str) -> Float64Arra
     Example:
         A quarter turn about z:
 
-        >>> converted(np.array([0.0, 0.0, np.pi / 2]), "axis_angle", "euler_angles_ypr").round(4)
-        array([1.5708, 0.    , 0.    ])
+        >>> converted(np.array([0.0, 0.0, np.pi / 2]), "axis_angle", "quaternion").round(3)
+        array([0.707, 0.   , 0.   , 0.707])
     """
     return from_matrix(to_matrix(values, source), target)
 
