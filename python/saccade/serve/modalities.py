@@ -23,6 +23,9 @@ MODALITIES = ("video", "state", "action", "language")
 #: Isaac-GR00T's usual key of the instruction, where a checkpoint names none.
 LANGUAGE_KEY = "annotation.human.action.task_description"
 
+#: Where checkpoints of N1.6 and N1.7 keep their configs: the first file that exists.
+FILES = ("processor_config.json", "processor/processor_config.json")
+
 Configs = dict[str, dict[str, Any]]
 
 
@@ -64,8 +67,11 @@ def _prefixed(modality: str, config: Mapping[str, Any]) -> dict[str, Any]:
 def _of_checkpoint(policy: Policy) -> Configs | None:
     """The configs that N1.6's and N1.7's checkpoints contain, as they are."""
     source, embodiment = policy.head.source, policy.requirements.embodiment
-    path = None if source is None else hub.resolve(source) / "processor_config.json"
-    if path is None or embodiment is None or not path.is_file():
+    if source is None or embodiment is None:
+        return None
+    folder = hub.resolve(source)
+    path = next((path for path in (folder / name for name in FILES) if path.is_file()), None)
+    if path is None:
         return None
     try:
         robot = read_json(path)["processor_kwargs"]["modality_configs"][embodiment]
@@ -81,20 +87,21 @@ def _of_checkpoint(policy: Policy) -> Configs | None:
 
 
 def _of_policy(policy: Policy) -> Configs:
-    """Configs made from what the policy knows."""
+    """Configs made from what the policy knows; with a data config, those that it states."""
     needs, normalizer = policy.requirements, policy.normalizer
+    seen, acted = needs.observation_indices, needs.action_indices
     horizon = normalizer.action_horizon or policy.head.config.action_horizon
     keys = {
         "video": [camera.name for camera in needs.cameras or ()],
         "state": [group.key for group in normalizer.state_groups],
         "action": [group.key for group in normalizer.action_groups],
-        "language": [needs.language_key or LANGUAGE_KEY],
+        "language": list(needs.language_keys) or [needs.language_key or LANGUAGE_KEY],
     }
     steps = {
-        "video": range(1 - (needs.video_horizon or 1), 1),
-        "state": range(1 - needs.state_history, 1),
-        "action": range(horizon),
-        "language": range(1),
+        "video": range(1 - (needs.video_horizon or 1), 1) if seen is None else seen,
+        "state": range(1 - needs.state_history, 1) if seen is None else seen,
+        "action": range(horizon) if acted is None else acted,
+        "language": range(1) if seen is None else seen,
     }
     return {
         name: {"delta_indices": list(steps[name]), "modality_keys": keys[name]}
