@@ -95,7 +95,7 @@ def _of_policy(policy: Policy) -> Configs:
         "video": [camera.name for camera in needs.cameras or ()],
         "state": [group.key for group in normalizer.state_groups],
         "action": [group.key for group in normalizer.action_groups],
-        "language": list(needs.language_keys) or [needs.language_key or LANGUAGE_KEY],
+        "language": list(needs.language_keys) or [LANGUAGE_KEY],
     }
     steps = {
         "video": range(1 - (needs.video_horizon or 1), 1) if seen is None else seen,
