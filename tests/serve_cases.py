@@ -24,7 +24,7 @@ from saccade.dialects import Camera, Reading, Requirements
 from saccade.serve import Limits, Server
 from saccade.serve.connections import bind
 
-HORIZON, WIDTH = 8, 3
+HORIZON, WIDTH, BUCKETS = 8, 3, 1000
 GROUPS = (SimpleNamespace(key="arm", size=2), SimpleNamespace(key="gripper", size=1))
 
 
@@ -35,6 +35,7 @@ class MemoryPolicy:
     Attributes:
         batches: The sizes of the batches of which features were computed.
         chunkings: The `Chunking` of each call of `sample`, or None.
+        steps: The number of Euler steps of each call of `sample`, or None.
         gate: Features are computed once it is set.
         nbytes: Size of its backbone.
     """
@@ -42,12 +43,18 @@ class MemoryPolicy:
     version: str = "n1.5"
     batches: list[int] = field(default_factory=list)
     chunkings: list[Any] = field(default_factory=list)
+    steps: list[int | None] = field(default_factory=list)
     gate: threading.Event = field(default_factory=threading.Event)
     nbytes: int = 1 << 32
 
     def __post_init__(self) -> None:
         self.gate.set()
-        config = SimpleNamespace(action_horizon=HORIZON, encoder_action_dim=WIDTH, version=self.version)
+        config = SimpleNamespace(
+            action_horizon=HORIZON,
+            encoder_action_dim=WIDTH,
+            version=self.version,
+            num_timestep_buckets=BUCKETS,
+        )
         self.head = SimpleNamespace(config=config, source=None, num_threads=2)
         self.backbone = SimpleNamespace(nbytes=self.nbytes)
         self.normalizer = SimpleNamespace(state_groups=GROUPS, action_groups=GROUPS, action_horizon=HORIZON)
@@ -75,12 +82,14 @@ class MemoryPolicy:
 
     def sample(self, context: Any, readings: Sequence[Reading], **options: Any) -> list[Any]:
         self.chunkings.append(options.get("chunking"))
+        self.steps.append(options.get("num_steps"))
         state = np.concatenate([reading.state[:, -1] for reading in readings])
         actions = options["noise"] + state[:, None] + context[:, None, None].astype(np.float32)
         if options.get("chunking") is not None:
             chunking = options["chunking"]
             previous = np.concatenate([chunk["arm"] for chunk in options["previous_chunk"]])
-            kept = previous[:, HORIZON - chunking.overlap : HORIZON - chunking.overlap + chunking.frozen]
+            start = (chunking.horizon or HORIZON) - chunking.overlap
+            kept = previous[:, start : start + chunking.frozen]
             actions[:, : chunking.frozen, :2] = kept
         answers, start = [], 0
         for reading in readings:

@@ -358,8 +358,7 @@ def test_what_does_not_fit_is_an_error_that_lists_what_does(
 def test_lerobots_form_is_checked_too() -> None:
     made = policy("lerobot")
     given = lerobot(nested(made, batch=2))
-    cameras = r"front \(40 x 48\), wrist \(40 x 48\)"
-    needs = rf"; embodiment 'new_embodiment' needs cameras {cameras}; state keys state \(7\)"
+    needs = "; embodiment 'new_embodiment' needs cameras front, wrist .*; state keys state"
     for changes, error, message in (
         ({"observation.images.front": given["observation.images.front"][:1]}, ShapeError, "front 1"),
         ({"observation.images.front": given["observation.images.front"][0]}, ShapeError, "front 1"),
@@ -368,7 +367,6 @@ def test_lerobots_form_is_checked_too() -> None:
             ShapeError,
             "3, height, width",
         ),
-        ({"observation.images.front": given["observation.images.front"][..., ::2]}, ShapeError, "40 x 24"),
         ({"observation.images.front": given["observation.images.front"].long()}, DtypeError, "got int64"),
         ({"observation.images.front": torch.zeros(2, 3, 40, 48, device="meta")}, DtypeError, "on meta"),
         ({"observation.images.front": "front.png"}, DtypeError, "got str"),

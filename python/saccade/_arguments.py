@@ -234,18 +234,6 @@ def add_seed(parser: Arguments, help: str) -> None:
     add_integer(parser, "--seed", minimum=0, default=0, help=help)
 
 
-def add_policy_options(parser: Arguments) -> None:
-    """Declares how a whole checkpoint is loaded: both precisions, preprocessing and tokenizer."""
-    parser.add_argument(
-        "--precision",
-        choices=PRECISIONS,
-        default="float32",
-        help="default: float32, which is exact",
-    )
-    parser.add_argument("--head-precision", choices=PRECISIONS, help="of the head (default: as --precision)")
-    add_preprocessing(parser)
-
-
 def add_preprocessing(parser: Arguments) -> None:
     """Declares what a whole checkpoint may not say: the robot, preprocessing and tokenizer."""
     parser.add_argument(
@@ -323,11 +311,6 @@ def check_frames(args: argparse.Namespace, *refused: str) -> None:
         raise UsageError(f"{flags}: {rule} --frames")
 
 
-def precisions(args: argparse.Namespace) -> dict[str, str]:
-    """The precision of each part of a policy, from `add_policy_options`."""
-    return {"backbone": args.precision, "head": args.head_precision or args.precision}
-
-
 def add_num_threads(
     parser: Arguments,
     help: str = "threads of the action head (default: the physical cores)",
@@ -337,9 +320,9 @@ def add_num_threads(
     add_integer(parser, "--num-threads", default=default, help=help)
 
 
-def add_num_steps(parser: Arguments) -> None:
+def add_num_steps(parser: Arguments, help: str = "Euler steps (default: those of the checkpoint)") -> None:
     """Declares the number of Euler steps."""
-    add_integer(parser, "--num-steps", help="Euler steps (default: those of the checkpoint)")
+    add_integer(parser, "--num-steps", help=help)
 
 
 def add_num_vl_tokens(parser: Arguments, default: int | None, help: str) -> None:

@@ -111,6 +111,9 @@ def check_precisions(
     embodiment: str | int | None = None,
     preprocessing: Preprocessing | None = None,
     tokenizer: str | os.PathLike[str] | None = None,
+    data_config: str | os.PathLike[str] | Mapping[str, Any] | None = None,
+    action_horizon: int | None = None,
+    processor_options: Mapping[str, Any] | None = None,
     num_threads: int | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -123,7 +126,8 @@ def check_precisions(
         source: The checkpoint, as for :meth:`saccade.Policy.load`.
         directory: Pictures, as :func:`saccade.frames.read_frames` reads them.
         instruction, state: As for :func:`saccade.frames.read_frames`.
-        embodiment, preprocessing, tokenizer, num_threads: As for :meth:`saccade.Policy.load`.
+        embodiment, preprocessing, tokenizer, data_config, action_horizon, processor_options, num_threads: As
+            for :meth:`saccade.Policy.load`.
         seed: Seed of the noise, at least 0.
         progress: Called with the number of precisions that are done, and of all.
 
@@ -150,6 +154,9 @@ def check_precisions(
             embodiment=embodiment,
             preprocessing=preprocessing,
             tokenizer=tokenizer,
+            data_config=data_config,
+            action_horizon=action_horizon,
+            processor_options=processor_options,
             precision=precision,
             num_threads=num_threads,
         )

@@ -20,7 +20,7 @@ from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError, SaccadeError
 from saccade.hub import resolve
-from saccade.robots import read_json
+from saccade.robots import DataConfigLike, read_json
 from saccade.robots.embodiments import IDS
 
 
@@ -31,6 +31,7 @@ def inspect(
     reference: Source | None = None,
     num_vl_tokens: int = 296,
     time: bool = True,
+    data_config: DataConfigLike | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Inspection:
     """Examines every tensor of a checkpoint's head. This is what ``saccade inspect`` prints.
@@ -42,6 +43,8 @@ def inspect(
         reference: A checkpoint to compare with, tensor by tensor; for example the one that ``source`` was
             trained from.
         num_vl_tokens: T_vl of the expected times. 296 is what one camera produces in N1.5.
+        data_config: The data config of the robots of GR00T N1 and N1.5, as for
+            :meth:`saccade.Normalizer.load`.
         time: Whether to estimate times. This measures the CPU, which takes about a second.
         progress: Called with the number of bytes that are done and the total number of bytes.
 
@@ -86,7 +89,7 @@ def inspect(
         parameters=sum(part.parameters for part in parts.values()),
         outside=outside,
         backbone=backbone_of(path, None if config is None else to_json(config)) if outside else None,
-        robots=robots_of(path, head.state_history),
+        robots=robots_of(path, head.state_history, data_config),
         memory={
             precision: Memory(
                 all=published.nbytes(precision, head.num_embodiments), one=published.nbytes(precision, 1)

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from saccade.precision_check import Difference, PrecisionCheck
 
 #: The arguments that need `--precision-check`; None where they are not given.
-ARGUMENTS = ("instruction", "state", "embodiment", "preprocessing", "tokenizer", "seed", "num_threads")
+ARGUMENTS = (
+    *("instruction", "state", "embodiment", "preprocessing", "tokenizer", "action_horizon"),
+    *("processor_options", "seed", "num_threads"),
+)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -34,6 +37,9 @@ def run(args: argparse.Namespace) -> int:
             embodiment=args.embodiment,
             preprocessing=args.preprocessing,
             tokenizer=args.tokenizer,
+            data_config=args.data_config,
+            action_horizon=args.action_horizon,
+            processor_options=args.processor_options,
             num_threads=args.num_threads,
             seed=args.seed or 0,
             progress=lambda done, total: update(done, total),

@@ -12,6 +12,7 @@ import numpy as np
 
 from saccade import _arguments as arguments
 from saccade._arguments import UsageError
+from saccade._policy_arguments import add_policy_options, policy_options
 from saccade.cli import EXIT_OK, _output, require
 from saccade.cli._tables import Section, show
 
@@ -27,7 +28,7 @@ backbone and the head. `saccade inspect` lists its robots, cameras and states.
 Without --image the frames are random, without --state the state is in the middle of the robot's range.
 
 examples:
-  saccade act GR00T-N1.5-3B/ --embodiment gr1 --image ego_view=table.png --instruction "pick up the pear"
+  saccade act GR00T-N1.5-3B/ --embodiment gr1 --data-config fourier_gr1_arms_only --image ego_view=table.png
   saccade act my-policy/ --image front=a.png wrist=b.png --instruction "open the drawer" --state state.json
   saccade act my-policy/ --precision int8 --head-precision bfloat16 --seed 7 --json
 state.json holds numbers by key, {"single_arm": [0, 0.1, 0, 0, 0], "gripper": [1]}, or one list of all.
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     seen.add_argument("--instruction", metavar="TEXT", help="what to do")
     seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
-    arguments.add_policy_options(parser)
+    add_policy_options(parser)
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_num_steps(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
@@ -76,14 +77,7 @@ def run(args: argparse.Namespace) -> int:
     state = None if args.state is None else read_state(args.state)
     clock = Clock()
     with _output.progress_bar("loading", transient=True):
-        policy = saccade.Policy.load(
-            args.checkpoint,
-            embodiment=args.embodiment,
-            preprocessing=args.preprocessing,
-            tokenizer=args.tokenizer,
-            precision=arguments.precisions(args),
-            num_threads=args.num_threads,
-        )
+        policy = saccade.Policy.load(args.checkpoint, **policy_options(args))
     clock.done("load")
     given = observation(policy, pictures, args.instruction, state)
     clock.done("frames")
@@ -173,7 +167,7 @@ def report(
         "checkpoint": str(args.checkpoint),
         "embodiment": policy.normalizer.embodiment,
         "embodiment_id": policy.embodiment_id,
-        "precision": arguments.precisions(args),
+        "precision": policy_options(args)["precision"],
         "num_vl_tokens": num_tokens,
         "actions": {key: part[0].tolist() for key, part in actions.items()},
         "milliseconds": clock.milliseconds,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from saccade import _arguments as arguments
 from saccade._arguments import UsageError
+from saccade._policy_arguments import add_data_config, add_overrides
 from saccade.cli import EXIT_OK, _output, _precisions
 from saccade.cli._tables import Section, show
 
@@ -35,6 +36,7 @@ examples:
   saccade inspect GR00T-N1.5-3B/
   saccade inspect nvidia/GR00T-N1.5-3B --json          from the local Hugging Face cache
   saccade inspect my-fork/ --reference GR00T-N1.5-3B/  is it still the checkpoint that it started from?
+  saccade inspect GR00T-N1.5-3B/ --data-config fourier_gr1_arms_only    what this data config needs
   saccade inspect my-policy/ --precision-check frames/ --instruction "open the drawer"
 """
 
@@ -44,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     arguments.add_checkpoint_argument(parser)
     arguments.add_config(parser)
+    add_data_config(parser)
     parser.add_argument(
         "--reference", type=Path, metavar="PATH", help="checkpoint to compare with, tensor by tensor"
     )
@@ -57,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     seen = parser.add_argument_group("compare the precisions on pictures and words")
     arguments.add_moments(seen, "--precision-check")
     arguments.add_preprocessing(seen)
+    add_overrides(seen)
     arguments.add_integer(seen, "--seed", minimum=0, help="seed of the noise (default: 0)")
     arguments.add_num_threads(seen, "threads (default: the physical cores)")
 
@@ -76,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
             args.checkpoint,
             config=args.config,
             reference=args.reference,
+            data_config=args.data_config,
             num_vl_tokens=args.num_vl_tokens,
             time=not args.no_time,
             progress=lambda done, total: update(done, total),
@@ -94,6 +99,8 @@ def sections(report: Inspection) -> list[Section]:
         found.append(backbone(report.backbone))
     if report.robots:
         found.append(robots(report.robots))
+        notes = robot_notes(report.robots)
+        found += [] if notes is None else [notes]
     found.append(embodiments(report))
     if report.future_tokens is not None:
         found.append(future_tokens(report.future_tokens))
@@ -205,7 +212,7 @@ def robots(found: Sequence[RobotFindings]) -> Section:
     for robot in found:
         name = robot.embodiment or "the robot"
         if robot.needs is None:
-            rows.append([name, "", line(robot.problem), "", "", ""])
+            rows.append([name, "", "cannot be used, see below", "", "", ""])
             continue
         needs = robot.needs
         cameras = "not named" if needs.cameras is None else ", ".join(map(str, needs.cameras))
@@ -221,6 +228,22 @@ def robots(found: Sequence[RobotFindings]) -> Section:
         )
     columns = ["embodiment", ">id", "cameras", "state", "language", "actions"]
     return Section("Robots whose statistics are here, and what an observation contains", columns, rows)
+
+
+def robot_notes(found: Sequence[RobotFindings]) -> Section | None:
+    """Why robots cannot be used, and what is not known of the others; None if there is nothing to say."""
+    rows = [
+        [robot.embodiment or "the robot", what, line(text)]
+        for robot in found
+        for what, text in (("cannot be used", robot.problem), ("not certain", robot.warning))
+        if text is not None
+    ]
+    rows += [
+        [robot.embodiment or "the robot", "data config", robot.data_config]
+        for robot in found
+        if robot.data_config is not None
+    ]
+    return Section("Notes on robots", ["embodiment", "", ""], rows) if rows else None
 
 
 def line(text: str | None) -> str:

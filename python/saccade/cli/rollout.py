@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from saccade import _arguments as arguments
 from saccade._files import path_text, writable_directory, write_atomically, write_json
+from saccade._policy_arguments import add_data_config, add_overrides
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output, require
 from saccade.errors import SaccadeError
 from saccade.parallel import Lost, Workers, each
@@ -43,6 +45,7 @@ examples:
   saccade rollout --video
   saccade rollout --tasks reach,push --episodes 20 --out out/twenty
   saccade rollout --checkpoint out/policy --engine torch --num-threads 1 --json
+  saccade rollout --checkpoint out/policy --data-config my_data_config.json
   saccade rollout --tasks reach --instruction-from push     the wrong instruction: it should fail
   saccade rollout --episodes 100 --jobs -1                  a process for each core
   saccade rollout --episodes 1000 --backend ray --address auto
@@ -59,6 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="rust",
         help="what computes backbone and head (default: rust)",
     )
+    add_data_config(parser)
+    add_overrides(parser)
     arguments.add_tasks(parser)
     arguments.add_episodes(parser, 4)
     arguments.add_seed(parser, "seed of the first episode; the next ones count up")
@@ -102,6 +107,7 @@ class Session:
             tasks=self.tasks,
             instruction_from=self.episodes.instruction_from,
         )
+        record |= self.episodes.overrides
         return record | {"processes": {"backend": self.workers.backend, "jobs": self.workers.jobs}}
 
     def run(self, on_episode: Callable[[Rolled], None]) -> None:
@@ -110,7 +116,11 @@ class Session:
 
         pieces = [(task, seed) for task in self.tasks for seed in self.seeds]
         order = {piece: position for position, piece in enumerate(pieces)}
-        for (task, seed), rolled in each(self.episodes, pieces, self.workers, [self.episodes.checkpoint]):
+        files = [self.episodes.checkpoint]
+        config = self.episodes.data_config
+        if config is not None and Path(config).is_file():
+            files.append(config)
+        for (task, seed), rolled in each(self.episodes, pieces, self.workers, files):
             if isinstance(rolled, Lost):
                 self.lost.append(f"{task} {seed}: {rolled.reason}")
                 continue
@@ -173,7 +183,16 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
     graphics.check()
     num_threads = args.num_threads if workers.alone else workers.num_threads
     checkpoint = path_text(args.checkpoint or DEMO_CHECKPOINT)
-    episodes = Episodes(checkpoint, args.engine, num_threads, args.instruction_from, args.video)
+    episodes = Episodes(
+        checkpoint,
+        args.engine,
+        num_threads,
+        args.instruction_from,
+        args.video,
+        args.data_config,
+        args.action_horizon,
+        None if args.processor_options is None else json.dumps(args.processor_options),
+    )
     tasks = list(args.tasks or episodes.policy.config.tasks)
     check_trained_on(episodes.policy, tasks)
     return Session(episodes, tasks, seeds, workers, args.out)

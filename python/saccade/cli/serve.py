@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from saccade import _arguments as arguments
 from saccade._arguments import UsageError
+from saccade._policy_arguments import add_policy_options, policy_options
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
 
 if TYPE_CHECKING:
@@ -27,7 +28,9 @@ give another host than 127.0.0.1 only in a network that you trust, with --api-to
 SIGTERM and Ctrl-C answer what was accepted, then end the server; a second one ends it at once.
 
 examples:
-  saccade serve GR00T-N1.5-3B/ --embodiment gr1 --precision int8
+  saccade serve GR00T-N1.5-3B/ --embodiment gr1 --data-config fourier_gr1_arms_only --precision int8
+  saccade serve my-policy/ --data-config my_data_config.json --action-horizon 8 --num-steps 2
+  saccade serve GR00T-N1.7-3B/ --embodiment libero_sim --processor-options '{{"letter_box_transform": true}}'
   saccade serve my-policy/ --host 0.0.0.0 --max-batch 32 --log json
 """
 
@@ -39,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     limits = Limits()
     arguments.add_checkpoint_argument(parser)
-    arguments.add_policy_options(parser)
+    add_policy_options(parser)
+    arguments.add_num_steps(parser, "Euler steps of requests that do not say it (default: the checkpoint's)")
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
     served = parser.add_argument_group("server")
     served.add_argument(
@@ -145,16 +149,9 @@ def run(args: argparse.Namespace) -> int:
     from saccade.serve.connections import bind
 
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
-    policy = saccade.Policy.load(
-        args.checkpoint,
-        embodiment=args.embodiment,
-        preprocessing=args.preprocessing,
-        tokenizer=args.tokenizer,
-        precision=arguments.precisions(args),
-        num_threads=args.num_threads,
-    )
+    policy = saccade.Policy.load(args.checkpoint, **policy_options(args))
     # What a first call sets up is not left to the first client.
-    policy.act(policy.example_observation(), seed=0)
+    policy.act(policy.example_observation(), seed=0, num_steps=args.num_steps)
     log = make_log(args.log)
     try:
         server = Server(
@@ -165,6 +162,7 @@ def run(args: argparse.Namespace) -> int:
             max_batch=args.max_batch,
             max_wait_ms=args.max_wait_ms,
             seed=args.seed,
+            num_steps=args.num_steps,
             api_token=args.api_token,
             allow_kill=args.allow_kill,
             modality_form=args.modality_form,

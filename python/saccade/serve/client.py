@@ -54,12 +54,13 @@ class Client:
 
         Args:
             observation: In one of the forms that :meth:`saccade.Policy.act` takes.
-            options: ``{"seed": 5}`` for actions that can be repeated.
-                ``{"session": name, "executed": steps}`` to continue the session's last chunk, of
-                which the robot has executed ``steps`` actions.
+            options: ``{"seed": 5}`` for actions that can be repeated, ``{"num_steps": 2}`` for another number
+                of Euler steps. ``{"session": name, "executed": steps}`` to continue the session's last
+                chunk, of which the robot has executed ``steps`` actions. ``docs/serve.md`` lists all.
 
         Returns:
-            The actions as :meth:`saccade.Policy.act` returns them, and information about them.
+            The actions as :meth:`saccade.Policy.act` returns them, and information about them: the
+            ``applied_options``, and the ``latency_ms`` from receipt to answer.
 
         Raises:
             ServerError: The server refused the request.

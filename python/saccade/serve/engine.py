@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +16,14 @@ from saccade._arrays import Float32Array
 from saccade.chunking import Chunking
 from saccade.options import PolicyOptions, noise_or_draw
 from saccade.serve.batching import Job
-from saccade.serve.requests import action_answer
+from saccade.serve.requests import CHUNKING, RELEASED_CHUNKING
 from saccade.serve.sessions import Chunk, Session, Sessions
 
 if TYPE_CHECKING:
     from saccade.policy import Policy
 
-#: The parts of which the time is reported, in their order. "wait" is the time in the queue.
+#: The parts of which the time is reported, in their order. "wait" is the time until a thread takes the
+#: request: its decoding, and the queue.
 PARTS = ("wait", "inputs", "backbone", "head")
 #: With a backbone of at most this many bytes, each thread computes a batch of its own. Loops are short there:
 #: threads that share them wait for each other. Measured once by hand, by a program that is not committed, on
@@ -39,13 +40,15 @@ class Outcome:
 
     Attributes:
         job: The request.
-        answer: The answer, if ``error`` is None.
-        error: Why there is none.
+        actions: The actions, if ``error`` is None.
+        info: What is told besides them.
+        error: Why there are none.
         batch: Number of observations that were computed together.
     """
 
     job: Job
-    answer: Any = None
+    actions: Any = None
+    info: Mapping[str, Any] = field(default_factory=dict)
     error: BaseException | None = None
     batch: int = 0
 
@@ -59,7 +62,13 @@ class _Work:
     noise: Float32Array
     session: Session | None
     continued: tuple[Chunk, Chunking] | None
+    num_steps: int | None
     features: Sequence[Any] = ()
+
+    @property
+    def group(self) -> Hashable:
+        """Requests for which it is equal are sampled together."""
+        return (None if self.continued is None else self.continued[1], self.num_steps)
 
 
 class Engine:
@@ -68,14 +77,16 @@ class Engine:
     Args:
         policy: The policy.
         sessions: The sessions, whose chunks it continues.
+        num_steps: Number of Euler steps of requests that do not say it, or None for that of the checkpoint.
 
     Attributes:
         num_workers: Number of threads that are to call :meth:`run` at the same time, at most.
     """
 
-    def __init__(self, policy: Policy, sessions: Sessions) -> None:
+    def __init__(self, policy: Policy, sessions: Sessions, num_steps: int | None = None) -> None:
         self._policy = policy
         self._sessions = sessions
+        self._num_steps = num_steps
         self._running = 0
         self._lock = threading.Lock()
         is_small = policy.backbone is not None and policy.backbone.nbytes <= SMALL_BACKBONE
@@ -154,7 +165,8 @@ class Engine:
         if options.session is not None:
             session = self._sessions.use(options.session, job.client)
             continued = session.continued(options, job.rows)
-        return _Work(job, job.inputs, noise_or_draw(None, options.seed, shape), session, continued)
+        noise = noise_or_draw(None, options.seed, shape)
+        return _Work(job, job.inputs, noise, session, continued, options.num_steps or self._num_steps)
 
     def _together(self, works: Sequence[_Work]) -> list[Outcome]:
         if not works:
@@ -166,10 +178,9 @@ class Engine:
         for work in works:
             work.features = features[start : start + len(work.inputs)]
             start += len(work.inputs)
-        # Those that continue a chunk in the same way are sampled together.
         groups: dict[Hashable, list[_Work]] = {}
         for work in works:
-            groups.setdefault(None if work.continued is None else work.continued[1], []).append(work)
+            groups.setdefault(work.group, []).append(work)
         outcomes = []
         for group in groups.values():
             with _timed([work.job for work in group], "head"):
@@ -177,7 +188,10 @@ class Engine:
         return outcomes
 
     def _sampled(self, works: Sequence[_Work], batch: int) -> list[Outcome]:
-        options: PolicyOptions = {"noise": np.concatenate([work.noise for work in works])}
+        options: PolicyOptions = {
+            "noise": np.concatenate([work.noise for work in works]),
+            "num_steps": works[0].num_steps,
+        }
         if works[0].continued is not None:
             options["chunking"] = works[0].continued[1]
             options["previous_chunk"] = [
@@ -189,9 +203,7 @@ class Engine:
         for work, actions in zip(works, found, strict=True):
             if work.session is not None:
                 work.session.chunk = Chunk(actions, len(work.inputs), _horizon(actions))
-            outcomes.append(
-                Outcome(work.job, action_answer(work.job.call, actions, _info(work)), batch=batch)
-            )
+            outcomes.append(Outcome(work.job, actions, _info(work), batch=batch))
         return outcomes
 
 
@@ -214,11 +226,17 @@ def _horizon(actions: Any) -> int:
 
 
 def _info(work: _Work) -> dict[str, Any]:
-    """What N1.6's and N1.7's clients are told besides the actions; empty for a plain request."""
+    """What N1.6's and N1.7's clients are told besides the actions."""
     options = work.job.call.options
-    info: dict[str, Any] = {}
+    applied = dict(options.stated)
+    if work.continued is None:
+        for name in (*CHUNKING, *RELEASED_CHUNKING):
+            applied.pop(name, None)
+    elif "frozen" in applied:
+        applied["frozen"] = work.continued[1].frozen  # which are not more than there are to continue
+    info: dict[str, Any] = {"applied_options": applied}
     if options.session is not None:
-        info = {"session": options.session, "continued": work.continued is not None}
+        info |= {"session": options.session, "continued": work.continued is not None}
     if options.ignored:
         info["ignored_options"] = list(options.ignored)
     return info

@@ -13,6 +13,7 @@ from saccade import hub
 from saccade._json import dumps
 from saccade.errors import CheckpointError
 from saccade.robots import read_json
+from saccade.robots.reading import processor_folder
 
 if TYPE_CHECKING:
     from saccade.policy import Policy
@@ -64,8 +65,10 @@ def _prefixed(modality: str, config: Mapping[str, Any]) -> dict[str, Any]:
 def _of_checkpoint(policy: Policy) -> Configs | None:
     """The configs that N1.6's and N1.7's checkpoints contain, as they are."""
     source, embodiment = policy.head.source, policy.requirements.embodiment
-    path = None if source is None else hub.resolve(source) / "processor_config.json"
-    if path is None or embodiment is None or not path.is_file():
+    if source is None or embodiment is None:
+        return None
+    path = processor_folder(hub.resolve(source)) / "processor_config.json"
+    if not path.is_file():
         return None
     try:
         robot = read_json(path)["processor_kwargs"]["modality_configs"][embodiment]
@@ -81,8 +84,9 @@ def _of_checkpoint(policy: Policy) -> Configs | None:
 
 
 def _of_policy(policy: Policy) -> Configs:
-    """Configs made from what the policy knows."""
+    """Configs made from what the policy knows; with a data config, those that it states."""
     needs, normalizer = policy.requirements, policy.normalizer
+    seen, acted = needs.observation_indices, needs.action_indices
     horizon = normalizer.action_horizon or policy.head.config.action_horizon
     keys = {
         "video": [camera.name for camera in needs.cameras or ()],
@@ -91,10 +95,10 @@ def _of_policy(policy: Policy) -> Configs:
         "language": list(needs.language_keys) or [LANGUAGE_KEY],
     }
     steps = {
-        "video": needs.observation_indices or range(1 - (needs.video_horizon or 1), 1),
-        "state": needs.observation_indices or range(1 - needs.state_history, 1),
-        "action": needs.action_indices or range(horizon),
-        "language": range(1),
+        "video": range(1 - (needs.video_horizon or 1), 1) if seen is None else seen,
+        "state": range(1 - needs.state_history, 1) if seen is None else seen,
+        "action": range(horizon) if acted is None else acted,
+        "language": range(1) if seen is None else seen,
     }
     return {
         name: {"delta_indices": list(steps[name]), "modality_keys": keys[name]}

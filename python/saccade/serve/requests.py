@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from saccade._arrays import integer
+from saccade.chunking import Chunking
 from saccade.errors import InputError
 
 ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
@@ -21,8 +22,12 @@ ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
 PING = {"status": "ok", "message": "Server is running"}
 UNAUTHORIZED = "Unauthorized: Invalid API token"
 
+#: How a chunk continues the last one of its session: in saccade's words, or in those of the released head of
+#: N1.7, which needs all of its four.
+CHUNKING = ("executed", "frozen", "ramp_rate")
+RELEASED_CHUNKING = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "rtc_ramp_rate")
 #: The keys of `options` that this server reads.
-OPTIONS = ("seed", "session", "executed", "frozen", "ramp_rate")
+OPTIONS = ("seed", "num_steps", "session", *CHUNKING, *RELEASED_CHUNKING)
 LONGEST_SESSION = 256
 #: Names of options that were not read, as an answer lists them.
 MOST_IGNORED = 8
@@ -34,19 +39,26 @@ class Options:
 
     Attributes:
         seed: Seed of the noise, or None for noise that is different each time.
+        num_steps: Number of Euler steps, or None for the server's.
         session: The id of the session whose last chunk is continued, or None.
         executed: Number of actions of the session's last chunk that the robot has executed when the
             observation was taken, or None if it was not said.
         frozen: Number of further actions that it executes before the answer arrives. They do not change.
         ramp_rate: See :class:`saccade.Chunking`.
-        ignored: Names of options that are not known.
+        chunking: How the last chunk is continued, if it was said in the released names: these count its rows
+            to ``horizon``, and not to its end.
+        stated: The options of the request that are read, by name.
+        ignored: Names of those that are not: unknown ones, and released ones that need a session.
     """
 
     seed: int | None = None
+    num_steps: int | None = None
     session: str | int | None = None
     executed: int | None = None
     frozen: int = 0
     ramp_rate: float = 6.0
+    chunking: Chunking | None = None
+    stated: Mapping[str, Any] = field(default_factory=dict)
     ignored: tuple[str, ...] = ()
 
 
@@ -67,11 +79,12 @@ class Call:
     options: Options = Options()
 
 
-def parse(value: Any, seed: int | None = None) -> Call:
+def parse(value: Any, num_timestep_buckets: int, seed: int | None = None) -> Call:
     """What a request asks for.
 
     Args:
         value: The unpacked message.
+        num_timestep_buckets: Euler steps of a chunk at most.
         seed: The seed of a request that brings none.
 
     Raises:
@@ -85,7 +98,7 @@ def parse(value: Any, seed: int | None = None) -> Call:
     data = value.get("data")
     if endpoint == "reset":
         given = data.get("options") if isinstance(data, dict) else None
-        return Call(endpoint, options=_options(given))
+        return Call(endpoint, options=_options(given, num_timestep_buckets))
     if endpoint != "get_action":
         return Call(endpoint)
     if not isinstance(data, dict):
@@ -100,10 +113,24 @@ def parse(value: Any, seed: int | None = None) -> Call:
     observation = data["observation"]
     if not isinstance(observation, dict):
         raise InputError(f"observation: expected a map, got {type(observation).__name__}")
-    options = _options(data.get("options"))
+    options = _options(data.get("options"), num_timestep_buckets)
     if options.seed is None:
         options = replace(options, seed=seed)
     return Call(endpoint, observation=observation, options=options)
+
+
+def check_num_steps(name: str, value: int, num_timestep_buckets: int) -> int:
+    """A number of Euler steps.
+
+    Raises:
+        InputError: It is not from 1 to ``num_timestep_buckets``.
+    """
+    number = integer(name, value)
+    if number > num_timestep_buckets:
+        raise InputError(
+            f"{name}: expected at most {num_timestep_buckets} (num_timestep_buckets), got {number}"
+        )
+    return number
 
 
 def action_answer(call: Call, actions: Any, info: Mapping[str, Any]) -> Any:
@@ -143,29 +170,79 @@ def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()
 
 
-def _options(given: Any) -> Options:
+def _options(given: Any, num_timestep_buckets: int) -> Options:
     if given is None:
         return Options()
     if not isinstance(given, dict):
         raise InputError(f"options: expected a map, got {type(given).__name__}")
-    seed, session, executed = given.get("seed"), given.get("session"), given.get("executed")
-    frozen, ramp_rate = given.get("frozen"), given.get("ramp_rate")
+    found = {name: given[name] for name in OPTIONS if given.get(name) is not None}
+    session = found.get("session")
     if session is not None and (type(session) not in (str, int) or len(str(session)) > LONGEST_SESSION):
         raise InputError(
             f"options: session: expected text of at most {LONGEST_SESSION} characters or a number, got "
             f"{session!r:.100}"
         )
-    if session is None and not (executed is None and frozen is None and ramp_rate is None):
+    if session is None and any(name in found for name in CHUNKING):
         raise InputError("options: executed, frozen and ramp_rate: expected a session with them, got none")
-    if ramp_rate is not None and not (
-        type(ramp_rate) in (int, float) and math.isfinite(ramp_rate) and ramp_rate > 0
-    ):
-        raise InputError(f"options: ramp_rate: expected a finite number above 0, got {ramp_rate!r:.100}")
+    unread = () if session is not None else RELEASED_CHUNKING
+    read: dict[str, Any] = {}
+    for name, value in found.items():
+        if name in unread or name == "session":
+            continue
+        if name == "num_steps":
+            read[name] = check_num_steps(f"options: {name}", value, num_timestep_buckets)
+        elif name in ("ramp_rate", "rtc_ramp_rate"):
+            read[name] = _rate(name, value)
+        else:
+            read[name] = integer(f"options: {name}", value, least=0)
+    ignored = [str(key)[:LONGEST_SESSION] for key in given if key not in OPTIONS or key in unread]
     return Options(
-        seed=None if seed is None else integer("options: seed", seed, least=0),
+        seed=read.get("seed"),
+        num_steps=read.get("num_steps"),
         session=session,
-        executed=None if executed is None else integer("options: executed", executed, least=0),
-        frozen=0 if frozen is None else integer("options: frozen", frozen, least=0),
-        ramp_rate=6.0 if ramp_rate is None else float(ramp_rate),
-        ignored=tuple(str(key)[:LONGEST_SESSION] for key in given if key not in OPTIONS)[:MOST_IGNORED],
+        executed=read.get("executed"),
+        frozen=read.get("frozen", 0),
+        ramp_rate=read.get("ramp_rate", 6.0),
+        chunking=_released(read),
+        stated=read if session is None else {"session": session, **read},
+        ignored=tuple(ignored[:MOST_IGNORED]),
     )
+
+
+def _rate(name: str, value: Any) -> float:
+    if type(value) in (int, float) and math.isfinite(value) and value > 0:
+        return float(value)
+    raise InputError(f"options: {name}: expected a finite number above 0, got {value!r:.100}")
+
+
+def _released(read: Mapping[str, Any]) -> Chunking | None:
+    """Real-time chunking in the released names; None if it was not asked for by them.
+
+    Raises:
+        InputError: They are incomplete, mixed with saccade's own, or contradict each other.
+    """
+    given = [name for name in RELEASED_CHUNKING if name in read]
+    if not given:
+        return None
+    own = [name for name in CHUNKING if name in read]
+    if own:
+        raise InputError(
+            f"options: expected real-time chunking by saccade's options ({', '.join(CHUNKING)}) or by "
+            f"Isaac-GR00T's ({', '.join(RELEASED_CHUNKING)}), got {', '.join([*own, *given])}"
+        )
+    missing = [name for name in RELEASED_CHUNKING if name not in read]
+    if missing:
+        raise InputError(
+            f"options: real-time chunking: expected all of {', '.join(RELEASED_CHUNKING)}, got "
+            f"{', '.join(given)} without {', '.join(missing)}"
+        )
+    horizon, overlap, frozen, ramp_rate = (read[name] for name in RELEASED_CHUNKING)
+    for name, value, limit, most in (
+        ("rtc_overlap_steps", overlap, "action_horizon", horizon),
+        ("rtc_frozen_steps", frozen, "rtc_overlap_steps", overlap),
+    ):
+        if value > most:
+            raise InputError(f"options: {name}: expected at most {most} ({limit}), got {value}")
+    if horizon < 1:
+        raise InputError(f"options: action_horizon: expected at least 1, got {horizon}")
+    return Chunking(overlap, frozen, ramp_rate, horizon)

@@ -23,7 +23,7 @@ from saccade.serve.connections import Connection, Connections, address_of
 from saccade.serve.limits import Limits
 from saccade.serve.logs import Log
 from saccade.serve.packing import pack, unpack
-from saccade.serve.requests import PING, UNAUTHORIZED, Call, Token, parse
+from saccade.serve.requests import PING, UNAUTHORIZED, Call, Token, action_answer, check_num_steps, parse
 from saccade.serve.sessions import Sessions
 from saccade.serve.statistics import Statistics
 from saccade.serve.zmtp import Request
@@ -51,6 +51,7 @@ class Server:
             each thread.
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
         seed: Seed of the noise of requests that bring none, or None for noise that is different each time.
+        num_steps: Number of Euler steps of requests that do not say it, or None for that of the checkpoint.
         api_token: A secret that every request must contain, or None.
         allow_kill: Whether a client may stop the server.
         modality_form: How `get_modality_config` is answered to a client that did not show its release:
@@ -61,6 +62,7 @@ class Server:
 
     Raises:
         CheckpointError: A file of the checkpoint is damaged.
+        InputError: ``num_steps`` is out of range.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class Server:
         max_batch: int = 16,
         max_wait_ms: float = 5.0,
         seed: int | None = None,
+        num_steps: int | None = None,
         api_token: str | None = None,
         allow_kill: bool = False,
         modality_form: str | None = None,
@@ -81,11 +84,14 @@ class Server:
         self._token = Token(api_token)
         self._allow_kill = allow_kill
         self._seed = seed
+        self._most_steps = policy.head.config.num_timestep_buckets
+        if num_steps is not None:
+            num_steps = check_num_steps("num_steps", num_steps, self._most_steps)
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
         self._forms: weakref.WeakKeyDictionary[Connection, str] = weakref.WeakKeyDictionary()
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
-        self._engine = engine.Engine(policy, self._sessions)
+        self._engine = engine.Engine(policy, self._sessions, num_steps)
         workers = min(self._engine.num_workers, max_batch)
         self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, workers)
         self._statistics = Statistics()
@@ -170,6 +176,7 @@ class Server:
 
     def _on_request(self, connection: Connection, request: Request) -> None:
         """Answers a request at once, or appends it to the queue."""
+        received = time.perf_counter()
         endpoint, error = "unreadable", None
         try:
             if not request.is_complete:
@@ -181,10 +188,14 @@ class Server:
             message = unpack(request.payload, self._limits)
             if not self._token.allows(message.value):
                 raise InputError(UNAUTHORIZED)
-            call = parse(message.value, self._seed)
+            call = parse(message.value, self._most_steps, self._seed)
             endpoint = call.endpoint
             if endpoint == "get_action":
-                self._enqueue(connection, request, call, message.is_msgpack_numpy)
+                reading = self._read(call)
+                reply = (connection, replace(request, payload=bytearray()))  # the payload was unpacked
+                self._enqueue(
+                    Job(call, reading, connection, message.is_msgpack_numpy, received=received, reply=reply)
+                )
                 return
             self._connections.send(connection, request, pack(self._answer(connection, call)))
         except Exception as caught:
@@ -215,16 +226,19 @@ class Server:
         self.stop("kill")
         return {"status": "ok", "message": "Server is stopping"}
 
-    def _enqueue(self, connection: Connection, request: Request, call: Call, is_msgpack_numpy: bool) -> None:
+    def _read(self, call: Call) -> dialects.Reading:
+        """The observations of a request, if it can be taken."""
         if self._stopping is not None:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
-        reading = dialects.read(call.observation, self._policy.requirements, self._limits.rows)
-        self._forms[connection] = "text" if call.is_bare else "map"
+        return dialects.read(call.observation, self._policy.requirements, self._limits.rows)
+
+    def _enqueue(self, job: Job) -> None:
+        connection, _ = job.reply
+        self._forms[connection] = "text" if job.call.is_bare else "map"
         self._unanswered += 1
-        reply = (connection, replace(request, payload=bytearray()))  # the payload was unpacked
-        self._queue.put(Job(call, reading, connection, is_msgpack_numpy, reply=reply))
+        self._queue.put(job)
 
     def _compute(self) -> None:
         """What a thread does that computes."""
@@ -235,7 +249,7 @@ class Server:
                 payload = None
                 if outcome.error is None:
                     try:
-                        payload = pack(outcome.answer, as_msgpack_numpy=outcome.job.is_msgpack_numpy)
+                        payload = self._packed(outcome)
                     except Exception as error:
                         outcome = engine.Outcome(outcome.job, error=error)
                 if payload is None:
@@ -243,6 +257,13 @@ class Server:
                     payload = pack({"error": describe(outcome.error)})
                 self._finished.append((outcome, payload))
             self._connections.wake()
+
+    def _packed(self, outcome: engine.Outcome) -> bytes:
+        """The answer of a request that was computed."""
+        job = outcome.job
+        latency = round(1e3 * (time.perf_counter() - job.received), 3)
+        answer = action_answer(job.call, outcome.actions, {**outcome.info, "latency_ms": latency})
+        return pack(answer, as_msgpack_numpy=job.is_msgpack_numpy)
 
     def _send_finished(self) -> None:
         while self._finished:
@@ -283,11 +304,11 @@ class Server:
 
 
 def describe(error: BaseException) -> str:
-    """An error as it is sent: errors of saccade by their message, others with their type."""
+    """An error as it is sent, on one line: errors of saccade by their message, others with their type."""
     text = str(error)
     if not isinstance(error, SaccadeError | MemoryError) or not text:
         text = f"{type(error).__name__}: {text}"
-    return printable(text)[:LONGEST_ERROR]
+    return printable("; ".join(line.strip() for line in text.splitlines()))[:LONGEST_ERROR]
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from typing import Any
 
 from saccade.chunking import Chunking
 from saccade.errors import InputError
-from saccade.serve.requests import Options
+from saccade.serve.requests import RELEASED_CHUNKING, Options
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,28 +50,42 @@ class Session:
             rows: Number of its observations.
 
         Raises:
-            InputError: The request does not say how many actions were executed, or is for another number of
-                robots.
+            InputError: The request does not say how many actions were executed, is for another number of
+                robots, or continues more actions than the chunk has.
         """
         chunk = self.chunk
         if chunk is None:
             return None
-        if options.executed is None:
+        if options.executed is None and options.chunking is None:
             raise InputError(
                 "options: executed: expected the number of actions that were executed of the last chunk of "
-                f"session {options.session!r:.100}, got none; reset begins anew"
+                f"session {options.session!r:.100}, or {', '.join(RELEASED_CHUNKING)}, got none; "
+                "reset begins anew"
             )
         if rows != chunk.rows:
             raise InputError(
                 f"observation: expected {chunk.rows} rows, as session {options.session!r:.100} began, got "
                 f"{rows}"
             )
+        if options.chunking is not None:
+            return self._released(chunk, options.chunking)
+        assert options.executed is not None
         overlap = chunk.horizon - options.executed
         if overlap <= 0:
             return None
         return chunk, Chunking(
             overlap=overlap, frozen=min(options.frozen, overlap), ramp_rate=options.ramp_rate
         )
+
+    def _released(self, chunk: Chunk, chunking: Chunking) -> tuple[Chunk, Chunking] | None:
+        """The same, as the released head of N1.7 continues a chunk."""
+        horizon = chunking.horizon or chunk.horizon
+        if horizon > chunk.horizon:
+            raise InputError(
+                f"options: action_horizon: expected at most {chunk.horizon}, the actions of the session's "
+                f"last chunk, got {horizon}"
+            )
+        return (chunk, chunking) if chunking.overlap else None
 
 
 class Sessions:

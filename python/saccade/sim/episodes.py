@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,8 @@ class Episodes:
         num_threads: Threads of the policy; None for its default.
         instruction_from: A task whose instruction the policy gets instead.
         video: Whether a video is made of each episode.
+        data_config, action_horizon: As `saccade.Policy.load` takes them.
+        processor_options: The same, as JSON.
     """
 
     checkpoint: str
@@ -50,11 +53,25 @@ class Episodes:
     num_threads: int | None = None
     instruction_from: str | None = None
     video: bool = False
+    data_config: str | None = None
+    action_horizon: int | None = None
+    processor_options: str | None = None
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """What is given of `data_config`, `action_horizon` and `processor_options`, as JSON values."""
+        options = None if self.processor_options is None else json.loads(self.processor_options)
+        found = {
+            "data_config": self.data_config,
+            "action_horizon": self.action_horizon,
+            "processor_options": options,
+        }
+        return {name: value for name, value in found.items() if value is not None}
 
     @property
     def policy(self) -> Policy:
         """The policy. The first call in a process loads it; raises as `Policy.load`."""
-        return policy_of(self.checkpoint, self.engine, self.num_threads)
+        return policy_of(self.checkpoint, self.engine, self.num_threads, json.dumps(self.overrides))
 
     def __call__(self, piece: tuple[str, int]) -> Rolled:
         """Runs the episode of a task and a seed."""
@@ -87,8 +104,8 @@ class Episodes:
 
 
 @functools.lru_cache(maxsize=1)
-def policy_of(checkpoint: str, engine: str, num_threads: int | None) -> Policy:
+def policy_of(checkpoint: str, engine: str, num_threads: int | None, overrides: str) -> Policy:
     """The policy in a directory, warmed up. The last one is kept for the next episode."""
-    policy = Policy.load(checkpoint, engine=engine, num_threads=num_threads)
+    policy = Policy.load(checkpoint, engine=engine, num_threads=num_threads, **json.loads(overrides))
     policy.warmup()
     return policy

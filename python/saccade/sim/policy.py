@@ -29,23 +29,29 @@ DEMO_CHECKPOINT = Path(__file__).parent / "demo"
 ENGINES = ("rust", "torch")
 
 
-def load_whole(checkpoint: Path, engine: str = "rust", num_threads: int | None = None) -> saccade.Policy:
+def load_whole(
+    checkpoint: Path, engine: str = "rust", num_threads: int | None = None, **overrides: Any
+) -> saccade.Policy:
     """The policy of a checkpoint, computed by one of `ENGINES`.
 
     Args:
         checkpoint: a directory.
         engine: `"rust"`, or `"torch"` for `saccade.reference`, which needs torch.
         num_threads: number of threads; for torch, of the whole process.
+        **overrides: `data_config`, `action_horizon` and `processor_options` of `saccade.Policy.load`; only
+            with `"rust"`.
 
     Raises:
         FileNotFoundError, CheckpointError: as `saccade.Policy.load`.
-        InputError: unknown engine, or `num_threads` below 1.
+        InputError: unknown engine, `num_threads` below 1, or `overrides` with `"torch"`.
     """
     if num_threads is not None and num_threads < 1:
         raise InputError(f"num_threads: given {num_threads}, expected at least 1")
     if engine == "rust":
-        return saccade.Policy.load(checkpoint, num_threads=num_threads)
+        return saccade.Policy.load(checkpoint, num_threads=num_threads, **overrides)
     if engine == "torch":
+        if overrides:
+            raise InputError(f"{', '.join(overrides)}: expected engine 'rust', got 'torch'")
         from saccade.sim.torch_engine import load_policy
 
         return load_policy(checkpoint, num_threads)
@@ -99,6 +105,7 @@ class Policy:
         *,
         engine: str = "rust",
         num_threads: int | None = None,
+        **overrides: Any,
     ) -> Policy:
         """Loads a policy.
 
@@ -106,11 +113,12 @@ class Policy:
             checkpoint: a directory that `saccade train` wrote. Default: the bundled policy.
             engine: `"rust"` or `"torch"`.
             num_threads: number of threads.
+            **overrides: as in `load_whole`.
 
         Raises:
             FileNotFoundError: a file is not there.
             CheckpointError: config or tensors do not fit.
-            InputError: unknown engine, or `num_threads` below 1.
+            InputError: as `load_whole`.
         """
         directory = Path(checkpoint)
         if not directory.is_dir():
@@ -119,7 +127,7 @@ class Policy:
         for name in FILES:
             if not (directory / name).is_file():
                 raise FileNotFoundError(f"{directory / name}: no such file")
-        whole = load_whole(directory, engine, num_threads)
+        whole = load_whole(directory, engine, num_threads, **overrides)
         normalizer = whole.normalizer
         for kind, groups in (("state", normalizer.state_groups), ("action", normalizer.action_groups)):
             found = {group.key: group.size for group in groups}
