@@ -111,6 +111,44 @@ def test_statistics_of_each_step_need_their_steps(tmp_path: Path) -> None:
         normalizer.unactions(draw(1, 5, 4), draw(1, 4))
 
 
+def pose_robot(folder: Path, pose: str, size: int) -> Normalizer:
+    """A robot of one pose and one gripper, whose bounds are far out, so that nothing is clipped."""
+    config, statistics = processor(
+        action={"action_configs": [{**RELATIVE, "type": "EEF", "format": pose}, ABSOLUTE]},
+        use_relative_action=True,
+        max_state_dim=12,
+        max_action_dim=12,
+    )
+    wide = {"min": [-9.0] * size, "max": [9.0] * size, "mean": [0.0] * size, "std": [1.0] * size}
+    one = {name: row[:1] for name, row in wide.items()}
+    statistics["robot"] = {
+        "state": {"arm": wide, "gripper": one},
+        "action": {"arm": wide, "gripper": one},
+        "relative_action": {"arm": wide},
+    }
+    return load_processor(folder, config, statistics)
+
+
+@pytest.mark.parametrize(("pose", "size"), [("XYZ_ROT6D", 9), ("XYZ_ROTVEC", 6)])
+def test_a_chunk_of_poses_goes_on_from_another_state(pose: str, size: int, tmp_path: Path) -> None:
+    """The poses that the robot is executing stay where they are, whatever they are relative to."""
+    normalizer = pose_robot(tmp_path, pose, size)
+    first, second = draw(2, size + 1, seed=1), draw(2, size + 1, seed=2)
+    robot = as_array(normalizer.actions(draw(2, 4, 12, scale=0.2), first))
+    again = as_array(normalizer.actions(normalizer.previous_chunk(robot, second), second))
+    assert np.allclose(again, robot, atol=2e-5)
+    assert not np.allclose(normalizer.previous_chunk(robot, second), normalizer.previous_chunk(robot, first))
+
+
+def test_numbers_that_are_no_pose_are_refused_by_name(tmp_path: Path) -> None:
+    normalizer = pose_robot(tmp_path, "XYZ_ROT6D", 9)
+    chunk = np.zeros((1, 4, 12), np.float32)
+    with pytest.raises(saccade.InputError, match=r"arm: expected poses, and state\.arm to be one"):
+        normalizer.actions(chunk, np.ones((1, 10), np.float32))
+    with pytest.raises(saccade.InputError, match=r"arm: expected poses, and state\.arm to be one"):
+        normalizer.actions(draw(1, 4, 12), np.zeros((1, 10), np.float32))
+
+
 def test_what_n17_can_say_and_is_not_supported(tmp_path: Path) -> None:
     with pytest.raises(saccade.CheckpointError, match="tactile"):
         load_processor(tmp_path, *processor(use_tactile=True))
