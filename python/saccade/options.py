@@ -57,10 +57,9 @@ class TraceOptions(TypedDict, total=False):
 
 
 class LoadOptions(TypedDict, total=False):
-    """How a head is loaded: the keyword arguments of :meth:`saccade.ActionHead.load` except the config."""
+    """How a head is loaded: the keyword arguments that ``ActionHead.load`` and ``from_tensors`` share."""
 
     embodiment_ids: Sequence[int] | None
-    action_horizon: int | None
     precision: str
     num_threads: int | None
 
