@@ -1,4 +1,4 @@
-"""GR00T-H's `dropout_prob_by_embodiment`: states of embodiments above 0.999 have no effect."""
+"""GR00T-H's `dropout_prob_by_embodiment`: the states of embodiments above 0.999 have no effect."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def test_from_tensors_refuses_the_same() -> None:
 
 
 def test_a_config_with_something_else_in_its_place(tmp_path: Path) -> None:
-    write(tmp_path, **{KEY: [1.0]})  # type: ignore[arg-type]
+    write(tmp_path, state_dropout_prob_per_embodiment=[1.0])
     with pytest.raises(saccade.CheckpointError, match=rf"{KEY} is \[1\.0\], expected a probability for each"):
         saccade.ActionHead.load(tmp_path)
 

@@ -56,7 +56,7 @@ class ActionHead:
     A checkpoint of GR00T-H may contain ``dropout_prob_by_embodiment``, ``(num_embodiments,)``: how often its
     training set the state of each embodiment to zero. As in the released code, the states of embodiments with
     an entry above 0.999 are set to zero here too, so they have no effect. The other entries act in training
-    only. The tensor is ignored if ``state_dropout_prob_per_embodiment`` of the config is null or empty.
+    only. The tensor is ignored if ``state_dropout_prob_per_embodiment`` is null or empty in the config.
 
     Example:
         The head of the bundled demo policy, on the features of two observations:

@@ -57,7 +57,7 @@ class TraceOptions(TypedDict, total=False):
 
 
 class LoadOptions(TypedDict, total=False):
-    """How a head is loaded: the keyword arguments of :meth:`saccade.ActionHead.load` except the config."""
+    """How a head is loaded: the keyword arguments that ``ActionHead.load`` and ``from_tensors`` share."""
 
     embodiment_ids: Sequence[int] | None
     precision: str
