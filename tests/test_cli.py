@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -193,6 +194,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 #: Runs the command where no optional package is installed.
 BARE = f"""
 import sys
+import warnings
 for module in {sorted(module for modules in _extras.EXTRAS.values() for module in modules)}:
     sys.modules[module] = None
 from saccade.cli import main
@@ -255,3 +257,20 @@ def test_commands_on_checkpoints_need_no_package(options: list[str], tmp_path: P
         assert (done.returncode, done.stderr) == (0, ""), command
         if options:
             json.loads(done.stdout)
+
+
+def test_warnings_are_one_line_without_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def warn(args: argparse.Namespace) -> int:
+        warnings.warn("no data config", UserWarning, stacklevel=1)
+        return 0
+
+    monkeypatch.setattr("saccade.cli.inspect.run", warn)
+    shown: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        monkeypatch.setattr(
+            warnings, "showwarning", lambda *given: shown.append(warnings.formatwarning(*given[:4]))
+        )
+        assert cli.main(["inspect", "nowhere"]) == 0
+    assert shown == ["saccade: warning: no data config\n"]
+    assert warnings.formatwarning("x", UserWarning, "file.py", 3).startswith("file.py:3: UserWarning: x")

@@ -16,8 +16,9 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
-from typing import NoReturn, Protocol, runtime_checkable
+from typing import Any, NoReturn, Protocol, runtime_checkable
 
 from saccade._arguments import UsageError
 
@@ -201,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _output.prepare_streams()
         try:
-            with terminable():
+            with terminable(), plain_warnings():
                 return dispatch(argv)
         finally:
             _output.flush()  # finds a closed pipe or a full disk here, not while the interpreter ends
@@ -236,6 +237,22 @@ def terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Warnings of this package are one line each, without the place in the code."""
+    usual = warnings.formatwarning
+
+    def plain(message: Warning | str, category: type[Warning], *place: Any) -> str:
+        is_own = issubclass(category, UserWarning)
+        return f"saccade: warning: {message}\n" if is_own else usual(message, category, *place)
+
+    warnings.formatwarning = plain
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def dispatch(argv: list[str]) -> int:
