@@ -9,6 +9,7 @@ import numpy as np
 from saccade._arrays import Float32Array
 from saccade.dialects import Camera, Requirements
 from saccade.robots import Group, Normalizer
+from saccade.robots.rotations import POSES, from_matrix
 
 #: Size of the frames of a camera whose size is not known.
 SIDE = 256
@@ -30,8 +31,14 @@ def example_observation(needs: Requirements, normalizer: Normalizer, seed: int) 
         )
         for camera in cameras
     }
+    poses = {
+        group.reference.key: group.reference.pose
+        for group in normalizer.action_groups
+        if group.reference is not None and group.reference.pose is not None
+    }
     state = {
-        group.key: np.tile(_middle(group), (1, needs.state_history, 1)) for group in normalizer.state_groups
+        group.key: np.tile(_middle(group, poses.get(group.key)), (1, needs.state_history, 1))
+        for group in normalizer.state_groups
     }
     return {
         "video": video,
@@ -40,8 +47,18 @@ def example_observation(needs: Requirements, normalizer: Normalizer, seed: int) 
     }
 
 
-def _middle(group: Group) -> Float32Array:
-    """The middle of the range of a part of the state, ``(size,)``."""
+def _middle(group: Group, pose: str | None) -> Float32Array:
+    """The middle of the range of a part of the state, ``(size,)``; a rotation is that of nothing.
+
+    Args:
+        group: The part of the state.
+        pose: The format of the pose that it is, where actions are relative to it.
+    """
+    if group.conversion is not None:
+        return from_matrix(np.eye(3), group.conversion.robot).astype(np.float32)
+    if pose is not None:
+        rotation = from_matrix(np.eye(3), POSES[pose][1])
+        return np.concatenate([_middle(group, None)[:3], rotation]).astype(np.float32)
     if group.first is None or group.second is None:
         return np.zeros(group.size, np.float32)
     middle = group.first if group.mode == "mean_std" else (group.first + group.second) / 2

@@ -173,6 +173,8 @@ def finished(
 ) -> Robot:
     """The robot, after checking that the widths of robot and head fit.
 
+    A head may be wider than the file says: what is beyond is padding, which is zero either way.
+
     Args:
         where: The file, for messages.
         options: What was requested.
@@ -187,22 +189,23 @@ def finished(
         CheckpointError, InputError: The widths do not fit.
     """
     widths = [sum(group.width for group in groups) for groups in (state, action)]
-    found = []
+    found, limits = [], []
     for name, width, given, said in zip(
         ("state_dim", "action_dim"), widths, (options.state_dim, options.action_dim), dims, strict=True
     ):
-        if given is not None and said is not None and given != said:
-            raise InputError(f"{name}: expected {said}, the head's in {where}, got {given}")
+        if given is not None and said is not None and given < said:
+            raise InputError(f"{name}: expected at least {said}, the head's in {where}, got {given}")
         found.append(given or said or width)
+        limits.append(said or given or width)
         if found[-1] > MOST_WIDTH:
             raise CheckpointError(f"{where}: {name}: expected at most {MOST_WIDTH}, got {found[-1]}")
-    if widths[0] > found[0] and not cuts_state:
+    if widths[0] > limits[0] and not cuts_state:
         raise CheckpointError(
-            f"{where}: the robot's state has {widths[0]} numbers, the head's only {found[0]} (state_dim)"
+            f"{where}: the robot's state has {widths[0]} numbers, the head's only {limits[0]} (state_dim)"
         )
-    if widths[1] > found[1]:
+    if widths[1] > limits[1]:
         raise CheckpointError(
-            f"{where}: the robot's action has {widths[1]} numbers, the head's only {found[1]} (action_dim)"
+            f"{where}: the robot's action has {widths[1]} numbers, the head's only {limits[1]} (action_dim)"
             f"{hint}"
         )
     return Robot(embodiment, embodiment_id, state, action, found[0], found[1], **more)
