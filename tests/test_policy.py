@@ -169,15 +169,16 @@ def test_which_embodiment_is_meant() -> None:
     head = load("nvidia")
     with pytest.raises(saccade.InputError, match=r"embodiment: expected one of those in .*got None"):
         Policy(head)
-    assert Policy(head, embodiment=24).normalizer.embodiment == "gr1"
+    assert Policy(head, embodiment=31).normalizer.embodiment == "new_embodiment"
     assert Policy(head, statistics(7, 6), 9).embodiment_id == 9
     assert Policy(head, Normalizer.load(statistics(7, 6), state_dim=12), 9).embodiment_id == 9
-    with pytest.raises(saccade.InputError, match="got None"):
+    with pytest.raises(saccade.InputError, match="files do not say .*: pass its id, one of 0, 1"):
         Policy(head, statistics(7, 6))
     with pytest.raises(saccade.InputError, match="got 40"):
         Policy(head, statistics(7, 6), 40)
-    read = Normalizer.load(published("nvidia"), "gr1")
-    assert Policy(head, read, "gr1").embodiment_id == 24
+    read = Normalizer.load(published("nvidia"), "new_embodiment")
+    for name in ("new_embodiment", "NEW_EMBODIMENT"):
+        assert Policy(head, read, name).embodiment_id == 31
     for other in ("oxe_droid", 17):
         with pytest.raises(saccade.InputError, match="embodiment: expected that of the normalizer"):
             Policy(head, read, other)
