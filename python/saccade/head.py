@@ -15,7 +15,7 @@ from saccade._arrays import (
     Float32Array,
     apart,
     as_stored,
-    boolean,
+    mask_bytes,
     check_precision,
     float32,
     indices,
@@ -298,9 +298,9 @@ class ActionHead:
         attention, hidden = check_record(record)
         held, recorded = self._head.encode(
             float32("backbone_features", backbone_features),
-            boolean("attention_mask", attention_mask),
-            boolean("image_mask", image_mask),
-            boolean("drop_vl", drop_vl),
+            mask_bytes("attention_mask", attention_mask),
+            mask_bytes("image_mask", image_mask),
+            mask_bytes("drop_vl", drop_vl),
             attention,
             hidden,
         )
