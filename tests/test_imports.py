@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from circles import circles
 
 import saccade
-from circles import circles
 
 PACKAGE = Path(saccade.__file__).parent
 PLUGIN = Path(__file__).parents[1] / "plugins/lerobot/lerobot_policy_saccade"
@@ -60,7 +60,7 @@ def modules(package: Path) -> dict[str, Path]:
 
 
 def imported(name: str, path: Path, names: set[str]) -> Iterator[str]:
-    """The modules of the package that a file imports anywhere: in functions, for type checkers, by a string."""
+    """The modules of the package that a file imports anywhere: in functions, for types, by a string."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in names)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-
 from circles import circles
 
 CRATES = Path(__file__).parents[1] / "crates"
@@ -118,7 +117,7 @@ class Crate:
         self.modules = modules(root)
 
     def absolute(self, path: tuple[str, ...], here: tuple[str, ...]) -> tuple[str, ...] | None:
-        """A path of a module as one of the crate. None if it leads to another crate, or to something within."""
+        """A path in a module as one of the crate. None if it leads elsewhere, or to something within."""
         first, *rest = path
         if first == "crate":
             return tuple(rest)
@@ -153,9 +152,7 @@ class Crate:
     def needs(self, module: Module) -> set[tuple[str, ...]]:
         """The modules that a file needs. A name that it only hands on is none of its needs."""
         words = set(re.findall(r"\w+", module.code))
-        paths = [
-            path for name, path in module.names.items() if name not in module.exported or name in words
-        ]
+        paths = [path for name, path in module.names.items() if name not in module.exported or name in words]
         paths += [*module.globs]
         paths += [tuple(re.split(r"\s*::\s*", found)) for found in PATH.findall(module.code)]
         absolute = (self.absolute(path, module.path) for path in paths)

@@ -12,12 +12,12 @@ from saccade._arrays import (
     Array,
     ArrayLike,
     apart,
-    mask_bytes,
     check_precision,
     float32,
     integer,
     is_torch,
     like_features,
+    mask_bytes,
     result,
     text,
 )

@@ -15,7 +15,6 @@ from saccade._arrays import (
     Float32Array,
     apart,
     as_stored,
-    mask_bytes,
     check_precision,
     float32,
     indices,
@@ -23,6 +22,7 @@ from saccade._arrays import (
     integer,
     is_torch,
     like_features,
+    mask_bytes,
     optional_integers,
     result,
 )
