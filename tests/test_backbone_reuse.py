@@ -136,9 +136,9 @@ def test_only_what_has_changed_is_computed() -> None:
     def work(previous: saccade.BackboneFeatures | None = None, **changes: Any) -> tuple[int, int]:
         """Multiply-adds of patches, and of the projections of both models."""
         inputs = released.inputs(**changes)
-        _saccade.start_profile()
-        backbone(inputs, previous=previous)
-        counted = _saccade.take_profile()
+        with _saccade.profile() as profile:
+            backbone(inputs, previous=previous)
+        counted = profile.counters()
         return counted["patches"][2], counted["feed_forward_in"][2]
 
     config, tokens = backbone.config, released.features.shape[1]

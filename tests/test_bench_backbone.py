@@ -53,9 +53,9 @@ def test_multiply_adds_are_those_of_the_engine(checkpoint: Path) -> None:
     sizes = setup.sizes_of(checkpoint)
     inputs = setup.inputs_of(sizes, 2)
     backbone = saccade.Backbone.load(checkpoint)
-    _saccade.start_profile()
-    backbone(inputs)
-    counted = sum(counter[2] for counter in _saccade.take_profile().values())
+    with _saccade.profile() as profile:
+        backbone(inputs)
+    counted = sum(counter[2] for counter in profile.counters().values())
     side = math.isqrt(sizes.vision.num_positions)
     works = backbone_work(sizes, [(side, side)] * 2, inputs.input_ids.shape[1])
     # The engine counts the squares of causal attention in blocks.

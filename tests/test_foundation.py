@@ -180,3 +180,39 @@ def test_every_problem_is_printed(
     monkeypatch.setattr(sys, "argv", ["needs.py", "one", "two", "three"])
     assert needs.main() == 1
     assert capsys.readouterr().err == "missing: this\nmissing: that\n"
+
+
+@pytest.mark.parametrize(
+    ("installed", "default", "built_with"),
+    [
+        ("{oldest}.0", "1.999.0", "+{oldest}.0 build --locked --quiet"),
+        ("1.999.0", "{oldest}.3", "build --locked --quiet"),  # a toolchain may have any name
+        ("", "{oldest}.3", "build --locked --quiet"),
+        ("", "1.999.0", None),
+    ],
+)
+def test_the_declared_rust_is_what_builds(
+    installed: str, default: str, built_with: str | None, tmp_path: Path
+) -> None:
+    """`.ci/oldest_rust.sh` with a cargo whose named and default toolchains are of these versions."""
+    oldest = re.search(r'^rust-version = "(.+)"', (ROOT / "Cargo.toml").read_text(), re.MULTILINE)[1]  # type: ignore[index]
+    assert f"Rust {oldest} or newer" in (ROOT / "docs/usage.md").read_text()
+    named, default = installed.format(oldest=oldest), default.format(oldest=oldest)
+    (tmp_path / "cargo").write_text(
+        f"#!/bin/sh\nversion={default}\n"
+        f"case $1 in +{oldest}.0) version={named};; +*) exit 1;; esac\n"
+        '[ -n "$version" ] || exit 1\n'
+        'case "$*" in *--version) echo "cargo $version (date)";; *) echo "ran $*";; esac\n'
+    )
+    (tmp_path / "cargo").chmod(0o755)
+    done = subprocess.run(
+        [ROOT / ".ci/oldest_rust.sh"],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
+    )
+    if built_with is None:
+        assert done.returncode == 1
+        assert f"rustup toolchain install {oldest}.0" in done.stderr
+    else:
+        assert done.stdout.splitlines()[-1] == f"ran {built_with.format(oldest=oldest)}"

@@ -9,10 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from circles import circles
 
 import saccade
 
 PACKAGE = Path(saccade.__file__).parent
+PLUGIN = Path(__file__).parents[1] / "plugins/lerobot/lerobot_policy_saccade"
 LAZY = ("bench", "checkpoints", "comparison", "integrations", "maps", "observation", "reference", "robots",
         "serve", "sim", "study", "torch")  # fmt: skip
 
@@ -48,64 +50,60 @@ def test_without_torch_the_extra_is_named(name: str, statement: str) -> None:
     assert found.startswith("True torch torch is not installed. Install with: ")
 
 
-def modules() -> dict[str, Path]:
-    """Every module of the package, by name."""
+def modules(package: Path) -> dict[str, Path]:
+    """Every module of a package, by name."""
     found = {}
-    for path in PACKAGE.rglob("*.py"):
-        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    for path in package.rglob("*.py"):
+        parts = path.relative_to(package.parent).with_suffix("").parts
         found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 
 
-def imported(path: Path, names: set[str]) -> Iterator[str]:
-    """The modules of the package that a file imports anywhere, in functions and for type checkers too."""
+def imported(name: str, path: Path, names: set[str]) -> Iterator[str]:
+    """The modules of the package that a file imports anywhere: in functions, for types, by a string."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in names)
-        elif isinstance(node, ast.ImportFrom) and node.module in names:
-            for alias in node.names:
-                full = f"{node.module}.{alias.name}"
-                yield full if full in names else node.module
+        elif isinstance(node, ast.ImportFrom):
+            module = from_where(node, name, path)
+            if module in names:
+                for alias in node.names:
+                    full = f"{module}.{alias.name}"
+                    yield full if full in names else module
+        elif (given := import_by_string(node)) is not None and isinstance(given, ast.Constant):
+            parts = str(given.value).split(".")
+            known = (".".join(parts[:end]) for end in range(len(parts), 0, -1))
+            yield from [module for module in known if module in names][:1]
 
 
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Strongly connected components of more than one module (Tarjan)."""
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found = []
-
-    def visit(node: str) -> None:
-        index[node] = low[node] = len(index)
-        stack.append(node)
-        for other in graph[node]:
-            if other not in index:
-                visit(other)
-            if other in stack:
-                low[node] = min(low[node], low[other])
-        if low[node] == index[node]:
-            component = []
-            while True:
-                component.append(stack.pop())
-                if component[-1] == node:
-                    break
-            if len(component) > 1:
-                found.append(sorted(component))
-
-    for node in graph:
-        if node not in index:
-            visit(node)
-    return found
+def from_where(node: ast.ImportFrom, name: str, path: Path) -> str:
+    """The module that a statement imports from, with its dots resolved."""
+    if node.level == 0:
+        return node.module or ""
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    above = package[: len(package) - (node.level - 1)]
+    return ".".join([*above, *([node.module] if node.module else [])])
 
 
-def imports() -> dict[str, set[str]]:
+def import_by_string(node: ast.AST) -> ast.expr | None:
+    """The name that `import_module` or `__import__` is called with. None for anything else."""
+    if not isinstance(node, ast.Call):
+        return None
+    called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", None)
+    if called not in ("import_module", "__import__"):
+        return None
+    return node.args[0] if node.args else node.keywords[0].value
+
+
+def imports(package: Path) -> dict[str, set[str]]:
     """The modules that each module imports."""
-    files = modules()
-    return {name: set(imported(path, set(files))) for name, path in files.items()}
+    files = modules(package)
+    return {name: set(imported(name, path, set(files))) for name, path in files.items()}
 
 
-def test_no_circle_of_imports() -> None:
-    assert circles(imports()) == []
+@pytest.mark.parametrize("package", [PACKAGE, PLUGIN], ids=["saccade", "plugin"])
+def test_no_circle_of_imports(package: Path) -> None:
+    assert circles(imports(package)) == []
 
 
 def test_no_circle_of_packages() -> None:
@@ -115,6 +113,52 @@ def test_no_circle_of_packages() -> None:
         return ".".join(module.split(".")[:2])
 
     graph: dict[str, set[str]] = {}
-    for module, others in imports().items():
+    for module, others in imports(PACKAGE).items():
         graph.setdefault(package(module), set()).update(map(package, others))
     assert circles({name: others - {name} for name, others in graph.items()}) == []
+
+
+#: Modules that import by a name that is not written there. It comes from a table or from the user, and leads
+#: down to what was asked for; anywhere else it could hide a circle.
+REGISTRIES = {
+    "saccade",  # its submodules, when they are first used
+    "saccade.cli",  # the command that was given
+    "saccade.reference.lerobot_head",  # a module of lerobot
+    "saccade.serve",  # its classes, which need optional packages
+    "saccade.study.study",  # the study that was given, which may be the user's
+}
+
+
+def test_only_registries_import_by_a_name_that_is_not_written_there() -> None:
+    found = {
+        name
+        for name, path in modules(PACKAGE).items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if (given := import_by_string(node)) is not None and not isinstance(given, ast.Constant)
+    }
+    assert found == REGISTRIES
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import planted.low",
+        "from planted import low",
+        "from planted.low import name",
+        "from . import low",
+        "from .low import name",
+        "def call():\n    from planted.low import name",
+        "def call():\n    importlib.import_module('planted.low').name()",
+        "def call():\n    import_module(name='planted.low')",
+        "if TYPE_CHECKING:\n    from planted.low import name",
+        "__import__('planted.low.name')",
+    ],
+)
+def test_a_planted_circle_is_found(statement: str, tmp_path: Path) -> None:
+    package = tmp_path / "planted"
+    package.mkdir()
+    for name, code in (("__init__", ""), ("low", ""), ("middle", "import planted.low"), ("high", statement)):
+        (package / f"{name}.py").write_text(code)
+    assert circles(imports(package)) == []
+    (package / "low.py").write_text("import planted.middle, planted.high")
+    assert circles(imports(package)) == [["planted.high", "planted.low", "planted.middle"]]

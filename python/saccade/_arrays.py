@@ -191,6 +191,8 @@ def check_precision(precision: str) -> None:
 def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
     """``value`` as a C-contiguous boolean array. None stays None.
 
+    A view of other memory may have bytes that are neither 0 nor 1. They count as True, as they do in NumPy.
+
     Raises:
         DtypeError: ``value`` contains anything but booleans, or is not on the CPU.
     """
@@ -201,7 +203,17 @@ def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
     array = _asarray(name, value)
     if array.dtype != np.bool_:
         raise DtypeError(f"{name}: expected booleans, got {array.dtype}")
-    return np.require(array, np.bool_, ["C", "A"])
+    return np.require(array.view(np.uint8) != 0, np.bool_, ["C", "A"])
+
+
+def mask_bytes(name: str, value: ArrayLike | None) -> UInt8Array | None:
+    """:func:`boolean` as the bytes that the engine takes, since not every byte of NumPy is a boolean of Rust.
+
+    Raises:
+        DtypeError: ``value`` contains anything but booleans, or is not on the CPU.
+    """
+    array = boolean(name, value)
+    return None if array is None else array.view(np.uint8)
 
 
 def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:

@@ -10,6 +10,7 @@ from saccade._arrays import StoredTensor
 
 _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
+_Bytes = npt.NDArray[np.uint8]  # of a mask: 0 is False
 _Int64 = npt.NDArray[np.int64]
 _Frame = npt.NDArray[np.uint8] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
@@ -39,14 +40,13 @@ __all__ = [
     "merge_future_tokens",
     "panic_in_core",
     "parse_config",
+    "profile",
     "quantize",
     "read_stored",
     "read_tensors",
     "resize",
     "selected_isa",
-    "start_profile",
     "stay_on_this_thread",
-    "take_profile",
     "tensor_names",
     "tensor_shapes",
 ]
@@ -101,9 +101,9 @@ class ActionHead:
     def encode(
         self,
         backbone_features: _Float32,
-        attention_mask: _Bool | None,
-        image_mask: _Bool | None,
-        drop_vl: _Bool | None,
+        attention_mask: _Bytes | None,
+        image_mask: _Bytes | None,
+        drop_vl: _Bytes | None,
         attention: bool,
         hidden: bool,
     ) -> tuple[Context, _Recorded]: ...
@@ -261,7 +261,7 @@ class CrossAttention:
         self,
         hidden_states: _Float32,
         kv: KeyValues,
-        key_mask: _Bool | None,
+        key_mask: _Bytes | None,
         key_bias: _Float32 | None,
         weights: _Float32 | None,
         out: _Float32,
@@ -288,6 +288,19 @@ class Published:
     def read(self, name: str, index: int | None) -> _Float32: ...
     def nbytes(self, precision: str, num_embodiments: int) -> int: ...
 
+@final
+class profile:
+    def __new__(cls) -> profile: ...
+    def __enter__(self) -> profile: ...
+    def __exit__(self, *_error: object) -> None: ...
+    def counters(self) -> dict[str, tuple[int, float, int, int]]: ...  # calls, seconds, multiply-adds, bytes
+
+@final
+class stay_on_this_thread:
+    def __new__(cls) -> stay_on_this_thread: ...
+    def __enter__(self) -> None: ...
+    def __exit__(self, *_error: object) -> None: ...
+
 def parse_config(text: str) -> dict[str, Any]: ...
 def read_stored(source: str) -> dict[str, tuple[str, list[int], bytes]]: ...  # dtype, shape, content
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
@@ -308,8 +321,5 @@ def dot_products() -> list[str]: ...
 def cpu_report() -> tuple[str, str, str]: ...  # family, whose rates, tiles
 def default_num_threads() -> int: ...
 def measure_peaks(num_threads: int) -> dict[str, Any]: ...
-def start_profile() -> None: ...
-def stay_on_this_thread(stays: bool) -> None: ...
-def take_profile() -> dict[str, tuple[int, float, int, int]]: ...  # calls, seconds, multiply-adds, bytes
 def tensor_shapes(text: str) -> list[tuple[str, list[int]]]: ...
 def panic_in_core(message: str) -> None: ...

@@ -12,12 +12,12 @@ from saccade._arrays import (
     Array,
     ArrayLike,
     apart,
-    boolean,
     check_precision,
     float32,
     integer,
     is_torch,
     like_features,
+    mask_bytes,
     result,
     text,
 )
@@ -221,7 +221,7 @@ class CrossAttention:
             weights = result((kv.batch, self.num_heads, *states.shape[1:2], kv.num_vl_tokens), None)
         bias = None if key_bias is None else apart(float32("key_bias", key_bias), output)
         self._attention.attend(
-            apart(states, output), kv._held, boolean("key_mask", key_mask), bias, weights, output
+            apart(states, output), kv._held, mask_bytes("key_mask", key_mask), bias, weights, output
         )
         attended = like_features(output, kv._torch) if out is None else out
         if weights is None:

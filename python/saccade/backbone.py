@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
-from saccade._arrays import ArrayLike, as_stored, check_precision
+from saccade._arrays import ArrayLike, as_stored, check_precision, mask_bytes
 from saccade.backbone_config import BackboneConfig
 from saccade.backbone_features import BackboneFeatures, check_backbone_record, made
 from saccade.backbone_inputs import BackboneInputs
@@ -261,6 +261,6 @@ def _plain(inputs: BackboneInputs) -> dict[str, Any]:
     return {
         "pixel_values": list(pixels) if isinstance(pixels, tuple) else [pixels],
         "input_ids": inputs.input_ids,
-        "attention_mask": inputs.attention_mask,
+        "attention_mask": mask_bytes("attention_mask", inputs.attention_mask),
         "image_grid_thw": inputs.image_grid_thw,
     }

@@ -15,7 +15,6 @@ from saccade._arrays import (
     Float32Array,
     apart,
     as_stored,
-    boolean,
     check_precision,
     float32,
     indices,
@@ -23,6 +22,7 @@ from saccade._arrays import (
     integer,
     is_torch,
     like_features,
+    mask_bytes,
     optional_integers,
     result,
 )
@@ -313,9 +313,9 @@ class ActionHead:
         attention, hidden = check_record(record)
         held, recorded = self._head.encode(
             float32("backbone_features", backbone_features),
-            boolean("attention_mask", attention_mask),
-            boolean("image_mask", image_mask),
-            boolean("drop_vl", drop_vl),
+            mask_bytes("attention_mask", attention_mask),
+            mask_bytes("image_mask", image_mask),
+            mask_bytes("drop_vl", drop_vl),
             attention,
             hidden,
         )

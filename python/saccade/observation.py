@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
-from saccade._arrays import Float32Array
+from saccade._arrays import Float32Array, boolean
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.options import SampleOptions, TraceOptions
 
@@ -347,7 +347,9 @@ def as_mask(where: str, name: str, array: npt.NDArray[Any] | None) -> BoolArray 
     """
     if array is None:
         return None
-    if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+    if array.dtype == np.bool_:
+        return boolean(name, array)
+    if array.dtype.kind not in "iu" or not np.isin(array, (0, 1)).all():
         raise InputError(f"{where}: {name}: expected booleans, or 0 and 1")
     return np.asarray(array, dtype=np.bool_)
 

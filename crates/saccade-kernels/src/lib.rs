@@ -24,6 +24,7 @@ mod isa;
 mod linear;
 mod matrix;
 mod norm;
+mod parts;
 pub mod peak;
 mod pool;
 mod rope;
@@ -44,7 +45,9 @@ pub use linear::{Epilogue, KernelError, LinearScratch, PackedLinear};
 pub use matrix::Matrix;
 pub use norm::layer::layer_norm;
 pub use norm::rms::{rms_norm, rms_norm_in_place};
-pub use pool::{Interrupted, interrupted, interruptible, parallel_for, stay_on_this_thread};
+pub use pool::{
+    Interrupted, StayOnThisThread, interrupted, interruptible, parallel_for, stay_on_this_thread,
+};
 pub use rope::rotary_embedding;
 pub use rows::{Rows, RowsMut};
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};

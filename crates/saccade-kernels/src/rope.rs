@@ -1,6 +1,9 @@
 //! Rotary position embedding, with the two halves of a head as the parts of the complex numbers that are rotated.
 
+use std::ops::Range;
+
 use crate::isa::Isa;
+use crate::parts::part;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
 use crate::simd::{Kernel, Simd, Vector, load, store};
@@ -42,7 +45,7 @@ pub fn rotary_embedding(
         "head_dim: expected a divisor of the {width} columns of x, got {head_dim}"
     );
     assert!(
-        cos.num_rows() == rows && 2 * pairs <= head_dim,
+        cos.num_rows() == rows && pairs <= head_dim / 2,
         "cos: expected ({rows}, at most {}), got ({}, {pairs})",
         head_dim / 2,
         cos.num_rows()
@@ -63,18 +66,17 @@ pub fn rotary_embedding(
         cos,
         sin,
     };
-    let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).min(rows);
-    let threads = if rows * width < ELEMENTS_FOR_THREADS {
+    let elements = rows.saturating_mul(width);
+    let tasks = elements.div_ceil(ELEMENTS_PER_TASK).min(rows);
+    let threads = if elements < ELEMENTS_FOR_THREADS {
         1
     } else {
         threads
     };
     parallel_for(threads, tasks, &|task| {
-        let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
         isa.run(RotationRows {
             call: &call,
-            first,
-            end,
+            rows: part(rows, task, tasks),
         });
     });
 }
@@ -93,8 +95,7 @@ unsafe impl Sync for Rotation<'_> {}
 
 struct RotationRows<'a> {
     call: &'a Rotation<'a>,
-    first: usize,
-    end: usize,
+    rows: Range<usize>,
 }
 
 impl Kernel for RotationRows<'_> {
@@ -103,7 +104,7 @@ impl Kernel for RotationRows<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) {
         let call = self.call;
-        for row in self.first..self.end {
+        for row in self.rows {
             let (cos, sin) = (call.cos.row(row), call.sin.row(row));
             for head in (0..call.width).step_by(call.head_dim) {
                 // SAFETY: rows are within the view, heads within rows, and pairs within heads.

@@ -91,8 +91,8 @@ impl WeightRef<'_> {
 pub fn quantize_rows(weight: WeightRef<'_>, values: &mut [i8], scales: &mut [f32]) {
     let (rows, inputs) = weight.shape();
     assert_eq!(
-        values.len(),
-        rows * inputs,
+        Some(values.len()),
+        rows.checked_mul(inputs),
         "values: expected the elements of weight"
     );
     assert_eq!(scales.len(), rows, "scales: expected one for each row of weight");

@@ -451,3 +451,14 @@ fn weights_of_another_shape_panic() {
     let case = Case::new(11, 2, 3, 2, 4, 0);
     case.run(best(), 1, None, Some(&mut [0.0; 11]));
 }
+
+#[test]
+fn heads_whose_width_wraps_are_refused() {
+    // Two of these have the width 2 in a product that wraps: keys of two columns would pass for them.
+    for (num_kv_heads, head_dim) in [(usize::MAX / 2 + 2, 2), (2, usize::MAX / 2 + 2), (1, usize::MAX)] {
+        let made = std::panic::catch_unwind(|| {
+            PackedKeyValues::new(Isa::Portable, Element::F32, num_kv_heads, head_dim)
+        });
+        assert!(made.is_err(), "{num_kv_heads} heads of {head_dim}");
+    }
+}

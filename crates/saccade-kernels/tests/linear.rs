@@ -8,6 +8,7 @@ use half::bf16;
 use proptest::prelude::*;
 use saccade_kernels::{
     Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, WeightRef,
+    quantize_rows,
 };
 
 const EPILOGUES: [Epilogue; 7] = [
@@ -489,4 +490,34 @@ fn a_layer_without_inputs_gives_its_bias() {
             assert_eq!(out, [1.0, 2.0, 3.0].repeat(4), "{isa}, {arithmetic:?}");
         }
     }
+}
+
+#[test]
+fn inputs_whose_panel_wraps_are_refused() {
+    // One element is all that these weights need: a column that is repeated.
+    for inputs in [usize::MAX / 64 + 1, usize::MAX / 2, usize::MAX] {
+        let weight = WeightRef::F32(Matrix::from(Rows::strided(&[1.0], inputs, 1, 0)).transpose());
+        for isa in isas() {
+            for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+                let packed = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]);
+                let size = PackedLinear::packed_nbytes(isa, arithmetic, Element::F32, (1, inputs));
+                if arithmetic == Arithmetic::Int8 {
+                    assert!(matches!(packed, Err(KernelError::TooManyInputs { .. })));
+                    assert!(matches!(size, Err(KernelError::TooManyInputs { .. })));
+                } else {
+                    assert!(matches!(packed, Err(KernelError::Alloc(_))), "{inputs} {isa}");
+                    assert_eq!(size.unwrap(), usize::MAX, "{inputs} {isa}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+#[should_panic(expected = "values: expected the elements of weight")]
+fn quantising_weights_whose_size_wraps_panics() {
+    // Four rows of 2^62 elements on 64 bits: their product is 0 if it wraps.
+    let inputs = usize::MAX / 4 + 1;
+    let weight = WeightRef::F32(Matrix::from(Rows::strided(&[1.0; 4], inputs, 4, 0)).transpose());
+    quantize_rows(weight, &mut [], &mut [0.0; 4]);
 }

@@ -21,6 +21,35 @@ pub(crate) fn optional_view<'a, T: Element>(
     array.as_ref().map(view).transpose()
 }
 
+/// A mask. The Python package gives bytes: NumPy's booleans may hold any byte, and a `bool` of Rust only two.
+pub(crate) struct Mask {
+    data: Vec<bool>,
+    shape: Vec<usize>,
+}
+
+impl<'py> FromPyObject<'_, 'py> for Mask {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let bytes: PyReadonlyArrayDyn<'py, u8> = object.extract()?;
+        let data = collected("mask", bytes.as_slice()?, |byte| byte != 0)?;
+        Ok(Self {
+            data,
+            shape: bytes.shape().to_vec(),
+        })
+    }
+}
+
+impl Mask {
+    pub(crate) fn view(&self) -> PyResult<Array<'_, bool>> {
+        Array::new(&self.data, &self.shape).map_err(raise)
+    }
+
+    pub(crate) fn optional_view(mask: &Option<Self>) -> PyResult<Option<Array<'_, bool>>> {
+        mask.as_ref().map(Self::view).transpose()
+    }
+}
+
 /// An array to be written, with its `shape`.
 pub(crate) fn view_mut<'a>(
     array: &'a mut PyReadwriteArrayDyn<'_, f32>,
@@ -31,15 +60,20 @@ pub(crate) fn view_mut<'a>(
 
 /// A copy, or a `MemoryError`.
 pub(crate) fn copied<T: Copy>(what: &'static str, data: &[T]) -> PyResult<Vec<T>> {
-    let mut copy = Vec::new();
-    copy.try_reserve_exact(data.len()).map_err(|_| {
+    collected(what, data, |element| element)
+}
+
+/// What `of` makes of each element, or a `MemoryError`.
+fn collected<T: Copy, R>(what: &'static str, data: &[T], of: impl Fn(T) -> R) -> PyResult<Vec<R>> {
+    let mut made = Vec::new();
+    made.try_reserve_exact(data.len()).map_err(|_| {
         raise(Error::Memory {
             what,
-            bytes: size_of_val(data),
+            bytes: data.len().saturating_mul(size_of::<R>()),
         })
     })?;
-    copy.extend_from_slice(data);
-    Ok(copy)
+    made.extend(data.iter().map(|&element| of(element)));
+    Ok(made)
 }
 
 pub(crate) fn to_numpy<'py, T: Element>(

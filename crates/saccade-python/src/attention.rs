@@ -5,7 +5,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade::KeyOptions;
 
-use crate::arrays::{held_tensors, optional_view, tensor_views, view, view_mut};
+use crate::arrays::{Mask, held_tensors, optional_view, tensor_views, view, view_mut};
 use crate::detached::call;
 use crate::error::raise;
 
@@ -86,14 +86,14 @@ impl CrossAttention {
         py: Python<'_>,
         hidden_states: PyReadonlyArrayDyn<'_, f32>,
         kv: &KeyValues,
-        key_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
+        key_mask: Option<Mask>,
         key_bias: Option<PyReadonlyArrayDyn<'_, f32>>,
         mut weights: Option<PyReadwriteArrayDyn<'_, f32>>,
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let hidden_states = view(&hidden_states)?;
         let keys = KeyOptions::default()
-            .with_key_mask(optional_view(&key_mask)?)
+            .with_key_mask(Mask::optional_view(&key_mask)?)
             .with_key_bias(optional_view(&key_bias)?);
         let weights_shape = weights.as_ref().map(|weights| weights.shape().to_vec());
         let weights = match (&mut weights, &weights_shape) {

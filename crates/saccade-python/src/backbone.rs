@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use saccade::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray};
 
-use crate::arrays::{held_tensors, optional_view, tensor_views, to_numpy, view};
+use crate::arrays::{Mask, held_tensors, optional_view, tensor_views, to_numpy, view};
 use crate::detached::call;
 use crate::error::raise;
 
@@ -18,7 +18,7 @@ use crate::error::raise;
 pub(crate) struct PyInputs<'py> {
     pixel_values: Vec<PyReadonlyArrayDyn<'py, f32>>,
     input_ids: PyReadonlyArrayDyn<'py, i64>,
-    attention_mask: PyReadonlyArrayDyn<'py, bool>,
+    attention_mask: Mask,
     image_grid_thw: Option<PyReadonlyArrayDyn<'py, i64>>,
 }
 
@@ -26,7 +26,7 @@ impl PyInputs<'_> {
     fn view(&self) -> PyResult<BackboneInputs<'_>> {
         let pixel_values = self.pixel_values.iter().map(view).collect::<PyResult<_>>()?;
         Ok(BackboneInputs::new(pixel_values, view(&self.input_ids)?)
-            .with_attention_mask(view(&self.attention_mask)?)
+            .with_attention_mask(self.attention_mask.view()?)
             .with_image_grid_thw(optional_view(&self.image_grid_thw)?))
     }
 }

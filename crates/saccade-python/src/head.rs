@@ -10,7 +10,7 @@ use saccade::{
     Chunking, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Sampling, TraceOptions,
 };
 
-use crate::arrays::{copied, held_tensors, optional_view, tensor_views, to_numpy, view, view_mut};
+use crate::arrays::{Mask, copied, held_tensors, optional_view, tensor_views, to_numpy, view, view_mut};
 use crate::config::config_dict;
 use crate::context::Context;
 use crate::detached::call;
@@ -112,16 +112,16 @@ impl ActionHead {
         &self,
         py: Python<'py>,
         backbone_features: PyReadonlyArrayDyn<'_, f32>,
-        attention_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
-        image_mask: Option<PyReadonlyArrayDyn<'_, bool>>,
-        drop_vl: Option<PyReadonlyArrayDyn<'_, bool>>,
+        attention_mask: Option<Mask>,
+        image_mask: Option<Mask>,
+        drop_vl: Option<Mask>,
         attention: bool,
         hidden: bool,
     ) -> PyResult<(Context, PyRecorded<'py>)> {
         let features = Features::new(view(&backbone_features)?)
-            .with_attention_mask(optional_view(&attention_mask)?)
-            .with_image_mask(optional_view(&image_mask)?)
-            .with_drop_vl(optional_view(&drop_vl)?)
+            .with_attention_mask(Mask::optional_view(&attention_mask)?)
+            .with_image_mask(Mask::optional_view(&image_mask)?)
+            .with_drop_vl(Mask::optional_view(&drop_vl)?)
             .with_record(Keep::default().with_attention(attention).with_hidden(hidden));
         let mut context = call(py, || self.0.encode(&features))?;
         let kept = recorded(py, context.take_recorded())?;

@@ -37,8 +37,8 @@ mod _saccade {
     use crate::head::ActionHead;
     #[pymodule_export]
     use crate::machine::{
-        available_isas, cpu_report, default_num_threads, dot_products, measure_peaks, selected_isa,
-        start_profile, stay_on_this_thread, take_profile,
+        PyProfile, StayOnThisThread, available_isas, cpu_report, default_num_threads, dot_products,
+        measure_peaks, selected_isa,
     };
     #[pymodule_export]
     use crate::processor::{Processor, ProcessorSource};

@@ -2,9 +2,9 @@
 
 use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyTuple};
 use saccade::peak::{self, PeakError};
-use saccade::{Arithmetic, CpuReport, Error, Isa, Part, Profile};
+use saccade::{Arithmetic, CpuReport, Error, Isa, Part, Profile, Profiling};
 
 use crate::detached::call;
 use crate::error::raise;
@@ -54,10 +54,26 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
     Ok(peaks)
 }
 
-/// Whether calls of this thread compute on it alone from now on, whatever number of threads a head or backbone has.
-#[pyfunction]
-pub(crate) fn stay_on_this_thread(stays: bool) {
-    saccade::stay_on_this_thread(stays);
+/// A context in which calls of this thread compute on it alone, whatever number of threads a head or backbone has.
+#[pyclass(unsendable, name = "stay_on_this_thread", module = "saccade._saccade")]
+#[derive(Default)]
+pub(crate) struct StayOnThisThread(Option<saccade::StayOnThisThread>);
+
+#[pymethods]
+impl StayOnThisThread {
+    #[new]
+    fn new() -> Self {
+        Self::default()
+    }
+
+    fn __enter__(&mut self) {
+        self.0 = Some(saccade::stay_on_this_thread());
+    }
+
+    #[pyo3(signature = (*_error))]
+    fn __exit__(&mut self, _error: &Bound<'_, PyTuple>) {
+        self.0 = None;
+    }
 }
 
 /// The rate, or the exception for it: for memory that the system refused, or threads.
@@ -68,16 +84,40 @@ fn peak_or_raise(measured: Result<f64, PeakError>) -> PyResult<f64> {
     })
 }
 
-/// Begins to count where the time of this thread's calls goes.
-#[pyfunction]
-pub(crate) fn start_profile() {
-    Profile::start();
+/// A context in which it is counted where the time of this thread's calls goes.
+#[pyclass(unsendable, name = "profile", module = "saccade._saccade")]
+#[derive(Default)]
+pub(crate) struct PyProfile {
+    profiling: Option<Profiling>,
+    counted: Profile,
 }
 
-/// Ends it: `(calls, seconds, multiply_adds, bytes)` by part.
-#[pyfunction]
-pub(crate) fn take_profile(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
-    let profile = Profile::take().unwrap_or_default();
+#[pymethods]
+impl PyProfile {
+    #[new]
+    fn new() -> Self {
+        Self::default()
+    }
+
+    fn __enter__(mut this: PyRefMut<'_, Self>) -> PyRefMut<'_, Self> {
+        this.profiling = Some(Profile::start());
+        this
+    }
+
+    #[pyo3(signature = (*_error))]
+    fn __exit__(&mut self, _error: &Bound<'_, PyTuple>) {
+        if let Some(profiling) = self.profiling.take() {
+            self.counted = profiling.finish();
+        }
+    }
+
+    /// `(calls, seconds, multiply_adds, bytes)` by part, once the context is left.
+    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        counters(py, &self.counted)
+    }
+}
+
+fn counters<'py>(py: Python<'py>, profile: &Profile) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     for part in Part::ALL {
         let counter = profile.part(part);

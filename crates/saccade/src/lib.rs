@@ -52,7 +52,7 @@ pub use processor::{
     Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, ProcessorSource, Tokenizer,
     TokenizerFiles, View,
 };
-pub use profile::{Counter, Part, Profile};
+pub use profile::{Counter, Part, Profile, Profiling};
 pub use recognise::{Published, TensorFacts};
 pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
 pub use rewrite::float::Float;
@@ -62,6 +62,8 @@ pub use rewrite::resize::{
 };
 pub use rewrite::{RewriteOptions, Written};
 pub use saccade_checkpoint::{self as files, Checkpoint, Elements};
-pub use saccade_kernels::{Arithmetic, CpuReport, Isa, default_num_threads, peak, stay_on_this_thread};
+pub use saccade_kernels::{
+    Arithmetic, CpuReport, Isa, StayOnThisThread, default_num_threads, peak, stay_on_this_thread,
+};
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;

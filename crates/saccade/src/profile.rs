@@ -1,6 +1,7 @@
 //! Where the time of a thread's calls goes, by part. Costs a branch around every kernel call unless that thread asked for it.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
+use std::marker::PhantomData;
 use std::time::{Duration, Instant};
 
 /// A part of the work of a head or a backbone.
@@ -94,15 +95,22 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// Begins to count what this thread does from now on; earlier counts are forgotten.
-    pub fn start() {
-        CURRENT.replace(Some(Self::default()));
-    }
+    const NONE: Self = Self {
+        counters: [Counter {
+            calls: 0,
+            time: Duration::ZERO,
+            multiply_adds: 0,
+            bytes: 0,
+        }; Part::ALL.len()],
+    };
 
-    /// Ends it, and hands over what was counted; none if it was not begun.
-    #[must_use]
-    pub fn take() -> Option<Self> {
-        CURRENT.take()
+    /// Counts what this thread does, until what this returns is finished or dropped.
+    pub fn start() -> Profiling {
+        GUARDS.set(GUARDS.get() + 1);
+        Profiling {
+            before: COUNTED.with_borrow(|counted| *counted),
+            of_thread: PhantomData,
+        }
     }
 
     /// What was counted of a part.
@@ -112,26 +120,57 @@ impl Profile {
     }
 }
 
+/// The guard of [`Profile::start`]. It belongs to the thread that made it; where there are several, each counts all that is done while it is there.
+#[derive(Debug)]
+#[must_use = "nothing is counted once it is dropped"]
+pub struct Profiling {
+    /// What the thread had counted before.
+    before: Profile,
+    of_thread: PhantomData<*const ()>,
+}
+
+impl Profiling {
+    /// Ends it, and hands over what was counted.
+    #[must_use]
+    pub fn finish(self) -> Profile {
+        let mut counters = COUNTED.with_borrow(|counted| counted.counters);
+        for (counter, before) in counters.iter_mut().zip(self.before.counters) {
+            counter.calls -= before.calls;
+            counter.time -= before.time;
+            counter.multiply_adds -= before.multiply_adds;
+            counter.bytes -= before.bytes;
+        }
+        Profile { counters }
+    }
+}
+
+impl Drop for Profiling {
+    fn drop(&mut self) {
+        GUARDS.set(GUARDS.get() - 1);
+    }
+}
+
 thread_local! {
-    static CURRENT: RefCell<Option<Profile>> = const { RefCell::new(None) };
+    /// How many guards of this thread there are.
+    static GUARDS: Cell<usize> = const { Cell::new(0) };
+    /// What was counted while there was any.
+    static COUNTED: RefCell<Profile> = const { RefCell::new(Profile::NONE) };
 }
 
 /// Runs `call`, whose work is `(multiply_adds, bytes)`, and counts it under `part` if this thread counts.
 pub(crate) fn counted<R>(part: Option<Part>, work: (usize, usize), call: impl FnOnce() -> R) -> R {
-    let Some(part) = part.filter(|_| CURRENT.with_borrow(Option::is_some)) else {
+    let Some(part) = part.filter(|_| GUARDS.get() > 0) else {
         return call();
     };
     let start = Instant::now();
     let result = call();
     let time = start.elapsed();
-    CURRENT.with_borrow_mut(|profile| {
-        if let Some(profile) = profile {
-            let counter = &mut profile.counters[part as usize];
-            counter.calls += 1;
-            counter.time += time;
-            counter.multiply_adds += work.0 as u64;
-            counter.bytes += work.1 as u64;
-        }
+    COUNTED.with_borrow_mut(|counted| {
+        let counter = &mut counted.counters[part as usize];
+        counter.calls += 1;
+        counter.time += time;
+        counter.multiply_adds += work.0 as u64;
+        counter.bytes += work.1 as u64;
     });
     result
 }
@@ -141,17 +180,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn counts_between_start_and_take_on_this_thread_only() {
+    fn counts_between_start_and_finish_on_this_thread_only() {
         let work = || counted(Some(Part::ToQ), (6, 24), || 7);
         assert_eq!(work(), 7);
-        assert_eq!(Profile::take(), None, "nothing is counted before");
-        Profile::start();
+        let profiling = Profile::start();
         std::thread::scope(|scope| {
             scope.spawn(work);
         });
         work();
         work();
-        let profile = Profile::take().unwrap();
+        let profile = profiling.finish();
         let Counter {
             calls,
             multiply_adds,
@@ -161,7 +199,39 @@ mod tests {
         assert_eq!((calls, multiply_adds, bytes), (2, 12, 48));
         assert_eq!(profile.part(Part::Norm), Counter::default());
         work();
-        assert_eq!(Profile::take(), None);
+        assert_eq!(
+            Profile::start().finish(),
+            Profile::default(),
+            "nothing is counted in between"
+        );
+    }
+
+    #[test]
+    fn nothing_is_counted_after_an_error() {
+        let fails = || -> Result<(), ()> {
+            let _profiling = Profile::start();
+            Err(())
+        };
+        assert_eq!((fails(), GUARDS.get()), (Err(()), 0));
+        let panics = std::panic::catch_unwind(|| {
+            let _profiling = Profile::start();
+            panic!("within");
+        });
+        assert!(panics.is_err() && GUARDS.get() == 0);
+    }
+
+    #[test]
+    fn a_guard_counts_what_others_count_as_well() {
+        let work = || counted(Some(Part::ToQ), (6, 24), || 7);
+        let calls = |profile: Profile| profile.part(Part::ToQ).calls;
+        let first = Profile::start();
+        work();
+        let second = Profile::start();
+        work();
+        assert_eq!(calls(first.finish()), 2);
+        work();
+        assert_eq!(calls(second.finish()), 2);
+        assert_eq!(GUARDS.get(), 0);
     }
 
     #[test]

@@ -99,13 +99,11 @@ def by_turns(
 
 def profiled(work: Callable[[], Any]) -> tuple[float, dict[str, Counter]]:
     """Seconds of one run of `work`, and the counters of the parts that were called."""
-    _saccade.start_profile()
-    start = time.perf_counter()
-    try:
+    with _saccade.profile() as profile:
+        start = time.perf_counter()
         work()
-    finally:
         seconds = time.perf_counter() - start
-        counters = {part: Counter(*counted) for part, counted in _saccade.take_profile().items()}
+    counters = {part: Counter(*counted) for part, counted in profile.counters().items()}
     return seconds, {part: counter for part, counter in counters.items() if counter.calls}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -112,11 +112,9 @@ class Engine:
             job.milliseconds["wait"] = waited - job.milliseconds.get("inputs", 0.0)
         with self._running_threads() as running:
             # A request that is computed alone has all threads.
-            _saccade.stay_on_this_thread(self.num_workers > 1 and (running > 1 or len(jobs) > 1))
-            try:
+            alone = self.num_workers > 1 and (running > 1 or len(jobs) > 1)
+            with _saccade.stay_on_this_thread() if alone else nullcontext():
                 return self._outcomes(jobs)
-            finally:
-                _saccade.stay_on_this_thread(False)
 
     @contextmanager
     def _running_threads(self) -> Iterator[int]:

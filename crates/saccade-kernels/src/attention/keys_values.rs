@@ -44,10 +44,19 @@ impl PackedKeyValues {
     /// Holds no key yet. Keys and values will be held as `element`s: as they come, or rounded to bfloat16 in half the memory.
     ///
     /// # Panics
-    /// If this CPU lacks `isa`, `head_dim` is 0, or `element` is neither [`Element::F32`] nor [`Element::Bf16`].
+    /// If this CPU lacks `isa`, `head_dim` is 0, `num_kv_heads * head_dim` is more than memory can have, or `element` is neither
+    /// [`Element::F32`] nor [`Element::Bf16`].
     #[must_use]
     pub fn new(isa: Isa, element: Element, num_kv_heads: usize, head_dim: usize) -> Self {
         assert!(head_dim > 0, "head_dim: expected at least 1");
+        // The sizes of a head and of all of them are multiplied without checks from here on, and padded by less than the 2 bits left.
+        assert!(
+            num_kv_heads
+                .max(1)
+                .checked_mul(head_dim)
+                .is_some_and(|width| width <= usize::MAX >> 2),
+            "num_kv_heads, head_dim: expected sizes whose product memory can have, got {num_kv_heads} and {head_dim}"
+        );
         isa.check();
         assert!(
             matches!(element, Element::F32 | Element::Bf16),
@@ -127,7 +136,7 @@ impl PackedKeyValues {
             value_group: self.value_group(),
         };
         let (isa, element) = (self.isa, self.element);
-        let threads = if 2 * rows * width < ELEMENTS_FOR_THREADS {
+        let threads = if rows.saturating_mul(width) < ELEMENTS_FOR_THREADS / 2 {
             1
         } else {
             threads

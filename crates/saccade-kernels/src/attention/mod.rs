@@ -12,6 +12,7 @@ mod product;
 mod softmax;
 mod tile;
 
+use crate::parts::part;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
 use crate::weights::Element;
@@ -72,10 +73,11 @@ pub fn attention(
         "out: expected the shape of queries"
     );
     if let Some(weights) = &weights {
-        assert_eq!(
-            weights.len(),
-            num_heads * rows * kv.len(),
-            "weights: expected (num_heads, queries, len)"
+        assert!(
+            holds(weights.len(), [num_heads, rows, kv.len()]),
+            "weights: expected (num_heads, queries, len) = ({num_heads}, {rows}, {}), got {} elements",
+            kv.len(),
+            weights.len()
         );
     }
     if rows == 0 || num_heads == 0 {
@@ -95,21 +97,21 @@ pub fn attention(
         out: out.as_mut_ptr(),
     };
     let tiles = rows.div_ceil(kv.tile_rows());
-    let threads = if 2 * rows * kv.len() * width < MACS_FOR_THREADS {
-        1
-    } else {
-        threads
-    };
+    let macs = rows
+        .saturating_mul(kv.len())
+        .saturating_mul(width)
+        .saturating_mul(2);
+    let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
     // Tiles of one head follow each other: its keys and values are then in the caches of all threads.
     parallel_for(threads, num_heads * tiles, &|task| {
         let (head, tile) = (task / tiles, task % tiles);
         // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
-        let (first, end) = (rows * tile / tiles, rows * (tile + 1) / tiles);
+        let of_tile = part(rows, tile, tiles);
         let tile = QueryTile {
             call: &call,
             head,
-            first,
-            rows: end - first,
+            first: of_tile.start,
+            rows: of_tile.len(),
         };
         match kv.element() {
             Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(&tile)),
@@ -117,4 +119,30 @@ pub fn attention(
             _ => kv.isa().run(FloatTile(&tile)),
         }
     });
+}
+
+/// Whether `len` elements are an array of these sizes. Tasks write to it through pointers, so a product that wraps must not pass.
+fn holds(len: usize, sizes: [usize; 3]) -> bool {
+    let product = sizes
+        .iter()
+        .try_fold(1_usize, |product, &size| product.checked_mul(size));
+    product == Some(len)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_whose_product_wraps_fit_no_array() {
+        assert!(holds(24, [2, 3, 4]) && holds(0, [2, 0, 4]));
+        let half = 1 << (usize::BITS / 2);
+        for (len, sizes) in [
+            (0, [1, half, half]),
+            (0, [half, 2, half]),
+            (2, [2, usize::MAX / 2 + 2, 1]),
+        ] {
+            assert!(!holds(len, sizes), "{sizes:?} in {len}");
+        }
+    }
 }

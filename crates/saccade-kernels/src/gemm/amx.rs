@@ -7,7 +7,7 @@ use super::dot_bf16::Narrowing;
 use super::dot_int8::Quantizing;
 use super::outliers::MultiplyOutliers;
 use super::streams::Parts;
-use super::{Block, Gemm, PanelMut, ROW_BLOCK, Shape, Source, odd_lines, panel};
+use super::{Block, Gemm, MAX_ROW_BLOCK, PanelMut, ROW_BLOCK, Shape, Source, odd_lines, panel};
 use crate::simd::{Simd, Vector};
 use crate::tiles::{Ahead, MAX_ROWS, Operation, Product, Session, TILE, TileUnit};
 use crate::weights::WeightRef;
@@ -21,11 +21,8 @@ const STEP_WORDS: usize = TILE * COLUMNS;
 /// Steps of a part of a panel at most: 192 kB, and in as many steps a line of each of 48 streams of 4 kB.
 const PART_STEPS: usize = 64;
 
-/// Rows that go through a panel together at most. Products in tiles are so fast that weights come from memory no faster than they are used:
-/// as many rows as fit into the second-level cache beside the panel, 2 MB where there is AMX.
-pub(super) const MAX_ROW_BLOCK: usize = 320;
-
-/// Bytes of these rows.
+/// Bytes of the rows that go through a panel together at most. Products in tiles are so fast that weights come from memory no faster than
+/// they are used: as many rows as fit into the second-level cache beside the panel, 2 MB where there is AMX.
 const ROW_BYTES: usize = 5 << 18;
 
 /// What is multiplied, and how weights and rows become words of it.

@@ -19,6 +19,7 @@ mod tile;
 use std::ops::Range;
 
 use crate::aligned::Zeroable;
+use crate::parts::part_start;
 use crate::simd::LINE;
 use crate::weights::WeightRef;
 use outliers::{MultiplyOutliers, Outliers};
@@ -56,8 +57,11 @@ pub(crate) const MAX_COLUMNS: usize = 64;
 /// past. 96 rows of 2048 are 768 kB, three quarters of a 1 MB cache.
 pub(crate) const ROW_BLOCK: usize = 96;
 
+/// Rows of the largest block of any product, that of tiles; or a tile more.
+pub(crate) const MAX_ROW_BLOCK: usize = 320;
+
 /// Words of the sums of a block of rows and a panel: of 48 columns, where the block is the largest.
-pub(crate) const MAX_SUMS: usize = (amx::MAX_ROW_BLOCK + 32) * 48;
+pub(crate) const MAX_SUMS: usize = (MAX_ROW_BLOCK + 32) * 48;
 
 const _: () = assert!(MAX_SUMS >= (ROW_BLOCK + 32) * MAX_COLUMNS);
 
@@ -117,10 +121,11 @@ impl Tiles {
     #[inline(always)]
     pub(crate) fn first_row(&self, tile: usize) -> usize {
         if self.row_group == 1 {
-            return self.rows * tile / self.count;
+            return part_start(self.rows, tile, self.count);
         }
         let groups = self.rows.div_ceil(self.row_group);
-        self.rows.min(groups * tile / self.count * self.row_group)
+        self.rows
+            .min(part_start(groups, tile, self.count) * self.row_group)
     }
 }
 

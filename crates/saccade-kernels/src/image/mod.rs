@@ -107,7 +107,7 @@ impl<'a> Image<'a> {
     /// # Errors
     /// If the system refuses the memory.
     pub fn to_vec(self) -> Result<Vec<u8>, AllocError> {
-        let mut pixels = reserved(self.height * self.width * CHANNELS)?;
+        let mut pixels = reserved(area(self.height, self.width)?)?;
         for row in 0..self.height {
             pixels.extend_from_slice(self.row(row));
         }

@@ -13,11 +13,12 @@ mod rows;
 use std::mem::MaybeUninit;
 use std::ops::Range;
 
-use crate::aligned::{AlignedBuffer, AllocError};
+use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::cpu::Cpu;
 use crate::gemm::outliers::{MultiplyOutliers, Outliers};
-use crate::gemm::{Block, Gemm, MAX_SUMS, Product, Quantized, Tiles};
+use crate::gemm::{Block, Gemm, MAX_COLUMNS, MAX_SUMS, Product, Quantized, Tiles};
 use crate::isa::Isa;
+use crate::parts::part;
 use crate::pool::{parallel_for, usable};
 use crate::rows::{Rows, RowsMut};
 use crate::weights::{Arithmetic, Element, WeightRef};
@@ -129,6 +130,7 @@ impl PackedLinear {
             .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
         let (product, element) = product_of(arithmetic, are_bf16, in_features)?;
         let gemm = isa.gemm(product);
+        check_panel(in_features)?;
         let columns = gemm.shape().columns;
         let mut bias = AlignedBuffer::zeroed(out_features.next_multiple_of(columns))?;
         let mut column = 0;
@@ -173,7 +175,7 @@ impl PackedLinear {
         }
     }
 
-    /// The bytes that a layer of `(out_features, in_features)` holds when it is packed. `weights` is [`Element::Bf16`] if all its parts are
+    /// The bytes that a layer of `(out_features, in_features)` holds when it is packed; `usize::MAX` for more than that. `weights` is [`Element::Bf16`] if all its parts are
     /// bf16; every other element is packed as [`Element::F32`] is.
     ///
     /// # Errors
@@ -188,6 +190,9 @@ impl PackedLinear {
         (out_features, in_features): (usize, usize),
     ) -> Result<usize, KernelError> {
         let (product, _) = product_of(arithmetic, weights == Element::Bf16, in_features)?;
+        if check_panel(in_features).is_err() {
+            return Ok(usize::MAX);
+        }
         let gemm = isa.gemm(product);
         let columns = gemm.shape().columns;
         // A bias for each column; for int8 also a scale and a sum.
@@ -311,7 +316,7 @@ impl PackedLinear {
         let order = Order::new(blocks, num_panels, panel_bytes, threads, TASKS_PER_THREAD);
         parallel_for(threads, order.tasks(), &|task| {
             let (block, panel) = order.at(task);
-            let range = tiles.count * block / blocks..tiles.count * (block + 1) / blocks;
+            let range = part(tiles.count, block, blocks);
             self.run_panel(&call, range, columns, panel, order.ahead(task));
         });
         Ok(())
@@ -326,7 +331,7 @@ impl PackedLinear {
         let first = panel * columns;
         let rows = call.tiles.first_row(range.start)..call.tiles.first_row(range.end);
         assert!(
-            rows.len() * columns <= MAX_SUMS,
+            rows.len() <= MAX_SUMS / columns,
             "a block of {} rows and {columns} columns",
             rows.len()
         );
@@ -413,6 +418,14 @@ impl PackedLinear {
             out_stride: call.out_stride,
         });
     }
+}
+
+/// Checks that memory can have a panel, and a converted row, of `in_features`: every [`Gemm`] multiplies and pads their sizes without checks.
+fn check_panel(in_features: usize) -> Result<(), AllocError> {
+    // More than any product pads a row to.
+    let padded = in_features.checked_next_multiple_of(1024);
+    let padded = padded.ok_or(AllocError { bytes: usize::MAX })?;
+    elements(padded, MAX_COLUMNS * size_of::<u32>()).map(drop)
 }
 
 /// What multiplies weights, which `are_bf16` or are not, and the elements that they are packed as.

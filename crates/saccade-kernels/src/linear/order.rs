@@ -41,13 +41,17 @@ impl Order {
         Self {
             blocks,
             panels,
-            // One block meets each panel once.
-            groups: if blocks == 1 { 1 } else { panels.div_ceil(in_group) },
+            // One block meets each panel once. `at` multiplies the two numbers without checks.
+            groups: match blocks {
+                1 => 1,
+                _ => panels.div_ceil(in_group).min(usize::MAX / panels.max(1)),
+            },
             threads,
         }
     }
 
     pub(super) fn tasks(&self) -> usize {
+        // Each writes a result of its own, so there are no more than memory has.
         self.blocks * self.panels
     }
 

@@ -3,6 +3,7 @@
 use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::gemm::outliers::Outliers;
 use crate::gemm::{Gemm, Quantized, Source};
+use crate::parts::part_start;
 use crate::pool::parallel_for;
 use crate::rows::Rows;
 
@@ -79,8 +80,9 @@ impl LinearScratch {
         if keeps_outliers && self.outliers.len() < rows {
             self.outliers = AlignedBuffer::zeroed(rows)?;
         }
-        let tasks = (rows * width).div_ceil(ELEMENTS_PER_TASK).clamp(1, groups.max(1));
-        let threads = if rows * width < ELEMENTS_FOR_THREADS {
+        let elements_given = rows.saturating_mul(width);
+        let tasks = elements_given.div_ceil(ELEMENTS_PER_TASK).clamp(1, groups.max(1));
+        let threads = if elements_given < ELEMENTS_FOR_THREADS {
             1
         } else {
             threads
@@ -95,7 +97,7 @@ impl LinearScratch {
         });
         parallel_for(threads, tasks, &|task| {
             let source = &source;
-            let first = |task| rows.min(groups * task / tasks * shape.row_group);
+            let first = |task| rows.min(part_start(groups, task, tasks) * shape.row_group);
             // SAFETY: tasks have different groups of rows, for which there is room.
             unsafe { gemm.convert(&source.0, first(task)..first(task + 1)) };
         });

@@ -1,7 +1,10 @@
 //! LayerNorm over rows, plain or with a scale and a shift applied in the same pass.
 
+use std::ops::Range;
+
 use super::split;
 use crate::isa::Isa;
+use crate::parts::part;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
 use crate::simd::{Kernel, Simd, Vector, load, store};
@@ -58,11 +61,9 @@ pub fn layer_norm(
     };
     let (threads, tasks) = split(threads, rows, width);
     parallel_for(threads, tasks, &|task| {
-        let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
         isa.run(LayerNormRows {
             call: &call,
-            first,
-            end,
+            rows: part(rows, task, tasks),
         });
     });
 }
@@ -82,8 +83,7 @@ unsafe impl Sync for LayerNorm<'_> {}
 
 struct LayerNormRows<'a> {
     call: &'a LayerNorm<'a>,
-    first: usize,
-    end: usize,
+    rows: Range<usize>,
 }
 
 impl Kernel for LayerNormRows<'_> {
@@ -91,7 +91,7 @@ impl Kernel for LayerNormRows<'_> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) {
-        for row in self.first..self.end {
+        for row in self.rows {
             // SAFETY: rows are within the views; the caller has the instruction set.
             unsafe {
                 let x = self.call.x.offset(row as isize * self.call.x_stride);

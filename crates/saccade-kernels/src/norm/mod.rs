@@ -11,7 +11,7 @@ const ELEMENTS_PER_TASK: usize = 1 << 13;
 
 /// How many threads and tasks a norm of `rows` rows of `width` elements gets.
 fn split(threads: usize, rows: usize, width: usize) -> (usize, usize) {
-    let elements = rows * width;
+    let elements = rows.saturating_mul(width);
     let tasks = elements.div_ceil(ELEMENTS_PER_TASK).min(rows);
     let threads = if elements < ELEMENTS_FOR_THREADS {
         1

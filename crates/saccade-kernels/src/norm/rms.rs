@@ -1,7 +1,10 @@
 //! RMSNorm over rows, or over each head of a row.
 
+use std::ops::Range;
+
 use super::split;
 use crate::isa::Isa;
+use crate::parts::part;
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut};
 use crate::simd::{Kernel, Simd, Vector, load, store};
@@ -87,15 +90,16 @@ fn run(isa: Isa, threads: usize, rows: usize, call: &RmsNorm<'_>) {
     );
     let (threads, tasks) = split(threads, rows, call.width);
     parallel_for(threads, tasks, &|task| {
-        let (first, end) = (rows * task / tasks, rows * (task + 1) / tasks);
-        isa.run(RmsNormRows { call, first, end });
+        isa.run(RmsNormRows {
+            call,
+            rows: part(rows, task, tasks),
+        });
     });
 }
 
 struct RmsNormRows<'a> {
     call: &'a RmsNorm<'a>,
-    first: usize,
-    end: usize,
+    rows: Range<usize>,
 }
 
 impl Kernel for RmsNormRows<'_> {
@@ -104,7 +108,7 @@ impl Kernel for RmsNormRows<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self, _: S) {
         let call = self.call;
-        for row in self.first..self.end {
+        for row in self.rows {
             for head in (0..call.width).step_by(call.weight.len()) {
                 // SAFETY: rows are within the views, heads within rows.
                 unsafe {

@@ -17,6 +17,7 @@ mod slot;
 
 use std::cell::Cell;
 use std::hint::black_box;
+use std::marker::PhantomData;
 use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicPtr, AtomicU32, AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex, PoisonError};
@@ -27,7 +28,7 @@ pub use interrupt::{Interrupted, interrupted, interruptible};
 
 use interrupt::Scope;
 use place::Place;
-use slot::{Job, Slot, lock};
+use slot::{Job, Slot, lock, spin_until};
 
 /// Calls that can have workers at the same time. A call beyond them runs on its own thread only.
 const SLOTS: usize = 8;
@@ -195,22 +196,11 @@ impl Pool {
     }
 }
 
-/// At most 32 turns, or until `is_over()`; returns whether it is. Reading the clock costs a few turns, so callers read it only in between.
-/// Looking once in 32 turns instead finds work up to 0.6 us late (Zen 4); the loops of a small head take about 10 us.
-fn spin_until(is_over: impl Fn() -> bool) -> bool {
-    (0..32).any(|_| {
-        is_over() || {
-            std::hint::spin_loop();
-            false
-        }
-    })
-}
-
 thread_local! {
     /// Whether this thread is running a task: a loop inside runs on this thread alone.
     static INSIDE: Cell<bool> = const { Cell::new(false) };
-    /// What the caller asked for with [`stay_on_this_thread`].
-    static STAYS: Cell<bool> = const { Cell::new(false) };
+    /// How many guards of [`stay_on_this_thread`] there are.
+    static STAYS: Cell<usize> = const { Cell::new(0) };
 }
 
 /// The pool of this process, or of the one that it was forked from; null before anyone needed one. Never freed.
@@ -240,8 +230,8 @@ fn pool() -> &'static Pool {
 
 /// Runs `f(task)` for every `task` in `0..tasks`, on up to `threads` threads of which the caller is one.
 ///
-/// Tasks are dealt one by one to threads that are free. With one thread, one task, within a task of another loop, or after
-/// [`stay_on_this_thread`], everything runs on the calling thread and nothing is started. The pool belongs to the process
+/// Tasks are dealt one by one to threads that are free. With one thread, one task, within a task of another loop, or while there is a
+/// guard of [`stay_on_this_thread`], everything runs on the calling thread and nothing is started. The pool belongs to the process
 /// and may be used from many threads at once, after `fork`, and with more threads than there are cores. Once its threads
 /// run, a call allocates nothing.
 ///
@@ -271,25 +261,40 @@ pub fn parallel_for(threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
     }
 }
 
-/// Whether the loops that the calling thread starts run on this thread alone from now on, as within a task.
+/// The loops that the calling thread starts run on this thread alone, as within a task, until what this returns is dropped.
 ///
 /// For a caller that computes several things at the same time, one on each of its threads. Where every loop is short this is faster than all
 /// threads in every loop: nothing waits for the last task of a loop.
 ///
 /// ```
 /// use saccade_kernels::{parallel_for, stay_on_this_thread};
-/// stay_on_this_thread(true);
+/// let _alone = stay_on_this_thread();
 /// let here = std::thread::current().id();
 /// parallel_for(2, 8, &|_| assert_eq!(std::thread::current().id(), here));
-/// stay_on_this_thread(false);
 /// ```
-pub fn stay_on_this_thread(stays: bool) {
-    STAYS.set(stays);
+pub fn stay_on_this_thread() -> StayOnThisThread {
+    STAYS.set(STAYS.get() + 1);
+    StayOnThisThread(PhantomData)
+}
+
+/// The guard of [`stay_on_this_thread`]. It belongs to the thread that made it; of several, the last one dropped ends it.
+#[derive(Debug)]
+#[must_use = "loops use other threads again once it is dropped"]
+pub struct StayOnThisThread(PhantomData<*const ()>);
+
+impl Drop for StayOnThisThread {
+    fn drop(&mut self) {
+        STAYS.set(STAYS.get() - 1);
+    }
 }
 
 /// How many of `threads` threads a loop of the calling thread can have.
 pub(crate) fn usable(threads: usize) -> usize {
-    if INSIDE.get() || STAYS.get() { 1 } else { threads }
+    if INSIDE.get() || STAYS.get() > 0 {
+        1
+    } else {
+        threads
+    }
 }
 
 #[cfg(test)]
@@ -304,6 +309,26 @@ mod tests {
             visits[task].fetch_add(1, Ordering::Relaxed);
         });
         visits.into_iter().map(AtomicUsize::into_inner).collect()
+    }
+
+    #[test]
+    fn a_thread_stays_alone_until_its_last_guard_is_gone_also_after_errors() {
+        let fails = || -> Result<(), ()> {
+            let _alone = stay_on_this_thread();
+            assert_eq!(usable(8), 1);
+            Err(())
+        };
+        assert_eq!((fails(), usable(8)), (Err(()), 8));
+        let panics = catch_unwind(|| {
+            let _alone = stay_on_this_thread();
+            panic!("within");
+        });
+        assert!(panics.is_err() && usable(8) == 8);
+        let (first, second) = (stay_on_this_thread(), stay_on_this_thread());
+        drop(first);
+        assert_eq!(usable(8), 1);
+        drop(second);
+        assert_eq!(usable(8), 8);
     }
 
     #[test]

@@ -7,7 +7,6 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::place::Place;
-use super::spin_until;
 
 /// One call of [`parallel_for`](crate::parallel_for), on the caller's stack.
 pub(super) struct Job<'a> {
@@ -201,4 +200,15 @@ impl Slot {
 /// The lock, whether or not a thread has panicked while it held it.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// At most 32 turns, or until `is_over()`; returns whether it is. Reading the clock costs a few turns, so callers read it only in between.
+/// Looking once in 32 turns instead finds work up to 0.6 us late (Zen 4); the loops of a small head take about 10 us.
+pub(super) fn spin_until(is_over: impl Fn() -> bool) -> bool {
+    (0..32).any(|_| {
+        is_over() || {
+            std::hint::spin_loop();
+            false
+        }
+    })
 }

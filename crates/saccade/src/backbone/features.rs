@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use saccade_kernels::PackedKeyValues;
 
-use crate::alloc::reserve;
+use crate::alloc::{product, reserve};
 use crate::array::OwnedArray;
 use crate::error::Result;
 
@@ -90,7 +90,8 @@ impl BackboneFeatures {
     /// [`Error::Memory`](crate::Error::Memory).
     pub fn all_features(&self) -> Result<Vec<f32>> {
         let mut all = Vec::new();
-        let len = self.batch() * self.num_tokens * self.feature_dim;
+        let sizes = [self.batch(), self.num_tokens, self.feature_dim];
+        let len = product("backbone_features", &sizes)?;
         reserve("backbone_features", &mut all, len)?;
         for prompt in &self.prompts {
             all.extend_from_slice(&prompt.features);

@@ -21,6 +21,7 @@ mod released;
 mod siglip;
 mod vision;
 mod vision_block;
+mod vision_buffers;
 
 pub use config::{BackboneConfig, LanguageConfig, VisionConfig};
 pub use encode::BackboneKeep;

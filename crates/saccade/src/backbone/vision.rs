@@ -2,16 +2,14 @@
 
 use std::sync::Arc;
 
-use saccade_kernels::Activations;
-
 use super::config::{BackboneConfig, Tower};
 use super::features::View;
 use super::inputs::{ViewPixels, num_tokens};
 use super::qwen3_vl::Qwen3Vl;
 use super::released::Names;
 use super::siglip::Siglip;
-use super::vision_block::BlockBuffers;
-use crate::alloc::{collected, filled, reserve};
+use super::vision_buffers::VisionBuffers;
+use crate::alloc::{collected, reserve};
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::weights::Weights;
@@ -24,35 +22,6 @@ const VISION_ROWS: usize = 2048;
 pub(super) enum Vision {
     Siglip(Siglip),
     Qwen3Vl(Qwen3Vl),
-}
-
-/// What a tower makes of views, one after the other.
-pub(super) struct EncodedViews {
-    /// `(tokens, width of the language model)`.
-    pub tokens: Vec<f32>,
-    /// The same, to be added after the first layers of the language model.
-    pub deepstack: Vec<Vec<f32>>,
-}
-
-impl EncodedViews {
-    /// Room for `len` elements of tokens.
-    pub(super) fn new(len: usize) -> Result<Self> {
-        Ok(Self {
-            tokens: filled("tokens of views", len, 0.0)?,
-            deepstack: Vec::new(),
-        })
-    }
-}
-
-/// Memory of one call that is kept for the next.
-#[derive(Default)]
-pub(super) struct VisionBuffers {
-    /// `(patches, width)`.
-    pub x: Activations,
-    /// The pixels of patches, `(patches, elements)`.
-    pub patch_vectors: Activations,
-    pub block: BlockBuffers,
-    pub connector: super::connector::ConnectorBuffers,
 }
 
 impl Vision {

@@ -4,7 +4,7 @@ use saccade_kernels::{Activations, Epilogue, LinearScratch, LogitBias, PackedKey
 
 use super::linear::Linear;
 use super::weights::Weights;
-use crate::alloc::{collected, reserve, sized};
+use crate::alloc::{collected, product, reserve, sized};
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::ops::{self, no_keys_values, rows, rows_mut};
@@ -106,7 +106,8 @@ impl Bias<'_> {
         };
         let heads = if shared.head_stride == 0 { 1 } else { heads };
         chosen.clear();
-        reserve("activations", chosen, heads * queries * keys)?;
+        let len = product("activations", &[heads, queries, keys])?;
+        reserve("activations", chosen, len)?;
         for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
             let row = &shared.values[head * shared.head_stride + query * shared.query_stride..];
             chosen.extend(positions.iter().map(|&position| row[position]));
@@ -139,7 +140,8 @@ impl Bias<'_> {
         };
         let heads = if shared.head_stride == 0 { 1 } else { heads };
         sum.clear();
-        reserve("activations", sum, heads * queries * keys)?;
+        let len = product("activations", &[heads, queries, keys])?;
+        reserve("activations", sum, len)?;
         for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
             let row = &shared.values[head * shared.head_stride + query * shared.query_stride..][..keys];
             sum.extend(row.iter().zip(own).map(|(shared, own)| shared + own));

@@ -5,8 +5,7 @@ use std::fmt;
 use serde::de::{Deserialize, Deserializer, Error as _, IgnoredAny, SeqAccess, Unexpected, Visitor};
 use serde_json::{Value, json};
 
-use super::PATTERN;
-use super::parts::{Added, Ids, Parts, Problems};
+use super::parts::{Added, Ids, PATTERN, Parts, Problems};
 use crate::error::{Error, Result};
 
 #[derive(serde::Deserialize)]

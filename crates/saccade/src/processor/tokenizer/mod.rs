@@ -19,14 +19,11 @@ use tokenizers::{
 
 use crate::error::{Error, Result};
 use find::FilesText;
-use parts::Parts;
+use parts::{PATTERN, Parts};
 
 pub use find::TokenizerFiles;
 
-/// How Qwen2 splits text before BPE.
-const PATTERN: &str = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+";
-
-/// Longer text is refused before it is looked at: no model takes as many tokens, and the pattern above gives up on a million spaces.
+/// Longer text is refused before it is looked at: no model takes as many tokens, and the pattern gives up on a million spaces.
 const MAX_TEXT_BYTES: usize = 1 << 18;
 
 /// That text which errors call `name` is not too long to be split.

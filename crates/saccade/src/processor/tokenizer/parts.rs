@@ -15,6 +15,9 @@ const MAX_ID: u32 = 1 << 24;
 /// Problems that one error lists.
 const MAX_PROBLEMS: usize = 20;
 
+/// How Qwen2 splits text before BPE.
+pub(super) const PATTERN: &str = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+";
+
 /// A token that is found in text before anything else.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Added {
