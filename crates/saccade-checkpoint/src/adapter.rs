@@ -127,7 +127,9 @@ fn object(path: &Path) -> Map<String, Value> {
 /// A file of weights in `directory` that is no adapter's.
 fn weights_in(directory: &Path) -> Option<PathBuf> {
     let entries = std::fs::read_dir(directory).ok()?;
-    let mut names: Vec<_> = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).collect();
+    let mut names: Vec<_> = entries
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .collect();
     names.sort();
     let is_weights = |name: &&String| {
         (name.ends_with(".safetensors") || name.ends_with(".safetensors.index.json"))

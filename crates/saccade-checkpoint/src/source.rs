@@ -127,6 +127,9 @@ pub fn read_text(what: &'static str, path: &Path) -> Result<String> {
     let text = read().map_err(|error| Error::reading(what, path, error))?;
     match pointer_problem(path, text.as_bytes()) {
         None => Ok(text),
-        Some(problem) => Err(Error::Checkpoint(format!("{what}: {}: {problem}", path.display()))),
+        Some(problem) => Err(Error::Checkpoint(format!(
+            "{what}: {}: {problem}",
+            path.display()
+        ))),
     }
 }
