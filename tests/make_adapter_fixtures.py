@@ -83,9 +83,7 @@ def main() -> None:
     torch.manual_seed(0)
     whole = Whole()
     DATA.mkdir(exist_ok=True)
-    backbone = {
-        name: value for name, value in whole.state_dict().items() if name.startswith("backbone.")
-    }
+    backbone = {name: value for name, value in whole.state_dict().items() if name.startswith("backbone.")}
     save_file(backbone, DATA / "backbone.safetensors")
     for name, (dtype, adapter_dtype, options) in CASES.items():
         folder = DATA / name

@@ -30,7 +30,9 @@ CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 def base_tensors(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
     """The model that `make_adapter_fixtures` adapted."""
     head = {name: value for name, value in load_file(TINY.path).items() if name.startswith("action_head.")}
-    return {name: value.to(dtype) for name, value in (head | load_file(DATA / "backbone.safetensors")).items()}
+    return {
+        name: value.to(dtype) for name, value in (head | load_file(DATA / "backbone.safetensors")).items()
+    }
 
 
 def write_base(folder: Path, tensors: dict[str, Tensor]) -> Path:
@@ -148,18 +150,27 @@ BROKEN: dict[str, tuple[Break, str]] = {
         keys(modules_to_save=["state_encoder", "action_encoder"]),
         "action_head.action_encoder.W1.W of modules_to_save is not in the adapter",
     ),
-    "half a pair": (tensors(lambda all: all.pop(f"{Q}.lora_B.weight")), "is there without .*to_q.lora_B.weight"),
+    "half a pair": (
+        tensors(lambda all: all.pop(f"{Q}.lora_B.weight")),
+        "is there without .*to_q.lora_B.weight",
+    ),
     "a tensor of another rule": (
         tensors(lambda all: all.update({f"{Q}.lora_magnitude_vector": torch.ones(4)})),
         "lora_magnitude_vector: expected a lora_A or lora_B",
     ),
-    "a name without a base": (tensors(lambda all: all.update(a=torch.ones(4))), "a: expected a name that begins"),
+    "a name without a base": (
+        tensors(lambda all: all.update(a=torch.ones(4))),
+        "a: expected a name that begins",
+    ),
     "not finite": (
         tensors(lambda all: all[f"{Q}.lora_A.weight"].fill_(float("nan"))),
         "lora_A.weight holds NaN, expected finite",
     ),
     "not there": (lambda folder: (folder / CONFIG).unlink(), "no such file.*adapter_config.json"),
-    "without weights": (lambda folder: (folder / WEIGHTS).unlink(), "no such file.*adapter_model.safetensors"),
+    "without weights": (
+        lambda folder: (folder / WEIGHTS).unlink(),
+        "no such file.*adapter_model.safetensors",
+    ),
     "weights of an old PEFT": (
         lambda folder: (folder / WEIGHTS).rename(folder / "adapter_model.bin"),
         "adapter_model.bin, expected adapter_model.safetensors",
@@ -220,7 +231,9 @@ def test_the_adapters_other_files_take_the_place_of_the_bases(base: Path, tmp_pa
 def test_lerobots_config_is_the_adapters(tmp_path: Path) -> None:
     source = layouts.write(tmp_path / "source", "lerobot")
     config = json.loads((source / "config.json").read_text())
-    name = next(name for name in load_file(source / "model.safetensors") if name.endswith("0.attn1.to_q.weight"))
+    name = next(
+        name for name in load_file(source / "model.safetensors") if name.endswith("0.attn1.to_q.weight")
+    )
     rows, columns = load_file(source / "model.safetensors")[name].shape
     module = f"base_model.model.{name.removesuffix('.weight')}"
     adapter = tmp_path / "adapter"
@@ -235,7 +248,9 @@ def test_lerobots_config_is_the_adapters(tmp_path: Path) -> None:
     about = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "target_modules": [name.removesuffix(".weight")]}
     (adapter / CONFIG).write_text(json.dumps(about | {"base_model_name_or_path": str(source)}))
     (adapter / "config.json").write_text(json.dumps(config | {"use_peft": True, "n_action_steps": 7}))
-    with pytest.raises(CheckpointError, match=r"use_peft.*saccade convert .*source --adapter .* --out MERGED"):
+    with pytest.raises(
+        CheckpointError, match=r"use_peft.*saccade convert .*source --adapter .* --out MERGED"
+    ):
         saccade.ActionHead.load(adapter)
     convert(source, tmp_path / "out", adapter=adapter)
     written = json.loads((tmp_path / "out" / "config.json").read_text())

@@ -26,8 +26,8 @@ pub(crate) struct Delta {
     b: Vec<f32>,
     columns: usize,
     scaling: f32,
-    /// The products of one row, in float64: closer to the exact sum than any order of additions in float32.
-    sums: Vec<f64>,
+    /// The products of one row.
+    sums: Vec<f32>,
     row: Option<usize>,
 }
 
@@ -63,7 +63,7 @@ impl Delta {
             let count = (self.columns - column).min(values.len() - done);
             let sums = &self.sums[column..column + count];
             for (value, sum) in values[done..done + count].iter_mut().zip(sums) {
-                *value += *sum as f32 * self.scaling;
+                *value += sum * self.scaling;
             }
             done += count;
         }
@@ -80,7 +80,8 @@ impl Delta {
         for (factor, a) in factors.iter().zip(self.a.chunks_exact(self.columns)) {
             let factor = f64::from(*factor);
             for (sum, a) in self.sums.iter_mut().zip(a) {
-                *sum += factor * f64::from(*a);
+                // A fused multiply-add, one rank after the other, as torch's product on a CPU: in float64 this product is exact.
+                *sum = (f64::from(*sum) + factor * f64::from(*a)) as f32;
             }
         }
     }

@@ -1,7 +1,7 @@
 //! LoRA adapters of PEFT, merged into the weights of their base: `W + scaling * B A`.
 //!
 //! As PEFT's `merge_and_unload` on a CPU: the product and the sum are computed in float32, also for weights of 16 bits, and the sum is rounded to
-//! the type of the weight. Here the product is summed in float64 first, so a float32 weight may differ from PEFT's by rounding.
+//! the type of the weight. The bits are those of torch's matrix product on x86; other libraries may add in another order.
 
 mod config;
 mod delta;
