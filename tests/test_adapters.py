@@ -68,8 +68,9 @@ def test_merged_as_by_peft(case: str, tmp_path: Path) -> None:
     for name, value in expected.items():
         assert merged[name].dtype == value.dtype
         if name in load_file(DATA / case / "merged.safetensors"):
-            # PEFT's product is rounded in an order of its own.
-            torch.testing.assert_close(merged[name], value, rtol=2e-6 if case == "float32" else 0, atol=1e-6)
+            # Another CPU's matrix product may add in another order.
+            rtol = 1e-6 if case == "float32" else 0
+            torch.testing.assert_close(merged[name], value, rtol=rtol, atol=1e-6)
         else:
             assert torch.equal(merged[name], value)
     replaced = sum("state_encoder" in name for name in expected) if case == "float32" else 0
@@ -284,7 +285,7 @@ def test_an_adapter_is_no_model(reader: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("reader", READERS)
 def test_an_adapter_beside_a_model_is_not_ignored(reader: str, base: Path, tmp_path: Path) -> None:
     copy_adapter(base)
-    message = r"holds a model \(model.safetensors\) and beside it a LoRA adapter .*saccade convert .*remove adapter_"
+    message = r"holds a model \(model.safetensors\) and beside it a LoRA adapter .*convert .*remove adapter_"
     with pytest.raises(CheckpointError, match=message):
         READERS[reader](base)
     convert(base, tmp_path / "merged", adapter=base)

@@ -1,4 +1,4 @@
-"""Git LFS pointers in place of a checkpoint's files: the message names the file and the command that downloads it.
+"""Git LFS pointers in place of a checkpoint's files: messages name the file and the command that downloads it.
 
 Weights, indexes and configs are among the files of test_hostile_files.
 """
@@ -55,5 +55,5 @@ def test_tokenizers(name: str, tmp_path: Path) -> None:
 def test_a_tokenizer_that_is_not_json_is_named(tmp_path: Path) -> None:
     path = tmp_path / "tokenizer.json"
     path.write_text("{")
-    with pytest.raises(CheckpointError, match="tokenizer: .*tokenizer.json: not valid JSON"):
+    with pytest.raises(CheckpointError, match=r"tokenizer: .*tokenizer.json: not valid JSON"):
         saccade.Processor("n1.5", path)

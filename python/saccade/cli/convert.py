@@ -1,4 +1,4 @@
-"""`saccade convert`: writes a checkpoint with other embodiments, dtype or shards, or with a merged adapter."""
+"""`saccade convert`: writes a checkpoint with other embodiments, dtype or shards, or a merged adapter."""
 
 from __future__ import annotations
 
