@@ -1,4 +1,4 @@
-"""Git LFS pointers in place of a checkpoint's files: messages name the file and the command that downloads it.
+"""Git LFS pointers in place of files of a checkpoint: messages name the file and the command to download it.
 
 Weights, indexes and configs are among the files of test_hostile_files.
 """
