@@ -170,6 +170,56 @@ def test_a_name_in_two_files_outside_the_head_is_ignored(tmp_path: Path) -> None
     saccade.ActionHead.load(tmp_path, config=TINY.config)
 
 
+def test_a_single_file_beside_an_index_counts(tmp_path: Path) -> None:
+    (tmp_path / "model.safetensors").write_bytes(TINY.path.read_bytes())
+    expected = saccade.ActionHead.load(TINY.path, config=TINY.config)(FEATURES, STATE, 1, noise=NOISE)
+    other = {name: np.zeros_like(value) for name, value in load_file(TINY.path).items()}
+    save_file(other, tmp_path / "model-00001-of-00001.safetensors")
+    weight_map = dict.fromkeys(other, "model-00001-of-00001.safetensors")
+    (tmp_path / "model.safetensors.index.json").write_text(json.dumps({"weight_map": weight_map}))
+    head = saccade.ActionHead.load(tmp_path, config=TINY.config)
+    np.testing.assert_array_equal(head(FEATURES, STATE, 1, noise=NOISE), expected)
+    # Without it the index counts.
+    (tmp_path / "model.safetensors").unlink()
+    head = saccade.ActionHead.load(tmp_path, config=TINY.config)
+    assert not np.array_equal(head(FEATURES, STATE, 1, noise=NOISE), expected)
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda name: f"_orig_mod.{name}",
+        lambda name: f"module.{name}",
+        lambda name: f"module._orig_mod.{name}",
+        lambda name: name.replace("action_head.", "action_head._orig_mod."),
+        lambda name: name.replace("model.transformer_blocks.", "model._orig_mod.transformer_blocks."),
+        lambda name: name.replace("attn1.", "attn1._orig_mod."),
+    ],
+)
+@pytest.mark.parametrize("indexed", [False, True])
+def test_names_of_wrapped_models(wrapped: Callable[[str], str], indexed: bool, tmp_path: Path) -> None:
+    expected = saccade.ActionHead.load(TINY.path, config=TINY.config)(FEATURES, STATE, 1, noise=NOISE)
+    tensors = {wrapped(name): value for name, value in load_file(TINY.path).items()}
+    save_file(tensors, tmp_path / ("shard.safetensors" if indexed else "model.safetensors"))
+    if indexed:
+        weight_map = dict.fromkeys(tensors, "shard.safetensors")
+        (tmp_path / "model.safetensors.index.json").write_text(json.dumps({"weight_map": weight_map}))
+    head = saccade.ActionHead.load(tmp_path, config=TINY.config)
+    np.testing.assert_array_equal(head(FEATURES, STATE, 1, noise=NOISE), expected)
+
+
+def test_names_that_become_the_same(tmp_path: Path) -> None:
+    def change(tensors: dict[str, Any]) -> None:
+        tensors["module.action_head._orig_mod.vlln.bias"] = tensors["action_head.vlln.bias"]
+
+    path = rewritten(tmp_path / "model.safetensors", change)
+    message = (
+        r"action_head.vlln.bias and module.action_head._orig_mod.vlln.bias|module.* and action_head.vlln.bias"
+    )
+    with pytest.raises(saccade.CheckpointError, match=f"({message}) are the same tensor"):
+        saccade.ActionHead.load(path, config=TINY.config)
+
+
 def test_a_tensor_in_two_files(tmp_path: Path) -> None:
     for name in ("a.safetensors", "b.safetensors"):
         save_file({"action_head.vlln.bias": np.zeros(24, np.float32)}, tmp_path / name)

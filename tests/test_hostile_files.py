@@ -65,7 +65,17 @@ def config(content: str | bytes) -> Callable[[Path], object]:
 
 def index(weight_map: dict[str, Any] | str) -> Callable[[Path], object]:
     text = weight_map if isinstance(weight_map, str) else json.dumps({"weight_map": weight_map})
-    return lambda folder: (folder / "model.safetensors.index.json").write_text(text)
+    return indexed(lambda folder: (folder / INDEX).write_text(text))
+
+
+def indexed(change: Callable[[Path], object]) -> Callable[[Path], object]:
+    """A change to an index that counts: model.safetensors beside one would count alone."""
+
+    def apply(folder: Path) -> None:
+        (folder / "model.safetensors").rename(folder / "weights.safetensors")
+        change(folder)
+
+    return apply
 
 
 def pipe(name: str) -> Callable[[Path], object]:
@@ -101,6 +111,7 @@ def holes(dtype: str, shape: list[int], nbytes: int) -> Callable[[Path], object]
 
 
 INDEX = "model.safetensors.index.json"
+POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 4967215360\n"
 # The head's names and shapes are compared before anything is read.
 TOO_LARGE = "cannot allocate|do not fit the config|disagree"
 SUM_OVERFLOWS = {
@@ -116,11 +127,14 @@ BROKEN_WEIGHTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "directory": (directory("model.safetensors"), "not a regular file"),
     "dangling link": (link("model.safetensors", "nowhere"), "no such file.*model.safetensors"),
     "link to itself": (link("model.safetensors", "model.safetensors"), "model.safetensors cannot be read"),
-    "index is a pipe": (pipe(INDEX), "index.json cannot be read: not a regular file"),
-    "index is a device": (link(INDEX, "/dev/zero"), "index.json cannot be read: not a regular file"),
-    "index is a directory": (directory(INDEX), "index.json cannot be read: not a regular file"),
-    "index is a dangling link": (link(INDEX, "nowhere"), "no such file.*index.json"),
-    "index is no text": (lambda folder: (folder / INDEX).write_bytes(b'{"\xff": 1}'), "UTF-8"),
+    "index is a pipe": (indexed(pipe(INDEX)), "index.json cannot be read: not a regular file"),
+    "index is a device": (
+        indexed(link(INDEX, "/dev/zero")),
+        "index.json cannot be read: not a regular file",
+    ),
+    "index is a directory": (indexed(directory(INDEX)), "index.json cannot be read: not a regular file"),
+    "index is a dangling link": (indexed(link(INDEX, "nowhere")), "no such file.*index.json"),
+    "index is no text": (indexed(lambda folder: (folder / INDEX).write_bytes(b'{"\xff": 1}')), "UTF-8"),
     "index is deep": (index("[" * 100_000), "index.json: "),
     "index with a name twice": (index('{"weight_map": {"a": "x", "a": "y"}}'), "a appears twice"),
     "index names a folder": (index({"a": "."}), "expected a file name in the same directory"),
@@ -145,6 +159,11 @@ BROKEN_WEIGHTS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "header of many lines": (weights(safetensors({"a\nb": tensor(0, 0, [0])})), "holds control characters"),
     "header of numbers that are none": (weights(safetensors('{"a": NaN}')), "header"),
+    "a Git LFS pointer": (
+        weights(POINTER.encode()),
+        "model.safetensors: it is a Git LFS pointer, not the file itself: run `git lfs pull` in .*good",
+    ),
+    "index is a Git LFS pointer": (index(POINTER), "index.json: it is a Git LFS pointer"),
     "a lone surrogate": (weights(safetensors('{"\\ud800": 1}')), "header"),
     "a name that is not UTF-8": (
         lambda folder: Path(os.fsdecode(bytes(folder) + b"/\xff.safetensors")).write_bytes(b""),
@@ -166,7 +185,11 @@ BROKEN_CONFIGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "dangling link": (link("config.json", "nowhere"), "no such file"),
     "link to itself": (link("config.json", "config.json"), "cannot be read"),
     "terabytes": (lambda folder: os.truncate(folder / "config.json", 2**42), "more than 100000000 bytes"),
-    "empty": (config(""), "not valid JSON"),
+    "empty": (config(""), "config.json: not valid JSON"),
+    "a Git LFS pointer": (
+        config(POINTER),
+        "config: .*config.json: it is a Git LFS pointer.*git lfs pull` in",
+    ),
     "not UTF-8": (config(b'{"\xff": 1}'), "UTF-8"),
     "deep": (config('{"a": ' * 100_000), "not valid JSON: recursion limit"),
     "a list": (config("[]"), "expected a JSON object"),

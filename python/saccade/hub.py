@@ -119,6 +119,8 @@ def _snapshot(name: str, revision: str | None) -> Path:
 
 def _missing(folder: Path) -> list[str]:
     """Required files that a partial download does not contain."""
+    if (folder / "adapter_config.json").exists():  # an adapter alone, whose readers say what it lacks
+        return []
     missing = [] if (folder / "config.json").exists() else ["config.json"]
     indexes = sorted(folder.glob("*.safetensors.index.json"))
     if not indexes:

@@ -1,11 +1,12 @@
 //! The files next to a checkpoint's weights that belong to it: statistics, processors, tokenizers, licences. The programs that read the
 //! source need them, so a copy has them too, byte for byte.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use crate::adapter::{ADAPTER_CONFIG, is_adapter};
 use crate::error::{Error, Result};
 use crate::source::open_regular;
 
@@ -22,6 +23,16 @@ const WEIGHTS: [&str; 7] = ["safetensors", "bin", "pt", "pth", "ckpt", "gguf", "
 
 /// Where lerobot keeps the statistics of its processors.
 const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
+
+/// Files, in the folders below, that describe robots: statistics, keys, cameras, ids.
+const ROBOTS: [&str; 5] = [
+    "processor_config.json",
+    "statistics.json",
+    "dataset_statistics.json",
+    "embodiment_id.json",
+    "metadata.json",
+];
+const ROBOT_FOLDERS: [&str; 3] = ["", "processor", "experiment_cfg"];
 
 /// A tokenizer has 15 MB.
 const MAX_BYTES: u64 = 1 << 28;
@@ -40,8 +51,8 @@ pub(crate) fn is_processor(name: &str) -> bool {
 /// The files next to a checkpoint's weights.
 pub struct Companions {
     root: PathBuf,
-    /// What is copied, by the path from `root`.
-    carried: BTreeSet<PathBuf>,
+    /// What is copied, by the path in the copy: where it is.
+    carried: BTreeMap<PathBuf, PathBuf>,
     /// What is not.
     left: Vec<PathBuf>,
 }
@@ -60,14 +71,16 @@ impl Companions {
         };
         let mut companions = Self {
             root: root.to_owned(),
-            carried: BTreeSet::new(),
+            carried: BTreeMap::new(),
             left: Vec::new(),
         };
         if is_directory {
             let weights: BTreeSet<&Path> = weights.collect();
             companions.add_folder(Path::new(""), &weights)?;
         } else if root.join(OWN_CONFIG).is_file() {
-            companions.carried.insert(PathBuf::from(OWN_CONFIG));
+            companions
+                .carried
+                .insert(PathBuf::from(OWN_CONFIG), root.join(OWN_CONFIG));
         }
         Ok(companions)
     }
@@ -105,7 +118,7 @@ impl Companions {
                 && belongs(name)
                 && self.carried.len() < MAX_FILES
             {
-                self.carried.insert(path);
+                self.carried.insert(path, from);
             } else {
                 self.left.push(path);
             }
@@ -122,6 +135,28 @@ impl Companions {
                 .is_ok_and(|entries| !entries.flatten().any(is_weights))
     }
 
+    /// These together with the files of the adapter in `directory`, which take the place of those of the same name. If it has files that describe
+    /// robots, the others of that kind are left: they would describe the robots of the base. The files of an adapter alone are not copied.
+    /// `is_beside` says that the directory is the checkpoint's own.
+    ///
+    /// # Errors
+    /// As [`Companions::of`].
+    pub fn with_adapter(mut self, directory: &Path, is_beside: bool) -> Result<Self> {
+        if !is_beside {
+            let mut other = Self::of(directory, std::iter::empty())?;
+            // PEFT's own description of the adapter.
+            other.carried.remove(Path::new("README.md"));
+            if other.carried.keys().any(|path| describes_robots(path)) {
+                self.carried.retain(|path, _| !describes_robots(path));
+            }
+            self.carried.extend(other.carried);
+            self.left.extend(other.left);
+        }
+        self.carried.remove(Path::new(ADAPTER_CONFIG));
+        self.left.retain(|path| !path.to_str().is_some_and(is_adapter));
+        Ok(self)
+    }
+
     /// All of them but `file`, which is written separately.
     #[must_use]
     pub fn without(mut self, file: &str) -> Self {
@@ -132,7 +167,7 @@ impl Companions {
     /// What is copied, by the path from the checkpoint's directory.
     #[must_use]
     pub fn all_paths(&self) -> BTreeSet<PathBuf> {
-        self.carried.clone()
+        self.carried.keys().cloned().collect()
     }
 
     /// What is not copied: other weights, states of an optimizer, other checkpoints.
@@ -142,9 +177,9 @@ impl Companions {
     }
 
     pub(crate) fn copy_to(&self, directory: &Path) -> Result<()> {
-        for path in &self.carried {
-            let (from, to) = (self.root.join(path), directory.join(path));
-            let source = open_regular(&from).map_err(|error| Error::reading("source", &from, error))?;
+        for (path, from) in &self.carried {
+            let to = directory.join(path);
+            let source = open_regular(from).map_err(|error| Error::reading("source", from, error))?;
             let folder = to.parent().expect("a path in a directory has a parent");
             let copy = || {
                 std::fs::create_dir_all(folder)?;
@@ -157,6 +192,14 @@ impl Companions {
         }
         Ok(())
     }
+}
+
+/// Whether the file at `path` of a checkpoint describes robots.
+fn describes_robots(path: &Path) -> bool {
+    let (Some(name), Some(folder)) = (path.file_name().and_then(|name| name.to_str()), path.parent()) else {
+        return false;
+    };
+    ROBOT_FOLDERS.iter().any(|one| folder == Path::new(one)) && (ROBOTS.contains(&name) || is_processor(name))
 }
 
 fn belongs(name: &str) -> bool {

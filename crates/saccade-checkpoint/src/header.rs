@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use safetensors::tensor::{Metadata, TensorInfo};
 
 use crate::error::reserve;
+use crate::lfs::{TELLING, pointer_problem};
 use crate::source::{MAX_TEXT_BYTES, SourceFile};
 use crate::unique_map::UniqueMap;
 
@@ -24,6 +25,12 @@ impl Header {
         let mut size = [0; 8];
         file.read_at(&mut size, 0)
             .map_err(|_| format!("not safetensors: {length} bytes, expected at least 8"))?;
+        let mut start = [0; TELLING];
+        if file.read_at(&mut start, 0).is_ok()
+            && let Some(problem) = pointer_problem(&file.path, &start)
+        {
+            return Err(problem);
+        }
         let size = u64::from_le_bytes(size);
         if size > MAX_TEXT_BYTES || size > length - 8 {
             return Err(format!(

@@ -4,10 +4,15 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+use crate::adapter::is_adapter;
 use crate::companions::is_processor;
 use crate::error::{Error, Result};
+use crate::names::plain_name;
 use crate::source::read_text;
 use crate::unique_map::UniqueMap;
+
+/// The file that transformers and lerobot look for first: beside it they read neither an index nor other files.
+const SINGLE: &str = "model.safetensors";
 
 /// The `.safetensors` files of a directory.
 pub(crate) struct WeightFiles {
@@ -17,7 +22,8 @@ pub(crate) struct WeightFiles {
 }
 
 impl WeightFiles {
-    /// Those that the directory's index (`*.safetensors.index.json`) names, or else all that are no processor's statistics.
+    /// `model.safetensors` alone if it is there, as in transformers and lerobot; or else those that the directory's index
+    /// (`*.safetensors.index.json`) names; or else all that are no processor's statistics.
     pub(crate) fn of(directory: &Path) -> Result<Self> {
         let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", directory.display()));
         let all: Vec<OsString> = std::fs::read_dir(directory)
@@ -35,12 +41,18 @@ impl WeightFiles {
             }
         }
         names.sort();
+        if names.iter().any(|name| name == SINGLE) {
+            return Ok(Self {
+                files: vec![directory.join(SINGLE)],
+                weight_map: Vec::new(),
+            });
+        }
         let mut indexes = names
             .iter()
             .filter(|name| name.ends_with(".safetensors.index.json"));
         let files: Vec<PathBuf> = names
             .iter()
-            .filter(|name| name.ends_with(".safetensors") && !is_processor(name))
+            .filter(|name| name.ends_with(".safetensors") && !is_processor(name) && !is_adapter(name))
             .map(|name| directory.join(name))
             .collect();
         match (indexes.next(), indexes.next()) {
@@ -76,7 +88,7 @@ impl WeightFiles {
                 )));
             }
             files.insert(directory.join(&shard));
-            weight_map.push((name, directory.join(shard)));
+            weight_map.push((plain_name(&name).into_owned(), directory.join(shard)));
         }
         if files.is_empty() {
             return Err(bad("weight_map names no tensor".to_owned()));

@@ -8,22 +8,27 @@
 
 #![forbid(unsafe_code)]
 
+mod adapter;
 mod ahead;
 mod companions;
 mod elements;
 mod error;
 mod header;
 mod index;
+mod lfs;
+mod names;
 mod reader;
 mod source;
 pub mod spec;
 mod unique_map;
 mod writer;
 
+pub use adapter::{ADAPTER_CONFIG, ADAPTER_WEIGHTS};
 pub use ahead::{ReadAhead, Wanted};
 pub use companions::{Companions, OWN_CONFIG};
 pub use elements::Elements;
 pub use error::{Error, Result, granted, printable, reserve, show_bytes, show_shape};
+pub use names::plain_name;
 pub use reader::Checkpoint;
 /// The types that tensors are stored in.
 pub use safetensors::Dtype;

@@ -9,10 +9,12 @@ use half::{bf16, f16};
 use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 
+use crate::adapter::{refuse_adapter, refuse_use_peft};
 use crate::elements::{Elements, check_int8};
 use crate::error::{Error, Result, granted, reserve, show_shape};
 use crate::header::Header;
 use crate::index::WeightFiles;
+use crate::names::plain_name;
 use crate::source::SourceFile;
 use crate::spec::{self, Problem, SCALE_SUFFIX, TensorSpec};
 
@@ -24,6 +26,8 @@ struct Entry {
     info: TensorInfo,
     /// The position of the tensor's first byte in the file.
     start: u64,
+    /// Its name in the file, where that is another.
+    wrapped: Option<String>,
 }
 
 /// The tensors of one checkpoint, by name.
@@ -39,29 +43,62 @@ pub struct Checkpoint {
 impl Checkpoint {
     /// Opens `path`: one `.safetensors` file, or a directory with one or more of them.
     ///
-    /// A directory with an index (`*.safetensors.index.json`) is read as the index says; otherwise every `.safetensors` file in it counts.
+    /// Of a directory, `model.safetensors` counts alone if it is there; otherwise an index (`*.safetensors.index.json`) says which files do;
+    /// otherwise every `.safetensors` file in it does. Names lose what wrappers of a model add to them, see [`plain_name`].
     ///
     /// # Errors
-    /// [`Error::NotFound`] for a path that is not there; [`Error::Checkpoint`] for a file that is not safetensors, is truncated,
-    /// or names a tensor twice. A name in two files is an error only where that tensor is wanted.
+    /// [`Error::NotFound`] for a path that is not there; [`Error::Checkpoint`] for a file that is not safetensors, is truncated, names a
+    /// tensor twice, or is a Git LFS pointer; for an adapter, whether alone or beside a model. A name in two files is an error only where that
+    /// tensor is wanted.
     pub fn open(path: &Path) -> Result<Self> {
         let metadata = std::fs::metadata(path).map_err(|error| Error::reading("source", path, error))?;
-        let mut checkpoint = Self {
+        refuse_use_peft(path)?;
+        refuse_adapter(path)?;
+        Self::open_weights(path, metadata.is_dir())
+    }
+
+    /// As [`Checkpoint::open`], where an adapter beside the weights is known and will be merged into them.
+    ///
+    /// # Errors
+    /// Those of [`Checkpoint::open`], except for an adapter beside a model.
+    pub fn open_beside_adapter(path: &Path) -> Result<Self> {
+        let metadata = std::fs::metadata(path).map_err(|error| Error::reading("source", path, error))?;
+        refuse_use_peft(path)?;
+        Self::open_weights(path, metadata.is_dir())
+    }
+
+    /// Opens one file that need not be a model's weights: names stay as they are, and what is beside it does not count.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] and [`Error::Checkpoint`] as for [`Checkpoint::open`].
+    pub fn open_file(path: &Path) -> Result<Self> {
+        let mut checkpoint = Self::empty();
+        checkpoint.add_file(path, |name| name)?;
+        Ok(checkpoint)
+    }
+
+    fn open_weights(path: &Path, is_directory: bool) -> Result<Self> {
+        let plain = |name: String| plain_name(&name).into_owned();
+        let mut checkpoint = Self::empty();
+        if is_directory {
+            let weights = WeightFiles::of(path)?;
+            for file in &weights.files {
+                checkpoint.add_file(file, plain)?;
+            }
+            checkpoint.check_index(&weights)?;
+        } else {
+            checkpoint.add_file(path, plain)?;
+        }
+        Ok(checkpoint)
+    }
+
+    fn empty() -> Self {
+        Self {
             files: Vec::new(),
             entries: BTreeMap::new(),
             duplicates: BTreeMap::new(),
             metadata: BTreeMap::new(),
-        };
-        if metadata.is_dir() {
-            let weights = WeightFiles::of(path)?;
-            for file in &weights.files {
-                checkpoint.add_file(file)?;
-            }
-            checkpoint.check_index(&weights)?;
-        } else {
-            checkpoint.add_file(path)?;
         }
-        Ok(checkpoint)
     }
 
     /// What the files say of themselves; where they differ, what the first one says.
@@ -315,7 +352,7 @@ impl Checkpoint {
         Ok(values)
     }
 
-    fn add_file(&mut self, path: &Path) -> Result<()> {
+    fn add_file(&mut self, path: &Path, rename: impl Fn(String) -> String) -> Result<()> {
         let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
         let file = SourceFile::open(path).map_err(|error| Error::reading("source", path, error))?;
         let header = Header::read(&file).map_err(bad)?;
@@ -323,9 +360,19 @@ impl Checkpoint {
             self.metadata.entry(key).or_insert(value);
         }
         let index = self.files.len();
-        for (name, info) in header.tensors {
+        for (written, info) in header.tensors {
             let start = header.data_start + info.data_offsets.0 as u64;
+            let name = rename(written.clone());
+            let wrapped = (written != name).then_some(written);
             if let Some(other) = self.entries.get(&name) {
+                if other.wrapped != wrapped {
+                    let (one, two) = (other.wrapped.as_ref(), wrapped.as_ref());
+                    return Err(bad(format!(
+                        "{} and {} are the same tensor, {name}, without what torch.compile and DistributedDataParallel add",
+                        one.unwrap_or(&name),
+                        two.unwrap_or(&name)
+                    )));
+                }
                 let other = self.files[other.file].path.display();
                 let problem = format!("{name} is in two files, {other} and {}", path.display());
                 self.duplicates.insert(name, problem);
@@ -337,6 +384,7 @@ impl Checkpoint {
                     file: index,
                     info,
                     start,
+                    wrapped,
                 },
             );
         }

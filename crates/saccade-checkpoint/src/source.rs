@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use crate::error::{Error, Result};
+use crate::lfs::pointer_problem;
 
 /// A longer header, index or config is hostile: the released head has 314 tensors in 40 kB.
 pub(crate) const MAX_TEXT_BYTES: u64 = 100_000_000;
@@ -108,7 +109,8 @@ pub(crate) fn open_regular(path: &Path) -> IoResult<File> {
 /// The text of the file `path`, an index or a config, which errors call `what`.
 ///
 /// # Errors
-/// [`Error::NotFound`] if it is not there; [`Error::Unreadable`] if it is no regular file, not UTF-8, or larger than 100 MB.
+/// [`Error::NotFound`] if it is not there; [`Error::Unreadable`] if it is no regular file, not UTF-8, or larger than 100 MB;
+/// [`Error::Checkpoint`] if it is a Git LFS pointer.
 pub fn read_text(what: &'static str, path: &Path) -> Result<String> {
     let read = || {
         let mut text = String::new();
@@ -122,5 +124,12 @@ pub fn read_text(what: &'static str, path: &Path) -> Result<String> {
         }
         Ok(text)
     };
-    read().map_err(|error| Error::reading(what, path, error))
+    let text = read().map_err(|error| Error::reading(what, path, error))?;
+    match pointer_problem(path, text.as_bytes()) {
+        None => Ok(text),
+        Some(problem) => Err(Error::Checkpoint(format!(
+            "{what}: {}: {problem}",
+            path.display()
+        ))),
+    }
 }

@@ -44,13 +44,13 @@ pub(crate) fn tensor_names(py: Python<'_>, source: PathBuf) -> PyResult<Vec<Stri
 /// Type, shape and bytes of a tensor, as stored.
 type PyStoredTensor<'py> = (String, Vec<usize>, Bound<'py, PyBytes>);
 
-/// Every tensor as it is stored, of whatever type, by name. For small files.
+/// Every tensor of a file as it is stored, of whatever type, by name. For small files.
 #[pyfunction]
 pub(crate) fn read_stored<'py>(
     py: Python<'py>,
     source: PathBuf,
 ) -> PyResult<BTreeMap<String, PyStoredTensor<'py>>> {
-    let checkpoint = call(py, || Ok(Checkpoint::open(&source)?))?;
+    let checkpoint = call(py, || Ok(Checkpoint::open_file(&source)?))?;
     let mut tensors = BTreeMap::new();
     for name in checkpoint.names() {
         let mut bytes = Vec::new();
@@ -79,6 +79,20 @@ impl Published {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
         call(py, || saccade::Published::open(&source, config.as_deref())).map(Self)
+    }
+
+    /// The base of the adapter in a directory.
+    #[staticmethod]
+    fn open_base(
+        py: Python<'_>,
+        source: PathBuf,
+        config: Option<String>,
+        adapter: Option<PathBuf>,
+    ) -> PyResult<Self> {
+        call(py, || {
+            saccade::open_base(&source, config.as_deref(), adapter.as_deref())
+        })
+        .map(Self)
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {

@@ -91,14 +91,17 @@ pub(crate) fn convert<'py>(
     rewrite: PyRewrite,
     embodiment_ids: Option<Vec<i64>>,
     dtype: Option<String>,
+    adapter: Option<PathBuf>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let dtype = dtype.map(|name| name.parse()).transpose().map_err(raise)?;
     let report = rewrite.run(py, |source, out, rewrite, progress| {
         let mut options = ConvertOptions::new(rewrite);
-        (options.embodiment_ids, options.dtype) = (embodiment_ids, dtype);
+        (options.embodiment_ids, options.dtype, options.adapter) = (embodiment_ids, dtype, adapter);
         saccade::convert(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;
+    dict.set_item("num_merged", report.num_merged)?;
+    dict.set_item("num_replaced", report.num_replaced)?;
     dict.set_item("num_converted", report.num_converted)?;
     dict.set_item("num_rounded", report.num_rounded)?;
     dict.set_item("largest_error", report.largest_error)?;

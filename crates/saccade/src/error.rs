@@ -1,5 +1,7 @@
 //! What can go wrong: every message names the argument, what was given and what was expected.
 
+use std::path::Path;
+
 pub(crate) use saccade_checkpoint::show_shape;
 use saccade_checkpoint::{printable, show_bytes};
 use saccade_kernels::{IsaError, KernelError, NumThreadsError};
@@ -74,6 +76,17 @@ pub enum ErrorKind {
 }
 
 impl Error {
+    /// The error of the text in the file `path`: one that names what is not JSON names the file too.
+    pub(crate) fn in_file(self, path: &Path) -> Self {
+        match self {
+            Self::Json { what, source } => Self::Json {
+                what: format!("{what}: {}", path.display()),
+                source,
+            },
+            other => other,
+        }
+    }
+
     /// What went wrong.
     #[must_use]
     pub fn kind(&self) -> ErrorKind {

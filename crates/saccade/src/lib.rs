@@ -54,6 +54,7 @@ pub use processor::{
 };
 pub use profile::{Counter, Part, Profile, Profiling};
 pub use recognise::{Published, TensorFacts};
+pub use rewrite::adapter::open_base;
 pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
 pub use rewrite::float::Float;
 pub use rewrite::quantize::{QuantizeReport, quantize};

@@ -1,4 +1,4 @@
-"""Changed copies of checkpoints: quantised, converted, or with another number of future tokens."""
+"""Changed copies of checkpoints: quantised, converted, merged with an adapter, with more or fewer tokens."""
 
 from __future__ import annotations
 
@@ -61,6 +61,10 @@ class QuantizeReport(Written):
 class ConvertReport(Written):
     """What :func:`convert` wrote."""
 
+    num_merged: int
+    """Number of weights that an adapter was added to."""
+    num_replaced: int
+    """Number of tensors that an adapter replaced (``modules_to_save``)."""
     num_converted: int
     """Number of tensors whose dtype changed."""
     num_rounded: int
@@ -157,6 +161,7 @@ def convert(
     source: Source,
     out: str | os.PathLike[str],
     *,
+    adapter: Source | None = None,
     config: Config = None,
     embodiment_ids: Sequence[int] | None = None,
     dtype: str | None = None,
@@ -165,7 +170,7 @@ def convert(
     force: bool = False,
     progress: Progress = None,
 ) -> ConvertReport:
-    """Writes a copy of a checkpoint with fewer embodiments, in another dtype, or split into other files.
+    """Writes a copy of a checkpoint: fewer embodiments, another dtype, other files, or with a LoRA adapter.
 
     Everything else is copied bit for bit: tensors, ``config.json``, and the other files of the directory
     (statistics, processors, tokenizers). A part of one tensor at a time is in memory. The directory appears
@@ -174,6 +179,13 @@ def convert(
     Args:
         source, config, out, head_only, force, progress: As in :func:`quantize`. Other programs need the
             tensors outside the head.
+        adapter: The directory or id of a LoRA adapter that PEFT saved (``adapter_config.json``,
+            ``adapter_model.safetensors``). ``W + scaling * B A`` takes the place of each weight ``W`` that it
+            adapts, and the tensors of its ``modules_to_save`` take the place of the source's, as by PEFT's
+            ``merge_and_unload`` on a model in the dtype of the copy: product and sum are computed in float32
+            and rounded to that dtype. The adapter's other files (statistics, processors, lerobot's
+            ``config.json``) take the place of the source's; if it has files that describe robots, those of
+            the source are left out. A README of the adapter is not copied.
         embodiment_ids: The embodiments to keep. The layers of the others become zero. They keep their place,
             so that ids keep their numbers and every program that reads the source reads the copy. A note in
             the metadata of the files makes saccade refuse the ids that were removed. The zeros take no disk
@@ -187,15 +199,20 @@ def convert(
     Raises:
         FileNotFoundError: ``source`` or the config does not exist.
         CheckpointError: The source is damaged, does not fit the config, or contains a finite value beyond the
-            range of the dtype. Or ``out`` cannot be written.
+            range of the dtype. Or ``out`` cannot be written. Or the adapter is of another kind (DoRA, biases,
+            another type of PEFT), a tensor of it does not fit the source, or the source is in int8.
         InputError: An option is out of range, ``out`` exists and ``force`` is not set, or ``out`` contains
             other files or the source.
     """
-    rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
+    folder = None if adapter is None else resolve(adapter)
+    rewrite = _rewrite(
+        source, out, config, force=force, progress=progress, head_only=head_only, adapter=folder
+    )
     if max_shard_bytes is not None:
         rewrite["max_shard_bytes"] = integer("max_shard_bytes", max_shard_bytes)
     ids = optional_integers("embodiment_ids", embodiment_ids)
-    found = _paths(_saccade.convert(rewrite, ids, None if dtype is None else text("dtype", dtype)))
+    dtype_name = None if dtype is None else text("dtype", dtype)
+    found = _paths(_saccade.convert(rewrite, ids, dtype_name, None if folder is None else os.fspath(folder)))
     kept = found["embodiment_ids"]
     return ConvertReport(**{**found, "embodiment_ids": None if kept is None else tuple(kept)})
 
@@ -262,14 +279,25 @@ def _rewrite(
     force: bool,
     progress: Progress,
     head_only: bool = False,
+    adapter: Path | None = None,
 ) -> dict[str, Any]:
     """The arguments that the three functions share, for the engine."""
     path = resolve(source)
     config_text = None if config is None else to_json(config)
-    published = _saccade.Published.open(os.fspath(path), config_text)
+    published = _saccade.Published.open_base(
+        os.fspath(path), config_text, None if adapter is None else os.fspath(adapter)
+    )
     published.check()  # before the hash, which takes long
     config_file = (path if path.is_dir() else path.parent) / "config.json"
     hashed = [config_file] if config_file.is_file() else []
+    metadata = {
+        "format": "pt",
+        "saccade": _saccade.__version__,
+        "source_sha256": sha256_of(*hashed, *published.files),
+    }
+    if adapter is not None:
+        files = (adapter / name for name in ("adapter_config.json", "adapter_model.safetensors"))
+        metadata["adapter_sha256"] = sha256_of(*filter(Path.is_file, files))
     return {
         "source": os.fspath(path),
         "out": os.fspath(out),
@@ -277,11 +305,7 @@ def _rewrite(
         "head_only": head_only,
         "keep_backbone": False,
         "force": force,
-        "metadata": {
-            "format": "pt",
-            "saccade": _saccade.__version__,
-            "source_sha256": sha256_of(*hashed, *published.files),
-        },
+        "metadata": metadata,
         "max_shard_bytes": None,
         "progress": progress,
     }

@@ -1,4 +1,4 @@
-"""`saccade convert`: writes a checkpoint with other embodiments, another dtype or other shards."""
+"""`saccade convert`: writes a checkpoint with other embodiments, dtype or shards, or a merged adapter."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from saccade._arguments import UsageError
 from saccade.cli import EXIT_OK, _output
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
-HELP = "write a checkpoint with other embodiments, another dtype or other shards"
+HELP = "write a checkpoint with other embodiments, another dtype or other shards, or merge a LoRA adapter"
 
 EPILOG = """\
 Everything else is copied bit for bit: tensors, config.json, and other files of the checkpoint such as
@@ -21,7 +21,13 @@ The weights of embodiments that are left out become zero and stay in place: ids 
 program that reads CHECKPOINT reads the copy. On file systems with sparse files the zeros take no space (see
 du). A narrower dtype rounds; the report says by how much.
 
+--adapter merges a LoRA adapter that PEFT saved into CHECKPOINT, its base: W + scaling * B A, and the modules
+that were trained whole. The adapter's own statistics, processors and (lerobot's) config.json take the place
+of the base's. With --dtype the base is converted first, as if PEFT merged into a model of that dtype. What is
+not plain addition (DoRA, biases) is refused.
+
 examples:
+  saccade convert GR00T-N1.5-3B/ --adapter my-lora/ --out merged
   saccade convert GR00T-N1.5-3B/ --out GR00T-N1.5-3B-bf16 --dtype bfloat16
   saccade convert GR00T-N1.5-3B/ --out two-robots --embodiment-ids 24,31 --head-only
   saccade convert my-finetune/ --out my-finetune-shards --max-shard-size 2GB --json
@@ -34,6 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
     add_copy_arguments(parser)
+    parser.add_argument(
+        "--adapter", metavar="DIR", help="LoRA adapter to merge: a directory, or an id in the local cache"
+    )
     arguments.add_list(
         parser, "--embodiment-ids", item=int, metavar="ID", help="embodiments to keep (default: all)"
     )
@@ -59,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
         report = convert(
             args.checkpoint,
             args.out,
+            adapter=args.adapter,
             config=args.config,
             embodiment_ids=None if args.embodiment_ids is None else list(args.embodiment_ids),
             dtype=args.dtype,
@@ -76,6 +86,11 @@ def run(args: argparse.Namespace) -> int:
         f"{args.out}: {files}, {report.bytes_after / 1e6:.1f} MB (was {report.bytes_before / 1e6:.1f} MB); "
         f"{report.num_converted} tensors converted, {report.num_dropped} left out; {others} copied"
     )
+    if args.adapter is not None:
+        print(
+            f"merged {args.adapter}: added to {report.num_merged} weights, "
+            f"replaced {report.num_replaced} tensors"
+        )
     if report.embodiment_ids is not None:
         kept = ", ".join(map(str, report.embodiment_ids))
         print(f"kept embodiments {kept}; {report.zeroed_bytes / 1e6:.1f} MB of the others are zero")

@@ -16,6 +16,9 @@ from saccade.errors import CheckpointError, printable
 #: A larger file is refused, since it is read at once. No robot's statistics are larger.
 MOST_BYTES = 1 << 26
 
+#: How the text of a Git LFS pointer begins: what a clone holds in place of a file that was not downloaded.
+POINTER = b"version https://git-lfs.github.com/spec/v1"
+
 #: The types of safetensors that statistics may have, and those of NumPy.
 DTYPES = {
     "F64": "<f8",
@@ -82,3 +85,9 @@ def _check_small(path: Path) -> None:
         raise ValueError("not a regular file")
     if about.st_size > MOST_BYTES:
         raise ValueError(f"more than {MOST_BYTES} bytes")
+    with path.open("rb") as file:
+        if file.read(len(POINTER)) == POINTER:
+            raise ValueError(
+                f"it is a Git LFS pointer, not the file itself: run `git lfs pull` in {path.parent}, or "
+                "download the repository with `hf download`"
+            )

@@ -31,7 +31,7 @@ impl PublishedBackbone {
         let checkpoint = Checkpoint::open(source)?;
         let given = match config {
             Some(text) => GivenConfig::parse(text)?,
-            None => GivenConfig::parse(&config_of(source)?)?,
+            None => config_of(source)?,
         };
         let names: Vec<&str> = checkpoint.names().collect();
         let found = Found::new(names.iter().copied(), &given)?;
@@ -79,15 +79,15 @@ impl PublishedBackbone {
     }
 }
 
-/// The text of the config next to the weights; that of an empty one if there is none.
-fn config_of(source: &Path) -> Result<String> {
+/// The config next to the weights; an empty one if there is none.
+fn config_of(source: &Path) -> Result<GivenConfig> {
     let directory = match source.is_dir() {
         true => source,
         false => source.parent().unwrap_or(Path::new("")),
     };
     let path = directory.join("config.json");
     match path.exists() {
-        true => Ok(read_text("config", &path)?),
-        false => Ok("{}".to_owned()),
+        true => GivenConfig::parse(&read_text("config", &path)?).map_err(|error| error.in_file(&path)),
+        false => GivenConfig::parse("{}"),
     }
 }

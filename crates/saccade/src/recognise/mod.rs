@@ -52,17 +52,25 @@ impl Published {
     /// [`Error::File`] for a path or a config that is not there and for broken files; [`Error::Checkpoint`] for a config that is not one, and
     /// for everything that config and tensors disagree on, in one list.
     pub fn open(source: &Path, config: Option<&str>) -> Result<Self> {
-        let checkpoint = Checkpoint::open(source)?;
+        Self::of(Checkpoint::open(source)?, source, config)
+    }
+
+    /// The same of the open `checkpoint` at `source`.
+    pub(crate) fn of(checkpoint: Checkpoint, source: &Path, config: Option<&str>) -> Result<Self> {
         let directory = match source.is_dir() {
             true => source,
             false => source.parent().unwrap_or(Path::new("")),
         };
+        let path = directory.join("config.json");
         let given_config = match config {
             Some(text) => text.to_owned(),
-            None => read_text("config", &directory.join("config.json"))?,
+            None => read_text("config", &path)?,
         };
         let prefix = head_prefix(&checkpoint)?;
-        let config = WholeConfig::parse(&given_config)?;
+        let config = WholeConfig::parse(&given_config).map_err(|error| match config {
+            Some(_) => error,
+            None => error.in_file(&path),
+        })?;
         let clues = Clues {
             has_head_config: has_head_config(&config)?,
             config: &config,

@@ -1,10 +1,11 @@
-//! Checkpoints with fewer embodiments, in another type, or cut into other files.
+//! Checkpoints with fewer embodiments, in another type, cut into other files, or with an adapter merged into them.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
 
 use saccade_checkpoint::spec::SCALE_SUFFIX;
-use saccade_checkpoint::{CheckpointWriter, Dtype, PlannedTensor};
+use saccade_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor};
 
 use crate::error::{Error, Result};
 use crate::head::embodiments::chosen_embodiments;
@@ -12,6 +13,7 @@ use crate::head::plan::tensor_specs;
 use crate::head::state_dropout::STATE_DROPOUT;
 use crate::ops::check_interrupted;
 use crate::recognise::kept::{KEPT_EMBODIMENTS, kept_embodiments};
+use crate::rewrite::adapter::{Adapter, Delta};
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
@@ -27,6 +29,9 @@ pub struct ConvertOptions {
     /// The type of all floating-point tensors; default the one that each has. int8 and its scales stay, and so do the
     /// probabilities of dropping a state, since one that is rounded up to 1 would act.
     pub dtype: Option<Float>,
+    /// The directory of a LoRA adapter to merge into the weights, in their type in the copy. Its statistics and processors take the place of the
+    /// source's, and so does its `config.json`, unless the options have one.
+    pub adapter: Option<PathBuf>,
 }
 
 impl ConvertOptions {
@@ -45,6 +50,10 @@ impl ConvertOptions {
 pub struct ConvertReport {
     /// The files.
     pub written: Written,
+    /// Weights that an adapter was added to.
+    pub num_merged: usize,
+    /// Tensors that an adapter replaced.
+    pub num_replaced: usize,
     /// Tensors of another type than before.
     pub num_converted: usize,
     /// Numbers that rounding changed.
@@ -71,8 +80,8 @@ pub struct ConvertReport {
 /// tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
 /// # Errors
-/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, and for a finite number that the
-/// type cannot hold; [`Input`](crate::ErrorKind::Input) for ids out of range, and if `out` exists and `force` is not set, holds anything but
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, for an adapter that is not plain
+/// LoRA or does not fit the source, and for a finite number that the type cannot hold; [`Input`](crate::ErrorKind::Input) for ids out of range, and if `out` exists and `force` is not set, holds anything but
 /// such a checkpoint, or is the source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn convert(
     source: &Path,
@@ -80,8 +89,15 @@ pub fn convert(
     options: &ConvertOptions,
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<ConvertReport> {
-    let source = SourceCheckpoint::open(source, options.rewrite.config.as_deref())?;
+    let folder = options.adapter.as_deref();
+    let source = SourceCheckpoint::open_base(source, options.rewrite.config.as_deref(), folder)?;
+    let adapter = folder
+        .map(|folder| Adapter::open(folder, &source.checkpoint))
+        .transpose()?;
     let mut report = ConvertReport::default();
+    if let Some(adapter) = &adapter {
+        (report.num_merged, report.num_replaced) = adapter.counts();
+    }
     let mut rewrite = options.rewrite.clone();
     let mut kept = None;
     if let Some(ids) = &options.embodiment_ids {
@@ -105,8 +121,8 @@ pub fn convert(
     let mut rounding = Rounding::default();
     let mut zeroed_bytes = 0;
     report.written = source.write(out, &rewrite, &config, planned, &mut progress, |name, writer| {
-        let change = change(&source, name, options)?;
-        let nbytes = source.checkpoint.nbytes(name)?;
+        let mut tensor = Changed::new(&source, name, options, adapter.as_ref())?;
+        let nbytes = tensor.nbytes()?;
         let slices = match &kept {
             Some(kept) if per_embodiment.contains(name) => {
                 let slice = nbytes / source.config.num_embodiments as u64;
@@ -118,17 +134,9 @@ pub fn convert(
         let mut start = 0;
         for (is_kept, nbytes) in slices {
             if is_kept {
-                source
-                    .checkpoint
-                    .read_byte_range(name, start..start + nbytes, |bytes| {
-                        check_interrupted()?;
-                        match change {
-                            None => Ok(writer.tensor(name, bytes)?),
-                            Some((from, to)) => rounding.write(name, bytes, from, to, writer),
-                        }
-                    })?;
+                tensor.copy(start..start + nbytes, &mut rounding, writer)?;
             } else {
-                let nbytes = change.map_or(nbytes, |(from, to)| nbytes / from.size() * to.size());
+                let nbytes = tensor.nbytes_after(nbytes);
                 writer.zeros(name, nbytes);
                 zeroed_bytes += nbytes;
             }
@@ -181,6 +189,75 @@ fn change(source: &SourceCheckpoint, name: &str, options: &ConvertOptions) -> Re
         .filter(|(from, to)| from != to && !is_scale && !is_state_dropout))
 }
 
+/// A tensor of the source on its way into the copy.
+struct Changed<'a> {
+    /// Its name in the copy.
+    name: &'a str,
+    /// Where it is read from: the source, or an adapter that replaces it.
+    checkpoint: &'a Checkpoint,
+    name_there: &'a str,
+    /// The types before and after, if its numbers may change.
+    types: Option<(Float, Float)>,
+    delta: Option<Delta>,
+}
+
+impl<'a> Changed<'a> {
+    fn new(
+        source: &'a SourceCheckpoint,
+        name: &'a str,
+        options: &ConvertOptions,
+        adapter: Option<&'a Adapter>,
+    ) -> Result<Self> {
+        let there = Float::of(source.checkpoint.dtype(name)?);
+        let after = change(source, name, options)?.map(|(_, to)| to).or(there);
+        let (checkpoint, name_there) = adapter
+            .and_then(|adapter| adapter.replacement(name))
+            .unwrap_or((&source.checkpoint, name));
+        let delta = adapter.map(|adapter| adapter.delta(name)).transpose()?.flatten();
+        let before = Float::of(checkpoint.dtype(name_there)?);
+        let is_changed = before != after || delta.is_some();
+        Ok(Self {
+            name,
+            checkpoint,
+            name_there,
+            types: before.zip(after).filter(|_| is_changed),
+            delta,
+        })
+    }
+
+    /// Bytes that are read.
+    fn nbytes(&self) -> Result<u64> {
+        Ok(self.checkpoint.nbytes(self.name_there)?)
+    }
+
+    /// What `nbytes` of them become.
+    fn nbytes_after(&self, nbytes: u64) -> u64 {
+        self.types
+            .map_or(nbytes, |(from, to)| nbytes / from.size() * to.size())
+    }
+
+    /// Writes some of its bytes, which hold whole elements.
+    fn copy(
+        &mut self,
+        bytes: Range<u64>,
+        rounding: &mut Rounding,
+        writer: &mut CheckpointWriter,
+    ) -> Result<()> {
+        let (name, types, delta) = (self.name, self.types, &mut self.delta);
+        let mut start = bytes.start;
+        self.checkpoint.read_byte_range(self.name_there, bytes, |bytes| {
+            check_interrupted()?;
+            let Some((from, to)) = types else {
+                return Ok(writer.tensor(name, bytes)?);
+            };
+            let first = (start / from.size()) as usize;
+            start += bytes.len() as u64;
+            let delta = delta.as_mut().map(|delta| (delta, first));
+            rounding.write(name, bytes, (from, to), delta, writer)
+        })
+    }
+}
+
 /// What was lost in converting.
 #[derive(Default)]
 struct Rounding {
@@ -197,8 +274,8 @@ impl Rounding {
         &mut self,
         name: &str,
         bytes: &[u8],
-        from: Float,
-        to: Float,
+        (from, to): (Float, Float),
+        delta: Option<(&mut Delta, usize)>,
         writer: &mut CheckpointWriter,
     ) -> Result<()> {
         from.read(bytes, &mut self.values);
@@ -221,7 +298,24 @@ impl Rounding {
                 self.largest_in = Some(name.to_owned());
             }
         }
+        if let Some((delta, first)) = delta {
+            self.merge(name, to, delta, first)?;
+        }
         to.write(&self.values, &mut self.bytes);
         Ok(writer.tensor(name, &self.bytes)?)
+    }
+
+    /// Adds what an adapter adds to the values, the tensor's from number `first` on, after they were rounded to the type of the copy.
+    fn merge(&mut self, name: &str, to: Float, delta: &mut Delta, first: usize) -> Result<()> {
+        self.values.iter_mut().for_each(|value| *value = to.round(*value));
+        let is_finite = self.values.iter().all(|value| value.is_finite());
+        delta.add(first, &mut self.values);
+        match self.values.iter().find(|value| !to.round(**value).is_finite()) {
+            Some(bad) if is_finite => Err(Error::Checkpoint(format!(
+                "adapter: {name} would be {bad}, more than {:?} can hold: expected another dtype",
+                to.dtype()
+            ))),
+            _ => Ok(()),
+        }
     }
 }

@@ -1,7 +1,9 @@
 //! Writing a checkpoint from another: opening the source, choosing what is kept, writing the copy.
 
+pub(crate) mod adapter;
 pub(crate) mod convert;
 pub(crate) mod float;
+mod json_edit;
 pub(crate) mod quantize;
 pub(crate) mod resize;
 
@@ -13,7 +15,7 @@ use saccade_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTensor
 use crate::config::HeadConfig;
 use crate::error::{Error, Result};
 use crate::ops::check_interrupted;
-use crate::recognise::Published;
+use adapter::{is_beside, open_base};
 
 /// Published checkpoints are cut into files of this size.
 const MAX_SHARD_BYTES: u64 = 5_000_000_000;
@@ -65,6 +67,8 @@ pub(crate) struct SourceCheckpoint {
     pub config: HeadConfig,
     /// The config as it was given, or as `config.json` has it.
     pub given_config: String,
+    /// The directory of an adapter, whose other files are copied too.
+    adapter: Option<PathBuf>,
 }
 
 /// Called with the bytes done and the bytes in all; false stops the work.
@@ -74,7 +78,15 @@ impl SourceCheckpoint {
     /// # Errors
     /// As [`ActionHead::load`](crate::ActionHead::load).
     pub(crate) fn open(path: &Path, config: Option<&str>) -> Result<Self> {
-        let published = Published::open(path, config)?;
+        Self::open_base(path, config, None)
+    }
+
+    /// As [`SourceCheckpoint::open`], for the base of the adapter in a directory.
+    ///
+    /// # Errors
+    /// As [`ActionHead::load`](crate::ActionHead::load).
+    pub(crate) fn open_base(path: &Path, config: Option<&str>, adapter: Option<&Path>) -> Result<Self> {
+        let published = open_base(path, config, adapter)?;
         published.check()?;
         Ok(Self {
             path: path.to_owned(),
@@ -82,6 +94,7 @@ impl SourceCheckpoint {
             prefix: published.prefix,
             config: published.config,
             given_config: published.given_config,
+            adapter: adapter.map(Path::to_owned),
         })
     }
 
@@ -133,8 +146,13 @@ impl SourceCheckpoint {
         progress: Progress<'_>,
         mut write: impl FnMut(&str, &mut CheckpointWriter) -> Result<()>,
     ) -> Result<Written> {
-        check_apart(&self.path, self.checkpoint.files(), out)?;
+        let files = self.checkpoint.files().chain(self.adapter.as_deref());
+        check_apart(&self.path, files, out)?;
         let mut companions = Companions::of(&self.path, self.checkpoint.files())?;
+        if let Some(adapter) = &self.adapter {
+            let beside = is_beside(&self.path, adapter);
+            companions = companions.with_adapter(adapter, beside)?;
+        }
         for (name, _) in small {
             companions = companions.without(name);
         }

@@ -94,6 +94,13 @@ impl TokenizerFiles {
         })
     }
 
+    /// The file, or the directory of several.
+    pub(super) fn path(&self) -> &Path {
+        match self {
+            Self::Json(path) | Self::Slow(path) => path,
+        }
+    }
+
     /// The directory that they are in.
     #[must_use]
     pub fn folder(&self) -> &Path {

@@ -76,7 +76,7 @@ impl Tokenizer {
     /// # Errors
     /// [`Error::File`] for a file that cannot be read, and those of [`from_json`](Self::from_json).
     pub fn read(files: &TokenizerFiles) -> Result<Self> {
-        match files.text()? {
+        let tokenizer = match files.text()? {
             FilesText::Json(text) => Self::from_json(&text),
             FilesText::Slow {
                 vocab,
@@ -84,7 +84,8 @@ impl Tokenizer {
                 added,
                 config,
             } => Self::from_slow(&vocab, &merges, added.as_deref(), config.as_deref()),
-        }
+        };
+        tokenizer.map_err(|error| error.in_file(files.path()))
     }
 
     fn build(parts: Parts) -> Result<Self> {

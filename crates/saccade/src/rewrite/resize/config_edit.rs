@@ -5,9 +5,9 @@ use std::ops::Range;
 use serde_json::Value;
 use serde_json::value::RawValue;
 
-use super::json_edit::{Found, entry, find, span};
 use crate::config::{Feature, HEAD_KEY, HeadConfig, OWN_KEY, Version};
 use crate::error::{Error, Result};
+use crate::rewrite::json_edit::{Found, entry, find, span};
 
 /// Merging compares every token with every other, and a chunk takes time in proportion to their number.
 const MAX_TOKENS: usize = 4096;

@@ -5,7 +5,6 @@
 //! result is exact in saccade, while other programs see plain copies.
 
 mod config_edit;
-mod json_edit;
 mod merge;
 mod perturb;
 

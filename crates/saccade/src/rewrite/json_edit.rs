@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use saccade_checkpoint::UniqueMap;
 
 /// A value in a config.
-pub(super) struct Found<'a> {
+pub(crate) struct Found<'a> {
     /// The keys that lead to it, with dots between them.
     pub path: String,
     pub key: String,
@@ -16,7 +16,7 @@ pub(super) struct Found<'a> {
 }
 
 /// All values of the objects in `value`, which is at `path`.
-pub(super) fn find<'a>(path: &str, value: &'a RawValue, found: &mut Vec<Found<'a>>) -> Result<()> {
+pub(crate) fn find<'a>(path: &str, value: &'a RawValue, found: &mut Vec<Found<'a>>) -> Result<()> {
     let broken = |error: serde_json::Error| Error::Checkpoint(format!("config: {path}: {error}"));
     match value.get().as_bytes().first() {
         Some(b'{') => {
@@ -43,7 +43,7 @@ pub(super) fn find<'a>(path: &str, value: &'a RawValue, found: &mut Vec<Found<'a
 
 /// Where in `text` the entry of an object with this `key` is, given where its `value` is, with the comma that goes with it; none if the key is
 /// written with escapes.
-pub(super) fn entry(text: &str, value: &Range<usize>, key: &str) -> Option<Range<usize>> {
+pub(crate) fn entry(text: &str, value: &Range<usize>, key: &str) -> Option<Range<usize>> {
     let before = text[..value.start].trim_end().strip_suffix(':')?.trim_end();
     let before = before.strip_suffix('"')?.strip_suffix(key)?.strip_suffix('"')?;
     let before = before.trim_end();
@@ -55,7 +55,7 @@ pub(super) fn entry(text: &str, value: &Range<usize>, key: &str) -> Option<Range
 }
 
 /// The position in `text` of a value that was read from it.
-pub(super) fn span(text: &str, value: &RawValue) -> Range<usize> {
+pub(crate) fn span(text: &str, value: &RawValue) -> Range<usize> {
     let start = value.get().as_ptr() as usize - text.as_ptr() as usize;
     start..start + value.get().len()
 }

@@ -1,0 +1,52 @@
+//! Names of tensors, without what wrappers of a model add to them.
+
+use std::borrow::Cow;
+
+/// What `torch.compile` puts in front of the names of the module that it wraps.
+const COMPILED: &str = "_orig_mod";
+
+/// What `DistributedDataParallel` puts in front of all names.
+const DISTRIBUTED: &str = "module";
+
+/// A tensor's name in the model that was wrapped: without `_orig_mod.` anywhere along the path, and without `module.` at its front.
+#[must_use]
+pub fn plain_name(name: &str) -> Cow<'_, str> {
+    let is_wrapped = |name: &str| name.split('.').any(|part| part == COMPILED);
+    if !is_wrapped(name) && !name.starts_with("module.") {
+        return Cow::Borrowed(name);
+    }
+    let (modules, tensor) = name.rsplit_once('.').unwrap_or(("", name));
+    let mut path: Vec<&str> = modules.split('.').filter(|part| *part != COMPILED).collect();
+    let wrappers = path.iter().take_while(|part| **part == DISTRIBUTED).count();
+    path.drain(..wrappers);
+    path.push(tensor);
+    Cow::Owned(path.join("."))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wrappers_are_left_out() {
+        for (name, expected) in [
+            ("a.b.weight", "a.b.weight"),
+            ("_orig_mod.a.weight", "a.weight"),
+            ("backbone._orig_mod.model.weight", "backbone.model.weight"),
+            ("module.a.weight", "a.weight"),
+            ("module._orig_mod.a.weight", "a.weight"),
+            ("_orig_mod.module.a._orig_mod.weight", "a.weight"),
+            ("module.module.a", "a"),
+            ("_orig_mod.weight", "weight"),
+            // Not wrappers.
+            ("a.module.weight", "a.module.weight"),
+            ("modules.a", "modules.a"),
+            ("x_orig_mod.a", "x_orig_mod.a"),
+            ("module", "module"),
+            ("a._orig_mod", "a._orig_mod"),
+            ("", ""),
+        ] {
+            assert_eq!(plain_name(name), expected);
+        }
+    }
+}
