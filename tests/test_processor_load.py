@@ -193,7 +193,7 @@ def test_keys_that_the_release_does_not_know(
     tmp_path: Path, version: str, kwargs: dict[str, Any], key: str
 ) -> None:
     whole = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
-    with pytest.raises(CheckpointError, match=rf"processor_config\.json: {key}: expected none"):
+    with pytest.raises(InputError, match=rf"processor_config\.json: processor_kwargs: {key}: expected none"):
         load(isaac(tmp_path, version, **whole, **kwargs))
     for nothing in (None, False, "", [], {}):
         load(isaac(tmp_path, version, **whole, surprise=nothing))
@@ -248,7 +248,7 @@ def test_steps_of_lerobot_that_are_not_known(tmp_path: Path) -> None:
 )
 def test_keys_that_a_step_of_lerobot_does_not_have(tmp_path: Path, name: str, fixture: str) -> None:
     load(lerobot(tmp_path, [{"registry_name": name, "config": {"surprise": None}}], fixture))
-    with pytest.raises(CheckpointError, match=f"{name}: surprise: expected none"):
+    with pytest.raises(InputError, match=f"{name}: surprise: expected none"):
         load(lerobot(tmp_path, [{"registry_name": name, "config": {"surprise": 3}}], fixture))
 
 

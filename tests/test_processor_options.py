@@ -20,7 +20,7 @@ from saccade.processor import Version
 IMAGES = Path(__file__).parent / "data" / "images"
 RELEASES: dict[str, Version] = {"N1.6": "n1.6", "N1.7": "n1.7"}
 
-#: What `image_n17`'s like-named fixture leaves alone: frames go to the last resize as they are.
+#: Frames go to the last resize as they are.
 UNCHANGED = {key: value for key, value in AS_IT_IS.items() if key != "min_pixels"}
 
 NOISE = np.random.default_rng(0).integers(0, 256, (90, 161, 3), np.uint8)
@@ -43,11 +43,11 @@ def test_frames_of_the_released_processors(name: str, isa: str) -> None:
     about, arrays = case(name)
     version = RELEASES[about["release"]]
     processor, unchanged = made(version, about["options"]), made(version, UNCHANGED)
-    count = sum(key.startswith("frame.") for key in arrays)
-    assert count >= 2
-    for index in range(count):
-        expected = unchanged.frame(arrays[f"out.{index}"])
-        assert_same(processor.frame(arrays[f"frame.{index}"]), expected)
+    frames = [key for key in arrays if key.startswith("frame.")]
+    assert len(frames) >= 2
+    for key in frames:
+        expected = unchanged.frame(arrays[key.replace("frame", "out")])
+        assert_same(processor.frame(arrays[key]), expected)
 
 
 @pytest.mark.parametrize("name", ["lerobot-n17-rename", "lerobot-n17-native-libero"])

@@ -110,10 +110,10 @@ class Processor:
                 ``{"letter_box_transform": True}``: some files do not say what was trained.
 
         Raises:
-            InputError: An argument has the wrong type or an unknown value. An option is unknown, concerns
-                states or actions, or does not fit the others.
-            CheckpointError: The checkpoint or tokenizer is broken or of another kind, or its files have an
-                option or a step that their release does not know.
+            InputError: An argument has the wrong type or an unknown value. An option, given or in a file, is
+                unknown to its release or does not fit the others; one that is given concerns states or actions.
+            CheckpointError: The checkpoint or tokenizer is broken or of another kind, or its files have a
+                step that is not known.
             FileNotFoundError: There is no such checkpoint, or no tokenizer. The message says which files of
                 which published id are needed.
 

@@ -151,7 +151,9 @@ fn processor_kwargs(version: Version, directory: &Path) -> Result<Option<Object>
             );
             return refused(&path, &what);
         }
-        check_keys(&path, "", &kwargs, &|key| is_argument(version, key))?;
+        check_keys(&path, "processor_kwargs", &kwargs, &|key| {
+            is_argument(version, key)
+        })?;
         return Ok(Some(kwargs));
     }
     Ok(None)
@@ -226,29 +228,20 @@ fn as_lerobot_writes(mut kwargs: Object) -> Object {
     kwargs
 }
 
-/// That a config has keys only that its release knows.
+/// That a config has keys only that its release knows. Others are options that cannot be used, like those with a value that cannot.
 fn check_keys(path: &Path, owner: &str, config: &Object, is_known: &dyn Fn(&str) -> bool) -> Result<()> {
     let unknown = config
         .iter()
         .filter(|(key, value)| !is_known(key) && !asks_for_nothing(value));
     let unknown: Vec<&str> = unknown.map(|(key, _)| key.as_str()).collect();
-    match (unknown.is_empty(), owner) {
-        (true, _) => Ok(()),
-        (false, "") => refused(
-            path,
-            &format!(
-                "{}: expected none: the release has no such option",
-                unknown.join(", ")
-            ),
-        ),
-        (false, _) => refused(
-            path,
-            &format!(
-                "{owner}: {}: expected none: the step has no such option",
-                unknown.join(", ")
-            ),
-        ),
+    if unknown.is_empty() {
+        return Ok(());
     }
+    Err(Error::Input(format!(
+        "source: {}: {owner}: {}: expected none: its release has no such option",
+        path.display(),
+        unknown.join(", ")
+    )))
 }
 
 fn refused<T>(path: &Path, what: &str) -> Result<T> {
