@@ -70,6 +70,15 @@ def torch_cubic(image: Image, rng: np.random.Generator) -> tuple[Image, Image]:
     return found, torch_resize(image, (size, size), "bicubic")
 
 
+def torch_linear_u8(image: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+    """Isaac-GR00T's N1.6 and N1.7 without albumentations: uint8, linear."""
+    height, width = (32 * int(side) for side in rng.integers(1, 8, 2))
+    options: dict[str, Any] = {"use_albumentations": False, "min_pixels": 1}
+    options |= {"image_target_size": [height, width], "image_crop_size": [height, width]}
+    found = saccade.Processor("n1.7", TOKENIZER, options=options).frame(image)
+    return from_patches(found, height, width), torch_resize(image, (height, width), "bilinear")
+
+
 def torch_linear(image: Image, rng: np.random.Generator) -> tuple[Image, Image]:
     """Isaac-GR00T's N1.5: float32, linear, truncated."""
     size = int(rng.integers(8, 300))
@@ -110,16 +119,20 @@ def opencv_area(image: Image, rng: np.random.Generator) -> tuple[Image, Image]:
     """N1.6 and N1.7: OpenCV's INTER_AREA, in one step to a size that nothing changes after it."""
     import cv2  # type: ignore[import-not-found]
 
-    height, width = (32 * int(side) for side in rng.integers(1, 8, 2))
-    options = AS_IT_IS | {"image_target_size": [height, width]}
-    found = saccade.Processor("n1.7", TOKENIZER, options=options).frame(image)
-    expected = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return from_patches(found, height, width), expected
+    # Both sides of the view are multiples of 32, so that nothing changes it after: a square part of the frame.
+    edge = 32 * int(rng.integers(1, 8))
+    side = min(image.shape[:2])
+    square = np.ascontiguousarray(image[:side, :side])
+    options = AS_IT_IS | {"shortest_image_edge": edge}
+    found = saccade.Processor("n1.7", TOKENIZER, options=options).frame(square)
+    expected = cv2.resize(square, (edge, edge), interpolation=cv2.INTER_AREA)
+    return from_patches(found, edge, edge), expected
 
 
 #: What is compared: the library, and how.
 COMPARISONS: dict[str, tuple[str, Callable[[Image, np.random.Generator], tuple[Image, Image]]]] = {
     "torch uint8 cubic": ("torch", torch_cubic),
+    "torch uint8 linear": ("torch", torch_linear_u8),
     "torch float32 linear": ("torch", torch_linear),
     "Pillow cubic": ("PIL", pillow_cubic),
     "Pillow cubic, width first": ("PIL", pillow_cubic_width_first),

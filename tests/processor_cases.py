@@ -24,15 +24,21 @@ AS_IT_IS = {"shortest_image_edge": None, "image_target_size": None, "crop_fracti
 
 def read(name: str) -> tuple[dict[str, Array], dict[str, Any]]:
     """The arrays of a fixture that are no weights, and its description."""
-    arrays = {}
     path = DATA / f"{name}.safetensors"
-    kinds = {"U8": np.uint8, "F32": np.float32, "I64": np.int64}
-    for key, (dtype, shape, data) in _saccade.read_stored(str(path)).items():
-        if dtype in kinds:
-            arrays[key] = np.frombuffer(data, kinds[dtype]).reshape(shape)
+    arrays = stored(path)
     with path.open("rb") as file:
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     return arrays, json.loads(header["__metadata__"]["about"])
+
+
+def stored(path: Path) -> dict[str, Array]:
+    """The arrays of a file that are frames, numbers or ids."""
+    kinds = {"U8": np.uint8, "F32": np.float32, "I64": np.int64}
+    return {
+        key: np.frombuffer(data, kinds[dtype]).reshape(shape)
+        for key, (dtype, shape, data) in _saccade.read_stored(str(path)).items()
+        if dtype in kinds
+    }
 
 
 def raw_frames(arrays: dict[str, Array], samples: int) -> list[list[Image]]:

@@ -364,12 +364,6 @@ def test_keys_of_the_whole_released_file_are_taken() -> None:
     assert_same(found.frame(NOISE), N17.frame(NOISE))
 
 
-def test_isaac_without_albumentations_is_not_supported() -> None:
-    processor = saccade.Processor("n1.7", TOKENIZER, options={"use_albumentations": False})
-    with pytest.raises(InputError, match="use_albumentations: expected true"):
-        processor.frame(NOISE)
-
-
 def test_letter_boxes_are_black_bars() -> None:
     for height, width in itertools.permutations((20, 50)):
         image = np.full((height, width, 3), 255, np.uint8)

@@ -102,7 +102,7 @@ def test_options_of_isaac(tmp_path: Path, folder: str) -> None:
     source = checkpoint(tmp_path / "isaac", "n17_one_view")
     (source / folder).mkdir(exist_ok=True)
     options = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
-    kwargs = options | {"modality_configs": {}, "a key of a later release": 1}
+    kwargs = options | {"modality_configs": {}, "a key of a later release": None}
     (source / folder / "processor_config.json").write_text(json.dumps({"processor_kwargs": kwargs}))
     limits = {"size": {"shortest_edge": 4096, "longest_edge": 1 << 24}, "patch_size": 16}
     (source / "preprocessor_config.json").write_text(json.dumps(limits))
@@ -133,6 +133,200 @@ def test_options_of_lerobot(tmp_path: Path) -> None:
     found = load(source)([NOISE], "Push!")
     assert_same(found.input_ids, expected([NOISE], "Push!").input_ids)
     assert_same(np.asarray(found.pixel_values), np.asarray(expected([NOISE], "Push!").pixel_values))
+
+
+def write(path: Path, values: Any) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(values))
+
+
+def isaac(tmp_path: Path, version: str = "n17", folder: str = ".", **kwargs: Any) -> Path:
+    """A checkpoint with Isaac-GR00T's file."""
+    source = checkpoint(tmp_path / version, {"n16": "n16_two_views", "n17": "n17_one_view"}[version])
+    values = {"processor_class": f"Gr00tN1d{version[-1]}Processor", "processor_kwargs": kwargs}
+    write(source / folder / "processor_config.json", values)
+    return source
+
+
+def lerobot(tmp_path: Path, steps: list[Any], fixture: str = "n17_one_view") -> Path:
+    """A checkpoint with lerobot's file."""
+    source = checkpoint(tmp_path / "steps", fixture, {"type": "groot"})
+    write(source / "policy_preprocessor.json", {"name": "policy_preprocessor", "steps": steps})
+    return source
+
+
+def test_the_folder_processor_counts_where_the_root_has_no_file(tmp_path: Path) -> None:
+    for version in ("n16", "n17"):
+        source = isaac(tmp_path, version, "processor", use_albumentations=True, shortest_image_edge=64)
+        options = {"use_albumentations": True, "shortest_image_edge": 64}
+        name: Any = f"{version[:2]}.{version[2]}"
+        assert_same(load(source).frame(NOISE), saccade.Processor(name, TOKENIZER, options=options).frame(NOISE))
+        options["shortest_image_edge"] = 128
+        write(source / "processor_config.json", {"processor_kwargs": options})
+        assert_same(load(source).frame(NOISE), saccade.Processor(name, TOKENIZER, options=options).frame(NOISE))
+
+
+@pytest.mark.parametrize("version", ["n16", "n17"])
+def test_a_file_without_use_albumentations_has_torchvisions_path(tmp_path: Path, version: str) -> None:
+    """It is the default of the released constructors, which then need the sizes."""
+    with pytest.raises(InputError, match="image_target_size: expected a height and a width, since use_alb"):
+        load(isaac(tmp_path, version, shortest_image_edge=256))
+    sizes = {"image_target_size": [64, 64], "image_crop_size": [60, 60]}
+    found = load(isaac(tmp_path, version, **sizes)).frame(NOISE)
+    options = {"use_albumentations": False, **sizes}
+    name: Any = f"{version[:2]}.{version[2]}"
+    assert_same(found, saccade.Processor(name, TOKENIZER, options=options).frame(NOISE))
+
+
+@pytest.mark.parametrize(
+    ("version", "kwargs", "key"),
+    [
+        ("n16", {"surprise": 1}, "surprise"),
+        ("n17", {"surprise": "x"}, "surprise"),
+        ("n17", {"surprise": 0.0}, "surprise"),
+        ("n17", {"min_pixels": 1}, "min_pixels"),  # of another file
+        ("n16", {"letter_box_transform": True}, "letter_box_transform"),
+        ("n16", {"exclude_state": True}, "exclude_state"),
+    ],
+)
+def test_keys_that_the_release_does_not_know(
+    tmp_path: Path, version: str, kwargs: dict[str, Any], key: str
+) -> None:
+    whole = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    with pytest.raises(InputError, match=rf"processor_config\.json: processor_kwargs: {key}: expected none"):
+        load(isaac(tmp_path, version, **whole, **kwargs))
+    for nothing in (None, False, "", [], {}):
+        load(isaac(tmp_path, version, **whole, surprise=nothing))
+
+
+def test_every_argument_of_the_released_processors_is_known(tmp_path: Path) -> None:
+    common = """modality_configs image_crop_size image_target_size use_albumentations random_rotation_angle
+        color_jitter_params shortest_image_edge crop_fraction model_name model_type formalize_language
+        max_state_dim max_action_dim max_action_horizon use_percentiles clip_outliers
+        apply_sincos_state_encoding use_relative_action extra_augmentation_config
+        transformers_loading_kwargs"""
+    later = "letter_box_transform use_mean_std exclude_state state_dropout_prob"
+    typed = {"image_crop_size": [9, 9], "image_target_size": [9, 9], "crop_fraction": 0.5}
+    typed |= {"use_albumentations": True, "formalize_language": True, "letter_box_transform": True}
+    for version, names in (("n16", common), ("n17", common + " " + later)):
+        load(isaac(tmp_path, version, **{name: typed.get(name, 1) for name in names.split()}))
+
+
+def test_the_class_of_another_release(tmp_path: Path) -> None:
+    source = isaac(tmp_path, use_albumentations=True)
+    write(source / "processor_config.json", {"processor_class": "Gr00tN1d6Processor", "processor_kwargs": {}})
+    with pytest.raises(CheckpointError, match="processor_class: expected Gr00tN1d7Processor"):
+        load(source)
+
+
+def test_steps_of_lerobot_that_are_not_known(tmp_path: Path) -> None:
+    known = ["rename_observations_processor", "to_batch_processor", "device_processor"]
+    known += ["relative_actions_processor", "delta_actions_processor", "groot_n1_7_pack_inputs_v1"]
+    steps: list[Any] = [{"registry_name": name, "config": {}} for name in known]
+    load(lerobot(tmp_path, steps))
+    off = {"registry_name": "flip_frames", "config": {"enabled": False}}
+    load(lerobot(tmp_path, [*steps, off]))
+    for name, step in (
+        ("flip_frames", {"registry_name": "flip_frames", "config": {"enabled": True}}),
+        ("flip_frames", {"registry_name": "flip_frames"}),
+        ("my.module.Flip", {"class": "my.module.Flip", "config": {}}),
+        ("groot_n1_7_vlm_encode_v2", {"registry_name": "groot_n1_7_vlm_encode_v2", "config": {}}),
+        ("a step without a name", 5),
+    ):
+        with pytest.raises(CheckpointError, match=rf"steps\[6\]: expected one of .*, got {name}"):
+            load(lerobot(tmp_path, [*steps, step]))
+
+
+@pytest.mark.parametrize(
+    ("name", "fixture"),
+    [
+        ("groot_pack_inputs_v3", "n15_two_views"),
+        ("groot_eagle_encode_v3", "n15_two_views"),
+        ("groot_n1_7_pack_inputs_v1", "n17_one_view"),
+        ("groot_n1_7_vlm_encode_v1", "n17_one_view"),
+    ],
+)
+def test_keys_that_a_step_of_lerobot_does_not_have(tmp_path: Path, name: str, fixture: str) -> None:
+    load(lerobot(tmp_path, [{"registry_name": name, "config": {"surprise": None}}], fixture))
+    with pytest.raises(InputError, match=f"{name}: surprise: expected none"):
+        load(lerobot(tmp_path, [{"registry_name": name, "config": {"surprise": 3}}], fixture))
+
+
+def test_what_lerobots_step_leaves_out_has_the_default_of_its_class(tmp_path: Path) -> None:
+    """No target: frames are not resized. The file of an NVIDIA checkpoint beside it plays no part."""
+    encode = {"registry_name": "groot_n1_7_vlm_encode_v1", "config": {"model_name": "a/b"}}
+    source = lerobot(tmp_path, [encode])
+    write(source / "processor_config.json", {"processor_kwargs": {"use_albumentations": True}})
+    expected = saccade.Processor(
+        "n1.7", TOKENIZER, preprocessing="lerobot", options={"image_target_size": None}
+    )
+    assert_same(load(source).frame(NOISE), expected.frame(NOISE))
+
+
+def test_an_nvidia_checkpoint_read_as_lerobot_reads_it(tmp_path: Path) -> None:
+    """Its sizes count if it has a target; else those that lerobot writes."""
+    kwargs = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    kwargs["letter_box_transform"] = True
+    for target in (None, [96, 96]):
+        source = isaac(tmp_path, image_target_size=target, image_crop_size=None, **kwargs)
+        options = kwargs | {"image_target_size": target, "image_crop_size": None}
+        if target is None:
+            options |= {"image_target_size": [256, 256], "image_crop_size": [230, 230]}
+            options |= {"shortest_image_edge": None, "crop_fraction": None}
+        expected = saccade.Processor("n1.7", TOKENIZER, preprocessing="lerobot", options=options)
+        assert_same(load(source, preprocessing="lerobot").frame(NOISE), expected.frame(NOISE))
+
+
+# --- options in place of the checkpoint's ---
+
+
+@pytest.mark.parametrize("version", ["n16", "n17"])
+def test_single_options_are_replaced(tmp_path: Path, version: str) -> None:
+    kwargs = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    kwargs |= {"image_target_size": [64, 64], "image_crop_size": [60, 60], "formalize_language": True}
+    name: Any = f"{version[:2]}.{version[2]}"
+    source = isaac(tmp_path, version, **kwargs)
+    for replaced in (
+        {"letter_box_transform": True},
+        {"letter_box_transform": False},
+        {"crop_fraction": 0.5, "shortest_image_edge": 96},
+        {"crop_fraction": None, "shortest_image_edge": None},
+        {"use_albumentations": False},
+        {"formalize_language": False},
+        {"min_pixels": 1},
+        {"processor_kwargs": {"crop_fraction": 0.5}},
+    ):
+        expected = saccade.Processor(name, TOKENIZER, options=kwargs | replaced)([NOISE], "Push!")
+        found = load(source, options=replaced)([NOISE], "Push!")
+        assert_same(found.input_ids, expected.input_ids)
+        assert_same(np.asarray(found.pixel_values), np.asarray(expected.pixel_values))
+    assert_same(load(source, options={}).frame(NOISE), load(source).frame(NOISE))
+
+
+def test_replaced_options_of_lerobot(tmp_path: Path) -> None:
+    sizes = {"image_target_size": [64, 64], "image_crop_size": [58, 58]}
+    source = lerobot(tmp_path, [{"registry_name": "groot_n1_7_vlm_encode_v1", "config": sizes}])
+    options: dict[str, Any] = sizes | {"letter_box_transform": True}
+    expected = saccade.Processor("n1.7", TOKENIZER, preprocessing="lerobot", options=options)
+    assert_same(load(source, options={"letter_box_transform": True}).frame(NOISE), expected.frame(NOISE))
+
+
+@pytest.mark.parametrize(
+    ("replaced", "says"),
+    [
+        ({"letter_box": True}, "letter_box: expected a key of the released files"),
+        ({"surprise": None}, "surprise: expected a key of the released files"),
+        ({"clip_outliers": False}, "clip_outliers: expected a key about frames or words"),
+        ({"use_percentiles": True, "b": 1}, "use_percentiles: expected a key about"),
+        ({"letter_box_transform": "yes"}, "letter_box_transform: expected true or false"),
+        ({"use_albumentations": False}, "image_target_size: expected a height and a width"),
+        ([], "options: expected a mapping"),
+    ],
+)
+def test_options_that_cannot_be_replaced(tmp_path: Path, replaced: Any, says: str) -> None:
+    source = isaac(tmp_path, use_albumentations=True, shortest_image_edge=64, crop_fraction=0.9)
+    with pytest.raises(InputError, match=says):
+        load(source, options=replaced)
 
 
 def test_lerobot_may_formalize_the_instructions_of_n15(tmp_path: Path) -> None:

@@ -245,7 +245,7 @@ pub fn use_processor_files(folder: &Path, text: &str) {
         write_checkpoint(folder, r#"{"type":"groot"}"#, HEADER, b"", 4);
         fs::write(folder.join(name), text).expect("memory is not full");
         let files = TokenizerFiles::at(Path::new(TOKENIZER)).expect("it is in the repository");
-        match ProcessorSource::open(folder).and_then(|source| source.processor(Some(&files), None)) {
+        match ProcessorSource::open(folder).and_then(|source| source.processor(Some(&files), None, None)) {
             Ok(processor) => assert_eq!(processor.version(), "n1.7"),
             Err(error) => check_message(&error),
         }

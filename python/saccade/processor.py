@@ -43,11 +43,13 @@ class Processor:
         plain_text: N1.5: the instruction stands in the prompt as it is. Otherwise it stands there as Python
             prints a list of it, ``['open the drawer']``, as in both released processors.
         options: Keys of the released ``processor_config.json`` and ``preprocessor_config.json``, such as
-            ``shortest_image_edge``, ``crop_fraction``, ``min_pixels`` or ``formalize_language``. Default: as
-            in the published checkpoints.
+            ``shortest_image_edge``, ``crop_fraction``, ``min_pixels`` or ``formalize_language``. If
+            ``use_albumentations`` is among them, they are read as a released file: a key that is missing has
+            the default of the released constructor. Otherwise the rest is as in the published checkpoints.
 
     Raises:
-        InputError: An argument or option is unknown, has another type, or belongs to another version.
+        InputError: An argument or option is unknown, has another type, belongs to another version, or needs
+            another one that is null or missing.
         CheckpointError: The tokenizer is broken, or of another kind than the version's. The message lists
             every problem.
         FileNotFoundError: There is no such tokenizer.
@@ -90,12 +92,13 @@ class Processor:
         *,
         preprocessing: Preprocessing | None = None,
         tokenizer: str | os.PathLike[str] | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> Processor:
         """The processor of a checkpoint.
 
-        Version and sizes come from its tensors, options from ``processor_config.json``,
-        ``preprocessor_config.json`` or lerobot's ``policy_preprocessor.json``. A checkpoint that holds only a
-        backbone will do.
+        Version and sizes come from its tensors, options from ``processor_config.json`` (in the folder or, if
+        that has none, in its ``processor/``), ``preprocessor_config.json`` or lerobot's
+        ``policy_preprocessor.json``. A checkpoint that holds only a backbone will do.
 
         Args:
             source: A path, or the id of a published checkpoint in the local Hugging Face cache.
@@ -103,10 +106,14 @@ class Processor:
                 else Isaac-GR00T's.
             tokenizer: A ``tokenizer.json``, a directory, or a published id in the local cache. Default: the
                 checkpoint's own, or that of the released processor in the local cache.
+            options: Options that take the place of the checkpoint's, one by one, such as
+                ``{"letter_box_transform": True}``: some files do not say what was trained.
 
         Raises:
-            InputError: An argument has the wrong type or an unknown value.
-            CheckpointError: The checkpoint or tokenizer is broken or of another kind.
+            InputError: An argument has the wrong type or an unknown value. An option, given or in a file, is
+                unknown to its release or does not fit the others; one that is given concerns states or actions.
+            CheckpointError: The checkpoint or tokenizer is broken or of another kind, or its files have a
+                step that is not known.
             FileNotFoundError: There is no such checkpoint, or no tokenizer. The message says which files of
                 which published id are needed.
 
@@ -118,7 +125,10 @@ class Processor:
         held = _saccade.ProcessorSource(os.fspath(resolve(source)))
         chosen = None if preprocessing is None else text("preprocessing", preprocessing)
         processor = cls.__new__(cls)
-        processor._processor = _saccade.Processor.load(held, _tokenizer_of(held, tokenizer), chosen)
+        replaced = None if options is None else _to_json(options)
+        processor._processor = _saccade.Processor.load(
+            held, _tokenizer_of(held, tokenizer), chosen, replaced
+        )
         return processor
 
     @property

@@ -39,7 +39,9 @@ pub use aligned::{Activations, AllocError};
 pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
 pub use cpu::CpuReport;
 pub use half::bf16;
-pub use image::{CubicRule, FloatImage, Image, resize_area, resize_cubic_u8, resize_linear_f32};
+pub use image::{
+    FloatImage, Image, WeightRounding, resize_area, resize_cubic_u8, resize_linear_f32, resize_linear_u8,
+};
 pub use isa::{ISA_VARIABLE, Isa, IsaError};
 pub use linear::{Epilogue, KernelError, LinearScratch, PackedLinear};
 pub use matrix::Matrix;

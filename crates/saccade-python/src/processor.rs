@@ -107,13 +107,14 @@ impl Processor {
         .map(Self)
     }
 
-    /// That of a checkpoint, with these files and this path, or its own.
+    /// That of a checkpoint, with these files and this path, or its own, and with these options in place of its own.
     #[staticmethod]
     fn load(
         py: Python<'_>,
         source: &ProcessorSource,
         tokenizer: Option<PathBuf>,
         preprocessing: Option<&str>,
+        options: Option<&str>,
     ) -> PyResult<Self> {
         let preprocessing = preprocessing
             .map(Preprocessing::named)
@@ -121,7 +122,7 @@ impl Processor {
             .map_err(raise)?;
         call(py, || {
             let files = tokenizer.as_deref().map(TokenizerFiles::at).transpose()?;
-            source.0.processor(files.as_ref(), preprocessing)
+            source.0.processor(files.as_ref(), preprocessing, options)
         })
         .map(Self)
     }

@@ -17,7 +17,7 @@ mod taps;
 
 pub use resize_area::resize_area;
 pub use resize_f32::{FloatImage, resize_linear_f32};
-pub use resize_u8::{CubicRule, resize_cubic_u8};
+pub use resize_u8::{WeightRounding, resize_cubic_u8, resize_linear_u8};
 
 use crate::aligned::AllocError;
 use crate::isa::Isa;

@@ -1,4 +1,4 @@
-//! Cubic, antialiased resizing in whole numbers: torch's and Pillow's.
+//! Cubic and linear resizing of bytes in whole numbers, antialiased: torch's and Pillow's.
 
 use super::taps::Taps;
 use super::{Image, Sums, TOGETHER, along_height, along_width};
@@ -7,8 +7,8 @@ use crate::isa::Isa;
 
 /// Whose rounding of the weights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum CubicRule {
-    /// torch's `interpolate(..., mode="bicubic", antialias=True)` of uint8: as many bits as keep every weight in 16.
+pub enum WeightRounding {
+    /// torch's `interpolate(..., antialias=True)` of uint8: as many bits as keep every weight in 16.
     Torch,
     /// Pillow's `resize(..., Image.BICUBIC)`: 22 bits.
     Pillow,
@@ -17,16 +17,32 @@ pub enum CubicRule {
 /// Bits of Pillow's weights, and the most that torch's have.
 const MAX_BITS: u32 = 22;
 
-/// Inputs on either side of an output that is as large as they.
-const SUPPORT: f64 = 2.0;
+/// What the inputs around an output weigh.
+#[derive(Clone, Copy)]
+struct Filter {
+    /// Inputs on either side of an output that is as large as they.
+    support: f64,
+    /// The weight at a distance.
+    weight: fn(f64) -> f64,
+}
+
+const CUBIC: Filter = Filter {
+    support: 2.0,
+    weight: cubic,
+};
+
+const LINEAR: Filter = Filter {
+    support: 1.0,
+    weight: |x| (1.0 - x.abs()).max(0.0),
+};
 
 /// `image` resized to `(height, width, 3)`: cubic with `a = -0.5`, antialiased, along the width and then along the height, each result rounded
 /// to bytes. A pass that would change no size is left out.
 ///
 /// ```
-/// use saccade_kernels::{CubicRule, Image, Isa, resize_cubic_u8};
+/// use saccade_kernels::{WeightRounding, Image, Isa, resize_cubic_u8};
 /// let grey = vec![100; 40 * 30 * 3];
-/// let small = resize_cubic_u8(Isa::best(), Image::new(&grey, 40, 30), 20, 20, CubicRule::Torch)?;
+/// let small = resize_cubic_u8(Isa::best(), Image::new(&grey, 40, 30), 20, 20, WeightRounding::Torch)?;
 /// assert_eq!(small, vec![100; 20 * 20 * 3]);
 /// # Ok::<(), saccade_kernels::AllocError>(())
 /// ```
@@ -41,31 +57,68 @@ pub fn resize_cubic_u8(
     image: Image<'_>,
     height: usize,
     width: usize,
-    rule: CubicRule,
+    rule: WeightRounding,
+) -> Result<Vec<u8>, AllocError> {
+    resize_u8(isa, image, height, width, CUBIC, rule)
+}
+
+/// `image` resized to `(height, width, 3)` as torch's `interpolate(..., mode="bilinear", antialias=True)` of uint8 does it on x86-64 with AVX2
+/// and on ARM: linear, along the width and then along the height, each result rounded to bytes.
+///
+/// ```
+/// use saccade_kernels::{Image, Isa, resize_linear_u8};
+/// let pixels = [0, 0, 0, 100, 100, 100];
+/// let wide = resize_linear_u8(Isa::best(), Image::new(&pixels, 1, 2), 1, 4)?;
+/// assert_eq!(wide, [0, 0, 0, 25, 25, 25, 75, 75, 75, 100, 100, 100]);
+/// # Ok::<(), saccade_kernels::AllocError>(())
+/// ```
+///
+/// # Errors
+/// If the system refuses the memory.
+///
+/// # Panics
+/// If `height` or `width` is 0, or if this CPU lacks `isa`.
+pub fn resize_linear_u8(
+    isa: Isa,
+    image: Image<'_>,
+    height: usize,
+    width: usize,
+) -> Result<Vec<u8>, AllocError> {
+    resize_u8(isa, image, height, width, LINEAR, WeightRounding::Torch)
+}
+
+fn resize_u8(
+    isa: Isa,
+    image: Image<'_>,
+    height: usize,
+    width: usize,
+    filter: Filter,
+    rule: WeightRounding,
 ) -> Result<Vec<u8>, AllocError> {
     assert!(height > 0 && width > 0);
     let narrow = match image.width == width {
         true => image.to_vec()?,
-        false => along_width(isa, &Cubic::new(image.width, width, rule)?, image)?,
+        false => along_width(isa, &Weighted::new(image.width, width, filter, rule)?, image)?,
     };
     if image.height == height {
         return Ok(narrow);
     }
-    along_height(isa, &Cubic::new(image.height, height, rule)?, &narrow, width)
+    let sums = Weighted::new(image.height, height, filter, rule)?;
+    along_height(isa, &sums, &narrow, width)
 }
 
 /// The sums of one axis.
-struct Cubic {
+struct Weighted {
     taps: Taps<i32>,
     bits: u32,
 }
 
-impl Cubic {
-    fn new(from: usize, to: usize, rule: CubicRule) -> Result<Self, AllocError> {
-        let taps = cubic_taps(from, to)?;
+impl Weighted {
+    fn new(from: usize, to: usize, filter: Filter, rule: WeightRounding) -> Result<Self, AllocError> {
+        let taps = exact_taps(from, to, filter)?;
         let bits = match rule {
-            CubicRule::Pillow => MAX_BITS,
-            CubicRule::Torch => {
+            WeightRounding::Pillow => MAX_BITS,
+            WeightRounding::Torch => {
                 let largest = taps.weights().iter().copied().fold(0.0, f64::max);
                 let fits = |bits: &u32| 0.5 + largest * f64::from(1 << bits) < f64::from(1 << 15);
                 (0..=MAX_BITS).rev().find(fits).unwrap_or(0)
@@ -79,10 +132,10 @@ impl Cubic {
 }
 
 /// The weights in double.
-fn cubic_taps(from: usize, to: usize) -> Result<Taps<f64>, AllocError> {
+fn exact_taps(from: usize, to: usize, filter: Filter) -> Result<Taps<f64>, AllocError> {
     let scale = from as f64 / to as f64;
     let stretch = scale.max(1.0);
-    let support = SUPPORT * stretch;
+    let support = filter.support * stretch;
     let shrink = 1.0 / stretch;
     let mut taps = Taps::with_room(to)?;
     let mut weights = super::reserved((2.0 * support) as usize + 3)?;
@@ -92,7 +145,7 @@ fn cubic_taps(from: usize, to: usize) -> Result<Taps<f64>, AllocError> {
         let first = (centre - support + 0.5) as usize;
         let end = ((centre + support + 0.5) as usize).min(from);
         weights.clear();
-        weights.extend((first..end).map(|input| cubic((input as f64 - centre + 0.5) * shrink)));
+        weights.extend((first..end).map(|input| (filter.weight)((input as f64 - centre + 0.5) * shrink)));
         let sum: f64 = weights.iter().sum();
         weights.iter_mut().for_each(|weight| *weight /= sum);
         taps.push(first, &weights)?;
@@ -113,7 +166,7 @@ fn cubic(x: f64) -> f64 {
     }
 }
 
-impl Sums for Cubic {
+impl Sums for Weighted {
     type Value = u8;
 
     fn num_outputs(&self) -> usize {

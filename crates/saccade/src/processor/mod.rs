@@ -1,6 +1,9 @@
 //! From camera frames and an instruction to what a backbone takes, as the released processors prepare it.
 
+mod files;
+mod flexible;
 mod frames;
+mod options;
 mod prompt;
 mod python_text;
 mod settings;

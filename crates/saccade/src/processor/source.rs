@@ -2,13 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use saccade_checkpoint::{Checkpoint, read_text};
-use serde_json::{Value, json};
+use saccade_checkpoint::Checkpoint;
+use serde_json::Value;
 
-use super::settings::{PATCH_SIZE, Preprocessing, ProcessorOptions, is_read};
+use super::files::{add_pixel_limits, options, read_object};
+use super::options::overrides;
+use super::settings::{PATCH_SIZE, Preprocessing, ProcessorOptions};
 use super::tokenizer::TokenizerFiles;
 use super::{Processor, Tokenizer};
-use crate::config::{Object, Version, WholeConfig};
+use crate::config::{Version, WholeConfig};
 use crate::error::{Error, Result, show_shape};
 use crate::recognise::Published;
 
@@ -52,20 +54,13 @@ const SLOW_FILES: [&str; 4] = [
     "tokenizer_config.json",
 ];
 
-/// lerobot's step that resizes N1.7's frames, and those that read the instruction.
-const LEROBOT_STEPS: [&str; 3] = [
-    "groot_n1_7_vlm_encode",
-    "groot_n1_7_pack_inputs",
-    "groot_pack_inputs",
-];
-
 /// The processor of a checkpoint, before its tokenizer is read.
 pub struct ProcessorSource {
     version: Version,
     preprocessing: Preprocessing,
     image_size: Option<usize>,
     tokens_per_view: Option<usize>,
-    options: Object,
+    directory: PathBuf,
     tokenizer: Option<TokenizerFiles>,
 }
 
@@ -73,8 +68,8 @@ impl ProcessorSource {
     /// Reads what the checkpoint `source` says, one file or a directory. Only headers of its weights are read.
     ///
     /// # Errors
-    /// [`Error::File`] for files that are not there or broken; [`Error::Json`] and [`Error::Checkpoint`] for configs that are not, for a
-    /// checkpoint of which no version can be found, and for a config that its tensors contradict.
+    /// [`Error::File`] for files that are not there or broken; [`Error::Json`] and [`Error::Checkpoint`] for a `config.json` that is not, for
+    /// a checkpoint of which no version can be found, and for a config that its tensors contradict.
     pub fn open(source: &Path) -> Result<Self> {
         let checkpoint = Checkpoint::open(source)?;
         let directory = match source.is_dir() {
@@ -110,7 +105,7 @@ impl ProcessorSource {
             preprocessing,
             image_size,
             tokens_per_view,
-            options: options(version, preprocessing, directory)?,
+            directory: directory.to_owned(),
             tokenizer: TokenizerFiles::of_checkpoint(directory),
         })
     }
@@ -144,14 +139,17 @@ impl ProcessorSource {
         found.map_or((&[], &[]), |(_, ids, files)| (*ids, *files))
     }
 
-    /// The processor, with these files or the checkpoint's own, and with this path or the checkpoint's own.
+    /// The processor, with these files or the checkpoint's own, and with this path or the checkpoint's own. `replaced` is a JSON object of
+    /// options that take the place of the checkpoint's.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] if no tokenizer is given and the checkpoint has none; those of reading a [`TokenizerFiles`] and [`Processor::new`].
+    /// [`Error::Checkpoint`] if no tokenizer is given and the checkpoint has none, and for files of the processor that are broken or hold what
+    /// their release does not know; those of reading a [`TokenizerFiles`] and [`Processor::new`].
     pub fn processor(
         &self,
         tokenizer: Option<&TokenizerFiles>,
         preprocessing: Option<Preprocessing>,
+        replaced: Option<&str>,
     ) -> Result<Processor> {
         let files = tokenizer.or(self.tokenizer.as_ref()).ok_or_else(|| {
             Error::Checkpoint(format!(
@@ -160,13 +158,17 @@ impl ProcessorSource {
                 self.published().join(" or ")
             ))
         })?;
-        let mut options = self.options.clone();
+        let preprocessing = preprocessing.unwrap_or(self.preprocessing);
+        let mut options = options(self.version, preprocessing, &self.directory)?;
         if self.version == Version::N17 {
             add_pixel_limits(&mut options, files.folder())?;
         }
+        if let Some(replaced) = replaced {
+            options.extend(overrides(replaced)?);
+        }
         let options = Value::Object(options).to_string();
         let given = ProcessorOptions {
-            preprocessing: Some(preprocessing.unwrap_or(self.preprocessing)),
+            preprocessing: Some(preprocessing),
             image_size: self.image_size,
             tokens_per_view: self.tokens_per_view,
             plain_text: false,
@@ -270,83 +272,4 @@ fn given_image_size(config: &WholeConfig) -> Option<u64> {
     let eagle = config.top().get("backbone_cfg")?.get("eagle_config")?;
     let forced = eagle.get("force_image_size").and_then(Value::as_u64);
     forced.or_else(|| eagle.get("vision_config")?.get("image_size")?.as_u64())
-}
-
-/// The options in the files of a checkpoint: those that have an effect.
-fn options(version: Version, preprocessing: Preprocessing, directory: &Path) -> Result<Object> {
-    let mut options = Object::new();
-    let mut add = |keys: Object| options.extend(keys.into_iter().filter(|(key, _)| is_read(version, key)));
-    if preprocessing == Preprocessing::Lerobot {
-        // What lerobot does with N1.7 where its own files say nothing.
-        if version == Version::N17 {
-            add(object(json!({
-                "use_albumentations": false,
-                "image_target_size": [256, 256],
-                "image_crop_size": [230, 230],
-            })));
-        }
-        if let Some(file) = read_object("source", &directory.join("policy_preprocessor.json"))? {
-            for step in file.get("steps").and_then(Value::as_array).into_iter().flatten() {
-                let name = step["registry_name"].as_str().unwrap_or_default();
-                if LEROBOT_STEPS.iter().any(|start| name.starts_with(start)) {
-                    add(object(step["config"].clone()));
-                }
-            }
-        }
-    }
-    for folder in [PathBuf::new(), PathBuf::from("processor")] {
-        let Some(mut file) = read_object("source", &directory.join(folder).join("processor_config.json"))?
-        else {
-            continue;
-        };
-        // Isaac-GR00T's; another program's file of this name holds nothing of it.
-        if let Some(keys) = file.remove("processor_kwargs") {
-            add(object(keys));
-            break;
-        }
-    }
-    if version == Version::N17 {
-        add_pixel_limits(&mut options, directory)?;
-    }
-    Ok(options)
-}
-
-/// Adds the least and the greatest area that the `preprocessor_config.json` in `folder` has, if they are not there yet.
-fn add_pixel_limits(options: &mut Object, folder: &Path) -> Result<()> {
-    let Some(file) = read_object("source", &folder.join("preprocessor_config.json"))? else {
-        return Ok(());
-    };
-    for (key, value) in file {
-        if ["min_pixels", "max_pixels", "size"].contains(&key.as_str()) {
-            options.entry(key).or_insert(value);
-        }
-    }
-    Ok(())
-}
-
-/// The keys of an object; none of anything else.
-fn object(value: Value) -> Object {
-    match value {
-        Value::Object(keys) => keys,
-        _ => Object::new(),
-    }
-}
-
-/// The object in a JSON file, if the file is there.
-fn read_object(what: &'static str, path: &Path) -> Result<Option<Object>> {
-    if !path.exists() {
-        return Ok(None);
-    }
-    let text = read_text(what, path)?;
-    match serde_json::from_str(&text) {
-        Ok(Value::Object(keys)) => Ok(Some(keys)),
-        Ok(_) => Err(Error::Checkpoint(format!(
-            "{what}: {}: expected a JSON object",
-            path.display()
-        ))),
-        Err(source) => Err(Error::Json {
-            what: format!("{what}: {}", path.display()),
-            source,
-        }),
-    }
 }

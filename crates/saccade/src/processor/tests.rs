@@ -5,7 +5,8 @@ use std::path::Path;
 use saccade_checkpoint::Checkpoint;
 use saccade_kernels::{Image, Isa};
 
-use super::frames::{Bytes, by_area, fitting};
+use super::flexible::{fitting, prepared};
+use super::frames::Bytes;
 use super::settings::{Flexible, Preprocessing, ProcessorOptions, Settings, Sizes};
 use crate::config::Version;
 
@@ -22,17 +23,16 @@ fn bytes(checkpoint: &Checkpoint, name: &str) -> Bytes<'static> {
     Bytes::new(pixels, shape[0], shape[1])
 }
 
-fn settings(preprocessing: Preprocessing, options: &str) -> (Settings, Flexible) {
+fn sizes_of(preprocessing: Preprocessing, options: &str) -> Flexible {
     let given = ProcessorOptions {
         preprocessing: Some(preprocessing),
         options: Some(options),
         ..ProcessorOptions::default()
     };
-    let settings = Settings::new(Version::N17, &given).unwrap();
-    let Sizes::Flexible(sizes) = settings.sizes.clone() else {
-        panic!("the views of N1.7 have no fixed size");
-    };
-    (settings, sizes)
+    match Settings::new(Version::N17, &given).unwrap().sizes {
+        Sizes::Flexible(sizes) => sizes,
+        Sizes::Square { .. } => panic!("the views of N1.7 have no fixed size"),
+    }
 }
 
 #[test]
@@ -40,16 +40,17 @@ fn frames_before_the_last_resize() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/backbone/image_n17.safetensors");
     let checkpoint = Checkpoint::open(&path).unwrap();
     let isaac = r#"{"shortest_image_edge": 64, "crop_fraction": 0.95}"#;
-    let lerobot = r#"{"image_crop_size": [58, 58], "image_target_size": [64, 64]}"#;
+    let lerobot =
+        r#"{"image_crop_size": [58, 58], "image_target_size": [64, 64], "use_albumentations": true}"#;
     for (name, preprocessing, options) in [
         ("albumentations_95", Preprocessing::Isaac, isaac),
         ("lerobot_albumentations_58", Preprocessing::Lerobot, lerobot),
     ] {
-        let (settings, sizes) = settings(preprocessing, options);
+        let sizes = sizes_of(preprocessing, options);
         for sample in 0..7 {
             for isa in Isa::available() {
                 let raw = bytes(&checkpoint, &format!("{sample}.raw"));
-                let found = by_area(&settings, &sizes, isa, "image", raw).unwrap();
+                let found = prepared(&sizes, isa, "image", raw).unwrap();
                 let expected = bytes(&checkpoint, &format!("{sample}.{name}"));
                 assert_eq!(
                     (found.height, found.width),
@@ -64,7 +65,7 @@ fn frames_before_the_last_resize() {
 
 #[test]
 fn sizes_of_views_are_multiples_within_limits() {
-    let (_, sizes) = settings(Preprocessing::Isaac, "{}");
+    let sizes = sizes_of(Preprocessing::Isaac, "{}");
     for (version, factor, frame, view) in [
         (Version::N17, 32, (256, 256), (256, 256)),
         (Version::N17, 32, (256, 341), (256, 352)),
