@@ -27,6 +27,7 @@ from lerobot_policy_saccade.files import (
 from lerobot_policy_saccade.lerobot_config import saved_options
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
 from lerobot_policy_saccade.real_time_chunking import continued
+from saccade.robots.data_configs import RELEASED
 
 OBSERVATION, TASK = "observation.", "task"
 
@@ -86,6 +87,7 @@ class SaccadePolicy(PreTrainedPolicy):
             processor_options=config.processor_options,
         )
         normalizer = self.policy.normalizer
+        _check_renames(self.policy.requirements.rename_map)
         width = config.action_feature.shape[-1] if config.action_feature else normalizer.action_width
         if width != normalizer.action_width:
             keys = ", ".join(f"{group.key} ({group.size})" for group in normalizer.action_groups)
@@ -94,7 +96,8 @@ class SaccadePolicy(PreTrainedPolicy):
             )
         saved = saved_options(config.checkpoint)
         self._chunking = saved.chunking
-        horizon = normalizer.action_horizon or self.policy.head.config.action_horizon
+        denoised = self.policy.head.config.action_horizon
+        horizon = min(normalizer.action_horizon or denoised, denoised)
         self._trained = min(horizon, normalizer.trained_horizon or horizon)
         self._steps = _steps(config.n_action_steps, saved.n_action_steps, horizon, self._trained)
         # It is no field, so that it is not saved.
@@ -211,10 +214,9 @@ class SaccadePolicy(PreTrainedPolicy):
         These are options, processors, a copy of the checkpoint, the tokenizer if the checkpoint has none, and
         the data config if it is a file.
         """
-        given = self._data_config
-        data_config = Path(given) if given is not None and Path(given).is_file() else None
+        name = self._data_config if self._data_config in RELEASED else None
+        data_config = None if name is not None or self._data_config is None else Path(self._data_config)
         copy_checkpoint(self._checkpoint, self._tokenizer, data_config, save_directory)
-        name = given if data_config is None else None
         saved = replace(self.config, checkpoint=None, tokenizer=None, data_config=name)
         saved._save_pretrained(save_directory)
         for processor in make_saccade_pre_post_processors(self.config):
@@ -284,6 +286,22 @@ class SaccadePolicy(PreTrainedPolicy):
 def _embodiment(given: str | None) -> str | int | None:
     """A tag, or an id if it is a number."""
     return int(given) if given is not None and given.isdecimal() else given
+
+
+def _check_renames(saved: tuple[tuple[str, str], ...]) -> None:
+    """Checks that it does not matter whether keys were renamed as the checkpoint says before they come here.
+
+    lerobot's programs take a rename map of their own, which users give as the checkpoint has it.
+
+    Raises:
+        saccade.InputError: A key would be renamed twice.
+    """
+    twice = [f"{old} to {new} to {dict(saved)[new]}" for old, new in saved if dict(saved).get(new, new) != new]
+    if twice:
+        raise saccade.InputError(
+            "rename_map: expected one whose new names it does not rename again, since lerobot's programs may "
+            f"have applied it before; the checkpoint's renames {', '.join(twice)} (policy_preprocessor.json)"
+        )
 
 
 def _steps(given: int | None, saved: int | None, horizon: int, trained: int) -> int:
