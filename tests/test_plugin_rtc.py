@@ -53,6 +53,7 @@ def test_as_released(case: dict[str, Any]) -> None:
     rows = torch.nn.functional.pad(options["previous_chunk"], (0, width - previous.shape[-1]))
     config: Any = SimpleNamespace(action_horizon=horizon, action_dim=width, encoder_action_dim=width)
     x, strength = start_of(noise, rows, chunking, config)
+    assert strength is not None
     for _ in range(case["steps"]):
         x = x + (x / 2 + 1) * strength / case["steps"]
     torch.testing.assert_close(x, expected, rtol=1e-5, atol=1e-5)
@@ -111,7 +112,5 @@ def test_refusals(left_over: Any, delay: Any, kind: type[Exception], message: st
 
 
 def test_a_row_that_is_no_number_is_not_padding() -> None:
-    found = continued(
-        rows(1, float("nan")), 0, batch=1, horizon=4, execution_horizon=None, chunking=RULE
-    )
+    found = continued(rows(1, float("nan")), 0, batch=1, horizon=4, execution_horizon=None, chunking=RULE)
     assert found["previous_chunk"].shape == (1, 2, 2)  # so that saccade refuses it

@@ -87,7 +87,9 @@ def client_of(address: str, saved: Path, **options: Any) -> RobotClient:
 
 def batch_of(seen: dict[str, Any]) -> dict[str, Any]:
     """An observation as lerobot's rollout gives it."""
-    frames = {f"observation.images.{name}": torch.from_numpy(seen[name]).movedim(-1, 0)[None] for name in VIEWS}
+    frames = {
+        f"observation.images.{name}": torch.from_numpy(seen[name]).movedim(-1, 0)[None] for name in VIEWS
+    }
     state = torch.tensor([[seen[name] for name in JOINTS]], dtype=torch.float32)
     return {**frames, "observation.state": state, "task": [TASK]}
 
@@ -112,7 +114,9 @@ def test_a_chunk_over_grpc(policy: SaccadePolicy, address: str, saved: Path) -> 
 
 def test_a_robot_runs(address: str, saved: Path) -> None:
     """lerobot's client with both of its threads."""
-    client = client_of(address, saved, after=lambda _, count: client.shutdown_event.set() if count >= 8 else None)
+    finished = threading.Event()
+    client = client_of(address, saved, after=lambda _, count: finished.set() if count >= 8 else None)
+    client.shutdown_event = finished
     assert client.start()
     receiver = threading.Thread(target=client.receive_actions, daemon=True)
     receiver.start()

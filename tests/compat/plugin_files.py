@@ -63,9 +63,7 @@ def data_config_file(path: Path) -> Path:
     """A data config of the checkpoint, with its keys and cameras in another order."""
     kinds = {"video": ("top", "left", "right"), "state": ("gripper", "hand"), "action": ("gripper", "hand")}
     keys = {f"{kind}_keys": [f"{kind}.{name}" for name in names] for kind, names in kinds.items()}
-    modes = {
-        f"{kind}_modes": dict.fromkeys(keys[f"{kind}_keys"], "min_max") for kind in ("state", "action")
-    }
+    modes = {f"{kind}_modes": dict.fromkeys(keys[f"{kind}_keys"], "min_max") for kind in ("state", "action")}
     config = {
         **keys,
         **modes,
@@ -102,7 +100,11 @@ def test_a_saved_policy_has_its_data_config(
 def test_options_that_saccade_reads(checkpoint: Path, policy: SaccadePolicy, tmp_path: Path) -> None:
     """They are given, saved and overridden as lerobot's programs do, and reach `saccade.Policy.load`."""
     policy.save_pretrained(tmp_path)
-    arguments = ['--processor_options={"letter_box_transform": true}', "--action_horizon=8", "--data_config=a.json"]
+    arguments = [
+        '--processor_options={"letter_box_transform": true}',
+        "--action_horizon=8",
+        "--data_config=a.json",
+    ]
     config = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=arguments)
     given = {
         "processor_options": {"letter_box_transform": True},

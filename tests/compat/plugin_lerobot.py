@@ -106,7 +106,9 @@ def test_more_actions_than_were_trained(edited: Callable[[str, Edit], Path]) -> 
     with pytest.warns(UserWarning, match="n_action_steps: 40 asked for, but only the first 16"):
         policy = loaded(folder, n_action_steps=40)
     assert policy.predict_action_chunk(batch_of()).shape[1] == 16
-    with pytest.raises(ValueError, match="n_action_steps: expected at most 40, the length of a chunk, got 41"):
+    with pytest.raises(
+        ValueError, match="n_action_steps: expected at most 40, the length of a chunk, got 41"
+    ):
         loaded(folder, n_action_steps=41)
 
 
@@ -126,14 +128,15 @@ RENAMED = {
 def test_keys_are_renamed_once(edited: Callable[[str, Edit], Path]) -> None:
     """By the checkpoint, by lerobot's program, or by both."""
     expected = loaded(whole_checkpoints.whole(N17)).predict_action_chunk(batch_of())
-    policy = loaded(edited(N17, lambda _, steps: steps[0]["config"].update(rename_map=RENAMED)))
+    folder = edited(N17, lambda _, steps: steps[0]["config"].update(rename_map=RENAMED))
+    policy = loaded(folder)
     batch = batch_of(("top", "hand"), "observation.joints")
     assert torch.equal(policy.predict_action_chunk(batch), expected)
     before, _ = make_saccade_pre_post_processors(policy.config)
     before.steps[0] = RenameObservationsProcessorStep(rename_map=RENAMED)
     policy.reset()
     assert torch.equal(policy.predict_action_chunk(before(batch)), expected)
-    other = loaded(policy._checkpoint, rename_map={"observation.images.first": "observation.images.top"})
+    other = loaded(folder, rename_map={"observation.images.first": "observation.images.top"})
     batch["observation.images.first"] = batch.pop("observation.images.top")
     assert torch.equal(other.predict_action_chunk(batch), expected)
 

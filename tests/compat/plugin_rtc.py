@@ -122,9 +122,12 @@ def test_a_chunk_is_continued(policy: SaccadePolicy, batch: dict[str, Any]) -> N
         batch, prev_chunk_left_over=left_over, inference_delay=3, execution_horizon=2
     )
     rule = saccade.Chunking(overlap=8, frozen=3, horizon=12)
-    expected = policy.policy.act(plugin_cases.plain(batch), seed=7, chunking=rule, previous_chunk={
-        "hand": before[..., :3].numpy(), "gripper": before[..., 3:].numpy()
-    })
+    expected = policy.policy.act(
+        plugin_cases.plain(batch),
+        seed=7,
+        chunking=rule,
+        previous_chunk={"hand": before[..., :3].numpy(), "gripper": before[..., 3:].numpy()},
+    )
     np.testing.assert_array_equal(chunk.numpy(), plugin_cases.joined(expected))
     torch.testing.assert_close(chunk[:, :3], left_over[:, :3], rtol=1e-5, atol=1e-5)
     policy.reset()
@@ -134,9 +137,9 @@ def test_a_chunk_is_continued(policy: SaccadePolicy, batch: dict[str, Any]) -> N
 
 
 def test_what_does_not_fit_is_refused(policy: SaccadePolicy, batch: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="prev_chunk_left_over: .*B 3, got"):
+    with pytest.raises(ValueError, match=r"prev_chunk_left_over: .*B 3, got"):
         policy.predict_action_chunk(batch, prev_chunk_left_over=torch.ones(2, 3, 4))
     with pytest.raises(ValueError, match="finite"):
         policy.predict_action_chunk(batch, prev_chunk_left_over=torch.full((3, 4), torch.nan))
-    with pytest.raises(ValueError, match="width|expected"):
+    with pytest.raises(ValueError, match="expected"):
         policy.predict_action_chunk(batch, prev_chunk_left_over=torch.ones(3, 5))

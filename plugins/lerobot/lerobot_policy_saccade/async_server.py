@@ -2,9 +2,9 @@
 
     python -m lerobot_policy_saccade.async_server --host=127.0.0.1 --port=8080
 
-The options are those of ``python -m lerobot.async_inference.policy_server``, which refuses every policy that is
-not in a list of its own. Everything else is lerobot's. Its clients send pickles, which can run any code: serve
-only those that you trust.
+The options are those of ``python -m lerobot.async_inference.policy_server``, which refuses every policy that
+is not in a list of its own. Everything else is lerobot's. Its clients send pickles, which can run any code:
+serve only those that you trust.
 """
 
 import logging

@@ -29,7 +29,8 @@ class SaccadeConfig(PreTrainedConfig):
             checkpoint's training program did.
         tokenizer: A ``tokenizer.json`` or its directory. Default: as :meth:`saccade.Policy.load`.
         cameras: The names of the cameras in the order of the prompt. Default: those of the checkpoint.
-        data_config: Name or file of an N1.5 checkpoint's data config, as :meth:`saccade.Policy.load` takes it.
+        data_config: Name or file of the data config of an N1.5 checkpoint, as for
+            :meth:`saccade.Policy.load`.
         action_horizon: Number of actions that were trained, where the checkpoint says another one.
         processor_options: Options of :class:`saccade.Processor` that replace those of the checkpoint.
         rename_map: Keys of the environment's observations, and the keys that the checkpoint knows. For
@@ -79,7 +80,7 @@ class SaccadeConfig(PreTrainedConfig):
 
     @property
     def image_features(self) -> dict[str, PolicyFeature]:
-        """The cameras. lerobot's async inference server resizes their frames to the size that is said here."""
+        """The cameras, with the size to which lerobot's async inference server resizes their frames."""
         return super().image_features or self.checkpoint_image_features
 
     @property

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn
 
 import torch
 from lerobot.configs.policies import PreTrainedConfig
@@ -13,6 +13,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
+from typing_extensions import Self
 
 import saccade
 from lerobot_policy_saccade.configuration_saccade import NO_TRAINING, SaccadeConfig
@@ -100,8 +101,8 @@ class SaccadePolicy(PreTrainedPolicy):
         horizon = min(normalizer.action_horizon or denoised, denoised)
         self._trained = min(horizon, normalizer.trained_horizon or horizon)
         self._steps = _steps(config.n_action_steps, saved.n_action_steps, horizon, self._trained)
-        # It is no field, so that it is not saved.
-        config.checkpoint_image_features = saved.image_features or _image_features(self.policy)
+        features = saved.image_features or _image_features(self.policy)
+        config.checkpoint_image_features = features  # type: ignore[misc]  # a field would be saved
         self._actions: deque[Tensor] = deque()
         self._chunks = 0
 
@@ -296,7 +297,9 @@ def _check_renames(saved: tuple[tuple[str, str], ...]) -> None:
     Raises:
         saccade.InputError: A key would be renamed twice.
     """
-    twice = [f"{old} to {new} to {dict(saved)[new]}" for old, new in saved if dict(saved).get(new, new) != new]
+    twice = [
+        f"{old} to {new} to {dict(saved)[new]}" for old, new in saved if dict(saved).get(new, new) != new
+    ]
     if twice:
         raise saccade.InputError(
             "rename_map: expected one whose new names it does not rename again, since lerobot's programs may "
@@ -322,8 +325,8 @@ def _steps(given: int | None, saved: int | None, horizon: int, trained: int) -> 
         )
     if given is not None and given > trained:
         warnings.warn(
-            f"n_action_steps: {given} asked for, but only the first {trained} actions of a chunk were trained; "
-            f"{trained} are executed",
+            f"n_action_steps: {given} asked for, but only the first {trained} actions of a chunk were "
+            f"trained; {trained} are executed",
             stacklevel=3,
         )
     return min(given or saved or horizon, trained)

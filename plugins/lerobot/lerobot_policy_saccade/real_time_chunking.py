@@ -17,10 +17,10 @@ def continued(
     execution_horizon: int | None,
     chunking: saccade.Chunking,
 ) -> dict[str, Any]:
-    """The options of :meth:`saccade.Policy.sample` with which a chunk continues what the robot still executes.
+    """The options of :meth:`saccade.Policy.sample` with which a chunk continues what the robot executes.
 
-    The rule is that of lerobot's own GR00T policy, as of lerobot 0.6: zero rows at the end are padding. Of the
-    others the last ``execution_horizon`` become the first actions of the new chunk.
+    The rule is that of lerobot's own GR00T policy, as of lerobot 0.6: zero rows at the end are padding. Of
+    the others the last ``execution_horizon`` become the first actions of the new chunk.
 
     Args:
         left_over: Actions of the last chunk that were not executed yet, ``(T, D)`` for every observation or
@@ -49,7 +49,8 @@ def continued(
     rows = rows[None] if rows.ndim == 2 else rows
     if rows.ndim != 3 or len(rows) not in (1, batch):
         raise saccade.ShapeError(
-            f"prev_chunk_left_over: expected (T, D), or (B, T, D) with B {batch}, got {tuple(left_over.shape)}"
+            f"prev_chunk_left_over: expected (T, D), or (B, T, D) with B {batch}, got "
+            f"{tuple(left_over.shape)}"
         )
     rows = _without_padding(rows.expand(batch, -1, -1))[:, -horizon:]
     most = rows.shape[1] if execution_horizon is None else int(execution_horizon)
