@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import socket
 import subprocess
@@ -37,13 +36,9 @@ checkpoint, policy = plugin_cases.checkpoint, plugin_cases.policy
 CHUNK = 5
 
 
-@pytest.fixture(scope="module", autouse=True)
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The working directory: lerobot writes logs there."""
-    before, now = Path.cwd(), tmp_path_factory.mktemp("async")
-    os.chdir(now)
-    yield now
-    os.chdir(before)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("async")
 
 
 @pytest.fixture(scope="module")

@@ -194,7 +194,8 @@ def run_tests(release: Release) -> None:
     # The settings of the main suite need packages that this environment lacks.
     command = [str(release.folder / "bin" / "python"), "-m", "pytest", "--noconftest", "--quiet"]
     tests = [str(HERE / test) for test in release.tests]
-    done = subprocess.run([*command, *tests], cwd=ROOT, env=environment)
+    # lerobot's async inference writes logs to the working directory as soon as it is imported.
+    done = subprocess.run([*command, *tests], cwd=release.result.parent, env=environment)
     if done.returncode:
         sys.exit(done.returncode)
 
