@@ -235,7 +235,7 @@ test-aarch64:
 test-aarch64-all:
 	CPUS="max,sve=off neoverse-n1 cortex-a72 max" .ci/aarch64/run.sh test
 
-# The plugin needs Python 3.12 to run, as lerobot does, but not to be packed.
+# The plugin needs lerobot to run, but not to be packed.
 wheel:
 	@$(PYTHON) .ci/needs.py python rust
 	@$(MAKE) -s $(WHEEL_VENV)/.tools

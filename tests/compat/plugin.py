@@ -1,4 +1,4 @@
-"""The plugin in lerobot: `make test-compat` runs this where lerobot is 0.5 or later."""
+"""The plugin in lerobot: `make test-compat` runs this in an environment of each release."""
 
 # lerobot has no types.
 # mypy: disable-error-code="no-any-return, no-untyped-call"

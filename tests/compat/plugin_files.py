@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,69 @@ def test_saved_and_loaded(
     batch["observation.images.up"] = batch.pop("observation.images.top")
     actions = [after(again.select_action(before(dict(batch)))) for _ in range(2)]
     assert torch.equal(torch.stack(actions, 1), expected[:, :2])
+
+
+def data_config_file(path: Path) -> Path:
+    """A data config of the checkpoint, with its keys and cameras in another order."""
+    kinds = {"video": ("top", "left", "right"), "state": ("gripper", "hand"), "action": ("gripper", "hand")}
+    keys = {f"{kind}_keys": [f"{kind}.{name}" for name in names] for kind, names in kinds.items()}
+    modes = {f"{kind}_modes": dict.fromkeys(keys[f"{kind}_keys"], "min_max") for kind in ("state", "action")}
+    config = {
+        **keys,
+        **modes,
+        "language_keys": ["annotation.human.task_description"],
+        "observation_indices": [0],
+        "action_indices": list(range(8)),
+        "target_rotations": {},
+    }
+    path.write_text(json.dumps(config))
+    return path
+
+
+def test_a_saved_policy_has_its_data_config(
+    checkpoint: Path, policy: SaccadePolicy, batch: dict[str, Any], tmp_path: Path
+) -> None:
+    given = data_config_file(tmp_path / "mine.json")
+    config = SaccadeConfig(checkpoint=str(checkpoint), num_threads=1, seed=7, data_config=str(given))
+    saved = SaccadePolicy(config)
+    expected = saved.predict_action_chunk(batch)
+    assert expected.shape == (3, 8, 4)
+    for _ in range(2):
+        saved.save_pretrained(tmp_path / "saved")
+    given.unlink()
+    assert PreTrainedConfig.from_pretrained(tmp_path / "saved").data_config is None
+    loaded = SaccadePolicy.from_pretrained(tmp_path / "saved")
+    assert torch.equal(loaded.predict_action_chunk(batch), expected)
+    loaded.save_pretrained(tmp_path / "saved")  # onto itself
+    assert SaccadePolicy.from_pretrained(tmp_path / "saved").config.data_config is not None
+    # One without leaves none behind.
+    policy.save_pretrained(tmp_path / "saved")
+    assert not (tmp_path / "saved" / "data_config").exists()
+
+
+def test_options_that_saccade_reads(checkpoint: Path, policy: SaccadePolicy, tmp_path: Path) -> None:
+    """They are given, saved and overridden as lerobot's programs do, and reach `saccade.Policy.load`."""
+    policy.save_pretrained(tmp_path)
+    arguments = [
+        '--processor_options={"letter_box_transform": true}',
+        "--action_horizon=8",
+        "--data_config=a.json",
+    ]
+    config = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=arguments)
+    given = {
+        "processor_options": {"letter_box_transform": True},
+        "action_horizon": 8,
+        "data_config": "a.json",
+    }
+    assert {name: getattr(config, name) for name in given} == given
+    config._save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path).processor_options == given["processor_options"]
+    with (
+        mock.patch("saccade.Policy.load", side_effect=RuntimeError("called")) as load,
+        pytest.raises(RuntimeError, match="called"),
+    ):
+        SaccadePolicy.from_pretrained(checkpoint, config=config)
+    assert {name: load.call_args.kwargs[name] for name in given} == given
 
 
 def without_tokenizer(checkpoint: Path, folder: Path) -> tuple[Path, Path]:

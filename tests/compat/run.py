@@ -4,8 +4,8 @@
 
 `make test-compat` runs all releases. Environments are `.venv-compat-lerobot-*` next to the Makefile. They are
 recreated when their list of packages changes. All packages are installed without their dependencies, because
-the lists in this folder are complete. torch is large, so two environments use the torch of another one. Where
-lerobot has plugins, that of plugins/lerobot is installed too.
+the lists in this folder are complete. torch is large, so two environments use the torch of another one. The
+plugin of plugins/lerobot is installed in all of them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--q
 
 #: The package of plugins/lerobot, and its tests.
 PLUGIN = ROOT / "plugins" / "lerobot"
-PLUGIN_TESTS = ("plugin.py", "plugin_files.py", "plugin_environments.py")
+PLUGIN_TESTS = (
+    "plugin.py",
+    "plugin_files.py",
+    "plugin_lerobot.py",
+    "plugin_async.py",
+    "plugin_environments.py",
+)
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,12 @@ class Release:
 
 #: In the order in which the environments build on each other; "" is the environment that runs this program.
 RELEASES = (
-    Release("0.4.4", "", ("policies.py", "whole.py", "normalizers.py")),
-    Release("0.6.1", None, ("policies.py", "whole.py", "normalizers.py", "n17_parity.py", *PLUGIN_TESTS)),
+    Release("0.4.4", "", ("policies.py", "whole.py", "normalizers.py", *PLUGIN_TESTS)),
+    Release(
+        "0.6.1",
+        None,
+        ("policies.py", "whole.py", "normalizers.py", "n17_parity.py", *PLUGIN_TESTS, "plugin_rtc.py"),
+    ),
     Release("0.5.1", "0.6.1", ("policies.py", "whole.py", "normalizers.py", *PLUGIN_TESTS)),
 )
 
@@ -105,9 +115,11 @@ environment these tests passed too:
   threads. In training, and where a gradient is asked for, the original backbone runs. Padding under another
   attention than torch's `sdpa` is refused.
 
-In lerobot 0.5.1 and 0.6.1 those of the plugin `lerobot_policy_saccade` passed too. `lerobot-eval`, started as
-users start it, runs episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their rewards
-are those of `saccade.Policy.act` in a loop.
+Those of the plugin `lerobot_policy_saccade` passed too. `lerobot-eval`, started as users start it, runs
+episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their rewards are those of
+`saccade.Policy.act` in a loop. lerobot's async client gets the actions of `saccade.Policy.act` over gRPC. In
+0.6.1 lerobot's rollout runs with real-time chunking, and every chunk is that of `saccade.Policy.act` with
+`saccade.Chunking`.
 
 ## What is not in the table
 
@@ -161,9 +173,8 @@ def set_up(release: Release, python312: str | None) -> None:
         (site_packages(release.folder / "bin" / "python") / "below.pth").write_text(f"{below}\n")
     install = [*PIP, "--no-deps", "--requirement", str(release.packages)]
     subprocess.run([str(release.folder / "bin" / "python"), *install], check=True)
-    if set(PLUGIN_TESTS) <= set(release.tests):
-        editable = [*PIP, "--no-deps", "--no-build-isolation", "--editable", str(PLUGIN)]
-        subprocess.run([str(release.folder / "bin" / "python"), *editable], check=True)
+    editable = [*PIP, "--no-deps", "--no-build-isolation", "--editable", str(PLUGIN)]
+    subprocess.run([str(release.folder / "bin" / "python"), *editable], check=True)
     stamp.write_text(release.packages.read_text())
 
 
@@ -183,7 +194,8 @@ def run_tests(release: Release) -> None:
     # The settings of the main suite need packages that this environment lacks.
     command = [str(release.folder / "bin" / "python"), "-m", "pytest", "--noconftest", "--quiet"]
     tests = [str(HERE / test) for test in release.tests]
-    done = subprocess.run([*command, *tests], cwd=ROOT, env=environment)
+    # lerobot's async inference writes logs to the working directory as soon as it is imported.
+    done = subprocess.run([*command, *tests], cwd=release.result.parent, env=environment)
     if done.returncode:
         sys.exit(done.returncode)
 

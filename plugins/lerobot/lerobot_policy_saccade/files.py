@@ -19,6 +19,10 @@ CHECKPOINT = "checkpoint"
 #: The folder of the tokenizer, if the checkpoint's own is not used.
 TOKENIZER = "tokenizer"
 
+#: The folder of a data config that was given as a file, and its name there.
+DATA_CONFIG = "data_config"
+DATA_CONFIG_FILE = "data_config.json"
+
 #: What saccade reads of a checkpoint. Other files, such as an optimizer's state, are not fetched or copied.
 FILES = ("*.json", "*.safetensors", "*.txt")
 
@@ -66,15 +70,16 @@ def folder_of(name: str | Path, *, revision: str | None, **hub_options: Any) -> 
         raise FileNotFoundError(f"pretrained_name_or_path: {name} is not on the Hub: {error}") from error
 
 
-def copy_checkpoint(source: str, tokenizer: str | None, folder: Path) -> None:
-    """Copies a checkpoint into the folder of a policy, and the tokenizer if it is elsewhere.
+def copy_checkpoint(source: str, tokenizer: str | None, data_config: Path | None, folder: Path) -> None:
+    """Copies a checkpoint into the folder of a policy, and what else the policy was loaded from.
 
     The folder then needs no other file: also where the local cache has no tokenizer. What was there before is
     replaced at the end only.
 
     Args:
         source: The directory or id of a checkpoint, or its weights.
-        tokenizer: As :meth:`saccade.Policy.load` takes it.
+        tokenizer: As :meth:`saccade.Policy.load` takes it. It is copied if the checkpoint has none.
+        data_config: The file of a data config, or None.
         folder: The policy's directory.
 
     Raises:
@@ -93,6 +98,10 @@ def copy_checkpoint(source: str, tokenizer: str | None, folder: Path) -> None:
         parts[TOKENIZER] = {}
     elif not _is(folder / TOKENIZER, files):
         parts[TOKENIZER] = _files_of_tokenizer(files)
+    if data_config is None:
+        parts[DATA_CONFIG] = {}
+    elif not _is(folder / DATA_CONFIG / DATA_CONFIG_FILE, data_config):
+        parts[DATA_CONFIG] = {Path(DATA_CONFIG_FILE): data_config}
     with tempfile.TemporaryDirectory(dir=folder, prefix=".saving-") as temporary:
         for name, part in parts.items():
             for below, file in part.items():

@@ -1,23 +1,39 @@
 """A whole GR00T checkpoint as one of lerobot's policies: tensors in, actions out, computed by saccade."""
 
+import warnings
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn
 
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
+from typing_extensions import Self
 
 import saccade
 from lerobot_policy_saccade.configuration_saccade import NO_TRAINING, SaccadeConfig
-from lerobot_policy_saccade.files import CHECKPOINT, TOKENIZER, copy_checkpoint, folder_of
+from lerobot_policy_saccade.files import (
+    CHECKPOINT,
+    DATA_CONFIG,
+    DATA_CONFIG_FILE,
+    TOKENIZER,
+    copy_checkpoint,
+    folder_of,
+)
+from lerobot_policy_saccade.lerobot_config import saved_options
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
+from lerobot_policy_saccade.real_time_chunking import continued
+from saccade.robots.data_configs import RELEASED
 
 OBSERVATION, TASK = "observation.", "task"
+
+#: What the processors of lerobot's own GR00T policy add to a batch. Its actions would be converted twice.
+PACKED = "embodiment_id"
 
 #: Seeds are drawn below this number.
 SEEDS = 2**63 - 1
@@ -58,6 +74,7 @@ class SaccadePolicy(PreTrainedPolicy):
         if config.checkpoint is None:
             raise saccade.InputError("checkpoint: expected a path or an id, got none (--policy.checkpoint)")
         self._checkpoint, self._tokenizer = config.checkpoint, config.tokenizer
+        self._data_config = config.data_config
         self.policy = saccade.Policy.load(
             config.checkpoint,
             embodiment=_embodiment(config.embodiment),
@@ -66,20 +83,26 @@ class SaccadePolicy(PreTrainedPolicy):
             precision={"backbone": config.precision, "head": config.head_precision or config.precision},
             num_threads=config.num_threads,
             cameras=config.cameras,
+            data_config=config.data_config,
+            action_horizon=config.action_horizon,
+            processor_options=config.processor_options,
         )
         normalizer = self.policy.normalizer
+        _check_renames(self.policy.requirements.rename_map)
         width = config.action_feature.shape[-1] if config.action_feature else normalizer.action_width
         if width != normalizer.action_width:
             keys = ", ".join(f"{group.key} ({group.size})" for group in normalizer.action_groups)
             raise saccade.InputError(
                 f"{ACTION}: expected an environment of {normalizer.action_width} numbers, {keys}, got {width}"
             )
-        horizon = normalizer.action_horizon or self.policy.head.config.action_horizon
-        self._steps = config.n_action_steps or horizon
-        if self._steps > horizon:
-            raise saccade.InputError(
-                f"n_action_steps: expected at most {horizon}, the length of a chunk, got {self._steps}"
-            )
+        saved = saved_options(config.checkpoint)
+        self._chunking = saved.chunking
+        denoised = self.policy.head.config.action_horizon
+        horizon = min(normalizer.action_horizon or denoised, denoised)
+        self._trained = min(horizon, normalizer.trained_horizon or horizon)
+        self._steps = _steps(config.n_action_steps, saved.n_action_steps, horizon, self._trained)
+        features = saved.image_features or _image_features(self.policy)
+        config.checkpoint_image_features = features  # type: ignore[misc]  # a field would be saved
         self._actions: deque[Tensor] = deque()
         self._chunks = 0
 
@@ -105,34 +128,72 @@ class SaccadePolicy(PreTrainedPolicy):
             self._actions.extend(chunk[:, : self._steps].unbind(1))
         return self._actions.popleft()
 
-    def predict_action_chunk(self, batch: Mapping[str, Any], noise: Tensor | None = None) -> Tensor:
+    def supports_rtc(self) -> bool:
+        """True: :meth:`predict_action_chunk` can continue the last chunk."""
+        return True
+
+    def predict_action_chunk(
+        self,
+        batch: Mapping[str, Any],
+        noise: Tensor | None = None,
+        *,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+        **ignored: Any,
+    ) -> Tensor:
         """A chunk of actions for each observation.
 
         Args:
             batch: ``observation.images.<name>`` ``(B, 3, H, W)``, uint8 or float from 0 to 1;
                 ``observation.state`` ``(B, D)``; ``task``, a string for each row. Other keys are ignored.
             noise: float32 ``(B, T, D)`` of the head. Default: drawn; see ``seed`` of the options.
+            inference_delay: Number of actions that the robot executes while the new chunk is computed.
+            prev_chunk_left_over: Actions of the last chunk that are not executed yet, ``(T, D)`` or ``(B, T,
+                D)`` in the robot's units: real-time chunking. The first ones, at most
+                ``config.rtc_config.execution_horizon``, become the first of the new chunk:
+                ``inference_delay`` of them unchanged, the others less and less so. Those relative to the
+                state are converted to the new state. Rows of zeros at the end are padding.
+            **ignored: Other keywords of lerobot's policies, which its GR00T policy ignores too.
 
         Returns:
-            float32 ``(B, T, D)``, in the robot's units.
+            float32 ``(B, T, D)``, in the robot's units: the actions that were trained.
 
         Raises:
             saccade.InputError, saccade.ShapeError, saccade.DtypeError: The observation does not fit the
-                robot; the message lists what the robot needs.
+                robot; the message lists what the robot needs. Or another argument does not fit.
         """
-        options: dict[str, Any] = {"num_steps": self.config.num_steps}
+        observation = self._observation(batch)
+        context = self.policy.encode(observation)
+        rtc = self.config.rtc_config
+        options: dict[str, Any] = continued(
+            prev_chunk_left_over,
+            inference_delay,
+            batch=context.batch,
+            horizon=self.policy.head.config.action_horizon,
+            execution_horizon=None if rtc is None else rtc.execution_horizon,
+            chunking=self._chunking,
+        )
         if noise is not None:
             options["noise"] = noise
         elif self.config.seed is not None:
             options["seed"] = self.config.seed + self._chunks
         else:
             options["seed"] = int(torch.randint(SEEDS, ()))
-        chunk: Tensor = self.policy.act(self._observation(batch), **options)
+        chunk: Tensor = self.policy.sample(context, observation, num_steps=self.config.num_steps, **options)
         self._chunks += 1
-        return chunk
+        return chunk[:, : self._trained]
 
     def _observation(self, batch: Mapping[str, Any]) -> dict[str, Any]:
-        """What saccade reads of a batch, on the CPU, with the checkpoint's keys."""
+        """What saccade reads of a batch, on the CPU, with the checkpoint's keys.
+
+        Raises:
+            saccade.InputError: The batch went through the processors of lerobot's own GR00T policy.
+        """
+        if PACKED in batch:
+            raise saccade.InputError(
+                f"batch: expected observations as they are, got {PACKED}, as lerobot's own GR00T processors "
+                "make it: load the processors from a folder that save_pretrained of this policy wrote"
+            )
         renamed = self.config.rename_map
         return {
             renamed.get(key, key): value.cpu() if isinstance(value, Tensor) else value
@@ -151,10 +212,14 @@ class SaccadePolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         """Writes what ``--policy.path`` needs on any machine.
 
-        These are options, processors, a copy of the checkpoint, and the tokenizer if the checkpoint has none.
+        These are options, processors, a copy of the checkpoint, the tokenizer if the checkpoint has none, and
+        the data config if it is a file.
         """
-        copy_checkpoint(self._checkpoint, self._tokenizer, save_directory)
-        replace(self.config, checkpoint=None, tokenizer=None)._save_pretrained(save_directory)
+        name = self._data_config if self._data_config in RELEASED else None
+        data_config = None if name is not None or self._data_config is None else Path(self._data_config)
+        copy_checkpoint(self._checkpoint, self._tokenizer, data_config, save_directory)
+        saved = replace(self.config, checkpoint=None, tokenizer=None, data_config=name)
+        saved._save_pretrained(save_directory)
         for processor in make_saccade_pre_post_processors(self.config):
             processor.save_pretrained(save_directory)
 
@@ -204,6 +269,7 @@ class SaccadePolicy(PreTrainedPolicy):
             local_files_only=local_files_only,
         )
         saved, tokenizer = folder / CHECKPOINT, folder / TOKENIZER
+        data_config = folder / DATA_CONFIG / DATA_CONFIG_FILE
         if config is None:
             config = PreTrainedConfig.from_pretrained(folder) if saved.is_dir() else SaccadeConfig()
         config = replace(config, **options)
@@ -211,6 +277,8 @@ class SaccadePolicy(PreTrainedPolicy):
             config.checkpoint = str(saved if saved.is_dir() else folder)
             if saved.is_dir() and tokenizer.is_dir() and config.tokenizer is None:
                 config.tokenizer = str(tokenizer)
+            if saved.is_dir() and data_config.is_file() and config.data_config is None:
+                config.data_config = str(data_config)
         policy = cls(config)
         policy.eval()
         return policy
@@ -219,3 +287,57 @@ class SaccadePolicy(PreTrainedPolicy):
 def _embodiment(given: str | None) -> str | int | None:
     """A tag, or an id if it is a number."""
     return int(given) if given is not None and given.isdecimal() else given
+
+
+def _check_renames(saved: tuple[tuple[str, str], ...]) -> None:
+    """Checks that it does not matter whether keys were renamed as the checkpoint says before they come here.
+
+    lerobot's programs take a rename map of their own, which users give as the checkpoint has it.
+
+    Raises:
+        saccade.InputError: A key would be renamed twice.
+    """
+    twice = [
+        f"{old} to {new} to {dict(saved)[new]}" for old, new in saved if dict(saved).get(new, new) != new
+    ]
+    if twice:
+        raise saccade.InputError(
+            "rename_map: expected one whose new names it does not rename again, since lerobot's programs may "
+            f"have applied it before; the checkpoint's renames {', '.join(twice)} (policy_preprocessor.json)"
+        )
+
+
+def _steps(given: int | None, saved: int | None, horizon: int, trained: int) -> int:
+    """How many actions of a chunk are executed.
+
+    Args:
+        given: What the user asks for, or None.
+        saved: What the checkpoint says, or None.
+        horizon: Length of a chunk.
+        trained: How many of these were trained.
+
+    Raises:
+        saccade.InputError: ``given`` is more than there are.
+    """
+    if given is not None and given > horizon:
+        raise saccade.InputError(
+            f"n_action_steps: expected at most {horizon}, the length of a chunk, got {given}"
+        )
+    if given is not None and given > trained:
+        warnings.warn(
+            f"n_action_steps: {given} asked for, but only the first {trained} actions of a chunk were "
+            f"trained; {trained} are executed",
+            stacklevel=3,
+        )
+    return min(given or saved or horizon, trained)
+
+
+def _image_features(policy: saccade.Policy) -> dict[str, PolicyFeature]:
+    """The cameras of a policy that takes frames of one size only."""
+    return {
+        f"{OBS_IMAGES}.{camera.name}": PolicyFeature(
+            type=FeatureType.VISUAL, shape=(3, camera.height, camera.width)
+        )
+        for camera in policy.requirements.cameras or ()
+        if camera.height is not None and camera.width is not None
+    }
