@@ -114,8 +114,10 @@ class Oracle:
                 return f"{key}: {reason}"
         if sum(self.width("action", key) for key in self.action_keys) > self.options["max_action_dim"]:
             return "action too wide"
-        widths = [self.width("state", key) * (2 if self.encoded(key) else 1) for key in self.state_keys]
-        if not self.option("exclude_state") and sum(widths) > self.options["max_state_dim"]:
+        # With exclude_state the release joins zeros as wide as the raw state, and checks their width.
+        double = [self.encoded(key) and not self.option("exclude_state") for key in self.state_keys]
+        widths = [self.width("state", key) * (1 + twice) for key, twice in zip(self.state_keys, double, strict=True)]
+        if sum(widths) > self.options["max_state_dim"]:
             return "state too wide"
         return None
 
@@ -126,6 +128,8 @@ class Oracle:
         rows = np.shape(self.statistics["relative_action"][key]["min"])
         if len(rows) == 2 and rows[0] not in (1, self.action_horizon):
             return "steps of statistics"
+        if rows[-1] != width:
+            return "width of statistics"
         if self.reference(key) not in self.state_keys:
             return "no reference"
         if self.width("state", self.reference(key)) != width:
