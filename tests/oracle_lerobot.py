@@ -119,6 +119,9 @@ class Oracle:
                 config["format"].lower() not in ("xyz+rot6d", "xyz_rot6d") or keys[key] != 9
             ):
                 return f"{key}: pose"
+            end = np.cumsum(list(keys.values()))[list(keys).index(key)]
+            if config["type"].lower() == "eef" and end - keys[key] < self.result_width < end:
+                return f"{key}: a pose that is cut: lerobot takes it, saccade does not"
         if self.libero:
             end = np.cumsum(list(keys.values()))[list(keys).index("gripper")] if "gripper" in keys else 0
             if keys.get("gripper") != 1 or end > self.result_width:

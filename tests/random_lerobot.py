@@ -171,7 +171,9 @@ def native(draw: st.DrawFn, rng: np.random.Generator) -> tuple[Step, dict[str, t
         if key == "gripper":
             rep, reference = draw(st.sampled_from([("ABSOLUTE", "grasp"), ("RELATIVE", "grasp")]))
         kind = "NON_EEF" if form == "joints" else draw(st.sampled_from(["EEF", "eef"]))
-        written = FORMS[form] if form == "joints" else draw(st.sampled_from(["XYZ_ROT6D", "xyz+rot6d"]))
+        written = draw(st.sampled_from(["XYZ_ROT6D", "xyz+rot6d"]))
+        if form == "joints":  # lerobot does not look at it
+            written = draw(st.sampled_from(["DEFAULT", "DEFAULT", "default", "xyz+rotvec", "XYZ_ROT6D"]))
         listed.append({"rep": rep, "type": kind, "format": written, "state_key": reference})
         if reference == key:
             listed[-1]["state_key"] = draw(st.sampled_from([key, None]))

@@ -194,7 +194,7 @@ class Pipeline:
         limits = [N17_HORIZON, *(self._migrated(name) for name in MIGRATED)]
         local = self._local_rows()
         returned = min(limit for limit in [*limits, local or N17_HORIZON] if limit > 0)
-        decoded = len(_steps(self.unpack.config.get("modality_config"))) or returned
+        decoded = len(action_steps(self.unpack.config.get("modality_config"))) or returned
         returned = max(1, min(returned, decoded if self.unpack.name == DECODE else returned))
         trained = [
             _positive(self.pack.config.get(name), N17_HORIZON)
@@ -214,7 +214,7 @@ class Pipeline:
         try:
             values = read_json(path) if path is not None and path.is_file() else {}
             robot = values["processor_kwargs"]["modality_configs"][self.pack.config.get("embodiment_tag")]
-            return len(_steps(robot)) or None
+            return len(action_steps(robot)) or None
         except (CheckpointError, KeyError, TypeError, OSError, ValueError):
             return None
 
@@ -366,7 +366,7 @@ def _statistics(folder: Path, name: Any) -> Statistics:
     return found
 
 
-def _steps(modality_config: Any) -> list[Any]:
+def action_steps(modality_config: Any) -> list[Any]:
     """The steps of the actions in a modality config; empty if it does not say."""
     action = modality_config.get("action") if isinstance(modality_config, Mapping) else None
     steps = action.get("delta_indices") if isinstance(action, Mapping) else None
