@@ -48,8 +48,9 @@ class Oracle:
         self, config: dict[str, Any], before: dict[str, Any], after: dict[str, Any], states: dict[str, Tensors]
     ) -> None:
         self.config, self.states = config, states
-        self.before = {step["registry_name"]: step["config"] for step in before["steps"]}
-        self.after = {step["registry_name"]: step["config"] for step in after["steps"]}
+        # The absolute step takes the first of several relative steps.
+        self.before = {step["registry_name"]: step["config"] for step in reversed(before["steps"])}
+        self.after = {step["registry_name"]: step["config"] for step in reversed(after["steps"])}
         self.release = "n1.5" if "groot_pack_inputs_v3" in self.before else "n1.7"
         names = {name for name in self.before if "pack_inputs" in name}
         self.pack_name = names.pop()
@@ -88,15 +89,15 @@ class Oracle:
     # --- refusals ---
 
     def refused(self) -> str | None:
-        if unknown := {*self.before, *self.after} - KNOWN[self.release]:
+        steps = self.before | self.after
+        # A step that says that it is off changes nothing.
+        if unknown := {name for name in steps if steps[name].get("enabled") is not False} - KNOWN[self.release]:
             return f"unknown steps {unknown}"
         if self.absolute and self.relative is None:
             return "absolute without relative"
-        if self.release == "n1.7":
-            if self.number("n_action_steps") > self.number("chunk_size"):
-                return "n_action_steps"
-            if self.state_width > self.pack["max_state_dim"]:
-                return "state too wide"
+        # lerobot also refuses n_action_steps above chunk_size, but the smaller of them counts anyhow.
+        if self.release == "n1.7" and self.state_width > self.pack["max_state_dim"]:
+            return "state too wide"
         if self.native and (reason := self.native_refused()):
             return reason
         if self.absolute and self.state_width < self.result_width:

@@ -14,7 +14,6 @@ from random_processor import FORMS, offsets
 from random_robots import F32, JOINTS, rotation, statistics_row, write
 from safetensors.numpy import save_file
 
-SHARED = ("input_features", "output_features", "device", "use_amp", "use_peft", "chunk_size", "n_action_steps")
 MAPPING = {
     "n1.5": {"new_embodiment": 31, "oxe_droid": 17, "agibot_genie1": 26, "gr1": 24, "so100": 2, "unitree_g1": 3},
     "n1.7": {"simpler_env_google": 0, "simpler_env_widowx": 1, "libero_sim": 2, "new_embodiment": 10},
@@ -28,6 +27,7 @@ UNPACK = {
 DEVICE = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
 VLM = {"model_name": "nvidia/Cosmos-Reason2-2B", "image_crop_size": [230, 230], "image_target_size": [256, 256]}
 VLM |= {"shortest_image_edge": None, "crop_fraction": None, "use_albumentations": False}
+RELATIVES = tuple(oracle_lerobot.RELATIVE.values())
 Step = dict[str, Any]
 
 
@@ -236,3 +236,43 @@ def robots(draw: st.DrawFn) -> Robot:
     rename_step = step("rename_observations_processor", rename_map=draw(st.sampled_from([{}, rename])))
     before = [rename_step, step("to_batch_processor"), *relative, pack, *encode, DEVICE]
     return Robot(config, before, [decode, *absolute, DEVICE], states, forms, seed)
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> Robot:
+    """A saved folder with one thing changed at random. The oracle says whether it is still a robot."""
+    robot = copy.deepcopy(draw(robots()))
+    config, pack = robot.config, next(step for step in robot.before if "pack" in step["registry_name"])
+    decode = robot.after[0]["config"]
+    changes = ["widths", "steps", "no relative step", "other release's relative step"]
+    if relative := decode.get("raw_stats", {}).get("relative_action"):
+        decode["use_relative_action"] = True
+        changes = ["reference", "format", "type", "no statistics", "rows"]
+        key = draw(st.sampled_from([*relative]))
+        about = decode["modality_config"]["action"]
+        about["action_configs"] = about["action_configs"] or []
+        place = about["modality_keys"].index(key)
+    change = draw(st.sampled_from(changes))
+    if change == "widths":
+        pack["config"]["max_state_dim"] = config["max_state_dim"] = draw(st.integers(1, 8))
+    elif change == "steps":
+        config |= draw(st.sampled_from([{"n_action_steps": 41}, {"chunk_size": 4}, {"n_action_steps": 50}]))
+    elif change == "no relative step":
+        robot.before = [step for step in robot.before if step["registry_name"] not in RELATIVES]
+        robot.after[1:-1] = [step("absolute_actions_processor", enabled=draw(st.booleans()))]
+    elif change == "other release's relative step":
+        name = draw(st.sampled_from(RELATIVES))
+        robot.before.insert(2, step(name, enabled=True, exclude_joints=[], action_names=None))
+        robot.after[1:-1] = [step("absolute_actions_processor", enabled=True)]
+    elif change == "no statistics":
+        del relative[key]
+    elif change == "rows":
+        count = draw(st.integers(1, 12))
+        for name, values in relative[key].items():
+            relative[key][name] = values[:count] if np.ndim(values) == 2 else values
+    elif place < len(about["action_configs"]):
+        values = {"format": ["DEFAULT", "XYZ_ROTVEC", "XYZ_ROT6D"], "type": ["EEF", "NON_EEF"]}
+        values["reference"] = ["nothing", *robot.forms]
+        field = "state_key" if change == "reference" else change
+        about["action_configs"][place] = {**about["action_configs"][place], field: draw(st.sampled_from(values[change]))}
+    return robot

@@ -26,8 +26,8 @@ def check(robot: random_lerobot.Robot) -> None:
     assert_close(normalizer.actions(chunk, state), oracle.actions(chunk, state))
 
 
-@given(random_lerobot.robots())
-@settings(max_examples=100)
+@given(random_lerobot.robots() | random_lerobot.damaged())
+@settings(max_examples=200)
 def test_robots_are_converted_or_refused_as_the_oracle_does(robot: random_lerobot.Robot) -> None:
     if robot.oracle.refused() is None:
         check(robot)

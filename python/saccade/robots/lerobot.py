@@ -17,7 +17,7 @@ import numpy.typing as npt
 from saccade.robots.building import Builder, Options, finished, size_of, width_of
 from saccade.robots.embodiments import N17_IDS
 from saccade.robots.groups import Group, Robot
-from saccade.robots.isaac_processor import Modality, check_reference, modality
+from saccade.robots.isaac_processor import Modality, check_reference, modality, single_row
 from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
 from saccade.robots.rotations import POSES
 
@@ -167,9 +167,8 @@ def _native_groups(builder: Builder, pipeline: Pipeline, state: tuple[Group, ...
         builder, _strict(builder, about), "action", relative=bool(config.get("use_relative_action"))
     )
     sizes = {group.key: group.size for group in state}
-    groups = [
-        _native_group(builder, key, raw, action, bool(config.get("use_percentiles"))) for key in action.keys
-    ]
+    uses_quantiles, rows = bool(config.get("use_percentiles")), pipeline.rows[0]
+    groups = [_native_group(builder, key, raw, action, uses_quantiles, rows) for key in action.keys]
     for group in groups:
         if group is not None and group.reference is not None:
             check_reference(builder, group, sizes)
@@ -208,7 +207,7 @@ def _strict(builder: Builder, about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _native_group(
-    builder: Builder, key: str, raw: Mapping[str, Any], about: Modality, uses_quantiles: bool
+    builder: Builder, key: str, raw: Mapping[str, Any], about: Modality, uses_quantiles: bool, rows: int
 ) -> Group | None:
     reference = about.references.get(key)
     kind = "action" if reference is None else "relative_action"
@@ -220,9 +219,15 @@ def _native_group(
     if isinstance(found, Mapping):
         found = {"min": found.get(low), "max": found.get(high)}
     group = builder.group(key, found, "min_max", clips=True, clips_back=True, reference=reference)
-    if group is not None and group.size != width:
+    if group is None or group.first is None:
+        return group
+    if group.size != width:
         builder.problems.append(f"action.{key}: {width} numbers, but statistics of {group.size}")
-    return group
+    if group.first.ndim == 2 and 1 < len(group.first) < rows:
+        builder.problems.append(
+            f"action.{key}: expected statistics of at least {rows} steps, got {len(group.first)}"
+        )
+    return single_row(group)
 
 
 def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group, ...]:

@@ -253,7 +253,9 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
         ends.problems.append(f"{unpack.name} does not belong to {pack.name}")
     _check_order(builder, ends, steps, steps_after, pack, unpack)
     rename = [step.config.get("rename_map") or {} for step in steps if step.name == RENAME]
-    relative = DELTA if pack.name == PACK_N15 else RELATIVE
+    relative, other = (DELTA, RELATIVE) if pack.name == PACK_N15 else (RELATIVE, DELTA)
+    if any(step.name == other and step.config.get("enabled") for step in steps):
+        builder.problems.append(f"expected {relative}, as the releases with {pack.name} have it, got {other}")
     offsets = _offsets(ends, steps, steps_after, relative)
     builder.check()
     ends.check()
