@@ -330,10 +330,10 @@ def _action_group(
         )
     if reference is not None:
         check_reference(builder, group, sizes)
-    return _single_row(group)
+    return single_row(group)
 
 
-def _single_row(group: Group) -> Group:
+def single_row(group: Group) -> Group:
     """A group whose statistics of one step are those of every step."""
     if group.first is None or group.first.ndim == 1 or len(group.first) > 1:
         return group

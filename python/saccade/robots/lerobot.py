@@ -17,8 +17,9 @@ import numpy.typing as npt
 from saccade.robots.building import Builder, Options, finished, size_of, width_of
 from saccade.robots.embodiments import N17_IDS
 from saccade.robots.groups import Group, Robot
-from saccade.robots.isaac_processor import Modality, check_reference, modality
-from saccade.robots.lerobot_pipeline import DECODE, Pipeline, read_pipeline
+from saccade.robots.isaac_processor import Modality, check_reference, modality, single_row
+from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
+from saccade.robots.rotations import POSES
 
 STATE, ACTION = "observation.state", "action"
 
@@ -55,8 +56,10 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     state = _state_groups(builder, pipeline)
     action = _native_groups(builder, pipeline, state) if native else _flat_groups(builder, pipeline)
     width = sum(group.size for group in action)
-    cut = size_of(giving.get("env_action_dim")) or pipeline.feature("output_features", ACTION)
-    if cut is not None and cut < width:
+    # lerobot replaces what N1.5's step says by the width in config.json.
+    given = size_of(giving.get("env_action_dim")) if pipeline.is_n17 else None
+    cut = min(given or width, pipeline.feature("output_features", ACTION) or width)
+    if cut < width:
         action, width = _cut(builder, action, cut), cut
     gripper = _libero(builder, pipeline, action, native)
     offsets = pipeline.offsets(width)
@@ -159,11 +162,13 @@ def _native_groups(builder: Builder, pipeline: Pipeline, state: tuple[Group, ...
         builder.problems.append(f"{DECODE}: no raw_stats and modality_config")
         builder.check()
     assert isinstance(raw, Mapping)
-    action = modality(builder, about, "action", relative=bool(config.get("use_relative_action")))
+    assert isinstance(about, Mapping)
+    action = modality(
+        builder, _strict(builder, about), "action", relative=bool(config.get("use_relative_action"))
+    )
     sizes = {group.key: group.size for group in state}
-    groups = [
-        _native_group(builder, key, raw, action, bool(config.get("use_percentiles"))) for key in action.keys
-    ]
+    uses_quantiles, rows = bool(config.get("use_percentiles")), pipeline.rows[0]
+    groups = [_native_group(builder, key, raw, action, uses_quantiles, rows) for key in action.keys]
     for group in groups:
         if group is not None and group.reference is not None:
             check_reference(builder, group, sizes)
@@ -172,8 +177,37 @@ def _native_groups(builder: Builder, pipeline: Pipeline, state: tuple[Group, ...
     return builder.check(groups)
 
 
+def _strict(builder: Builder, about: Mapping[str, Any]) -> dict[str, Any]:
+    """The modality config, with what lerobot alone takes written as Isaac-GR00T takes it.
+
+    These are actions without an action config, which are absolute; formats by value (``"xyz+rot6d"``); any
+    format of numbers that are no pose; and no ``delta_indices``.
+    """
+    action = about.get("action")
+    if not isinstance(action, Mapping):
+        return dict(about)
+    keys, configs = action.get("modality_keys"), action.get("action_configs", [])
+    if not isinstance(configs, list):
+        builder.problems.append(
+            f"{DECODE}: action_configs: expected a list, got {configs!r:.60}: lerobot then returns the actions "
+            "as the head does, not in the robot's units"
+        )
+        configs = []
+    found = []
+    for config in configs:
+        form = config.get("format") if isinstance(config, Mapping) else None
+        if isinstance(form, str):
+            form = form.upper().replace("+", "_")
+            joints = str(config.get("type")).upper() == "NON_EEF" and form in POSES
+            config = {**config, "format": "DEFAULT" if joints else form}
+        found.append(config)
+    missing = len(keys) - len(found) if isinstance(keys, list) else 0
+    found += [{"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT"}] * missing
+    return {**about, "action": {**action, "action_configs": found, "delta_indices": action_steps(about) or [0]}}
+
+
 def _native_group(
-    builder: Builder, key: str, raw: Mapping[str, Any], about: Modality, uses_quantiles: bool
+    builder: Builder, key: str, raw: Mapping[str, Any], about: Modality, uses_quantiles: bool, rows: int
 ) -> Group | None:
     reference = about.references.get(key)
     kind = "action" if reference is None else "relative_action"
@@ -185,9 +219,15 @@ def _native_group(
     if isinstance(found, Mapping):
         found = {"min": found.get(low), "max": found.get(high)}
     group = builder.group(key, found, "min_max", clips=True, clips_back=True, reference=reference)
-    if group is not None and group.size != width:
+    if group is None or group.first is None:
+        return group
+    if group.size != width:
         builder.problems.append(f"action.{key}: {width} numbers, but statistics of {group.size}")
-    return group
+    if group.first.ndim == 2 and 1 < len(group.first) < rows:
+        builder.problems.append(
+            f"action.{key}: expected statistics of at least {rows} steps, got {len(group.first)}"
+        )
+    return single_row(group)
 
 
 def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group, ...]:
@@ -198,7 +238,7 @@ def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group
         left -= size
         if size == group.size:
             found.append(group)
-        elif size > 0 and group.reference is not None:
+        elif size > 0 and group.reference is not None and group.reference.pose is not None:
             builder.problems.append(
                 f"action.{group.key}: cut to {size} of {group.size} numbers (env_action_dim)"
             )

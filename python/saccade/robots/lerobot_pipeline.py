@@ -25,6 +25,8 @@ UNPACK_N15, UNPACK_N17 = "groot_action_unpack_unnormalize_v1", "groot_action_unp
 DECODE = "groot_n1_7_action_decode_v1"
 RENAME, DEVICE, BATCH = "rename_observations_processor", "device_processor", "to_batch_processor"
 RELATIVE, ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
+#: The name of RELATIVE in lerobot 0.5, the last with N1.5. Neither release can load the other's.
+DELTA = "delta_actions_processor"
 
 #: Options of both releases' steps that pack an observation.
 _PACK = (
@@ -42,7 +44,7 @@ _PACK = (
 BEFORE: Mapping[str, tuple[str, ...]] = {
     RENAME: ("rename_map",),
     BATCH: (),
-    RELATIVE: ("enabled", "exclude_joints", "action_names"),
+    **dict.fromkeys((RELATIVE, DELTA), ("enabled", "exclude_joints", "action_names")),
     PACK_N15: _PACK,
     "groot_eagle_encode_v3": ("tokenizer_assets_repo",),
     "groot_eagle_collate_v3": ("tokenizer_assets_repo",),
@@ -192,7 +194,7 @@ class Pipeline:
         limits = [N17_HORIZON, *(self._migrated(name) for name in MIGRATED)]
         local = self._local_rows()
         returned = min(limit for limit in [*limits, local or N17_HORIZON] if limit > 0)
-        decoded = len(_steps(self.unpack.config.get("modality_config"))) or returned
+        decoded = len(action_steps(self.unpack.config.get("modality_config"))) or returned
         returned = max(1, min(returned, decoded if self.unpack.name == DECODE else returned))
         trained = [
             _positive(self.pack.config.get(name), N17_HORIZON)
@@ -212,7 +214,7 @@ class Pipeline:
         try:
             values = read_json(path) if path is not None and path.is_file() else {}
             robot = values["processor_kwargs"]["modality_configs"][self.pack.config.get("embodiment_tag")]
-            return len(_steps(robot)) or None
+            return len(action_steps(robot)) or None
         except (CheckpointError, KeyError, TypeError, OSError, ValueError):
             return None
 
@@ -251,7 +253,10 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
         ends.problems.append(f"{unpack.name} does not belong to {pack.name}")
     _check_order(builder, ends, steps, steps_after, pack, unpack)
     rename = [step.config.get("rename_map") or {} for step in steps if step.name == RENAME]
-    offsets = _offsets(ends, steps, steps_after)
+    relative, other = (DELTA, RELATIVE) if pack.name == PACK_N15 else (RELATIVE, DELTA)
+    if any(step.name == other and step.config.get("enabled") for step in steps):
+        builder.problems.append(f"expected {relative}, as the releases with {pack.name} have it, got {other}")
+    offsets = _offsets(ends, steps, steps_after, relative)
     builder.check()
     ends.check()
     config = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
@@ -299,7 +304,7 @@ def _check_order(
 
 
 def _offsets(
-    ends: Builder, steps: list[Step], steps_after: list[Step]
+    ends: Builder, steps: list[Step], steps_after: list[Step], relative: str
 ) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
     """Names for `Pipeline.offset_names`."""
     enabled = [step for step in steps_after if step.name == ABSOLUTE and step.config.get("enabled")]
@@ -307,14 +312,14 @@ def _offsets(
         return None
     if len(enabled) > 1:
         ends.problems.append(f"expected one {ABSOLUTE} that is enabled, got {len(enabled)}")
-    sources = [step for step in steps if step.name == RELATIVE]
+    sources = [step for step in steps if step.name == relative]
     if not sources:
-        ends.problems.append(f"{ABSOLUTE} is enabled, but the preprocessor has no {RELATIVE}")
+        ends.problems.append(f"{ABSOLUTE} is enabled, but the preprocessor has no {relative}")
         return None
     lists = [sources[0].config.get(name) or [] for name in ("action_names", "exclude_joints")]
     for found in lists:
         if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
-            ends.problems.append(f"{RELATIVE}: expected lists of names, got {found!r:.100}")
+            ends.problems.append(f"{relative}: expected lists of names, got {found!r:.100}")
             return None
     return tuple(lists[0]), tuple(lists[1])
 
@@ -363,7 +368,7 @@ def _statistics(folder: Path, name: Any) -> Statistics:
     return found
 
 
-def _steps(modality_config: Any) -> list[Any]:
+def action_steps(modality_config: Any) -> list[Any]:
     """The steps of the actions in a modality config; empty if it does not say."""
     action = modality_config.get("action") if isinstance(modality_config, Mapping) else None
     steps = action.get("delta_indices") if isinstance(action, Mapping) else None

@@ -1,0 +1,36 @@
+"""Random robots of lerobot's groot policy against an oracle written from a description of the released code."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+import random_lerobot
+from hypothesis import given, settings
+from random_robots import assert_close, assert_form
+
+from saccade import Normalizer, SaccadeError
+
+
+def load(robot: random_lerobot.Robot) -> Normalizer:
+    with tempfile.TemporaryDirectory() as folder:
+        return Normalizer.load(robot.save(Path(folder)))
+
+
+def check(robot: random_lerobot.Robot) -> None:
+    normalizer, oracle = load(robot), robot.oracle
+    assert_form(normalizer, oracle)
+    state, chunk = robot.state(), robot.chunk()
+    assert_close(normalizer.state(state), oracle.state(state))
+    assert_close(normalizer.actions(chunk, state), oracle.actions(chunk, state))
+
+
+@given(random_lerobot.robots() | random_lerobot.damaged())
+@settings(max_examples=200)
+def test_robots_are_converted_or_refused_as_the_oracle_does(robot: random_lerobot.Robot) -> None:
+    if robot.oracle.refused() is None:
+        check(robot)
+        return
+    with pytest.raises(SaccadeError):
+        load(robot)
