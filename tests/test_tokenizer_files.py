@@ -210,7 +210,7 @@ def test_merges_in_a_circle_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("where", [0, 1, 10, 1000, 20_000, -1])
 def test_files_that_are_cut_off(tmp_path: Path, where: int) -> None:
-    with pytest.raises(CheckpointError, match="tokenizer: not valid JSON"):
+    with pytest.raises(CheckpointError, match=r"tokenizer: .*tokenizer\.json: not valid JSON"):
         saccade.Processor("n1.5", write(tmp_path, TOKENIZER.read_text().rstrip()[:where]))
 
 
