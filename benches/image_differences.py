@@ -119,7 +119,7 @@ def opencv_area(image: Image, rng: np.random.Generator) -> tuple[Image, Image]:
     """N1.6 and N1.7: OpenCV's INTER_AREA, in one step to a size that nothing changes after it."""
     import cv2  # type: ignore[import-not-found]
 
-    # Both sides of the view are multiples of 32, so that nothing changes it after: a square part of the frame.
+    # A square part of the frame, so that both sides of the view are multiples of 32 and nothing changes it.
     edge = 32 * int(rng.integers(1, 8))
     side = min(image.shape[:2])
     square = np.ascontiguousarray(image[:side, :side])

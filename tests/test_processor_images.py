@@ -10,7 +10,9 @@ import saccade
 from benches.image_differences import differences
 
 
-@pytest.mark.parametrize("name", ["torch uint8 cubic", "torch uint8 linear", "torch float32 linear", "Pillow cubic, width first"])
+@pytest.mark.parametrize(
+    "name", ["torch uint8 cubic", "torch uint8 linear", "torch float32 linear", "Pillow cubic, width first"]
+)
 def test_random_sizes(name: str, isa: str) -> None:
     found = differences(name, count=12, seed=3, longest=160)
     assert found.any(), "the library is installed for the tests"

@@ -160,10 +160,14 @@ def test_the_folder_processor_counts_where_the_root_has_no_file(tmp_path: Path) 
         source = isaac(tmp_path, version, "processor", use_albumentations=True, shortest_image_edge=64)
         options = {"use_albumentations": True, "shortest_image_edge": 64}
         name: Any = f"{version[:2]}.{version[2]}"
-        assert_same(load(source).frame(NOISE), saccade.Processor(name, TOKENIZER, options=options).frame(NOISE))
+        assert_same(
+            load(source).frame(NOISE), saccade.Processor(name, TOKENIZER, options=options).frame(NOISE)
+        )
         options["shortest_image_edge"] = 128
         write(source / "processor_config.json", {"processor_kwargs": options})
-        assert_same(load(source).frame(NOISE), saccade.Processor(name, TOKENIZER, options=options).frame(NOISE))
+        assert_same(
+            load(source).frame(NOISE), saccade.Processor(name, TOKENIZER, options=options).frame(NOISE)
+        )
 
 
 @pytest.mark.parametrize("version", ["n16", "n17"])

@@ -110,8 +110,8 @@ class Processor:
                 ``{"letter_box_transform": True}``: some files do not say what was trained.
 
         Raises:
-            InputError: An argument has the wrong type or an unknown value. An option, given or in a file, is
-                unknown to its release or does not fit the others; one that is given concerns states or actions.
+            InputError: An argument has the wrong type or an unknown value. An option is unknown to its
+                release or does not fit the others, or one that is given concerns states or actions.
             CheckpointError: The checkpoint or tokenizer is broken or of another kind, or its files have a
                 step that is not known.
             FileNotFoundError: There is no such checkpoint, or no tokenizer. The message says which files of
@@ -126,9 +126,7 @@ class Processor:
         chosen = None if preprocessing is None else text("preprocessing", preprocessing)
         processor = cls.__new__(cls)
         replaced = None if options is None else _to_json(options)
-        processor._processor = _saccade.Processor.load(
-            held, _tokenizer_of(held, tokenizer), chosen, replaced
-        )
+        processor._processor = _saccade.Processor.load(held, _tokenizer_of(held, tokenizer), chosen, replaced)
         return processor
 
     @property
