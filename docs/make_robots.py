@@ -148,8 +148,8 @@ OFF = {"registry_name": "my_step_v1", "config": {"enabled": False}}
 
 
 def absolute_step(folder: Path) -> None:
-    """lerobot's generic relative actions, enabled."""
-    add_step(BEFORE, {"registry_name": "relative_actions_processor", "config": {"enabled": True}})(folder)
+    """The generic relative actions of lerobot 0.5, enabled."""
+    add_step(BEFORE, {"registry_name": "delta_actions_processor", "config": {"enabled": True}})(folder)
     add_step(AFTER, {"registry_name": "absolute_actions_processor", "config": {"enabled": True}})(folder)
 
 

@@ -175,12 +175,12 @@ def test_the_data_config_of_a_fine_tune_may_differ_from_its_metadata() -> None:
     assert policy.requirements.state == (("hand", 2), ("arm", 5))
     assert [camera.name for camera in policy.requirements.cameras] == ["front"]
     assert policy.head.config.action_horizon == 3
-    assert policy.act(observation)["arm"].shape[1] == 3
+    assert policy.act(observation)["arm"].shape[-2] == 3
     with pytest.raises(InputError, match=r"action_horizon: expected 3, .* got 4"):
         Policy.load(whole("isaac"), data_config=config, action_horizon=4)
     with pytest.raises(InputError, match="data_config: expected None with a Normalizer"):
         Policy.load(whole("isaac"), data_config=config, normalizer=policy.normalizer)
-    assert Policy.load(whole("isaac"), action_horizon=2).act(told(default, "push"))["arm"].shape[1] == 2
+    assert Policy.load(whole("isaac"), action_horizon=2).act(told(default, "push"))["arm"].shape[-2] == 2
     wrong: tuple[tuple[Any, str], ...] = (
         (["top"], r"cameras: expected names among those of the checkpoint \(wrist, front\), got top"),
         (["front", "front"], "cameras: expected distinct names"),
