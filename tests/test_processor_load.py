@@ -102,7 +102,7 @@ def test_options_of_isaac(tmp_path: Path, folder: str) -> None:
     source = checkpoint(tmp_path / "isaac", "n17_one_view")
     (source / folder).mkdir(exist_ok=True)
     options = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
-    kwargs = options | {"modality_configs": {}, "a key of a later release": None}
+    kwargs: dict[str, Any] = options | {"modality_configs": {}, "a key of a later release": None}
     (source / folder / "processor_config.json").write_text(json.dumps({"processor_kwargs": kwargs}))
     limits = {"size": {"shortest_edge": 4096, "longest_edge": 1 << 24}, "patch_size": 16}
     (source / "preprocessor_config.json").write_text(json.dumps(limits))
@@ -175,7 +175,7 @@ def test_a_file_without_use_albumentations_has_torchvisions_path(tmp_path: Path,
     """It is the default of the released constructors, which then need the sizes."""
     with pytest.raises(InputError, match="image_target_size: expected a height and a width, since use_alb"):
         load(isaac(tmp_path, version, shortest_image_edge=256))
-    sizes = {"image_target_size": [64, 64], "image_crop_size": [60, 60]}
+    sizes: dict[str, Any] = {"image_target_size": [64, 64], "image_crop_size": [60, 60]}
     found = load(isaac(tmp_path, version, **sizes)).frame(NOISE)
     options = {"use_albumentations": False, **sizes}
     name: Any = f"{version[:2]}.{version[2]}"
@@ -196,10 +196,11 @@ def test_a_file_without_use_albumentations_has_torchvisions_path(tmp_path: Path,
 def test_keys_that_the_release_does_not_know(
     tmp_path: Path, version: str, kwargs: dict[str, Any], key: str
 ) -> None:
-    whole = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    whole: dict[str, Any] = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
     with pytest.raises(InputError, match=rf"processor_config\.json: processor_kwargs: {key}: expected none"):
         load(isaac(tmp_path, version, **whole, **kwargs))
-    for nothing in (None, False, "", [], {}):
+    empty: tuple[Any, ...] = (None, False, "", [], {})
+    for nothing in empty:
         load(isaac(tmp_path, version, **whole, surprise=nothing))
 
 
@@ -210,7 +211,7 @@ def test_every_argument_of_the_released_processors_is_known(tmp_path: Path) -> N
         apply_sincos_state_encoding use_relative_action extra_augmentation_config
         transformers_loading_kwargs"""
     later = "letter_box_transform use_mean_std exclude_state state_dropout_prob"
-    typed = {"image_crop_size": [9, 9], "image_target_size": [9, 9], "crop_fraction": 0.5}
+    typed: dict[str, Any] = {"image_crop_size": [9, 9], "image_target_size": [9, 9], "crop_fraction": 0.5}
     typed |= {"use_albumentations": True, "formalize_language": True, "letter_box_transform": True}
     for version, names in (("n16", common), ("n17", common + " " + later)):
         load(isaac(tmp_path, version, **{name: typed.get(name, 1) for name in names.split()}))
@@ -269,7 +270,7 @@ def test_what_lerobots_step_leaves_out_has_the_default_of_its_class(tmp_path: Pa
 
 def test_an_nvidia_checkpoint_read_as_lerobot_reads_it(tmp_path: Path) -> None:
     """Its sizes count if it has a target; else those that lerobot writes."""
-    kwargs = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    kwargs: dict[str, Any] = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
     kwargs["letter_box_transform"] = True
     for target in (None, [96, 96]):
         source = isaac(tmp_path, image_target_size=target, image_crop_size=None, **kwargs)
@@ -286,7 +287,7 @@ def test_an_nvidia_checkpoint_read_as_lerobot_reads_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", ["n16", "n17"])
 def test_single_options_are_replaced(tmp_path: Path, version: str) -> None:
-    kwargs = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
+    kwargs: dict[str, Any] = {"use_albumentations": True, "shortest_image_edge": 64, "crop_fraction": 0.9}
     kwargs |= {"image_target_size": [64, 64], "image_crop_size": [60, 60], "formalize_language": True}
     name: Any = f"{version[:2]}.{version[2]}"
     source = isaac(tmp_path, version, **kwargs)

@@ -131,7 +131,8 @@ def test_random_sizes_without_albumentations(version: Version, seed: int, isa: s
 
 def test_missing_keys_have_the_defaults_of_the_released_constructor() -> None:
     said = {"use_albumentations": True}
-    for version, edge in (("n1.6", 512), ("n1.7", 256)):
+    edges: dict[Version, int] = {"n1.6": 512, "n1.7": 256}
+    for version, edge in edges.items():
         full = said | {"shortest_image_edge": edge, "crop_fraction": 0.95}
         # Sizes do not take the place of what is missing, only of what is null.
         sizes = {"image_target_size": [64, 64], "image_crop_size": [32, 32]}
@@ -158,7 +159,8 @@ def test_black_bars(use_albumentations: bool) -> None:
     square[35:125] = NOISE
     options: dict[str, Any] = {"use_albumentations": use_albumentations}
     options |= {"image_target_size": [64, 64], "image_crop_size": [60, 60]}
-    for version, default in (("n1.6", True), ("n1.7", False)):
+    defaults: dict[Version, bool] = {"n1.6": True, "n1.7": False}
+    for version, default in defaults.items():
         boxed = made(version, options).frame(square)
         bare = made(version, options | {"letter_box_transform": False}).frame(NOISE)
         assert boxed.shape != bare.shape or (boxed != bare).any()
