@@ -102,7 +102,8 @@ def data_config(given: DataConfigLike) -> DataConfig:
 def _from_mapping(values: Mapping[str, Any], where: str) -> DataConfig:
     """Reads and checks the fields."""
     names = [field.name for field in fields(DataConfig)]
-    problems = [f"{name}: unknown, expected {', '.join(names)}" for name in values if name not in names]
+    said = [name for name, value in values.items() if value not in (None, False, "", [], {})]
+    problems = [f"{name}: unknown, expected {', '.join(names)}" for name in said if name not in names]
     problems += [f"{name}: missing" for name in names if name not in values]
     if not problems:
         for kind in ("video", "state", "action", "language"):

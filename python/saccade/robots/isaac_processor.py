@@ -220,15 +220,14 @@ def _references(
             builder.problems.append(f"{where}: expected an action config, got {config!r:.60}")
             continue
         builder.refuse_unknown(where, config, ACTION)
-        names = {}
+        names, wrong = {}, []
         for name, allowed in ACTION.items():
             value = config.get(name)
             names[name] = value.upper() if isinstance(value, str) and allowed is not None else value
             if allowed is not None and names[name] not in allowed:
-                builder.problems.append(
-                    f"{where}: {name}: expected one of {', '.join(allowed)}, got {value!r:.60}"
-                )
-        if names["rep"] != "RELATIVE" or not relative:
+                wrong.append(f"{where}: {name}: expected one of {', '.join(allowed)}, got {value!r:.60}")
+        builder.problems += wrong
+        if wrong or names["rep"] != "RELATIVE" or not relative:
             continue
         state_key = config.get("state_key") or key
         is_pose = names["type"] == "EEF"

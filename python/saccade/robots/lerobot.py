@@ -195,11 +195,10 @@ def _strict(builder: Builder, about: Mapping[str, Any]) -> dict[str, Any]:
         configs = []
     found = []
     for config in configs:
-        form = config.get("format") if isinstance(config, Mapping) else None
-        if isinstance(form, str):
-            form = form.upper().replace("+", "_")
-            joints = str(config.get("type")).upper() == "NON_EEF" and form in POSES
-            config = {**config, "format": "DEFAULT" if joints else form}
+        form = str(config.get("format")).upper().replace("+", "_") if isinstance(config, Mapping) else ""
+        if form in POSES:
+            is_pose = str(config.get("type")).upper() == "EEF"
+            config = {**config, "format": form if is_pose else "DEFAULT"}
         found.append(config)
     missing = len(keys) - len(found) if isinstance(keys, list) else 0
     found += [{"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT"}] * missing
