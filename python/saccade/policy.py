@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from saccade._arrays import Array, ArrayLike, Float32Array, integer
+from saccade._arrays import Array, ArrayLike, integer
 from saccade.backbone import Backbone
 from saccade.backbone_features import BackboneFeatures
 from saccade.backbone_inputs import BackboneInputs
@@ -23,17 +23,13 @@ from saccade.policy_context import PolicyContext, encoded
 from saccade.policy_example import example_observation
 from saccade.policy_head import Head, check_steps, embodiment_of
 from saccade.policy_loading import load as load_parts
+from saccade.policy_observations import Observation, Observations, batched, is_observation, listed
 from saccade.processor import Preprocessing, Processor
 from saccade.robots import DataConfigLike, Normalizer, padded
 from saccade.robots.embodiments import resolved
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
-
-#: One observation in a form of `saccade.dialects`, with or without a batch axis.
-Observation = Mapping[str, Any]
-#: Or several of them. The server gives what it has read of them by `saccade.dialects`.
-Observations = Observation | Reading | Sequence[Observation | Reading]
 
 Kind = TypeVar("Kind", bound=StateReading)
 
@@ -350,9 +346,9 @@ class Policy:
                 :class:`saccade.Normalizer`; or the observation does not fit the robot.
         """
         held = context.context if isinstance(context, PolicyContext) else context
-        if not _is_observation(observation_or_state):
+        if not is_observation(observation_or_state):
             return self._of_state(held, observation_or_state, options)  # type: ignore[arg-type]
-        observations = _listed(observation_or_state)  # type: ignore[arg-type]
+        observations = listed(observation_or_state)  # type: ignore[arg-type]
         readings = [self._read_by(read_state, one) for one in observations]
         return self._sampled(held, observation_or_state, readings, options)  # type: ignore[arg-type]
 
@@ -370,7 +366,7 @@ class Policy:
 
     def _read(self, observation: Observations) -> list[Reading]:
         self._whole("act and encode", self.backbone)
-        return [self._read_by(read, one) for one in _listed(observation)]
+        return [self._read_by(read, one) for one in listed(observation)]
 
     def _read_by(
         self, reader: Callable[[Observation, Requirements], Kind], observation: Observation | Reading
@@ -425,13 +421,13 @@ class Policy:
             if len(chunks) != len(readings):
                 raise InputError(f"previous_chunk: expected {len(readings)}, got {len(chunks)}")
             joined = [
-                _batched(np.asarray(reading.dialect.previous_chunk(chunk, keys)), 3, reading)
+                batched(np.asarray(reading.dialect.previous_chunk(chunk, keys)), 3, reading)
                 for reading, chunk in zip(readings, chunks, strict=True)
             ]
             options["previous_chunk"] = np.concatenate(joined)
         if noise is not None and is_single:
             axes = 3 if options.get("num_samples") is None else 4
-            options["noise"] = _batched(np.asarray(noise), axes, readings[0])
+            options["noise"] = batched(np.asarray(noise), axes, readings[0])
         actions = np.asarray(self._of_state(context, state, options))
         answers, start = [], 0
         for reading in readings:
@@ -478,34 +474,6 @@ class Policy:
             f"<saccade.Policy embodiment_id={self.embodiment_id} head={self.head!r} "
             f"normalizer={self.normalizer!r}{'' if self.backbone is None else parts}>"
         )
-
-
-def _is_observation(value: Any) -> bool:
-    """Whether a value is an observation or a sequence of them, and not an array."""
-    if isinstance(value, (list, tuple)):
-        return bool(value) and isinstance(value[0], Mapping | Reading)
-    return isinstance(value, Mapping | Reading)
-
-
-def _listed(observation: Observations) -> list[Observation | Reading]:
-    """Observations as a list.
-
-    Raises:
-        InputError: There is none.
-    """
-    if isinstance(observation, Mapping | Reading):
-        return [observation]
-    found = list(observation) if isinstance(observation, (list, tuple)) else []
-    if not found:
-        raise InputError(
-            f"observation: expected a mapping, or several of them, got {type(observation).__name__}"
-        )
-    return found
-
-
-def _batched(array: Float32Array, axes: int, reading: StateReading) -> Float32Array:
-    """An array with a batch axis, which it may lack if the observation does."""
-    return array[None] if not reading.is_batched and array.ndim == axes - 1 else array
 
 
 def _is_named(name: str, version: str, embodiment: str | None) -> bool:

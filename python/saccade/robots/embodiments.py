@@ -50,6 +50,9 @@ N17_IDS = {
     "xdof_relative_eef_relative_joint_subtask": 27,
 }
 
+#: Robots whose keys an error lists.
+MOST_LISTED = 4
+
 #: Released ids by version of the model.
 IDS: Mapping[str, Mapping[str, int]] = {"n1": N15_IDS, "n1.5": N15_IDS, "n1.6": N16_IDS, "n1.7": N17_IDS}
 
@@ -100,7 +103,7 @@ def choose(
     ids: Mapping[str, int],
     version: str | None,
     where: str,
-    hint: str = "",
+    needs: Mapping[str, str],
 ) -> str:
     """The tag of the requested robot.
 
@@ -112,7 +115,7 @@ def choose(
         ids: Ids by tag.
         version: As in `resolved`.
         where: The file, for messages.
-        hint: More for the message.
+        needs: What each robot needs, for the message.
 
     Raises:
         InputError: It is not there, or there are several and None was given.
@@ -129,5 +132,9 @@ def choose(
         found = [tag for tag in listed if ids.get(tag, asked if alone else None) == asked]
     if len(found) != 1:
         shown = ", ".join(f"{tag} ({ids[tag]})" if tag in ids else tag for tag in listed)
-        raise InputError(f"embodiment: expected one of those in {where} ({shown}), got {wanted!r}{hint}")
+        keys = "; ".join(f"{tag} needs {needs[tag]}" for tag in listed[:MOST_LISTED] if needs.get(tag))
+        raise InputError(
+            f"embodiment: expected one of those in {where} ({shown}), got {wanted!r}"
+            f"{'; ' if keys else ''}{keys}"
+        )
     return found[0]

@@ -59,7 +59,8 @@ def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims
     Raises:
         CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
     """
-    found = choose(options.embodiment, list(values), N15_IDS, "n1.5", where)
+    needs = {tag: _needs(entry) for tag, entry in values.items()}
+    found = choose(options.embodiment, list(values), N15_IDS, "n1.5", where, needs)
     entry = _entry(values, found, where)
     config = options.data_config or _whole_file(entry)
     state, action = groups_of(entry, config)
@@ -78,6 +79,15 @@ def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims
         state_history=None if given is None else len(given.observation_indices),
         data_config=given,
     )
+
+
+def _needs(entry: Any) -> str:
+    """Keys that the file has of a robot, for a message."""
+    modalities = entry.get("modalities") if isinstance(entry, Mapping) else None
+    if not isinstance(modalities, Mapping):
+        return ""
+    found = [(kind, modalities.get(kind)) for kind in ("video", "state", "action")]
+    return "; ".join(f"{kind} {', '.join(keys)}" for kind, keys in found if isinstance(keys, Mapping))
 
 
 def groups_of(entry: Entry, config: DataConfig) -> tuple[tuple[Group, ...], tuple[Group, ...]]:

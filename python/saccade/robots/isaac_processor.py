@@ -114,7 +114,8 @@ def processor_robot(
         raise CheckpointError(
             f"{where}: statistics of {', '.join(statistics) or 'nothing'}, groups of {', '.join(configs)}"
         )
-    tag = choose(options.embodiment, tags, known, version, where)
+    needs = {tag: _needs(configs[tag]) for tag in tags}
+    tag = choose(options.embodiment, tags, known, version, where, needs)
     builder = Builder(f"{where}: {tag}", np.float64, is_close=True)
     if kwargs.get("use_tactile"):
         builder.problems.append("use_tactile: tactile states are not supported")
@@ -150,6 +151,17 @@ def processor_robot(
         state_history=state.steps,
         zero_state=switches["exclude_state"],
     )
+
+
+def _needs(config: Any) -> str:
+    """Keys of a robot, for a message."""
+    found = []
+    for kind in ("video", "state", "action"):
+        about = config.get(kind) if isinstance(config, Mapping) else None
+        keys = about.get("modality_keys") if isinstance(about, Mapping) else None
+        if isinstance(keys, list):
+            found.append(f"{kind} {', '.join(map(str, keys))}")
+    return "; ".join(found)
 
 
 #: Options that are on or off, with the released defaults.

@@ -202,7 +202,10 @@ def _strict(builder: Builder, about: Mapping[str, Any]) -> dict[str, Any]:
         found.append(config)
     missing = len(keys) - len(found) if isinstance(keys, list) else 0
     found += [{"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT"}] * missing
-    return {**about, "action": {**action, "action_configs": found, "delta_indices": action_steps(about) or [0]}}
+    return {
+        **about,
+        "action": {**action, "action_configs": found, "delta_indices": action_steps(about) or [0]},
+    }
 
 
 def _native_group(
