@@ -11,7 +11,7 @@ from typing import Any
 import saccade._saccade as _saccade
 from saccade.backbone_config import BackboneConfig
 from saccade.dialects import Requirements, observation_sources
-from saccade.errors import SaccadeError
+from saccade.errors import CheckpointError, SaccadeError
 from saccade.processor import Processor
 from saccade.robots import DataConfigLike, Normalizer, read_json
 from saccade.robots.reading import OWN_DATA_CONFIG, processor_folder
@@ -90,7 +90,11 @@ def robots_of(
         state_history: Number of states that its head takes.
         data_config: As for :meth:`saccade.Normalizer.load`; used for the robots of N1 and N1.5.
     """
-    return [_robot_of(source, tag, state_history, data_config) for tag in _tags(source)]
+    try:
+        tags = _tags(source)
+    except (OSError, SaccadeError) as error:
+        return [RobotFindings(None, None, None, (), str(error), None, None)]
+    return [_robot_of(source, tag, state_history, data_config) for tag in tags]
 
 
 def _robot_of(
@@ -117,14 +121,21 @@ def _robot_of(
 
 
 def _tags(source: Path) -> list[str | None]:
-    """The tags of the robots, from the first file that has statistics; None for robots without a tag."""
+    """The tags of the robots, from the first file that has statistics; None for robots without a tag.
+
+    Raises:
+        CheckpointError: A file cannot be read.
+    """
     for name, tags in TAGS.items():
         folder = processor_folder(source) if name == "processor_config.json" else source
-        try:
-            values = read_json(folder / name)
-            found = tags(values)
-        except (OSError, SaccadeError, AttributeError, TypeError, ValueError):
+        if not (folder / name).is_file():
             continue
+        try:
+            found = tags(read_json(folder / name))
+        except (AttributeError, TypeError, ValueError) as error:
+            if isinstance(error, SaccadeError):
+                raise
+            raise CheckpointError(f"{folder / name}: statistics of an unknown form ({error!r})") from error
         if found:
             return found
     return []
