@@ -95,7 +95,7 @@ def test_without_a_data_config_the_whole_file_is_used_with_one_warning() -> None
 def test_a_rotation_and_gr1_need_a_data_config() -> None:
     values = metadata(arm={"rotation_type": "axis_angle"})
     with pytest.raises(
-        saccade.InputError, match=r"data_config: .*state\.arm, action\.arm may be converted"
+        saccade.InputError, match=r"data_config: .*state\.arm, action\.arm are rotations"
     ) as found:
         Normalizer.load(values)
     assert "no released data config fits" in str(found.value)

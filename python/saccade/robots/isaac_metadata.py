@@ -156,7 +156,8 @@ def _whole_file(entry: Entry) -> DataConfig:
         f"{kind}.{key}" for kind in ("state", "action") for key in keys[kind] if entry.is_rotation(kind, key)
     ]
     if turned:
-        reasons.append(f"{', '.join(turned)} may be converted to another representation")
+        are = "is a rotation" if len(turned) == 1 else "are rotations"
+        reasons.append(f"{', '.join(turned)} {are}, which a data config may convert")
     if reasons:
         raise InputError(
             f"data_config: expected one for {entry.where}, got None: {'; '.join(reasons)}"
