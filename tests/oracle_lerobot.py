@@ -45,7 +45,11 @@ class Oracle:
     """A saved folder: its three JSON files and the tensors of its state files by step name."""
 
     def __init__(
-        self, config: dict[str, Any], before: dict[str, Any], after: dict[str, Any], states: dict[str, Tensors]
+        self,
+        config: dict[str, Any],
+        before: dict[str, Any],
+        after: dict[str, Any],
+        states: dict[str, Tensors],
     ) -> None:
         self.config, self.states = config, states
         # The absolute step takes the first of several relative steps.
@@ -91,7 +95,8 @@ class Oracle:
     def refused(self) -> str | None:
         steps = self.before | self.after
         # A step that says that it is off changes nothing.
-        if unknown := {name for name in steps if steps[name].get("enabled") is not False} - KNOWN[self.release]:
+        enabled = {name for name in steps if steps[name].get("enabled") is not False}
+        if unknown := enabled - KNOWN[self.release]:
             return f"unknown steps {unknown}"
         if self.absolute and self.relative is None:
             return "absolute without relative"

@@ -113,7 +113,9 @@ class Key:
 class Oracle:
     """One robot of metadata.json with one data config."""
 
-    def __init__(self, entry: dict[str, Any], config: dict[str, Any], state_dim: int, action_dim: int) -> None:
+    def __init__(
+        self, entry: dict[str, Any], config: dict[str, Any], state_dim: int, action_dim: int
+    ) -> None:
         self.config, self.state_dim, self.action_dim = config, state_dim, action_dim
         self.embodiment_id = PROJECTORS.get(entry["embodiment_tag"])
         self.states = [Key(name, entry, config) for name in config["state_keys"]]

@@ -111,7 +111,7 @@ def to_numbers(name: str, matrix: F64) -> F64:
 
 
 def well_conditioned(name: str, matrix: F64) -> NDArray[np.bool_]:
-    """Where float32 suffices for :func:`to_numbers`: not near a half turn, no gimbal lock, no jump by 2 pi."""
+    """Where float32 suffices for :func:`to_numbers`: no half turn, no gimbal lock, no jump by 2 pi."""
     if name == "rotation_6d":
         return np.ones(matrix.shape[:-2], np.bool_)
     if name in ("axis_angle", "quaternion"):

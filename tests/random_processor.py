@@ -113,7 +113,9 @@ def states(draw: st.DrawFn) -> dict[str, tuple[str, int]]:
 @st.composite
 def actions(draw: st.DrawFn, listed: dict[str, tuple[str, int]]) -> dict[str, dict[str, Any]]:
     """Width and action config of each action key."""
-    names = draw(st.lists(st.sampled_from((*listed, "goal", "rail", "push")), min_size=1, max_size=4, unique=True))
+    names = draw(
+        st.lists(st.sampled_from((*listed, "goal", "rail", "push")), min_size=1, max_size=4, unique=True)
+    )
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         reference = name if name in listed else draw(st.sampled_from([*listed]))
@@ -162,7 +164,10 @@ def robots(draw: st.DrawFn) -> Robot:
             if a["config"]["rep"] == "RELATIVE"
         },
     }
-    numbers["state"]["spare"] = numbers["action"]["spare"] = {**statistics_row(rng, 2), "min": [float("nan")] * 2}
+    numbers["state"]["spare"] = numbers["action"]["spare"] = {
+        **statistics_row(rng, 2),
+        "min": [float("nan")] * 2,
+    }
     flags = {name: draw(st.sampled_from([True, True, False, None, "absent"])) for name in FLAGS}
     kwargs = {name: value for name, value in flags.items() if value != "absent"} | IMAGES
     kwargs |= {"modality_configs": {tag: modalities}, "model_name": "nvidia/Eagle-Block2A-2B-v2"}
@@ -170,7 +175,10 @@ def robots(draw: st.DrawFn) -> Robot:
     kwargs["max_action_dim"] = sum(a["width"] for a in action.values()) + draw(st.integers(0, 4))
     kwargs["max_action_horizon"] = draw(st.sampled_from([16, 40]))
     if release == "n1.7":
-        kwargs |= {"use_mean_std": draw(st.booleans()), "exclude_state": draw(st.sampled_from([False] * 5 + [True]))}
+        kwargs |= {
+            "use_mean_std": draw(st.booleans()),
+            "exclude_state": draw(st.sampled_from([False] * 5 + [True])),
+        }
     ids = draw(st.sampled_from([None, {}, {"new_embodiment": 10}, {tag: 7}, {"of_my_own": 12}]))
     statistics = {tag: numbers}
     if draw(st.booleans()):
@@ -214,8 +222,14 @@ def damaged(draw: st.DrawFn) -> Robot:
     elif change == "relative":
         statistics["relative_action"].pop(key, None)
     elif change == "state_key":
-        config["state_key"] = draw(st.sampled_from([None, "nothing", *robot.modality("state")["modality_keys"]]))
+        config["state_key"] = draw(
+            st.sampled_from([None, "nothing", *robot.modality("state")["modality_keys"]])
+        )
     else:
-        values = {"rep": ["ABSOLUTE", "DELTA", "RELATIVE"], "type": ["EEF", "NON_EEF"], "format": [*FORMS.values()]}
+        values = {
+            "rep": ["ABSOLUTE", "DELTA", "RELATIVE"],
+            "type": ["EEF", "NON_EEF"],
+            "format": [*FORMS.values()],
+        }
         config[change] = draw(st.sampled_from(values[change]))
     return robot

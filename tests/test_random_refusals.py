@@ -44,12 +44,16 @@ def mappings(robot: Robot) -> list[dict[str, Any]]:
         keys = [name.split(".") for name in robot.config["state_keys"] + robot.config["action_keys"]]
         return [robot.config, *(robot.entry["modalities"][kind][key] for kind, key in keys)]
     if isinstance(robot, random_processor.Robot):
-        found = [robot.kwargs, robot.modality("state"), robot.modality("action")]
-        return found + (robot.modality("action").get("action_configs") or [])
+        found = [robot.kwargs]
+        for about in robot.kwargs["modality_configs"].values():
+            found += [about, *about.values(), *(about["action"].get("action_configs") or [])]
+        return found
     steps = robot.before + robot.after
     found = [robot.config, *steps, *(step["config"] for step in steps)]
-    about = robot.after[0]["config"].get("modality_config")
-    return found + ([about["action"], *about["action"]["action_configs"]] if about else [])
+    for step in steps:
+        if about := step["config"].get("modality_config"):
+            found += [about, *about.values(), *about["action"]["action_configs"]]
+    return found
 
 
 def all_robots() -> st.SearchStrategy[Robot]:
@@ -71,7 +75,12 @@ def test_an_unknown_key_is_refused_unless_it_says_nothing(
         load(robot)
 
 
-@given(random_lerobot.robots(), NAMES, st.sampled_from(["registry_name", "class"]), st.randoms(use_true_random=False))
+@given(
+    random_lerobot.robots(),
+    NAMES,
+    st.sampled_from(["registry_name", "class"]),
+    st.randoms(use_true_random=False),
+)
 @settings(max_examples=40)
 def test_an_unknown_step_is_refused(robot: random_lerobot.Robot, name: str, kind: str, random: Any) -> None:
     assume(robot.oracle.refused() is None)
@@ -88,7 +97,10 @@ def enums(robot: Robot) -> list[Callable[[str], None]]:
         config, found = robot.config, []
         for kind in ("state", "action"):
             modes = config[f"{kind}_modes"]
-            found += [lambda value, modes=modes, key=key: modes.update({key: value}) for key in config[f"{kind}_keys"]]
+            found += [
+                lambda value, modes=modes, key=key: modes.update({key: value})
+                for key in config[f"{kind}_keys"]
+            ]
         targets = config["target_rotations"]
         for name in targets:
             kind, key = name.split(".")
@@ -118,7 +130,7 @@ def test_a_value_that_is_on_no_list_is_refused(robot: Robot, value: str, random:
 
 
 def read(robot: Robot) -> dict[tuple[str, str, str], bool]:
-    """Whether the statistic (kind, key, name) of a robot is used. Keys of a lerobot pipeline: the first only."""
+    """Whether the statistic (kind, key, name) of a robot is used. Of lerobot's groups, only the first."""
     names = ("min", "max", "mean", "std", "q01", "q99")
     if isinstance(robot, random_n15.Robot):
         keys = [*robot.oracle.states, *robot.oracle.actions_]
