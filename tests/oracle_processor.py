@@ -53,7 +53,7 @@ NAMES = {  # N1.7's enum names that are not the value in capitals
     "UNITREE_G1": "unitree_g1_full_body_with_waist_height_nav_cmd",
     "LIBERO_PANDA": "libero_sim",
 }
-DEFAULTS = {"max_state_dim": 29, "max_action_dim": 29, "clip_outliers": True}
+DEFAULTS: dict[str, Any] = {"max_state_dim": 29, "max_action_dim": 29, "clip_outliers": True}
 POSES = {"XYZ_ROT6D": 9, "XYZ_ROTVEC": 6}
 
 

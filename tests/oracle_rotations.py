@@ -115,7 +115,6 @@ def well_conditioned(name: str, matrix: F64) -> NDArray[np.bool_]:
     if name == "rotation_6d":
         return np.ones(matrix.shape[:-2], np.bool_)
     if name in ("axis_angle", "quaternion"):
-        return np.trace(matrix, axis1=-2, axis2=-1) > -0.8
+        return np.asarray(np.trace(matrix, axis1=-2, axis2=-1) > -0.8)
     angles = to_numbers(name, matrix)
-    safe: NDArray[np.bool_] = (np.abs(angles) < [3.0, 1.25, 3.0]).all(-1)
-    return safe
+    return np.asarray((np.abs(angles) < [3.0, 1.25, 3.0]).all(-1))

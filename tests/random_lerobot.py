@@ -32,7 +32,7 @@ UNPACK = {
     "native": "groot_n1_7_action_decode_v1",
 }
 DEVICE = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
-VLM = {
+VLM: dict[str, Any] = {
     "model_name": "nvidia/Cosmos-Reason2-2B",
     "image_crop_size": [230, 230],
     "image_target_size": [256, 256],
@@ -105,10 +105,11 @@ def tensors(draw: st.DrawFn, rng: np.random.Generator, feature: str, width: int)
     """A state file: bounds, mostly of the right width, and statistics that nothing reads."""
     size = max(1, width + draw(st.sampled_from([0, 0, 0, 0, -1, 2])))
     found = {
-        f"{feature}.{name}": np.float32(row) for name, row in statistics_row(rng, size, gap=1e-6).items()
+        f"{feature}.{name}": np.asarray(row, np.float32)
+        for name, row in statistics_row(rng, size, gap=1e-6).items()
     }
     found[f"{feature}.mean"][0] = np.nan
-    found["timestamp.max"] = np.float32([np.inf])
+    found["timestamp.max"] = np.asarray([np.inf], np.float32)
     if draw(st.integers(0, 7)) == 0:  # A missing bound is 0 or 1. Bounds in the wrong order are refused.
         gone, kept = draw(st.sampled_from([("min", "max"), ("max", "min")]))
         del found[f"{feature}.{gone}"]
@@ -175,7 +176,8 @@ def native(draw: st.DrawFn, rng: np.random.Generator) -> tuple[Step, dict[str, t
     keys = draw(st.lists(st.sampled_from((*forms, "rail")), min_size=1, max_size=3, unique=True))
     keys += [] if draw(st.integers(0, 3)) == 0 else ["gripper"]
     horizon = draw(st.sampled_from([0, 8, 16, 40]))
-    listed, numbers = [], {"state": {}, "action": {}, "relative_action": {}}
+    listed: list[dict[str, Any]] = []
+    numbers: dict[str, dict[str, Any]] = {"state": {}, "action": {}, "relative_action": {}}
     numbers["state"] = {name: statistics_row(rng, width) for name, (_, width) in forms.items()}
     for key in keys:
         reference = key if key in forms else draw(st.sampled_from([*forms]))

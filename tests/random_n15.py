@@ -17,7 +17,16 @@ MODES = (None, "min_max", "q99", "mean_std", "binary")
 STATE_MODES = (*MODES, "scale", "sin_cos")
 SOURCES = ("quaternion", "axis_angle", "rotation_6d", *EULER)
 
-CHANGES = ("mode", "target", "source", "discrete", "relative", "modality", "statistics", "stranger")
+CHANGES: tuple[str, ...] = (
+    "mode",
+    "target",
+    "source",
+    "discrete",
+    "relative",
+    "modality",
+    "statistics",
+    "stranger",
+)
 CHANGES += ("indices", "unlisted", "action_dim")
 
 

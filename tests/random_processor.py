@@ -122,7 +122,12 @@ def actions(draw: st.DrawFn, listed: dict[str, tuple[str, int]]) -> dict[str, di
         form, width = listed[reference]
         if draw(st.integers(0, 2)):
             kind = "NON_EEF" if form == "joints" else "EEF"
-            config = {"rep": "RELATIVE", "type": kind, "format": FORMS[form], "state_key": reference}
+            config: dict[str, Any] = {
+                "rep": "RELATIVE",
+                "type": kind,
+                "format": FORMS[form],
+                "state_key": reference,
+            }
             if reference == name:
                 config["state_key"] = draw(st.sampled_from([name, None, ""]))
         else:  # nothing but the rep matters
@@ -144,15 +149,19 @@ def robots(draw: st.DrawFn) -> Robot:
     state = draw(states())
     action = draw(actions(state))
     horizon, history = draw(st.integers(1, 16)), draw(st.integers(1, 2))
-    some = lambda keys: draw(st.none() | st.lists(st.sampled_from([*keys]), unique=True))  # noqa: E731
+    some_states = st.none() | st.lists(st.sampled_from([*state]), unique=True)
+    some_actions = st.none() | st.lists(st.sampled_from([*action]), unique=True)
     modalities: dict[str, Any] = {
         "video": {"delta_indices": [0], "modality_keys": ["ego_view"], **MODALITY},
         "language": {"delta_indices": [0], "modality_keys": ["annotation.human.task_description"]},
         "state": {"delta_indices": list(range(1 - history, 1)), "modality_keys": [*state]},
         "action": {"delta_indices": list(range(horizon)), "modality_keys": [*action]},
     }
-    modalities["state"] |= {"sin_cos_embedding_keys": some(state), "mean_std_embedding_keys": some(state)}
-    modalities["action"]["mean_std_embedding_keys"] = some(action)
+    modalities["state"] |= {
+        "sin_cos_embedding_keys": draw(some_states),
+        "mean_std_embedding_keys": draw(some_states),
+    }
+    modalities["action"]["mean_std_embedding_keys"] = draw(some_actions)
     if any(a["config"]["rep"] == "RELATIVE" for a in action.values()) or draw(st.booleans()):
         modalities["action"]["action_configs"] = [a["config"] for a in action.values()]
     numbers = {
@@ -169,7 +178,7 @@ def robots(draw: st.DrawFn) -> Robot:
         "min": [float("nan")] * 2,
     }
     flags = {name: draw(st.sampled_from([True, True, False, None, "absent"])) for name in FLAGS}
-    kwargs = {name: value for name, value in flags.items() if value != "absent"} | IMAGES
+    kwargs: dict[str, Any] = {name: value for name, value in flags.items() if value != "absent"} | IMAGES
     kwargs |= {"modality_configs": {tag: modalities}, "model_name": "nvidia/Eagle-Block2A-2B-v2"}
     kwargs["max_state_dim"] = 2 * sum(width for _, width in state.values()) + draw(st.integers(0, 4))
     kwargs["max_action_dim"] = sum(a["width"] for a in action.values()) + draw(st.integers(0, 4))

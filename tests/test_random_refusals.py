@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,10 +21,12 @@ from hypothesis import strategies as st
 
 from saccade import Normalizer, SaccadeError
 
+#: Names of the statistics that are used, by kind and key.
+Used: TypeAlias = "dict[tuple[str, str], tuple[str, ...]]"
 Robot: TypeAlias = "random_n15.Robot | random_processor.Robot | random_lerobot.Robot"
 
 VALUES = st.sampled_from([True, 1, 0.5, "min_max", ["arm"], {"enabled": True}])
-NOTHING = st.sampled_from([None, False, "", [], {}])
+NOTHING: st.SearchStrategy[Any] = st.sampled_from([None, False, "", [], {}])
 NAMES = st.from_regex(r"\A[a-z]{3,9}_of_a_fork\Z")
 NOT_FINITE = st.sampled_from([float("nan"), float("inf"), float("-inf")])
 
@@ -91,30 +92,23 @@ def test_an_unknown_step_is_refused(robot: random_lerobot.Robot, name: str, kind
         load(robot)
 
 
-def enums(robot: Robot) -> list[Callable[[str], None]]:
-    """Functions that set each value of a robot's files that must be on a list."""
+def enums(robot: Robot) -> list[tuple[dict[str, Any], str]]:
+    """The mapping and the key of each value of a robot's files that must be on a list."""
     if isinstance(robot, random_n15.Robot):
         config, found = robot.config, []
         for kind in ("state", "action"):
-            modes = config[f"{kind}_modes"]
-            found += [
-                lambda value, modes=modes, key=key: modes.update({key: value})
-                for key in config[f"{kind}_keys"]
-            ]
-        targets = config["target_rotations"]
-        for name in targets:
+            found += [(config[f"{kind}_modes"], key) for key in config[f"{kind}_keys"]]
+        for name in config["target_rotations"]:
             kind, key = name.split(".")
-            about = robot.entry["modalities"][kind][key]
-            found.append(lambda value, name=name: targets.update({name: value}))
-            found.append(lambda value, about=about: about.update(rotation_type=value))
+            found.append((config["target_rotations"], name))
+            found.append((robot.entry["modalities"][kind][key], "rotation_type"))
         return found
     if isinstance(robot, random_processor.Robot):
         configs = robot.modality("action").get("action_configs") or []
     else:
         about = robot.after[0]["config"].get("modality_config") or {"action": {}}
         configs = about["action"].get("action_configs") or []
-    names = ("rep", "type", "format")
-    return [lambda value, c=c, name=name: c.update({name: value}) for c in configs for name in names]
+    return [(config, name) for config in configs for name in ("rep", "type", "format")]
 
 
 @given(all_robots(), NAMES, st.randoms(use_true_random=False))
@@ -124,7 +118,8 @@ def test_a_value_that_is_on_no_list_is_refused(robot: Robot, value: str, random:
     robot = copy.deepcopy(robot)
     places = enums(robot)
     assume(places)
-    random.choice(places)(value)
+    where, key = random.choice(places)
+    where[key] = value
     with pytest.raises(SaccadeError, match=value):
         load(robot)
 
@@ -132,6 +127,7 @@ def test_a_value_that_is_on_no_list_is_refused(robot: Robot, value: str, random:
 def read(robot: Robot) -> dict[tuple[str, str, str], bool]:
     """Whether the statistic (kind, key, name) of a robot is used. Of lerobot's groups, only the first."""
     names = ("min", "max", "mean", "std", "q01", "q99")
+    used: Used
     if isinstance(robot, random_n15.Robot):
         keys = [*robot.oracle.states, *robot.oracle.actions_]
         used = {
@@ -145,12 +141,15 @@ def read(robot: Robot) -> dict[tuple[str, str, str], bool]:
     return {(*where, name): name in found for where, found in used.items() for name in names}
 
 
-def processor_statistics(robot: random_processor.Robot) -> dict[tuple[str, str], tuple[str, ...]]:
-    oracle, used = robot.oracle, {}
+def processor_statistics(robot: random_processor.Robot) -> Used:
+    oracle = robot.oracle
+    used: Used = {}
     for kind, keys in (("state", oracle.state_keys), ("action", oracle.action_keys)):
         for key in keys:
             bounds = ("q01", "q99") if oracle.option("use_percentiles") else ("min", "max")
-            found = ("mean", "std") if oracle.in_list(kind, "mean_std_embedding_keys", key) else bounds
+            found: tuple[str, ...] = (
+                ("mean", "std") if oracle.in_list(kind, "mean_std_embedding_keys", key) else bounds
+            )
             if kind == "state" and (oracle.encoded(key) or oracle.option("exclude_state")):
                 found = ()
             if kind == "action" and key in robot.statistics[robot.tag]["relative_action"]:
@@ -161,8 +160,9 @@ def processor_statistics(robot: random_processor.Robot) -> dict[tuple[str, str],
     return used
 
 
-def lerobot_statistics(robot: random_lerobot.Robot) -> dict[tuple[str, str], tuple[str, ...]]:
-    oracle, used = robot.oracle, {}
+def lerobot_statistics(robot: random_lerobot.Robot) -> Used:
+    oracle = robot.oracle
+    used: Used = {}
     scales = oracle.release == "n1.5" or oracle.pack["normalize_min_max"]
     used["observation", "state"] = ("min", "max") if scales else ()
     if oracle.native is None:
