@@ -45,7 +45,11 @@ class Oracle:
     """A saved folder: its three JSON files and the tensors of its state files by step name."""
 
     def __init__(
-        self, config: dict[str, Any], before: dict[str, Any], after: dict[str, Any], states: dict[str, Tensors]
+        self,
+        config: dict[str, Any],
+        before: dict[str, Any],
+        after: dict[str, Any],
+        states: dict[str, Tensors],
     ) -> None:
         self.config, self.states = config, states
         # The absolute step takes the first of several relative steps.
@@ -91,7 +95,8 @@ class Oracle:
     def refused(self) -> str | None:
         steps = self.before | self.after
         # A step that says that it is off changes nothing.
-        if unknown := {name for name in steps if steps[name].get("enabled") is not False} - KNOWN[self.release]:
+        enabled = {name for name in steps if steps[name].get("enabled") is not False}
+        if unknown := enabled - KNOWN[self.release]:
             return f"unknown steps {unknown}"
         if self.absolute and self.relative is None:
             return "absolute without relative"
@@ -154,7 +159,7 @@ class Oracle:
         width = sum(self.groups("action").values()) if self.native else self.action_width
         step = self.native if self.native else self.after[self.unpack_name]
         limit = self.action_width if self.release == "n1.5" else step.get("env_action_dim", 0)
-        return min(width, self.action_width, limit or width)
+        return min(width, int(self.action_width), int(limit or width))
 
     # --- numbers ---
 
@@ -212,7 +217,7 @@ class Oracle:
             quantiles = self.native["use_percentiles"] and not relative
             rows = statistics["relative_action" if relative else "action"][key]
             low, high = (
-                np.float32(rows[name]).astype(np.float64)
+                np.asarray(rows[name], np.float32).astype(np.float64)
                 for name in (("q01", "q99") if quantiles else ("min", "max"))
             )
             if low.ndim == 2:
@@ -242,7 +247,9 @@ class Oracle:
         return mask
 
 
-def fitted(row: NDArray[np.float32] | None, width: int, pad: float, missing: float | None = None) -> F64:
+def fitted(
+    row: NDArray[np.float32] | F64 | None, width: int, pad: float, missing: float | None = None
+) -> F64:
     """A row of statistics, cut off or padded to the width; a missing one is all ``missing`` (or ``pad``)."""
     if row is None:
         return np.full(width, pad if missing is None else missing)

@@ -30,13 +30,15 @@ class Key:
         self.kind, self.key = name.split(".")
         self.about = entry["modalities"][self.kind].get(self.key)
         self.mode = config[f"{self.kind}_modes"].get(name)
-        self.target = config["target_rotations"].get(name)
+        self.target: Any = config["target_rotations"].get(name)
         rows = entry["statistics"][self.kind].get(self.key)
         self.has_statistics = rows is not None
         # Statistics are cast to the state's dtype first; comparisons come after.
-        self.rows = {k: np.float32(v).astype(np.float64) for k, v in (rows or {}).items()}
+        self.rows: dict[str, F64] = {
+            k: np.asarray(v, np.float32).astype(np.float64) for k, v in (rows or {}).items()
+        }
         self.width = self.about["shape"][0] if self.about else 0
-        self.source = self.about["rotation_type"] if self.about else None
+        self.source: Any = self.about["rotation_type"] if self.about else None
         self.converted = self.target is not None and self.target != self.source
         if self.converted and self.mode == "min_max" and self.target in WIDTHS:
             bound = 1.0 if self.target in ("rotation_6d", "quaternion") else math.pi
@@ -113,7 +115,9 @@ class Key:
 class Oracle:
     """One robot of metadata.json with one data config."""
 
-    def __init__(self, entry: dict[str, Any], config: dict[str, Any], state_dim: int, action_dim: int) -> None:
+    def __init__(
+        self, entry: dict[str, Any], config: dict[str, Any], state_dim: int, action_dim: int
+    ) -> None:
         self.config, self.state_dim, self.action_dim = config, state_dim, action_dim
         self.embodiment_id = PROJECTORS.get(entry["embodiment_tag"])
         self.states = [Key(name, entry, config) for name in config["state_keys"]]

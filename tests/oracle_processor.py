@@ -53,7 +53,7 @@ NAMES = {  # N1.7's enum names that are not the value in capitals
     "UNITREE_G1": "unitree_g1_full_body_with_waist_height_nav_cmd",
     "LIBERO_PANDA": "libero_sim",
 }
-DEFAULTS = {"max_state_dim": 29, "max_action_dim": 29, "clip_outliers": True}
+DEFAULTS: dict[str, Any] = {"max_state_dim": 29, "max_action_dim": 29, "clip_outliers": True}
 POSES = {"XYZ_ROT6D": 9, "XYZ_ROTVEC": 6}
 
 
@@ -82,9 +82,7 @@ class Oracle:
         listed = modalities["action"].get("action_configs")
         absolute = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
         self.count = len(self.action_keys) if listed is None else len(listed)
-        self.configs = dict(
-            zip(self.action_keys, listed or [absolute] * len(self.action_keys), strict=False)
-        )
+        self.configs = dict(zip(self.action_keys, listed or [absolute] * len(self.action_keys), strict=False))
 
     def option(self, name: str) -> Any:
         return self.options.get(name, False)
@@ -116,7 +114,9 @@ class Oracle:
             return "action too wide"
         # With exclude_state the release joins zeros as wide as the raw state, and checks their width.
         double = [self.encoded(key) and not self.option("exclude_state") for key in self.state_keys]
-        widths = [self.width("state", key) * (1 + twice) for key, twice in zip(self.state_keys, double, strict=True)]
+        widths = [
+            self.width("state", key) * (1 + twice) for key, twice in zip(self.state_keys, double, strict=True)
+        ]
         if sum(widths) > self.options["max_state_dim"]:
             return "state too wide"
         return None

@@ -111,11 +111,10 @@ def to_numbers(name: str, matrix: F64) -> F64:
 
 
 def well_conditioned(name: str, matrix: F64) -> NDArray[np.bool_]:
-    """Where float32 suffices for :func:`to_numbers`: not near a half turn, no gimbal lock, no jump by 2 pi."""
+    """Where float32 suffices for :func:`to_numbers`: no half turn, no gimbal lock, no jump by 2 pi."""
     if name == "rotation_6d":
         return np.ones(matrix.shape[:-2], np.bool_)
     if name in ("axis_angle", "quaternion"):
-        return np.trace(matrix, axis1=-2, axis2=-1) > -0.8
+        return np.asarray(np.trace(matrix, axis1=-2, axis2=-1) > -0.8)
     angles = to_numbers(name, matrix)
-    safe: NDArray[np.bool_] = (np.abs(angles) < [3.0, 1.25, 3.0]).all(-1)
-    return safe
+    return np.asarray((np.abs(angles) < [3.0, 1.25, 3.0]).all(-1))

@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 import oracle_lerobot
 from hypothesis import strategies as st
-from random_processor import FORMS, offsets
+from random_processor import offsets
 from random_robots import F32, JOINTS, rotation, statistics_row, write
 from safetensors.numpy import save_file
 
 MAPPING = {
-    "n1.5": {"new_embodiment": 31, "oxe_droid": 17, "agibot_genie1": 26, "gr1": 24, "so100": 2, "unitree_g1": 3},
+    "n1.5": {
+        "new_embodiment": 31,
+        "oxe_droid": 17,
+        "agibot_genie1": 26,
+        "gr1": 24,
+        "so100": 2,
+        "unitree_g1": 3,
+    },
     "n1.7": {"simpler_env_google": 0, "simpler_env_widowx": 1, "libero_sim": 2, "new_embodiment": 10},
 }
 PACK = {"n1.5": "groot_pack_inputs_v3", "n1.7": "groot_n1_7_pack_inputs_v1"}
@@ -25,7 +32,11 @@ UNPACK = {
     "native": "groot_n1_7_action_decode_v1",
 }
 DEVICE = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
-VLM = {"model_name": "nvidia/Cosmos-Reason2-2B", "image_crop_size": [230, 230], "image_target_size": [256, 256]}
+VLM: dict[str, Any] = {
+    "model_name": "nvidia/Cosmos-Reason2-2B",
+    "image_crop_size": [230, 230],
+    "image_target_size": [256, 256],
+}
 VLM |= {"shortest_image_edge": None, "crop_fraction": None, "use_albumentations": False}
 RELATIVES = tuple(oracle_lerobot.RELATIVE.values())
 Step = dict[str, Any]
@@ -93,9 +104,12 @@ def step(name: str, **config: Any) -> Step:
 def tensors(draw: st.DrawFn, rng: np.random.Generator, feature: str, width: int) -> oracle_lerobot.Tensors:
     """A state file: bounds, mostly of the right width, and statistics that nothing reads."""
     size = max(1, width + draw(st.sampled_from([0, 0, 0, 0, -1, 2])))
-    found = {f"{feature}.{name}": np.float32(row) for name, row in statistics_row(rng, size, gap=1e-6).items()}
+    found = {
+        f"{feature}.{name}": np.asarray(row, np.float32)
+        for name, row in statistics_row(rng, size, gap=1e-6).items()
+    }
     found[f"{feature}.mean"][0] = np.nan
-    found["timestamp.max"] = np.float32([np.inf])
+    found["timestamp.max"] = np.asarray([np.inf], np.float32)
     if draw(st.integers(0, 7)) == 0:  # A missing bound is 0 or 1. Bounds in the wrong order are refused.
         gone, kept = draw(st.sampled_from([("min", "max"), ("max", "min")]))
         del found[f"{feature}.{gone}"]
@@ -162,7 +176,8 @@ def native(draw: st.DrawFn, rng: np.random.Generator) -> tuple[Step, dict[str, t
     keys = draw(st.lists(st.sampled_from((*forms, "rail")), min_size=1, max_size=3, unique=True))
     keys += [] if draw(st.integers(0, 3)) == 0 else ["gripper"]
     horizon = draw(st.sampled_from([0, 8, 16, 40]))
-    listed, numbers = [], {"state": {}, "action": {}, "relative_action": {}}
+    listed: list[dict[str, Any]] = []
+    numbers: dict[str, dict[str, Any]] = {"state": {}, "action": {}, "relative_action": {}}
     numbers["state"] = {name: statistics_row(rng, width) for name, (_, width) in forms.items()}
     for key in keys:
         reference = key if key in forms else draw(st.sampled_from([*forms]))
@@ -184,7 +199,11 @@ def native(draw: st.DrawFn, rng: np.random.Generator) -> tuple[Step, dict[str, t
     count = draw(st.integers(0, len(listed))) if draw(st.integers(0, 3)) == 0 else len(listed)
     modality = {
         "state": {"delta_indices": [0], "modality_keys": [*forms], "sin_cos_embedding_keys": names[:1]},
-        "action": {"modality_keys": keys, "action_configs": listed[:count], "delta_indices": list(range(horizon))},
+        "action": {
+            "modality_keys": keys,
+            "action_configs": listed[:count],
+            "delta_indices": list(range(horizon)),
+        },
     }
     decode = step(UNPACK["native"], env_action_dim=0, raw_stats=numbers, modality_config=modality)
     decode["config"] |= {"use_percentiles": draw(st.booleans()), "use_relative_action": draw(st.booleans())}
@@ -224,7 +243,9 @@ def robots(draw: st.DrawFn) -> Robot:
         pack["config"] |= {"clip_outliers": draw(st.booleans()), "valid_action_horizon": 16}
         encode = [step("groot_n1_7_vlm_encode_v1", **VLM)]
     if kind == "native":
-        shared = {name: decode["config"][name] for name in ("raw_stats", "modality_config", "use_percentiles")}
+        shared = {
+            name: decode["config"][name] for name in ("raw_stats", "modality_config", "use_percentiles")
+        }
         pack["config"] |= copy.deepcopy(shared)
     states = {}
     if draw(st.integers(0, 5)):
@@ -274,5 +295,8 @@ def damaged(draw: st.DrawFn) -> Robot:
         values = {"format": ["DEFAULT", "XYZ_ROTVEC", "XYZ_ROT6D"], "type": ["EEF", "NON_EEF"]}
         values["reference"] = ["nothing", *robot.forms]
         field = "state_key" if change == "reference" else change
-        about["action_configs"][place] = {**about["action_configs"][place], field: draw(st.sampled_from(values[change]))}
+        about["action_configs"][place] = {
+            **about["action_configs"][place],
+            field: draw(st.sampled_from(values[change])),
+        }
     return robot

@@ -17,6 +17,18 @@ MODES = (None, "min_max", "q99", "mean_std", "binary")
 STATE_MODES = (*MODES, "scale", "sin_cos")
 SOURCES = ("quaternion", "axis_angle", "rotation_6d", *EULER)
 
+CHANGES: tuple[str, ...] = (
+    "mode",
+    "target",
+    "source",
+    "discrete",
+    "relative",
+    "modality",
+    "statistics",
+    "stranger",
+)
+CHANGES += ("indices", "unlisted", "action_dim")
+
 
 @dataclass
 class Robot:
@@ -109,14 +121,15 @@ def robots(draw: st.DrawFn) -> Robot:
     entry: dict[str, Any] = {"statistics": {}, "modalities": {"video": {}}}
     config: dict[str, Any] = {"target_rotations": {}, "video_keys": ["video.front"]}
     config["language_keys"] = ["annotation.human.task_description"]
-    size = dict.fromkeys(("resolution",), [64, 48]) | {"channels": 3, "fps": 20.0}
-    entry["modalities"]["video"]["front"] = size
+    entry["modalities"]["video"]["front"] = {"resolution": [64, 48], "channels": 3, "fps": 20.0}
     widths = {}
     for kind in ("state", "action"):
         listed = draw(keys(kind))
         config[f"{kind}_keys"] = [f"{kind}.{key['name']}" for key in listed]
         config[f"{kind}_modes"] = {f"{kind}.{key['name']}": key["mode"] for key in listed if key["mode"]}
-        config["target_rotations"] |= {f"{kind}.{key['name']}": key["target"] for key in listed if key["target"]}
+        config["target_rotations"] |= {
+            f"{kind}.{key['name']}": key["target"] for key in listed if key["target"]
+        }
         unused = draw(st.sampled_from([(), ("spare",)]))
         listed += [{"name": name, "width": 2, "source": None, "absolute": True} for name in unused]
         order = draw(st.permutations(listed))
@@ -151,12 +164,7 @@ def damaged(draw: st.DrawFn) -> Robot:
     name = draw(st.sampled_from(config["state_keys"] + config["action_keys"]))
     kind, key = name.split(".")
     about = entry["modalities"][kind][key]
-    change = draw(
-        st.sampled_from(
-            ["mode", "target", "source", "discrete", "relative", "modality", "statistics"]
-            + ["stranger", "indices", "unlisted", "action_dim"]
-        )
-    )
+    change = draw(st.sampled_from(CHANGES))
     if change == "mode":
         config[f"{kind}_modes"][name] = draw(st.sampled_from(["minmax", "scale", "sin_cos", "q99", "binary"]))
     elif change == "target":

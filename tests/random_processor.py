@@ -113,14 +113,21 @@ def states(draw: st.DrawFn) -> dict[str, tuple[str, int]]:
 @st.composite
 def actions(draw: st.DrawFn, listed: dict[str, tuple[str, int]]) -> dict[str, dict[str, Any]]:
     """Width and action config of each action key."""
-    names = draw(st.lists(st.sampled_from((*listed, "goal", "rail", "push")), min_size=1, max_size=4, unique=True))
+    names = draw(
+        st.lists(st.sampled_from((*listed, "goal", "rail", "push")), min_size=1, max_size=4, unique=True)
+    )
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         reference = name if name in listed else draw(st.sampled_from([*listed]))
         form, width = listed[reference]
         if draw(st.integers(0, 2)):
             kind = "NON_EEF" if form == "joints" else "EEF"
-            config = {"rep": "RELATIVE", "type": kind, "format": FORMS[form], "state_key": reference}
+            config: dict[str, Any] = {
+                "rep": "RELATIVE",
+                "type": kind,
+                "format": FORMS[form],
+                "state_key": reference,
+            }
             if reference == name:
                 config["state_key"] = draw(st.sampled_from([name, None, ""]))
         else:  # nothing but the rep matters
@@ -142,15 +149,19 @@ def robots(draw: st.DrawFn) -> Robot:
     state = draw(states())
     action = draw(actions(state))
     horizon, history = draw(st.integers(1, 16)), draw(st.integers(1, 2))
-    some = lambda keys: draw(st.none() | st.lists(st.sampled_from([*keys]), unique=True))  # noqa: E731
+    some_states = st.none() | st.lists(st.sampled_from([*state]), unique=True)
+    some_actions = st.none() | st.lists(st.sampled_from([*action]), unique=True)
     modalities: dict[str, Any] = {
         "video": {"delta_indices": [0], "modality_keys": ["ego_view"], **MODALITY},
         "language": {"delta_indices": [0], "modality_keys": ["annotation.human.task_description"]},
         "state": {"delta_indices": list(range(1 - history, 1)), "modality_keys": [*state]},
         "action": {"delta_indices": list(range(horizon)), "modality_keys": [*action]},
     }
-    modalities["state"] |= {"sin_cos_embedding_keys": some(state), "mean_std_embedding_keys": some(state)}
-    modalities["action"]["mean_std_embedding_keys"] = some(action)
+    modalities["state"] |= {
+        "sin_cos_embedding_keys": draw(some_states),
+        "mean_std_embedding_keys": draw(some_states),
+    }
+    modalities["action"]["mean_std_embedding_keys"] = draw(some_actions)
     if any(a["config"]["rep"] == "RELATIVE" for a in action.values()) or draw(st.booleans()):
         modalities["action"]["action_configs"] = [a["config"] for a in action.values()]
     numbers = {
@@ -162,15 +173,21 @@ def robots(draw: st.DrawFn) -> Robot:
             if a["config"]["rep"] == "RELATIVE"
         },
     }
-    numbers["state"]["spare"] = numbers["action"]["spare"] = {**statistics_row(rng, 2), "min": [float("nan")] * 2}
+    numbers["state"]["spare"] = numbers["action"]["spare"] = {
+        **statistics_row(rng, 2),
+        "min": [float("nan")] * 2,
+    }
     flags = {name: draw(st.sampled_from([True, True, False, None, "absent"])) for name in FLAGS}
-    kwargs = {name: value for name, value in flags.items() if value != "absent"} | IMAGES
+    kwargs: dict[str, Any] = {name: value for name, value in flags.items() if value != "absent"} | IMAGES
     kwargs |= {"modality_configs": {tag: modalities}, "model_name": "nvidia/Eagle-Block2A-2B-v2"}
     kwargs["max_state_dim"] = 2 * sum(width for _, width in state.values()) + draw(st.integers(0, 4))
     kwargs["max_action_dim"] = sum(a["width"] for a in action.values()) + draw(st.integers(0, 4))
     kwargs["max_action_horizon"] = draw(st.sampled_from([16, 40]))
     if release == "n1.7":
-        kwargs |= {"use_mean_std": draw(st.booleans()), "exclude_state": draw(st.sampled_from([False] * 5 + [True]))}
+        kwargs |= {
+            "use_mean_std": draw(st.booleans()),
+            "exclude_state": draw(st.sampled_from([False] * 5 + [True])),
+        }
     ids = draw(st.sampled_from([None, {}, {"new_embodiment": 10}, {tag: 7}, {"of_my_own": 12}]))
     statistics = {tag: numbers}
     if draw(st.booleans()):
@@ -214,8 +231,14 @@ def damaged(draw: st.DrawFn) -> Robot:
     elif change == "relative":
         statistics["relative_action"].pop(key, None)
     elif change == "state_key":
-        config["state_key"] = draw(st.sampled_from([None, "nothing", *robot.modality("state")["modality_keys"]]))
+        config["state_key"] = draw(
+            st.sampled_from([None, "nothing", *robot.modality("state")["modality_keys"]])
+        )
     else:
-        values = {"rep": ["ABSOLUTE", "DELTA", "RELATIVE"], "type": ["EEF", "NON_EEF"], "format": [*FORMS.values()]}
+        values = {
+            "rep": ["ABSOLUTE", "DELTA", "RELATIVE"],
+            "type": ["EEF", "NON_EEF"],
+            "format": [*FORMS.values()],
+        }
         config[change] = draw(st.sampled_from(values[change]))
     return robot

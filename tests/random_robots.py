@@ -19,8 +19,11 @@ F32 = NDArray[np.float32]
 class OracleLike(Protocol):
     """What all oracles have in common."""
 
-    action_horizon: int
-    embodiment_id: int | None
+    @property
+    def action_horizon(self) -> int: ...
+
+    @property
+    def embodiment_id(self) -> int | None: ...
 
 
 def statistics_row(rng: np.random.Generator, width: int, *, gap: float = 1e-9) -> dict[str, list[float]]:

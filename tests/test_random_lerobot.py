@@ -1,4 +1,4 @@
-"""Random robots of lerobot's groot policy against an oracle written from a description of the released code."""
+"""Random robots of lerobot's groot policy against an oracle written from a description of its code."""
 
 from __future__ import annotations
 

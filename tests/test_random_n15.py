@@ -19,6 +19,13 @@ def load(robot: random_n15.Robot) -> Normalizer:
         return Normalizer.load(robot.save(Path(folder)), robot.tag, data_config=robot.config)
 
 
+def load_and_act(robot: random_n15.Robot) -> None:
+    """An action with the mode "scale" is refused on the way back from the head, as the release does."""
+    normalizer = load(robot)
+    assert "scale" in robot.config["action_modes"].values()
+    normalizer.actions(np.zeros((normalizer.action_horizon or 1, robot.action_dim), np.float32))
+
+
 def check(robot: random_n15.Robot) -> None:
     normalizer, oracle = load(robot), robot.oracle
     assert_form(normalizer, oracle)
@@ -43,7 +50,4 @@ def test_what_the_oracle_refuses_is_refused(robot: random_n15.Robot) -> None:
         check(robot)
         return
     with pytest.raises(SaccadeError):
-        normalizer = load(robot)
-        # The release refuses an action with the mode "scale" on the way back from the head.
-        assert "scale" in robot.config["action_modes"].values()
-        normalizer.actions(np.zeros((normalizer.action_horizon or 1, robot.action_dim), np.float32))
+        load_and_act(robot)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,10 +21,12 @@ from hypothesis import strategies as st
 
 from saccade import Normalizer, SaccadeError
 
+#: Names of the statistics that are used, by kind and key.
+Used: TypeAlias = "dict[tuple[str, str], tuple[str, ...]]"
 Robot: TypeAlias = "random_n15.Robot | random_processor.Robot | random_lerobot.Robot"
 
 VALUES = st.sampled_from([True, 1, 0.5, "min_max", ["arm"], {"enabled": True}])
-NOTHING = st.sampled_from([None, False, "", [], {}])
+NOTHING: st.SearchStrategy[Any] = st.sampled_from([None, False, "", [], {}])
 NAMES = st.from_regex(r"\A[a-z]{3,9}_of_a_fork\Z")
 NOT_FINITE = st.sampled_from([float("nan"), float("inf"), float("-inf")])
 
@@ -44,12 +45,16 @@ def mappings(robot: Robot) -> list[dict[str, Any]]:
         keys = [name.split(".") for name in robot.config["state_keys"] + robot.config["action_keys"]]
         return [robot.config, *(robot.entry["modalities"][kind][key] for kind, key in keys)]
     if isinstance(robot, random_processor.Robot):
-        found = [robot.kwargs, robot.modality("state"), robot.modality("action")]
-        return found + (robot.modality("action").get("action_configs") or [])
+        found = [robot.kwargs]
+        for about in robot.kwargs["modality_configs"].values():
+            found += [about, *about.values(), *(about["action"].get("action_configs") or [])]
+        return found
     steps = robot.before + robot.after
     found = [robot.config, *steps, *(step["config"] for step in steps)]
-    about = robot.after[0]["config"].get("modality_config")
-    return found + ([about["action"], *about["action"]["action_configs"]] if about else [])
+    for step in steps:
+        if about := step["config"].get("modality_config"):
+            found += [about, *about.values(), *about["action"]["action_configs"]]
+    return found
 
 
 def all_robots() -> st.SearchStrategy[Robot]:
@@ -71,7 +76,12 @@ def test_an_unknown_key_is_refused_unless_it_says_nothing(
         load(robot)
 
 
-@given(random_lerobot.robots(), NAMES, st.sampled_from(["registry_name", "class"]), st.randoms(use_true_random=False))
+@given(
+    random_lerobot.robots(),
+    NAMES,
+    st.sampled_from(["registry_name", "class"]),
+    st.randoms(use_true_random=False),
+)
 @settings(max_examples=40)
 def test_an_unknown_step_is_refused(robot: random_lerobot.Robot, name: str, kind: str, random: Any) -> None:
     assume(robot.oracle.refused() is None)
@@ -82,27 +92,23 @@ def test_an_unknown_step_is_refused(robot: random_lerobot.Robot, name: str, kind
         load(robot)
 
 
-def enums(robot: Robot) -> list[Callable[[str], None]]:
-    """Functions that set each value of a robot's files that must be on a list."""
+def enums(robot: Robot) -> list[tuple[dict[str, Any], str]]:
+    """The mapping and the key of each value of a robot's files that must be on a list."""
     if isinstance(robot, random_n15.Robot):
         config, found = robot.config, []
         for kind in ("state", "action"):
-            modes = config[f"{kind}_modes"]
-            found += [lambda value, modes=modes, key=key: modes.update({key: value}) for key in config[f"{kind}_keys"]]
-        targets = config["target_rotations"]
-        for name in targets:
+            found += [(config[f"{kind}_modes"], key) for key in config[f"{kind}_keys"]]
+        for name in config["target_rotations"]:
             kind, key = name.split(".")
-            about = robot.entry["modalities"][kind][key]
-            found.append(lambda value, name=name: targets.update({name: value}))
-            found.append(lambda value, about=about: about.update(rotation_type=value))
+            found.append((config["target_rotations"], name))
+            found.append((robot.entry["modalities"][kind][key], "rotation_type"))
         return found
     if isinstance(robot, random_processor.Robot):
         configs = robot.modality("action").get("action_configs") or []
     else:
         about = robot.after[0]["config"].get("modality_config") or {"action": {}}
         configs = about["action"].get("action_configs") or []
-    names = ("rep", "type", "format")
-    return [lambda value, c=c, name=name: c.update({name: value}) for c in configs for name in names]
+    return [(config, name) for config in configs for name in ("rep", "type", "format")]
 
 
 @given(all_robots(), NAMES, st.randoms(use_true_random=False))
@@ -112,14 +118,16 @@ def test_a_value_that_is_on_no_list_is_refused(robot: Robot, value: str, random:
     robot = copy.deepcopy(robot)
     places = enums(robot)
     assume(places)
-    random.choice(places)(value)
+    where, key = random.choice(places)
+    where[key] = value
     with pytest.raises(SaccadeError, match=value):
         load(robot)
 
 
 def read(robot: Robot) -> dict[tuple[str, str, str], bool]:
-    """Whether the statistic (kind, key, name) of a robot is used. Keys of a lerobot pipeline: the first only."""
+    """Whether the statistic (kind, key, name) of a robot is used. Of lerobot's groups, only the first."""
     names = ("min", "max", "mean", "std", "q01", "q99")
+    used: Used
     if isinstance(robot, random_n15.Robot):
         keys = [*robot.oracle.states, *robot.oracle.actions_]
         used = {
@@ -133,12 +141,15 @@ def read(robot: Robot) -> dict[tuple[str, str, str], bool]:
     return {(*where, name): name in found for where, found in used.items() for name in names}
 
 
-def processor_statistics(robot: random_processor.Robot) -> dict[tuple[str, str], tuple[str, ...]]:
-    oracle, used = robot.oracle, {}
+def processor_statistics(robot: random_processor.Robot) -> Used:
+    oracle = robot.oracle
+    used: Used = {}
     for kind, keys in (("state", oracle.state_keys), ("action", oracle.action_keys)):
         for key in keys:
             bounds = ("q01", "q99") if oracle.option("use_percentiles") else ("min", "max")
-            found = ("mean", "std") if oracle.in_list(kind, "mean_std_embedding_keys", key) else bounds
+            found: tuple[str, ...] = (
+                ("mean", "std") if oracle.in_list(kind, "mean_std_embedding_keys", key) else bounds
+            )
             if kind == "state" and (oracle.encoded(key) or oracle.option("exclude_state")):
                 found = ()
             if kind == "action" and key in robot.statistics[robot.tag]["relative_action"]:
@@ -149,8 +160,9 @@ def processor_statistics(robot: random_processor.Robot) -> dict[tuple[str, str],
     return used
 
 
-def lerobot_statistics(robot: random_lerobot.Robot) -> dict[tuple[str, str], tuple[str, ...]]:
-    oracle, used = robot.oracle, {}
+def lerobot_statistics(robot: random_lerobot.Robot) -> Used:
+    oracle = robot.oracle
+    used: Used = {}
     scales = oracle.release == "n1.5" or oracle.pack["normalize_min_max"]
     used["observation", "state"] = ("min", "max") if scales else ()
     if oracle.native is None:

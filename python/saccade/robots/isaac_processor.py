@@ -124,7 +124,10 @@ def processor_robot(
     )
     switches = {name: _switch(builder, kwargs, name, default) for name, default in SWITCHES.items()}
     config, numbers = configs[tag], statistics[tag]
-    builder.refuse_unknown("modality_configs", config, MODALITIES)
+    for one, about in configs.items():  # the release refuses the file, whichever robot is used
+        refuse_unknown_fields(
+            builder, "modality_configs" if one == tag else f"modality_configs: {one}", about
+        )
     state = modality(builder, config, "state", relative=False)
     action = modality(builder, config, "action", relative=switches["use_relative_action"])
     if version != "n1.6":
@@ -181,6 +184,21 @@ def _switch(builder: Builder, kwargs: Mapping[str, Any], name: str, default: boo
     return bool(value)
 
 
+def refuse_unknown_fields(builder: Builder, where: str, about: Any) -> None:
+    """Records what is not known in the modality configs of a robot: modalities, and fields of each."""
+    modalities = about if isinstance(about, Mapping) else {}
+    builder.refuse_unknown(where, modalities, MODALITIES)
+    for kind in MODALITIES[:-1]:
+        config = modalities.get(kind)
+        if not isinstance(config, Mapping):
+            continue
+        builder.refuse_unknown(f"{where}: {kind}", config, MODALITY)
+        actions = config.get("action_configs")
+        for one in actions if isinstance(actions, list) else []:
+            if isinstance(one, Mapping):
+                builder.refuse_unknown(f"{where}: {kind}: action_configs", one, ACTION)
+
+
 def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modality:
     """What ``modality_configs`` contain of the state or the action; problems are recorded.
 
@@ -200,7 +218,6 @@ def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modali
     assert isinstance(found, Mapping)
     if len(set(keys)) != len(keys):
         builder.problems.append(f"{kind}: expected distinct modality_keys, got {', '.join(keys)}")
-    builder.refuse_unknown(kind, found, MODALITY)
     steps = found.get("delta_indices")
     if not isinstance(steps, list) or not steps or not all(type(step) is int for step in steps):
         builder.problems.append(f"{kind}: expected delta_indices, a list of integers, got {steps!r:.60}")
@@ -231,7 +248,6 @@ def _references(
         if not isinstance(config, Mapping):
             builder.problems.append(f"{where}: expected an action config, got {config!r:.60}")
             continue
-        builder.refuse_unknown(where, config, ACTION)
         names, wrong = {}, []
         for name, allowed in ACTION.items():
             value = config.get(name)

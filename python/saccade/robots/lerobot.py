@@ -17,7 +17,13 @@ import numpy.typing as npt
 from saccade.robots.building import Builder, Options, finished, size_of, width_of
 from saccade.robots.embodiments import N17_IDS
 from saccade.robots.groups import Group, Robot
-from saccade.robots.isaac_processor import Modality, check_reference, modality, single_row
+from saccade.robots.isaac_processor import (
+    Modality,
+    check_reference,
+    modality,
+    refuse_unknown_fields,
+    single_row,
+)
 from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
 from saccade.robots.rotations import POSES
 
@@ -52,6 +58,8 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     embodiment_id = _mapping(pipeline).get(tag, 0)  # as lerobot does with an unknown tag
     options.check_only(tag, embodiment_id, pipeline.where)
     builder = Builder(pipeline.where, np.float32)
+    for step in (pipeline.pack, pipeline.unpack):
+        refuse_unknown_fields(builder, f"{step.name}: modality_config", step.config.get("modality_config"))
     native = pipeline.unpack.name == DECODE
     state = _state_groups(builder, pipeline)
     action = _native_groups(builder, pipeline, state) if native else _flat_groups(builder, pipeline)
@@ -189,8 +197,8 @@ def _strict(builder: Builder, about: Mapping[str, Any]) -> dict[str, Any]:
     keys, configs = action.get("modality_keys"), action.get("action_configs", [])
     if not isinstance(configs, list):
         builder.problems.append(
-            f"{DECODE}: action_configs: expected a list, got {configs!r:.60}: lerobot then returns the actions "
-            "as the head does, not in the robot's units"
+            f"{DECODE}: action_configs: expected a list, got {configs!r:.60}: lerobot then returns the "
+            "head's actions, not the robot's units"
         )
         configs = []
     found = []
