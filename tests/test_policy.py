@@ -172,7 +172,7 @@ def test_which_embodiment_is_meant() -> None:
     assert Policy(head, embodiment=31).normalizer.embodiment == "new_embodiment"
     assert Policy(head, statistics(7, 6), 9).embodiment_id == 9
     assert Policy(head, Normalizer.load(statistics(7, 6), state_dim=12), 9).embodiment_id == 9
-    with pytest.raises(saccade.InputError, match="files do not say .*: pass its id, one of 0, 1"):
+    with pytest.raises(saccade.InputError, match=r"files do not say .*: pass its id, one of 0, 1"):
         Policy(head, statistics(7, 6))
     with pytest.raises(saccade.InputError, match="got 40"):
         Policy(head, statistics(7, 6), 40)

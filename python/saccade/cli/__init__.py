@@ -18,7 +18,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, NoReturn, Protocol, runtime_checkable
+from typing import NoReturn, Protocol, runtime_checkable
 
 from saccade._arguments import UsageError
 
@@ -244,9 +244,12 @@ def plain_warnings() -> Iterator[None]:
     """Warnings of this package are one line each, without the place in the code."""
     usual = warnings.formatwarning
 
-    def plain(message: Warning | str, category: type[Warning], *place: Any) -> str:
-        is_own = issubclass(category, UserWarning)
-        return f"saccade: warning: {message}\n" if is_own else usual(message, category, *place)
+    def plain(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+    ) -> str:
+        if issubclass(category, UserWarning):
+            return f"saccade: warning: {message}\n"
+        return usual(message, category, filename, lineno, line)
 
     warnings.formatwarning = plain
     try:
