@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import tempfile
 from pathlib import Path
 
 import pytest
 import random_lerobot
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from random_robots import assert_close, assert_form
 
 from saccade import Normalizer, SaccadeError
@@ -33,4 +34,15 @@ def test_robots_are_converted_or_refused_as_the_oracle_does(robot: random_lerobo
         check(robot)
         return
     with pytest.raises(SaccadeError):
+        load(robot)
+
+
+@given(random_lerobot.robots())
+@settings(max_examples=20)
+def test_actions_that_lerobot_does_not_decode_are_refused(robot: random_lerobot.Robot) -> None:
+    """With null in place of a list, its decode step returns the head's actions unchanged."""
+    assume(robot.oracle.native is not None)
+    robot = copy.deepcopy(robot)
+    robot.after[0]["config"]["modality_config"]["action"]["action_configs"] = None
+    with pytest.raises(SaccadeError, match="action_configs"):
         load(robot)

@@ -193,10 +193,12 @@ def refuse_unknown_fields(builder: Builder, where: str, about: Any) -> None:
         if not isinstance(config, Mapping):
             continue
         builder.refuse_unknown(f"{where}: {kind}", config, MODALITY)
-        actions = config.get("action_configs")
-        for one in actions if isinstance(actions, list) else []:
-            if isinstance(one, Mapping):
-                builder.refuse_unknown(f"{where}: {kind}: action_configs", one, ACTION)
+        keys, actions = (config.get(name) for name in ("modality_keys", "action_configs"))
+        if isinstance(keys, list) and isinstance(actions, list):
+            for key, one in zip(keys, actions, strict=False):
+                builder.refuse_unknown(
+                    f"{where}: {kind}.{key}", one if isinstance(one, Mapping) else {}, ACTION
+                )
 
 
 def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modality:
