@@ -123,7 +123,7 @@ class Policy:
         self.requirements = Requirements(
             embodiment=normalizer.embodiment,
             state=tuple((group.key, group.size) for group in normalizer.state_groups),
-            state_history=config.state_history,
+            state_history=config.num_states,
             **vars(known),
         )
 
