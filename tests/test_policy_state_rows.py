@@ -170,15 +170,6 @@ def test_examples_samples_and_wrong_numbers_of_states(n16: Path) -> None:
         saccade.ShapeError, match=r"state\.arm: expected 3 along the time axis, .*3 states each"
     ):
         policy.act(short)
-    trace = policy.head.trace(
-        policy.encode(example).context,
-        np.zeros((1, 3, policy.head.config.state_dim), np.float32),
-        policy.embodiment_id,
-        seed=0,
-        blocks=0,
-        steps=0,
-    )
-    assert trace.rows["state"] == slice(0, 3)
 
 
 def test_a_head_of_another_number_of_states_is_refused(n15: Path, n16: Path) -> None:

@@ -48,7 +48,10 @@ def apart(inputs: dict[str, Any]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """Features, masks, and the rest."""
     rest = dict(inputs)
     features = rest.pop("backbone_features")
-    masks = {name: rest.pop(name) for name in ("attention_mask", "image_mask") if name in rest}
+    masks: dict[str, Any] = {}
+    for name in ("attention_mask", "image_mask"):
+        if name in rest:
+            masks[name] = rest.pop(name)
     return features, masks, rest
 
 
