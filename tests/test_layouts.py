@@ -48,7 +48,7 @@ def actions(head: saccade.ActionHead) -> np.ndarray[Any, Any]:
     if config.mask_mode != "none":
         masks = {"image_mask": np.array([[True, False] * 4]), "attention_mask": np.ones((1, 8), bool)}
     features = rng.standard_normal((1, 8, config.context_dim), np.float32)
-    state = rng.standard_normal((1, config.state_history, config.state_dim), np.float32)
+    state = rng.standard_normal((1, config.num_states, config.state_dim), np.float32)
     return np.asarray(head(features, state, 31, seed=2, **masks))
 
 

@@ -98,7 +98,7 @@ def test_random_observations_are_drawn_in_a_fixed_order() -> None:
         found.backbone_features, rng.standard_normal((1, 7, config.context_dim), dtype=np.float32)
     )
     np.testing.assert_array_equal(
-        found.state, rng.standard_normal((1, config.state_history, config.state_dim), dtype=np.float32)
+        found.state, rng.standard_normal((1, config.num_states, config.state_dim), dtype=np.float32)
     )
     assert found.embodiment_id.tolist() == [1]
     repeated = found.repeated(3)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
+from saccade._arrays import integer
 from saccade.errors import CheckpointError
 
 #: A longer file is refused. The engine has the same limit for the config in a checkpoint's directory.
@@ -54,7 +55,10 @@ class HeadConfig:
         decoders: Module name and width of each decoder in the order of their outputs, which are concatenated.
             The widths add up to ``action_dim``.
         state_dim: Width of the state vector (``max_state_dim``).
-        state_history: Number of state vectors in the state row (``state_history_length``).
+        state_history: Number of state vectors in a state row (``state_history_length``).
+        num_states: Number of state vectors in an observation. N1.7 makes one row of all of them, so this is
+            ``state_history``. The other versions make a row of each: one, or as many as
+            :meth:`saccade.ActionHead.load` was told.
         hidden_dim: Hidden width of encoders and decoders (``hidden_size``).
         num_embodiments: Number of embodiments of the category-specific layers (``max_num_embodiments``).
         num_timestep_buckets: Number of buckets of the time from 0 to 1.
@@ -84,6 +88,7 @@ class HeadConfig:
     decoders: tuple[tuple[str, int], ...]
     state_dim: int
     state_history: int
+    num_states: int
     hidden_dim: int
     num_embodiments: int
     num_timestep_buckets: int
@@ -91,20 +96,33 @@ class HeadConfig:
     max_positions: int
     add_pos_embed: bool
 
+    @property
+    def num_state_rows(self) -> int:
+        """Number of state rows, the first rows of the query sequence."""
+        return self.num_states // self.state_history
+
+    @property
+    def num_rows(self) -> int:
+        """Number of rows of the query sequence: state, future, action."""
+        return self.num_state_rows + self.num_future_tokens + self.action_horizon
+
     @classmethod
-    def from_dict(cls, config: Mapping[str, Any]) -> HeadConfig:
+    def from_dict(cls, config: Mapping[str, Any], *, num_states: int | None = None) -> HeadConfig:
         """Reads a published config.
 
         Args:
             config: The config of a whole checkpoint (with ``action_head_cfg``, or flat as those of N1.6 and
                 N1.7) or of the head alone. The version is that of ``model_type``. Without this key, it is
                 recognised by the other keys.
+            num_states: As for :meth:`saccade.ActionHead.load`.
 
         Raises:
             CheckpointError: Values are missing, of the wrong type or contradictory. The message lists all of
                 them.
+            InputError: ``num_states`` is out of range.
         """
-        return cls(**_saccade.parse_config(to_json(config)))
+        states = None if num_states is None else integer("num_states", num_states)
+        return cls(**_saccade.parse_config(to_json(config), states))
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> HeadConfig:

@@ -99,6 +99,7 @@ class ActionHead:
         config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment_ids: Sequence[int] | None = None,
         action_horizon: int | None = None,
+        num_states: int | None = None,
         precision: str = "float32",
         num_threads: int | None = None,
     ) -> ActionHead:
@@ -122,6 +123,10 @@ class ActionHead:
                 fine-tunes whose config gives another number than they were trained with. Default: that of the
                 config. The ``config.json`` of a lerobot policy has none, so it is that of the published model
                 that lerobot starts from: 16 for N1.5, 40 for N1.7, whatever ``chunk_size`` is.
+            num_states: Number of states in an observation, for models that were trained with several
+                (``observation_indices`` of the data config of N1 and N1.5, ``delta_indices`` of the states
+                of N1.6). Each has a state row of its own. Default: 1. N1.7 makes one row of
+                ``config.state_history`` states and takes no other number.
             precision: How the head computes. The residual stream, norms, softmax and all sums of floating
                 point products are float32 at every precision.
 
@@ -150,12 +155,14 @@ class ActionHead:
         config_text = None if config is None else to_json(config)
         ids = optional_integers("embodiment_ids", embodiment_ids)
         horizon = optional_integer("action_horizon", action_horizon)
+        states = optional_integer("num_states", num_states)
         threads = optional_integer("num_threads", num_threads)
-        head = _saccade.ActionHead.load(path, config_text, ids, horizon, precision, threads)
+        head = _saccade.ActionHead.load(path, config_text, ids, horizon, states, precision, threads)
         options = {
             "config": config_text,
             "embodiment_ids": ids,
             "action_horizon": horizon,
+            "num_states": states,
             "precision": precision,
             "num_threads": threads,
         }
@@ -168,6 +175,7 @@ class ActionHead:
         *,
         config: Mapping[str, Any] | str | os.PathLike[str],
         embodiment_ids: Sequence[int] | None = None,
+        num_states: int | None = None,
         precision: str = "float32",
         num_threads: int | None = None,
     ) -> ActionHead:
@@ -185,7 +193,7 @@ class ActionHead:
                 Others are refused, except those that only training uses (``task_log_sigma.*``,
                 ``mask_token``) and ``dropout_prob_by_embodiment`` (see the class).
             config: The config of the head or of a whole checkpoint, as for :meth:`load`.
-            embodiment_ids, precision, num_threads: As for :meth:`load`.
+            embodiment_ids, num_states, precision, num_threads: As for :meth:`load`.
 
         Raises:
             DtypeError: A tensor has another dtype, or is not on the CPU.
@@ -198,8 +206,10 @@ class ActionHead:
         check_precision(precision)
         config_text = to_json(config)
         ids = optional_integers("embodiment_ids", embodiment_ids)
+        states = optional_integer("num_states", num_states)
         threads = optional_integer("num_threads", num_threads)
-        return cls(_saccade.ActionHead.from_tensors(as_stored(tensors), config_text, ids, precision, threads))
+        held = as_stored(tensors)
+        return cls(_saccade.ActionHead.from_tensors(held, config_text, ids, states, precision, threads))
 
     @property
     def config(self) -> HeadConfig:
@@ -343,8 +353,8 @@ class ActionHead:
 
         Args:
             context: From :meth:`encode` of this head.
-            state: ``(batch, state_history, state_dim)``, or ``(batch, state_dim)`` for a history of one.
-                Normalised and padded (see :meth:`policy` for states in the robot's units).
+            state: ``(batch, num_states, state_dim)``, the newest last, or ``(batch, state_dim)`` for a head
+                of one state. Normalised and padded (see :meth:`policy` for states in the robot's units).
             embodiment_id: One integer, or integers ``(batch,)``.
             noise: ``(batch, action_horizon, encoder_action_dim)``. With ``num_samples``, ``(batch,
                 num_samples, action_horizon, encoder_action_dim)``.
@@ -356,11 +366,12 @@ class ActionHead:
                 2 v(x, t), t + dt / 2)``, which evaluates the velocity twice in each step.
             num_samples: Number of chunks for each observation. With None, noise and result have no axis for
                 it. With any integer, 1 included, they have one.
-            future_refresh: The state row and the future rows are recomputed every ``future_refresh`` velocity
-                evaluations: at evaluations 0, r, 2 r, ... (for Euler, an evaluation is a step). At the others
-                only the action rows are computed, and self-attention uses the latest keys and values of the
-                other rows. None and 1 are exact and give the same bits. From 2 on, sampling is faster and
-                approximate. If r is not less than the number of evaluations, these rows are computed once.
+            future_refresh: The state rows and the future rows are recomputed every ``future_refresh``
+                velocity evaluations: at evaluations 0, r, 2 r, ... (for Euler, an evaluation is a step). At
+                the others only the action rows are computed, and self-attention uses the latest keys and
+                values of the other rows. None and 1 are exact and give the same bits. From 2 on, sampling is
+                faster and approximate. If r is not less than the number of evaluations, these rows are
+                computed once.
             intervention: One or several :class:`saccade.Intervention`, which act together. With
                 ``future_refresh``, cuts and biases act on the rows that are computed. A patch of state or
                 future rows at a step where they are not always computed is an error. All evaluations of a

@@ -39,7 +39,7 @@ class Observation:
 
     Attributes:
         backbone_features: ``(batch, T_vl, context_dim)``, floating point.
-        state: ``(batch, state_dim)`` or ``(batch, state_history, state_dim)``, normalised, floating point.
+        state: ``(batch, state_dim)`` or ``(batch, num_states, state_dim)``, normalised, floating point.
         embodiment_id: ``(batch,)`` int64.
         noise: The noise that sampling starts from, ``(batch, action_horizon, encoder_action_dim)``, or with
             several draws for each row ``(batch, draws, action_horizon, encoder_action_dim)``; None if it has
@@ -201,7 +201,7 @@ class Observation:
         """One observation of standard normal features, state and noise, drawn in this order."""
         shapes = (
             (1, num_vl_tokens, config.context_dim),
-            (1, config.state_history, config.state_dim),
+            (1, config.num_states, config.state_dim),
             (1, config.action_horizon, config.encoder_action_dim),
         )
         features, state, noise = (rng.standard_normal(shape, dtype=np.float32) for shape in shapes)
@@ -272,8 +272,8 @@ def _embodiments(
 
 def _state(given: npt.NDArray[Any], batch: int, config: HeadConfig, where: str) -> npt.NDArray[Any]:
     state = np.asarray(given)
-    shapes: list[tuple[int, ...]] = [(batch, config.state_history, config.state_dim)]
-    if config.state_history == 1:
+    shapes: list[tuple[int, ...]] = [(batch, config.num_states, config.state_dim)]
+    if config.num_states == 1:
         shapes.insert(0, (batch, config.state_dim))
     if state.shape not in shapes:
         expected = " or ".join(map(str, shapes))

@@ -60,6 +60,7 @@ class LoadOptions(TypedDict, total=False):
     """How a head is loaded: the keyword arguments that ``ActionHead.load`` and ``from_tensors`` share."""
 
     embodiment_ids: Sequence[int] | None
+    num_states: int | None
     precision: str
     num_threads: int | None
 

@@ -119,7 +119,7 @@ class Policy:
         self.requirements = Requirements(
             embodiment=normalizer.embodiment,
             state=tuple((group.key, group.size) for group in normalizer.state_groups),
-            state_history=config.state_history,
+            state_history=config.num_states,
             **vars(known),
         )
 
@@ -160,7 +160,7 @@ class Policy:
                 the checkpoint.
             data_config: GR00T N1 and N1.5: the data config that the checkpoint was trained with, as for
                 :meth:`saccade.Normalizer.load`. The head denoises as many actions as it has
-                ``action_indices``.
+                ``action_indices``, and takes as many states as it has ``observation_indices``.
             action_horizon: Number of actions that the head denoises, for a fine-tune that was trained with
                 another number than its config says.
             processor_options: Options of the checkpoint's processor to replace, such as

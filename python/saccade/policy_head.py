@@ -91,10 +91,11 @@ def check_steps(head: Head, normalizer: Normalizer) -> None:
             f"denoises, got {least}"
         )
     history = normalizer.state_history
-    if history is not None and history != config.state_history:
+    if history is not None and history != config.num_states:
+        hint = "" if config.version == "n1.7" else f": load the head with num_states={history}"
         raise InputError(
-            f"normalizer: expected {config.state_history} states in an observation, which this head takes, "
-            f"got {history}"
+            f"normalizer: expected {config.num_states} states in an observation, which this head takes, "
+            f"got {history}{hint}"
         )
 
 

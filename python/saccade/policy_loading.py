@@ -84,6 +84,8 @@ def load(
         path,
         embodiment_ids=None if chosen is None else [chosen],
         action_horizon=horizon,
+        # N1.7 takes as many states as its config says; the policy checks that the robot has as many.
+        num_states=None if config.version == "n1.7" else normalizer.state_history,
         precision=precisions["head"],
         num_threads=num_threads,
     )

@@ -38,6 +38,7 @@ pub(crate) fn config_dict<'py>(py: Python<'py>, config: &HeadConfig) -> PyResult
         ("encoder_action_dim", config.encoder_action_dim),
         ("state_dim", config.state_dim),
         ("state_history", config.state_history),
+        ("num_states", config.num_states),
         ("hidden_dim", config.hidden_dim),
         ("num_embodiments", config.num_embodiments),
         ("num_timestep_buckets", config.num_timestep_buckets),
@@ -49,9 +50,21 @@ pub(crate) fn config_dict<'py>(py: Python<'py>, config: &HeadConfig) -> PyResult
     Ok(dict)
 }
 
+/// A config with the number of states in an observation, unless that is the config's own.
 #[pyfunction]
-pub(crate) fn parse_config<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
-    let config = call(py, || HeadConfig::from_json(text))?;
+#[pyo3(signature = (text, num_states=None))]
+pub(crate) fn parse_config<'py>(
+    py: Python<'py>,
+    text: &str,
+    num_states: Option<usize>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let config = call(py, || {
+        let config = HeadConfig::from_json(text)?;
+        match num_states {
+            Some(num_states) => config.with_num_states(num_states),
+            None => Ok(config),
+        }
+    })?;
     config_dict(py, &config)
 }
 

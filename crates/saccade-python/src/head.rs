@@ -23,12 +23,14 @@ pub(crate) struct ActionHead(saccade::ActionHead);
 #[pymethods]
 impl ActionHead {
     #[staticmethod]
+    #[allow(clippy::too_many_arguments)]
     fn load(
         py: Python<'_>,
         source: PathBuf,
         config: Option<String>,
         embodiment_ids: Option<Vec<i64>>,
         action_horizon: Option<usize>,
+        num_states: Option<usize>,
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
@@ -36,6 +38,7 @@ impl ActionHead {
             .with_config(config)
             .with_embodiment_ids(embodiment_ids)
             .with_action_horizon(action_horizon)
+            .with_num_states(num_states)
             .with_precision(precision.parse().map_err(raise)?)
             .with_num_threads(num_threads);
         call(py, || saccade::ActionHead::load(&source, &options)).map(Self)
@@ -47,12 +50,14 @@ impl ActionHead {
         tensors: &Bound<'_, PyDict>,
         config: String,
         embodiment_ids: Option<Vec<i64>>,
+        num_states: Option<usize>,
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = LoadOptions::default()
             .with_config(config)
             .with_embodiment_ids(embodiment_ids)
+            .with_num_states(num_states)
             .with_precision(precision.parse().map_err(raise)?)
             .with_num_threads(num_threads);
         let held = held_tensors(tensors)?;

@@ -62,7 +62,7 @@ fn main() -> Result<()> {
         .with_image_mask(Array::new(&image_mask, &[1, NUM_VL_TOKENS])?);
     let context = head.encode(&features)?;
 
-    let state_shape = [1, config.state_history, config.state_dim];
+    let state_shape = [1, config.num_states, config.state_dim];
     let state = vec![0.0; state_shape.iter().product()];
     let noise_shape = [1, config.action_horizon, config.encoder_action_dim];
     let noise = numbers(noise_shape.iter().product(), 2);

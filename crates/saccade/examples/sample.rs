@@ -46,7 +46,7 @@ fn main() -> Result<()> {
     let context = head.encode(&features)?;
 
     // Chunks are sampled from it as often as wanted.
-    let state_shape = [1, config.state_history, config.state_dim];
+    let state_shape = [1, config.num_states, config.state_dim];
     let state = vec![0.0; state_shape.iter().product()];
     let noise_shape = [1, config.action_horizon, config.encoder_action_dim];
     let noise = numbers(noise_shape.iter().product(), 2);

@@ -93,11 +93,12 @@ def sample_work(config: HeadConfig, call: Call) -> Works:
     """
     width, hidden, horizon = config.width, config.hidden_dim, config.action_horizon
     chunks = call.batch * call.num_samples
-    all_rows = 1 + call.num_future_tokens + horizon
+    all_rows = config.num_state_rows + call.num_future_tokens + horizon
     works: Works = {}
     state = config.state_history * config.state_dim
-    add_linear(works, "embodiment", call.batch, state, hidden)
-    add_linear(works, "embodiment", call.batch, hidden, width)
+    states = call.batch * config.num_state_rows
+    add_linear(works, "embodiment", states, state, hidden)
+    add_linear(works, "embodiment", states, hidden, width)
     for step in range(call.num_steps):
         running = all_rows if step % call.future_refresh == 0 else horizon
         add_linear(works, "embodiment", chunks * horizon, config.encoder_action_dim, width)

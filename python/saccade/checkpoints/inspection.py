@@ -89,7 +89,7 @@ def inspect(
         parameters=sum(part.parameters for part in parts.values()),
         outside=outside,
         backbone=backbone_of(path, None if config is None else to_json(config)) if outside else None,
-        robots=robots_of(path, head.state_history, data_config),
+        robots=robots_of(path, head.num_states, data_config),
         memory={
             precision: Memory(
                 all=published.nbytes(precision, head.num_embodiments), one=published.nbytes(precision, 1)

@@ -213,8 +213,7 @@ def check(args: argparse.Namespace) -> None:
 
 def probabilities(config: HeadConfig, view: View, blocks: int, steps: int) -> int:
     """About how many probabilities the maps of all heads contain."""
-    rows = 1 + config.num_future_tokens + config.action_horizon
-    return blocks * steps * config.num_heads * rows * view.layout.num_tokens
+    return blocks * steps * config.num_heads * config.num_rows * view.layout.num_tokens
 
 
 def take_features(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:

@@ -206,7 +206,7 @@ class Accelerated(StandIn[ActionHead]):
             backbone_output: `backbone_features (batch, T_vl, context_dim)`. As in the original, they are
                 replaced by the output of the VL self-attention. Heads with text and image blocks also need
                 `backbone_attention_mask` and `image_mask`, bool `(batch, T_vl)`.
-            action_input: `state (batch, state_history, state_dim)` and `embodiment_id (batch,)`. With
+            action_input: `state (batch, num_states, state_dim)` and `embodiment_id (batch,)`. With
                 real-time chunking also `action`, the previous chunk.
             options: options of real-time chunking, for heads that support it.
 
@@ -374,7 +374,7 @@ def check_inputs(
     # On the CPU, whatever the default device is.
     shape = (1, len(CHECK_IMAGE), config.context_dim)
     tokens = torch.randn(shape, generator=generator, device="cpu")
-    rows = torch.randn(1, config.state_history, config.state_dim, generator=generator, device="cpu")
+    rows = torch.randn(1, config.num_states, config.state_dim, generator=generator, device="cpu")
     backbone_output = Features(
         backbone_features=tokens.to(features),
         backbone_attention_mask=torch.tensor([CHECK_ATTENDED], device=features.device),

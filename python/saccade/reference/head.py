@@ -2,7 +2,7 @@
 
 They are one architecture with different sizes and switches. Module names follow the checkpoint, so that
 `state_dict()` has the released tensor names. Shapes in comments: B is the batch, R the rows of the query
-sequence (one state row, N future rows, T action rows), S the vision-language tokens.
+sequence (H state rows, N future rows, T action rows), S the vision-language tokens.
 """
 
 # Calls of torch modules are untyped.
@@ -118,6 +118,7 @@ class ActionHead(nn.Module):
         source: str | PathLike[str],
         *,
         config: Mapping[str, Any] | str | PathLike[str] | None = None,
+        num_states: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> ActionHead:
         """Loads the head from a checkpoint.
@@ -128,12 +129,14 @@ class ActionHead(nn.Module):
             config: the config of the checkpoint or of the head, as a dict or a path. Default: the
                 `config.json` in the same directory, or else the `config` entry in the metadata of a single
                 file.
+            num_states: number of states in an observation, as for :meth:`saccade.ActionHead.load`.
             dtype: dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
         Raises:
             FileNotFoundError: a path does not exist.
             CheckpointError: there is no config, or tensors are missing, unknown or of the wrong shape. The
                 message lists all of them.
+            InputError: `num_states` is out of range.
         """
         checkpoint = loading.described(source, config)
         whole, names = checkpoint.head_config, loading.tensor_names(checkpoint)
@@ -141,7 +144,7 @@ class ActionHead(nn.Module):
         drops = drops_states(whole, has_state_dropout)
         with torch.device("meta"):  # no memory and no time for an initialisation that is replaced
             head = cls(
-                HeadConfig.from_dict(whole),
+                HeadConfig.from_dict(whole, num_states=num_states),
                 time_distribution=TimeDistribution.from_dict(whole),
                 unused=filter(is_unused, names),
                 has_state_dropout=has_state_dropout,
@@ -207,7 +210,7 @@ class ActionHead(nn.Module):
 
         Args:
             vl_embs: `(B, S, context_dim)`, from `encode`.
-            state: `(B, state_dim)` or `(B, history, state_dim)`, normalised and padded.
+            state: `(B, num_states, state_dim)`, or `(B, state_dim)` for one state; normalised and padded.
             embodiment_id: an int, or `(B,)`.
             actions: `(B, T, encoder_action_dim)`.
             timestep: time bucket, an int or `(B,)`.
@@ -242,20 +245,20 @@ class ActionHead(nn.Module):
         batch = vl_embs.shape[0]
         check_shape("actions", actions, (batch, horizon, config.encoder_action_dim))
         state = state[:, None] if state.ndim == 2 else state
-        check_shape("state", state, (batch, config.state_history, config.state_dim))
-        state = state.flatten(1)[:, None]  # (B, 1, history * state_dim)
+        check_shape("state", state, (batch, config.num_states, config.state_dim))
+        state = state.reshape(batch, config.num_state_rows, -1)  # (B, H, state_history * state_dim)
         embodiment_id = as_embodiment(embodiment_id, batch, config.num_embodiments, self.device)
         timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
         if self.drops_states:
             state = seen_state(state, self.dropout_prob_by_embodiment, embodiment_id)
 
-        state_row = self.state_encoder(state, embodiment_id)  # (B, 1, width)
+        state_rows = self.state_encoder(state, embodiment_id)  # (B, H, width)
         tokens = self.learned_tokens if run.future_tokens is None else run.future_tokens  # (N, width)
         future_rows = tokens.expand(batch, -1, -1)  # (B, N, width)
         action_rows = self.action_encoder(actions, timestep, embodiment_id)  # (B, T, width)
         if config.add_pos_embed:
             action_rows = action_rows + self.position_embedding.weight[:horizon]
-        rows = torch.cat((state_row, future_rows, action_rows), dim=1)  # (B, R, width)
+        rows = torch.cat((state_rows, future_rows, action_rows), dim=1)  # (B, R, width)
 
         changes = [run.change(evaluation, block) for block in range(config.num_layers)]
         hidden = self.model(rows[:, run.first_row(evaluation) :], vl_embs, timestep, changes)[
@@ -285,7 +288,7 @@ class ActionHead(nn.Module):
             noise: `(B, T, encoder_action_dim)`, standard normal.
             num_steps: number of steps. Default: that of the config.
             integrator: "euler" (default), or "midpoint", which evaluates the velocity twice in each step.
-            future_refresh: the state row and the future rows are recomputed every `future_refresh` velocity
+            future_refresh: the state rows and the future rows are recomputed every `future_refresh` velocity
                 evaluations, starting with the first. At the others, self-attention reads them as they were.
                 Default: at every evaluation.
             previous_chunk: the chunk that the robot is executing, `(B, rows, action_dim)` or `(B, rows,

@@ -107,7 +107,7 @@ class Run:
         vl_embs: `(B, S, context_dim)`. The run has its dtype and device.
         num_steps: number of steps.
         in_step: velocity evaluations in each step.
-        future_refresh: the state row and the future rows are recomputed every `future_refresh` evaluations,
+        future_refresh: the state rows and the future rows are recomputed every `future_refresh` evaluations,
             starting with the first.
         intervention: one, several or none.
         drop_vl, attention_mask, image_mask: as in `forbidden_tokens`.
@@ -118,7 +118,7 @@ class Run:
     Attributes:
         rows: the slice of each group of rows.
         future_tokens: `(N', width)`, used in place of the learned ones, or None.
-        held: the state row and the future rows as self-attention last read them, by block.
+        held: the state rows and the future rows as self-attention last read them, by block.
         attention, hidden: what was recorded so far, by `(step, block)`.
 
     Raises:
@@ -157,7 +157,7 @@ class Run:
 
         num_future = config.num_future_tokens if self.future_tokens is None else len(self.future_tokens)
         self.sizes = {
-            "state": 1,
+            "state": config.num_state_rows,
             "future": num_future,
             "action": config.action_horizon,
             "vl": num_vl_tokens,
@@ -187,7 +187,7 @@ class Run:
         return 0 if evaluation % self.future_refresh == 0 else self.rows["action"].start
 
     def hold(self, block: int, y: Tensor) -> None:
-        """Keeps the state row and the future rows of all rows `(B, R, width)`."""
+        """Keeps the state rows and the future rows of all rows `(B, R, width)`."""
         self.held[block] = y[:, : self.rows["action"].start]
 
     def change(self, evaluation: int, block: int) -> BlockChange:

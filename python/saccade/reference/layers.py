@@ -1,6 +1,6 @@
 """The layers of the head, as torch modules whose names follow the checkpoint.
 
-Shapes in comments: B is the batch, R the rows of the query sequence (one state row, N future rows, T action
+Shapes in comments: B is the batch, R the rows of the query sequence (H state rows, N future rows, T action
 rows), S the vision-language tokens.
 """
 

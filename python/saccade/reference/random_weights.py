@@ -118,7 +118,7 @@ def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: i
     generator = torch.Generator().manual_seed(seed)
     inputs = {
         "backbone_features": torch.randn(batch, num_vl_tokens, config.context_dim, generator=generator),
-        "state": torch.randn(batch, config.state_history, config.state_dim, generator=generator),
+        "state": torch.randn(batch, config.num_states, config.state_dim, generator=generator),
         "noise": torch.randn(batch, config.action_horizon, config.encoder_action_dim, generator=generator),
         "embodiment_id": torch.randint(config.num_embodiments, (batch,), generator=generator),
     }

@@ -128,7 +128,9 @@ class Learner(nn.Module):
         if not self.only:
             losses["target_loss"] = F.mse_loss(self.target_head(features[:, -1]), batch.targets)
         if batch.later is not None:
-            future = rows[0][:, 1 : 1 + self.action_head.config.num_future_tokens]  # (B, N, width)
+            config = self.action_head.config
+            first = config.num_state_rows
+            future = rows[0][:, first : first + config.num_future_tokens]  # (B, N, width)
             targets = self.alignment_targets(batch.later, average)
             losses["alignment_loss"] = 1 - F.cosine_similarity(self.projector(future), targets, dim=-1).mean()
         return losses

@@ -147,7 +147,7 @@ class Nudges:
 
     def __init__(self, head: ActionHead, batch: int) -> None:
         config = head.config
-        rows = 1 + config.num_future_tokens + config.action_horizon
+        rows = config.num_rows
         self._blocks = list(head.model.transformer_blocks)
         self._zeros = [
             torch.zeros(batch, rows, config.width, dtype=head.dtype, requires_grad=True)
@@ -275,5 +275,6 @@ def pooled(measured: Sequence[Sensitivity]) -> Sensitivity:
 
 def row_groups(head: ActionHead) -> dict[str, slice]:
     """Slices of the groups of rows."""
-    future = head.config.num_future_tokens
-    return {"state": slice(0, 1), "future": slice(1, 1 + future), "action": slice(1 + future, None)}
+    states = head.config.num_state_rows
+    actions = states + head.config.num_future_tokens
+    return {"state": slice(0, states), "future": slice(states, actions), "action": slice(actions, None)}

@@ -3,6 +3,7 @@
 //! The keys in JSON are the released ones (`input_embedding_dim`, `num_target_vision_tokens`); the fields of [`HeadConfig`] have the names that
 //! are used everywhere else.
 
+use super::versions::{Feature, Version};
 use crate::error::{Error, Result};
 
 /// The sizes and switches of an action head.
@@ -49,8 +50,11 @@ pub struct HeadConfig {
     pub decoders: Vec<(String, usize)>,
     /// Width of the state vector (`max_state_dim`).
     pub state_dim: usize,
-    /// State vectors that make the state row (`state_history_length`).
+    /// State vectors that make a state row (`state_history_length`).
     pub state_history: usize,
+    /// State vectors in an observation, `state_history` for each state row. No config says it: several rows are for models that were trained
+    /// with several states.
+    pub num_states: usize,
     /// Hidden width of the encoders and the decoders (`hidden_size`).
     pub hidden_dim: usize,
     /// Slices of the category-specific layers (`max_num_embodiments`).
@@ -77,10 +81,16 @@ pub(crate) enum Reads {
 }
 
 impl HeadConfig {
+    /// State rows, the first of the query sequence.
+    #[must_use]
+    pub fn num_state_rows(&self) -> usize {
+        self.num_states / self.state_history
+    }
+
     /// Rows of the query sequence: state, future, action.
     #[must_use]
     pub fn num_rows(&self) -> usize {
-        1 + self.num_future_tokens + self.action_horizon
+        self.num_state_rows() + self.num_future_tokens + self.action_horizon
     }
 
     /// Whether block `index` attends to the vision-language tokens.
@@ -110,6 +120,27 @@ impl HeadConfig {
             action_horizon,
             ..self
         })
+    }
+
+    /// This config with another number of states in an observation.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for none, for more than any config may ask for, and for a version that makes one row of as many states as its config
+    /// says, for another number.
+    pub fn with_num_states(self, num_states: usize) -> Result<Self> {
+        let has_history = Version::named(&self.version).is_some_and(|one| one.has(Feature::StateHistory));
+        if has_history && num_states != self.state_history {
+            return Err(Error::Input(format!(
+                "num_states: expected {}, since {} makes one row of its last states (state_history_length), got {num_states}",
+                self.state_history, self.version
+            )));
+        }
+        if !(1..=MAX_SIZE as usize).contains(&num_states) {
+            return Err(Error::Input(format!(
+                "num_states: expected 1 to {MAX_SIZE}, got {num_states}"
+            )));
+        }
+        Ok(Self { num_states, ..self })
     }
 
     /// How cross-attention blocks take masks: `"none"` ignores them, `"alternate"` is the rule of `attend_text_every_n_blocks`.

@@ -130,6 +130,10 @@ impl Reader {
         let alternates = version.has(Feature::AlternatingBlocks)
             && self.flag(head, "", "use_alternate_vl_dit", Some(true));
         let (encoder_action_dim, decoders) = self.actions(version, head);
+        let state_history = match version.has(Feature::StateHistory) {
+            true => self.size_of(version, head, "state_history_length", 1),
+            false => 1,
+        };
         let config = HeadConfig {
             version: version.name().to_owned(),
             width,
@@ -156,10 +160,8 @@ impl Reader {
             encoder_action_dim,
             decoders,
             state_dim: self.size_of(version, head, "max_state_dim", 1),
-            state_history: match version.has(Feature::StateHistory) {
-                true => self.size_of(version, head, "state_history_length", 1),
-                false => 1,
-            },
+            state_history,
+            num_states: state_history,
             hidden_dim: self.size_of(version, head, "hidden_size", 1),
             num_embodiments: self.size_of(version, head, "max_num_embodiments", 1),
             num_timestep_buckets: self.size_of(version, head, "num_timestep_buckets", 1),

@@ -21,19 +21,19 @@ impl ActionHead {
     }
 
     pub(super) fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
-        let (history, width) = (self.config.state_history, self.config.state_dim);
-        let is_one_state = history == 1 && state.shape() == [batch, width];
-        if !is_one_state && state.shape() != [batch, history, width] {
-            let axes = match history {
+        let (count, width) = (self.config.num_states, self.config.state_dim);
+        let is_one_state = count == 1 && state.shape() == [batch, width];
+        if !is_one_state && state.shape() != [batch, count, width] {
+            let axes = match count {
                 1 => format!(
-                    "(batch, state_dim) = {} or (batch, state_history, state_dim)",
+                    "(batch, state_dim) = {} or (batch, num_states, state_dim)",
                     show_shape(&[batch, width])
                 ),
-                _ => format!("the last {history} states, (batch, state_history, state_dim)"),
+                _ => format!("the last {count} states, (batch, num_states, state_dim)"),
             };
             return Err(Error::Shape(format!(
                 "state: expected {axes} = {}, normalised and zero-padded to state_dim as the checkpoint's normaliser does, got {}",
-                show_shape(&[batch, history, width]),
+                show_shape(&[batch, count, width]),
                 show_shape(state.shape())
             )));
         }

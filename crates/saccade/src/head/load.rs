@@ -35,6 +35,8 @@ pub struct LoadOptions {
     pub embodiment_ids: Option<Vec<i64>>,
     /// Actions in a chunk, in place of the config's `action_horizon`; at most as many as the position table has rows.
     pub action_horizon: Option<usize>,
+    /// States in an observation, each with a state row of its own; default 1. N1.7 makes one row of as many states as its config says.
+    pub num_states: Option<usize>,
     /// What is computed in what.
     pub precision: Precision,
     /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
@@ -69,6 +71,15 @@ impl LoadOptions {
         }
     }
 
+    /// With this number of states in an observation.
+    #[must_use]
+    pub fn with_num_states(self, num_states: impl Into<Option<usize>>) -> Self {
+        Self {
+            num_states: num_states.into(),
+            ..self
+        }
+    }
+
     /// With this precision.
     #[must_use]
     pub fn with_precision(self, precision: Precision) -> Self {
@@ -84,10 +95,13 @@ impl LoadOptions {
         }
     }
 
-    /// The head's config with the chunk that was asked for.
-    fn chunk_of(&self, config: HeadConfig) -> Result<HeadConfig> {
-        match self.action_horizon {
-            Some(action_horizon) => config.with_action_horizon(action_horizon),
+    /// The head's config with the actions and states that were asked for.
+    fn rows_of(&self, mut config: HeadConfig) -> Result<HeadConfig> {
+        if let Some(action_horizon) = self.action_horizon {
+            config = config.with_action_horizon(action_horizon)?;
+        }
+        match self.num_states {
+            Some(num_states) => config.with_num_states(num_states),
             None => Ok(config),
         }
     }
@@ -102,7 +116,7 @@ impl ActionHead {
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let mut published = Published::open(source, options.config.as_deref())?;
-        published.config = options.chunk_of(published.config)?;
+        published.config = options.rows_of(published.config)?;
         let embodiment_ids = chosen_embodiments(
             options.embodiment_ids.as_deref(),
             published.kept_embodiments()?.as_deref(),
@@ -139,7 +153,7 @@ impl ActionHead {
         let given_config = options.config.as_deref().ok_or_else(|| {
             Error::Input("config: expected one, since tensors in memory bring none".to_owned())
         })?;
-        let config = options.chunk_of(HeadConfig::from_json(given_config)?)?;
+        let config = options.rows_of(HeadConfig::from_json(given_config)?)?;
         let embodiment_ids =
             chosen_embodiments(options.embodiment_ids.as_deref(), None, config.num_embodiments)?;
         let has = |name: &str| tensors.contains_key(name);

@@ -105,8 +105,8 @@ pub(super) struct Steps {
 impl ActionHead {
     /// Samples a chunk of actions: Euler steps from `noise` (spec 1.8).
     ///
-    /// `state` is `(batch, state_history, state_dim)`, or `(batch, state_dim)` where the history is of one; `embodiment_id` a scalar or
-    /// `(batch,)`; `noise` `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with
+    /// `state` is `(batch, num_states, state_dim)`, or `(batch, state_dim)` where one is taken; `embodiment_id` a scalar or `(batch,)`;
+    /// `noise` `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with
     /// `num_samples`. `out` has the shape of the noise, with `action_dim` for its last axis.
     ///
     /// # Errors

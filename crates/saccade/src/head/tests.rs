@@ -73,7 +73,7 @@ fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRow
         .copy_from_slice(&actions);
     let times = &mut workspace.dit.times;
     times.resize(context.batch, head.layers.dit.time(head.engine, bucket).unwrap());
-    let state = numbers(context.batch * config.state_history * config.state_dim, 3);
+    let state = numbers(context.batch * config.num_states * config.state_dim, 3);
     head.encode_state(&state, &mut workspace).unwrap();
     let changes = Changes::new(&[], head.extent(&[], context, 1).unwrap()).unwrap();
     let pass = Pass {

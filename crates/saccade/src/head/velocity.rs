@@ -75,7 +75,7 @@ impl ActionHead {
         })
     }
 
-    /// One state row for each batch element, to `workspace.state (batch, width)`; of zeros for embodiments whose state does not act.
+    /// The state rows of each batch element, to `workspace.state (batch, state_rows, width)`; of zeros for embodiments whose state does not act.
     pub(super) fn encode_state(&self, state: &[f32], workspace: &mut Workspace) -> Result<()> {
         let Workspace {
             embodiment_ids,
@@ -176,6 +176,7 @@ impl ActionHead {
         let width = self.config.width;
         let actions = self.config.action_horizon * width;
         let sequence = pass.changes.extent.groups.num_rows() * width;
+        let states = pass.changes.extent.groups.state * width;
         let future_tokens = pass.changes.extent.future_tokens;
         let h = sized(&mut dit.h, encoded.len() / actions * sequence)?;
         for (index, (h, action)) in h
@@ -184,9 +185,9 @@ impl ActionHead {
             .enumerate()
         {
             let element = index / pass.samples;
-            let (h_state, rest) = h.split_at_mut(width);
+            let (h_state, rest) = h.split_at_mut(states);
             let (h_future, h_action) = rest.split_at_mut(future_tokens.len());
-            h_state.copy_from_slice(&state[element * width..(element + 1) * width]);
+            h_state.copy_from_slice(&state[element * states..(element + 1) * states]);
             h_future.copy_from_slice(future_tokens);
             h_action.copy_from_slice(action);
         }

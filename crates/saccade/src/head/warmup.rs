@@ -58,7 +58,7 @@ impl ActionHead {
         let image_mask = collected("masks", tokens, (0..tokens).map(is_image))?;
         let features = Features::new(Array::new(&features, &sizes)?);
         let context = self.encode(&features.with_image_mask(Array::new(&image_mask, &sizes[..2])?))?;
-        let state_shape = [batch, config.state_history, config.state_dim];
+        let state_shape = [batch, config.num_states, config.state_dim];
         let state = filled("state", product("state", &state_shape)?, 0.0)?;
         for &id in &self.embodiment_ids {
             for step in 0..config.num_steps {

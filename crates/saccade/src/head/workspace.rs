@@ -11,11 +11,11 @@ pub(crate) struct Workspace {
     pub dit: DitBuffers,
     /// By batch element.
     pub embodiment_ids: Vec<usize>,
-    /// States of which some are set to zero, `(batch, state_history * state_dim)`.
+    /// States of which some are set to zero, `(batch, num_states * state_dim)`.
     pub seen_state: Activations,
-    /// The state encoder's hidden layer, `(batch, hidden_dim)`.
+    /// The state encoder's hidden layer, `(batch, state_rows, hidden_dim)`.
     pub state_hidden: Activations,
-    /// State rows, `(batch, width)`.
+    /// State rows, `(batch, state_rows, width)`.
     pub state: Activations,
     /// Noisy actions, `(batch, samples, action_horizon, encoder_action_dim)`.
     pub x: Activations,

@@ -42,6 +42,7 @@ impl<'a> Extent<'a> {
             future_tokens,
             future_key_bias,
             groups: Groups {
+                state: config.num_state_rows(),
                 future: future_tokens.len() / config.width,
                 action: config.action_horizon,
                 vl: num_vl_tokens,

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Group {
-    /// The one state row.
+    /// The state rows: one, or one for each state of an observation.
     State,
     /// The future rows.
     Future,
@@ -54,6 +54,8 @@ pub struct Tokens {
 /// How many tokens each group has. Rows are in the order state, future, action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Groups {
+    /// State rows.
+    pub state: usize,
     /// Future rows.
     pub future: usize,
     /// Action rows.
@@ -66,16 +68,16 @@ impl Groups {
     /// Rows of a sequence.
     #[must_use]
     pub fn num_rows(&self) -> usize {
-        1 + self.future + self.action
+        self.state + self.future + self.action
     }
 
     /// A group's tokens: their range among the rows, or among the vision-language tokens.
     #[must_use]
     pub fn range(&self, group: Group) -> Range<usize> {
         match group {
-            Group::State => 0..1,
-            Group::Future => 1..1 + self.future,
-            Group::Action => 1 + self.future..self.num_rows(),
+            Group::State => 0..self.state,
+            Group::Future => self.state..self.state + self.future,
+            Group::Action => self.state + self.future..self.num_rows(),
             Group::Vl => 0..self.vl,
         }
     }
