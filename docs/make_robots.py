@@ -310,7 +310,8 @@ def outcome(release: str, change: Change | str, options: Json) -> str:
 
 def use(normalizer: saccade.Normalizer) -> None:
     """Converts a state and a chunk, which may show that a robot cannot be used."""
-    state = np.full((1, normalizer.state_history or 1, normalizer.state_width), 0.3, np.float32)
+    rng = np.random.default_rng(0)
+    state = rng.random((1, normalizer.state_history or 1, normalizer.state_width), np.float32)
     normalizer.state(state)
     chunk = np.full((1, normalizer.action_horizon or 16, normalizer.action_dim), 0.3, np.float32)
     normalizer.actions(chunk, state)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import sys
 import types
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import pytest
 import torch
 from normalizer_cases import as_array, draw, edit, step_config
 from published import sidecars
+from released import DATA
 
 import saccade
 from saccade import Normalizer
@@ -146,6 +148,70 @@ def test_lerobot_after_0_5_1_clips_states(tmp_path: Path) -> None:
     assert np.allclose(as_array(normalizer.state(state))[:, :6], expected, atol=1e-6)
     assert not as_array(normalizer.state(state))[:, 6:].any()
     assert normalizer.embodiment_id == layouts.N17_EMBODIMENTS["new_embodiment"]
+
+
+def test_a_policy_without_its_config_is_refused(tmp_path: Path) -> None:
+    sidecars(tmp_path, "lerobot-n17")
+    (tmp_path / "config.json").unlink(missing_ok=True)
+    with pytest.raises(saccade.CheckpointError, match=r"config\.json: missing"):
+        Normalizer.load(tmp_path)
+
+
+def case(name: str, folder: Path) -> Path:
+    """A copy of a case that the released lerobot made."""
+    return Path(shutil.copytree(DATA / "robots" / "lerobot" / name, folder / name))
+
+
+def test_an_empty_name_excludes_no_joint(tmp_path: Path) -> None:
+    folder = case("n17-generic-relative", tmp_path)
+    plain = Normalizer.load(folder).offsets
+
+    def exclude(*names: str) -> Any:
+        def change(values: dict[str, Any]) -> None:
+            step = next(one for one in values["steps"] if one["registry_name"].startswith("relative"))
+            step["config"]["exclude_joints"] = list(names)
+
+        edit(folder / "policy_preprocessor.json", change)
+        return Normalizer.load(folder).offsets
+
+    assert plain is not None
+    assert exclude("").all()
+    assert np.array_equal(exclude("", "grip"), plain)
+
+
+def test_null_fields_of_an_action_config_are_absolute(tmp_path: Path) -> None:
+    folder = case("n17-native-keys", tmp_path)
+    plain = Normalizer.load(folder)
+
+    def change(values: dict[str, Any]) -> None:
+        config = values["steps"][0]["config"]["modality_config"]["action"]["action_configs"][0]
+        config["format"] = None
+        del config["type"]
+
+    edit(folder / "policy_postprocessor.json", change)
+    found, chunk = Normalizer.load(folder), draw(2, 40, 132)
+    assert np.array_equal(as_array(found.actions(chunk)), as_array(plain.actions(chunk)))
+
+
+@pytest.mark.parametrize("mapping", [{"new_embodiment": "7"}, [1], {"new_embodiment": -2}])
+def test_an_embodiment_mapping_that_is_none_is_refused(mapping: Any, tmp_path: Path) -> None:
+    folder = case("n17-chunk", tmp_path)
+
+    def change(values: dict[str, Any]) -> None:
+        pack = next(one for one in values["steps"] if one["registry_name"].startswith("groot_n1_7_pack"))
+        pack["config"]["embodiment_mapping"] = mapping
+
+    edit(folder / "policy_preprocessor.json", change)
+    with pytest.raises(saccade.CheckpointError, match="embodiment ids: expected integers"):
+        Normalizer.load(folder)
+
+
+def test_a_robot_may_be_named_as_the_release_does() -> None:
+    folder = DATA / "robots" / "lerobot" / "n17-chunk"
+    for name in ("NEW_EMBODIMENT", "new_embodiment", 10):
+        assert Normalizer.load(folder, name).embodiment_id == 10
+    with pytest.raises(saccade.InputError, match="embodiment: expected an integer"):
+        Normalizer.load(folder, True)
 
 
 @pytest.mark.parametrize("file", ["policy_preprocessor.json", "policy_postprocessor.json"])

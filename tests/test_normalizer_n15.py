@@ -120,6 +120,10 @@ def test_the_message_names_the_data_configs_that_fit() -> None:
         ({"surprise": 1}, "surprise: unknown"),
         ({"state_keys": "state.arm"}, "state_keys: expected a list"),
         ({"state_keys": []}, "state_keys: expected at least one"),
+        ({"state_keys": None}, "state_keys: expected a list"),
+        ({"action_keys": 5}, "action_keys: expected a list"),
+        ({"surprise": np.ones(3)}, "surprise: unknown"),
+        ({"action_modes": {"action.arm": ["min_max"]}}, "action_modes: "),
         ({"state_keys": ["state.arm", "state.arm"]}, "state_keys: expected distinct"),
         ({"action_keys": ["state.arm"]}, r"action_keys: expected action\.<name>"),
         ({"observation_indices": [0, 1]}, "observation_indices"),
@@ -144,6 +148,8 @@ def test_a_data_config_may_be_a_name_a_file_or_a_mapping(tmp_path: Path) -> None
     assert by_file.data_config == by_mapping.data_config
     with pytest.raises(FileNotFoundError, match=r"fourier_gr1_arms_only.* or a JSON file, got 'mine'"):
         Normalizer.load(metadata(), data_config="mine")
+    with pytest.raises(saccade.InputError, match="data_config: expected a name"):
+        Normalizer.load(metadata(), data_config=b"so100")  # type: ignore[arg-type]
     path.write_text("{")
     with pytest.raises(saccade.CheckpointError, match=r"data_config: .*mine\.json"):
         Normalizer.load(metadata(), data_config=path)

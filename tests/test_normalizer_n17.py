@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,32 @@ def test_a_chunk_of_poses_goes_on_from_another_state(pose: str, size: int, tmp_p
     assert not np.allclose(normalizer.previous_chunk(robot, second), normalizer.previous_chunk(robot, first))
 
 
+@pytest.mark.parametrize("ids", [{"robot": "7"}, {"robot": 7.0}, {"robot": [7]}, {"robot": -1}])
+def test_an_id_that_is_none_is_refused(ids: dict[str, Any], tmp_path: Path) -> None:
+    load_processor(tmp_path, *processor())
+    (tmp_path / "embodiment_id.json").write_text(json.dumps(ids))
+    with pytest.raises(saccade.CheckpointError, match=r"embodiment ids: expected integers .* robot \("):
+        Normalizer.load(tmp_path)
+
+
+def test_statistics_by_step_are_for_actions(tmp_path: Path) -> None:
+    config, statistics = processor()
+    own = statistics["robot"]["state"]["arm"]
+    statistics["robot"] = {**statistics["robot"], "state": {**statistics["robot"]["state"]}}
+    statistics["robot"]["state"]["arm"] = {name: [row, row] for name, row in own.items()}
+    with pytest.raises(saccade.CheckpointError, match="arm: expected one row of statistics, got 2"):
+        load_processor(tmp_path, config, statistics)
+
+
+def test_a_tag_of_a_fork_is_found_although_the_release_calls_another_so(tmp_path: Path) -> None:
+    config, statistics = processor()
+    config["processor_class"] = "Gr00tN1d7Processor"
+    configs = config["processor_kwargs"]["modality_configs"]
+    configs["libero_panda"] = configs.pop("robot")
+    load_processor(tmp_path, config, {"libero_panda": statistics["robot"]})
+    assert Normalizer.load(tmp_path, "libero_panda").embodiment == "libero_panda"
+
+
 def test_numbers_that_are_no_pose_are_refused_by_name(tmp_path: Path) -> None:
     normalizer = pose_robot(tmp_path, "XYZ_ROT6D", 9)
     chunk = np.zeros((1, 4, 12), np.float32)
@@ -147,6 +174,9 @@ def test_numbers_that_are_no_pose_are_refused_by_name(tmp_path: Path) -> None:
         normalizer.actions(chunk, np.ones((1, 10), np.float32))
     with pytest.raises(saccade.InputError, match=r"arm: expected poses, and state\.arm to be one"):
         normalizer.actions(draw(1, 4, 12), np.zeros((1, 10), np.float32))
+    parallel = np.array([[0, 0, 0, 0.1, 0.2, 0.3, 0.2, 0.4, 0.6, 0]], np.float32)
+    with pytest.raises(saccade.InputError, match=r"arm: expected poses, and state\.arm to be one"):
+        normalizer.actions(draw(1, 4, 12), parallel)
 
 
 def test_what_n17_can_say_and_is_not_supported(tmp_path: Path) -> None:

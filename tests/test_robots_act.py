@@ -82,6 +82,41 @@ def test_every_released_robot_acts(folder: Path, tmp_path: Path) -> None:
     assert sizes == {key: (1, horizon, size) for key, size in case["expects"]["action"]}
 
 
+@pytest.mark.parametrize("name", ["03-n17-so100-real", "02-n17-droid-real", "10-n16-g1"])
+def test_frozen_actions_keep_their_values_where_each_step_has_its_own_statistics(
+    name: str, tmp_path: Path
+) -> None:
+    """Also from another state: joints and poses that are relative to it stay where they are."""
+    folder = DATA / "n16_n17" / name
+    case = json.loads((folder / "case.json").read_text())
+    whole = with_robot(tmp_path / "whole", case["release"].lower(), folder)
+    policy = saccade.Policy.load(whole, embodiment=case["embodiment"], num_threads=1)
+    seen = policy.example_observation()
+    context = policy.encode(seen)
+    before = policy.sample(context, seen, seed=1)
+    moved = {**seen, "state": {key: value + np.float32(0.01) for key, value in seen["state"].items()}}
+    horizon = case["horizon"]
+    chunking = saccade.Chunking(overlap=5, frozen=3)
+    after = policy.sample(context, moved, seed=2, previous_chunk=before, chunking=chunking)
+    for key, group in zip(before, policy.normalizer.action_groups, strict=True):
+        kept, old = after[key][:, :3], before[key][:, horizon - 5 : horizon - 2]
+        # What lies beyond the bounds of its new step is clipped, as everything that the head returns.
+        normalised = policy.normalizer.previous_chunk(
+            np.concatenate([part[:, horizon - 5 : horizon - 2] for part in before.values()], axis=-1),
+            np.concatenate(list(moved["state"].values()), axis=-1),
+        )
+        where = policy.normalizer.action_slices[key]
+        inside = (np.abs(np.asarray(normalised)[..., where]) <= 1).all(axis=-1) | (group.mode == "mean_std")
+        assert inside.any() or group.reference is not None
+        np.testing.assert_allclose(kept[inside], old[inside], atol=1e-3)
+    short = {key: value[:, :4] for key, value in before.items()}
+    with pytest.raises(saccade.ShapeError, match="previous_chunk: expected a chunk of at least"):
+        policy.sample(context, seen, seed=2, previous_chunk=short, chunking=chunking)
+    for wrong in ("x", 5, {**before, next(iter(before)): np.zeros((1, 3, 1), np.float32)}):
+        with pytest.raises(saccade.SaccadeError, match="previous_chunk"):
+            policy.sample(context, seen, seed=2, previous_chunk=wrong, chunking=chunking)
+
+
 #: Published processors: their release, and whose statistics they have if none of their own.
 PUBLISHED = {"n16_tests": ("n1.6", ()), "n17_tests": ("n1.7", ()), "main_tests": ("n1.7", ("n17_tests",))}
 

@@ -71,6 +71,8 @@ def exact_float32(name: str, value: ArrayLike) -> Float32Array:
     Raises:
         DtypeError, ShapeError: As `float32`; or float32 does not hold an integer.
     """
+    if isinstance(value, np.ma.MaskedArray):
+        raise DtypeError(f"{name}: expected an array without a mask, got {type(value).__name__}")
     if is_torch(value):
         if value.is_floating_point() or value.is_complex() or value.is_sparse:  # type: ignore[union-attr]
             return float32(name, value)

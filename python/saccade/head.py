@@ -40,7 +40,7 @@ from saccade.options import (
     plain_chunking,
     plain_interventions,
 )
-from saccade.robots import Normalizer
+from saccade.robots import DataConfigLike, Normalizer
 from saccade.trace import Record, Trace, check_record
 
 if TYPE_CHECKING:
@@ -558,6 +558,8 @@ class ActionHead:
         self,
         normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment: str | int | None = None,
+        *,
+        data_config: DataConfigLike | None = None,
     ) -> Any:
         """A :class:`saccade.Policy` of this head, without a backbone.
 
@@ -567,11 +569,12 @@ class ActionHead:
             normalizer: A normalizer, or anything that :meth:`saccade.Normalizer.load` reads one from.
                 Default: the checkpoint that this head was loaded from.
             embodiment: Tag or id of the robot. Required if the statistics are of several robots.
+            data_config: As for :meth:`saccade.Normalizer.load`.
 
         Raises:
             FileNotFoundError, CheckpointError, InputError: As :class:`saccade.Policy`.
         """
-        return self.make_policy(self, normalizer, embodiment)
+        return self.make_policy(self, normalizer, embodiment, data_config=data_config)
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._source is None:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from saccade._arrays import Array, ArrayLike, integer
+from saccade._arrays import Array, ArrayLike, float32, integer
 from saccade.backbone import Backbone
 from saccade.backbone_features import BackboneFeatures
 from saccade.backbone_inputs import BackboneInputs
 from saccade.chunking import Chunking
 from saccade.context import Context
 from saccade.dialects import ObservationSources, Reading, Requirements, StateReading, read, read_state
-from saccade.errors import InputError
+from saccade.errors import InputError, ShapeError
 from saccade.head import ActionHead
 from saccade.options import PolicyOptions, SampleOptions
 from saccade.policy_context import PolicyContext, encoded
@@ -49,6 +49,7 @@ class Policy:
             from. Default: the checkpoint that the head was loaded from.
         embodiment: Tag or id of the robot. Required if the statistics are of several robots. If the
             statistics do not contain the id, an id given here selects the head's embodiment.
+        data_config: As for :meth:`saccade.Normalizer.load`, which reads the normalizer.
         backbone: The backbone, or None.
         processor: The processor of the backbone's inputs, or None.
         sources: What the checkpoint says about observations.
@@ -84,6 +85,7 @@ class Policy:
         normalizer: Normalizer | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment: str | int | None = None,
         *,
+        data_config: DataConfigLike | None = None,
         backbone: Backbone | None = None,
         processor: Processor | None = None,
         sources: ObservationSources | None = None,
@@ -97,8 +99,14 @@ class Policy:
                     "checkpoint"
                 )
             normalizer = Normalizer.load(
-                source, embodiment, state_dim=config.state_dim, action_dim=config.encoder_action_dim
+                source,
+                embodiment,
+                data_config=data_config,
+                state_dim=config.state_dim,
+                action_dim=config.encoder_action_dim,
             )
+        elif data_config is not None:
+            raise InputError("data_config: expected None with a Normalizer, which has its own")
         elif isinstance(embodiment, str) and not _is_named(embodiment, config.version, normalizer.embodiment):
             raise InputError(
                 f"embodiment: expected that of the normalizer, {normalizer.embodiment!r}, got {embodiment!r}"
@@ -421,9 +429,12 @@ class Policy:
             if len(chunks) != len(readings):
                 raise InputError(f"previous_chunk: expected {len(readings)}, got {len(chunks)}")
             joined = [
-                batched(np.asarray(reading.dialect.previous_chunk(chunk, keys)), 3, reading)
+                batched(float32("previous_chunk", reading.dialect.previous_chunk(chunk, keys)), 3, reading)
                 for reading, chunk in zip(readings, chunks, strict=True)
             ]
+            if len({chunk.shape[1:] for chunk in joined}) != 1:
+                listed = ", ".join(str(chunk.shape) for chunk in joined)
+                raise ShapeError(f"previous_chunk: expected chunks of one length and width, got {listed}")
             options["previous_chunk"] = np.concatenate(joined)
         if noise is not None and is_single:
             axes = 3 if options.get("num_samples") is None else 4
@@ -444,15 +455,38 @@ class Policy:
         """:meth:`sample` of a state."""
         if "out" in options:
             raise InputError("out: expected none, since it would contain the normalised actions of the head")
-        previous, chunking = options.get("previous_chunk"), options.get("chunking")
-        if previous is not None:
-            normalised = np.asarray(self.normalizer.previous_chunk(previous, state))
-            options["previous_chunk"] = padded(normalised, self.head.config.encoder_action_dim)
-        horizon = self.normalizer.action_horizon
-        if isinstance(chunking, Chunking) and chunking.horizon is None and horizon is not None:
-            options["chunking"] = replace(chunking, horizon=min(horizon, self.head.config.action_horizon))
+        if options.get("previous_chunk") is not None:
+            self._continue(options, state)
         actions = self.head.sample(context, self.normalizer.state(state), self.embodiment_id, **options)
         return self.normalizer.actions(actions, state)
+
+    def _continue(self, options: SampleOptions, state: ArrayLike) -> None:
+        """Puts the part of the previous chunk that goes on, as the head takes it, into the options.
+
+        Its actions become the first of the new chunk, so they are normalised as these: each step may have
+        statistics of its own.
+        """
+        previous, chunking = float32("previous_chunk", options["previous_chunk"]), options.get("chunking")
+        if isinstance(chunking, Chunking):
+            most = self.head.config.action_horizon
+            horizon = chunking.horizon or min(self.normalizer.action_horizon or most, most)
+            if previous.ndim < 2 or previous.shape[-2] < horizon:
+                raise ShapeError(
+                    f"previous_chunk: expected a chunk of at least {horizon} actions, as many as go into chunking "
+                    f"(horizon), got shape {previous.shape}"
+                )
+            if not chunking.overlap <= horizon <= most:
+                raise InputError(
+                    f"chunking: expected an overlap of at most {horizon} (horizon), and that of at most {most}, "
+                    f"which the head denoises, got an overlap of {chunking.overlap}"
+                )
+            if not chunking.overlap:  # nothing goes on
+                options["previous_chunk"] = options["chunking"] = None
+                return
+            previous = previous[..., horizon - chunking.overlap : horizon, :]
+            options["chunking"] = replace(chunking, horizon=chunking.overlap)
+        normalised = np.asarray(self.normalizer.previous_chunk(previous, state))
+        options["previous_chunk"] = padded(normalised, self.head.config.encoder_action_dim)
 
     def _whole(self, what: str, part: Any) -> Any:
         """A part of a whole policy.

@@ -90,6 +90,12 @@ def check_steps(head: Head, normalizer: Normalizer) -> None:
             f"normalizer: expected chunks of at most {config.action_horizon} actions, which this head "
             f"denoises, got {least}"
         )
+    oneway = [group.key for group in normalizer.action_groups if group.mode in ("scale", "sin_cos")]
+    if oneway:
+        raise InputError(
+            "data_config: action_modes: expected modes that are converted back, got scale for "
+            f"{', '.join(oneway)}"
+        )
     history = normalizer.state_history
     if history is not None and history != config.num_states:
         hint = "" if config.version == "n1.7" else f": load the head with num_states={history}"

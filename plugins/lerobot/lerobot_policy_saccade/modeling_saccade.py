@@ -195,6 +195,12 @@ class SaccadePolicy(PreTrainedPolicy):
                 "make it: load the processors from a folder that save_pretrained of this policy wrote"
             )
         renamed = self.config.rename_map
+        names = [renamed.get(key, key) for key in batch if key.startswith(OBSERVATION)]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise saccade.InputError(
+                f"rename_map: expected one key for each name, got two for {', '.join(twice)}"
+            )
         return {
             renamed.get(key, key): value.cpu() if isinstance(value, Tensor) else value
             for key, value in batch.items()

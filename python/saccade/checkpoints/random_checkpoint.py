@@ -281,7 +281,7 @@ def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed:
             "clip_outliers": True,
             "crop_fraction": 0.95,
             "formalize_language": True,
-            "letter_box_transform": False,
+            **({"letter_box_transform": False} if version == "n1.7" else {}),
             "max_action_dim": head["max_action_dim"],
             "max_action_horizon": head["action_horizon"],
             "max_state_dim": head["max_state_dim"],

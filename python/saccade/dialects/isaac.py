@@ -19,7 +19,7 @@ from saccade.dialects.checks import (
     views,
 )
 from saccade.dialects.requirements import Requirements
-from saccade.errors import InputError
+from saccade.errors import InputError, ShapeError
 
 
 def read_frames(
@@ -133,4 +133,9 @@ def joined(answer: Any, prefix: str, keys: tuple[str, ...], needs: str) -> Any:
         raise InputError(
             f"{needs}: expected actions {', '.join(prefix + key for key in keys)}, got {', '.join(answer)}"
         )
-    return np.concatenate([float32(needs, answer[prefix + key]) for key in keys], axis=-1)
+    parts = {key: float32(needs, answer[prefix + key]) for key in keys}
+    shapes = {part.shape[:-1] if part.ndim else None for part in parts.values()}
+    if len(shapes) != 1 or None in shapes:
+        listed = ", ".join(f"{prefix}{key} {part.shape}" for key, part in parts.items())
+        raise ShapeError(f"{needs}: expected actions of one number of rows and steps, got {listed}")
+    return np.concatenate(list(parts.values()), axis=-1)

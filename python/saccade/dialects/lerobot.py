@@ -154,7 +154,7 @@ def _texts(given: Any, count: int, needs: Requirements) -> tuple[str | None, ...
     if given is None or isinstance(given, str):
         rows: list[Any] = [given]
     elif isinstance(given, (list, tuple)):
-        rows = list(given)
+        rows = list(given) or [None]
     else:
         raise needs.input_error(TASK, "an instruction, or one for each row", repr(given))
     # Isaac-GR00T takes an empty text as it is where it has no default.

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from saccade._arrays import integer
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.data_configs import DataConfig
+from saccade.robots.data_configs import DataConfig, says_nothing
+from saccade.robots.embodiments import resolved
 from saccade.robots.groups import Group, Robot, Statistics
 
 #: The statistics that a mode needs. The other modes need none.
@@ -49,9 +51,14 @@ class Options:
                 "are for GR00T N1 and N1.5"
             )
 
-    def check_only(self, found: str | None, found_id: int | None, where: str) -> None:
+    def check_only(self, found: str, found_id: int, version: str, where: str) -> None:
         """Raises InputError if another embodiment is requested than the only one that there is."""
-        if self.embodiment is not None and self.embodiment not in (found, found_id):
+        asked = self.embodiment
+        if isinstance(asked, str):
+            is_found = found in (asked, resolved(asked, version, (found,)))
+        else:
+            is_found = asked is None or integer("embodiment", asked, least=0) == found_id
+        if not is_found:
             raise InputError(
                 f"embodiment: expected {found!r} ({found_id}), the only one in {where}, got "
                 f"{self.embodiment!r}"
@@ -67,7 +74,9 @@ class Builder:
     is_close: bool = False  # N1.6 and later treat a dimension with nearly equal bounds as constant
     problems: list[str] = field(default_factory=list)
 
-    def group(self, key: str, statistics: Any, mode: str, **switches: Any) -> Group | None:
+    def group(
+        self, key: str, statistics: Any, mode: str, *, by_step: bool = False, **switches: Any
+    ) -> Group | None:
         """A group of this mode; None if there is a problem, which is recorded.
 
         Only the statistics that the mode needs are looked at. The others may be anything.
@@ -76,6 +85,7 @@ class Builder:
             key: Its name.
             statistics: Statistics by name.
             mode: One of `STATISTICS`.
+            by_step: Whether there may be a row for each step of a chunk.
             **switches: The remaining fields of :class:`Group`; ``size`` is that of the statistics by default.
         """
         if not isinstance(statistics, Mapping):
@@ -94,6 +104,9 @@ class Builder:
                 f"{key}: expected {' and '.join(names)} of one shape, got {first.shape} and {second.shape}"
             )
             return None
+        if first.ndim > 1 and not by_step:
+            self.problems.append(f"{key}: expected one row of statistics, got {len(first)}")
+            return None
         if mode == "scale":
             first, second = np.zeros_like(first), np.maximum(np.abs(first), np.abs(second))
         return self.scaled(key, mode, first, second, **switches)
@@ -111,7 +124,7 @@ class Builder:
             moving = second != 0
         if (second < start).any():
             self.problems.append(f"{key}: {above} is below {below}")
-        if (moving & (second - start < LEAST)).any():
+        elif (moving & (second - start < LEAST)).any():
             self.problems.append(f"{key}: {above} is less than {LEAST:g} above {below}")
         switches.setdefault("size", first.shape[-1])
         switches.setdefault("keeps_constant", mode == "mean_std" or (mode == "q99" and not self.is_close))
@@ -132,8 +145,7 @@ class Builder:
     def refuse_unknown(self, what: str, values: Mapping[str, Any], known: Collection[str]) -> None:
         """Records keys that are not known, unless they say nothing: null, empty or false."""
         for name, value in values.items():
-            is_empty = value is None or value is False or value in ("", [], {})
-            if name not in known and not is_empty:
+            if name not in known and not says_nothing(value):
                 self.problems.append(
                     f"{what}: {name} ({value!r:.60}) is not known, and may change the robot's actions"
                 )

@@ -81,9 +81,9 @@ def data_config(given: DataConfigLike) -> DataConfig:
     try:
         name = os.fspath(given)
     except TypeError:
-        raise InputError(
-            f"data_config: expected a name, a path or a mapping, got {type(given).__name__}"
-        ) from None
+        name = None
+    if not isinstance(name, str):
+        raise InputError(f"data_config: expected a name, a path or a mapping, got {type(given).__name__}")
     if name in RELEASED:
         return RELEASED[name]
     try:
@@ -102,7 +102,7 @@ def data_config(given: DataConfigLike) -> DataConfig:
 def _from_mapping(values: Mapping[str, Any], where: str) -> DataConfig:
     """Reads and checks the fields."""
     names = [field.name for field in fields(DataConfig)]
-    said = [name for name, value in values.items() if value not in (None, False, "", [], {})]
+    said = [name for name, value in values.items() if not says_nothing(value)]
     problems = [f"{name}: unknown, expected {', '.join(names)}" for name in said if name not in names]
     problems += [f"{name}: missing" for name in names if name not in values]
     if not problems:
@@ -110,7 +110,7 @@ def _from_mapping(values: Mapping[str, Any], where: str) -> DataConfig:
             problems += _key_problems(f"{kind}_keys", values[f"{kind}_keys"], kind)
         problems += _index_problems("observation_indices", values["observation_indices"])
         problems += _index_problems("action_indices", values["action_indices"])
-        problems += _mapping_problems(values)
+        problems += [] if problems else _mapping_problems(values)
     if problems:
         raise InputError(f"{where}: " + "; ".join(problems))
     taken: dict[str, Any] = {
@@ -118,6 +118,11 @@ def _from_mapping(values: Mapping[str, Any], where: str) -> DataConfig:
         for name in names
     }
     return DataConfig(**taken)
+
+
+def says_nothing(value: Any) -> bool:
+    """Whether a value of an unknown key asks for nothing: null, false or empty."""
+    return value is None or value is False or (isinstance(value, str | Sequence | Mapping) and not value)
 
 
 def _key_problems(name: str, keys: Any, kind: str) -> list[str]:
@@ -162,7 +167,7 @@ def _mapping_problems(values: Mapping[str, Any]) -> list[str]:
         for key, value in found.items():
             if key not in known:
                 problems.append(f"{name}: {key}: expected one of {', '.join(map(str, known))}")
-            elif value not in allowed:
+            elif not isinstance(value, str) or value not in allowed:
                 problems.append(f"{name}: {key}: expected one of {', '.join(allowed)}, got {value!r:.100}")
     return problems
 

@@ -124,8 +124,9 @@ def choose(
     if wanted is None:
         found = listed if len(listed) == 1 else []
     elif isinstance(wanted, str):
-        tag = resolved(wanted, version, listed)
-        found = [tag] if tag in listed else []
+        # A name of the release counts first; the exact text of a tag of the file, if that robot is not there.
+        names = (resolved(wanted, version, listed), wanted.strip())
+        found = [tag for tag in names if tag in listed][:1]
     else:
         asked = integer("embodiment", wanted, least=0)
         alone = len(listed) == 1

@@ -208,6 +208,9 @@ def _group(builder: Builder, entry: Entry, kind: str, key: str, config: DataConf
     if mode in ("binary", "sin_cos", "none"):
         return Group(key, size, mode, conversion=conversion)
     if conversion is not None:
+        if not isinstance(entry.statistics[kind].get(key), Mapping):
+            builder.problems.append(f"{full}: no statistics")  # which the released code looks for, unread
+            return None
         bound = np.full(SIZES[conversion.head], BOUNDS[conversion.head], np.float32)
         return builder.scaled(key, mode, -bound, bound, size=size, conversion=conversion)
     # N1.5 clips values that it scales by quantiles.
@@ -224,7 +227,7 @@ def _conversion(
     source = about.get("rotation_type")
     if source is None:
         return None, f"to be converted to {target}, but the file does not say which rotation it is"
-    if source not in SIZES:
+    if not isinstance(source, str) or source not in SIZES:
         return None, f"expected a rotation_type among {', '.join(SIZES)}, got {source!r:.60}"
     if size != SIZES[source]:
         return None, f"expected {SIZES[source]} numbers for {source}, got {size}"

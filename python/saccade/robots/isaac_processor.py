@@ -108,7 +108,7 @@ def processor_robot(
     configs = kwargs.get("modality_configs")
     if not isinstance(configs, Mapping) or not configs:
         raise CheckpointError(f"{where}: no modality_configs")
-    known = {**IDS.get(version or "", {}), **{tag: n for tag, n in ids.items() if type(n) is int}}
+    known = {**IDS.get(version or "", {}), **checked_ids(where, ids)}
     tags = [tag for tag in configs if tag in statistics]
     if not tags:
         raise CheckpointError(
@@ -154,6 +154,23 @@ def processor_robot(
         state_history=state.steps,
         zero_state=switches["exclude_state"],
     )
+
+
+def checked_ids(where: str, ids: Any) -> dict[str, int]:
+    """Embodiment ids of a file by tag.
+
+    Raises:
+        CheckpointError: They are no such thing. The message names the tags.
+    """
+    found = ids if isinstance(ids, Mapping) else {"the ids": ids}
+    wrong = [
+        f"{tag} ({number!r:.40})" for tag, number in found.items() if type(number) is not int or number < 0
+    ]
+    if wrong:
+        raise CheckpointError(
+            f"{where}: embodiment ids: expected integers of at least 0, got {', '.join(wrong)}"
+        )
+    return dict(found)
 
 
 def _needs(config: Any) -> str:
@@ -340,13 +357,21 @@ def _action_group(
     clips = switches["clip_outliers"]
     if key in about.mean_std:
         group = builder.group(
-            key, statistics, "mean_std", clips=clips, returns_constant=True, reference=reference
+            key,
+            statistics,
+            "mean_std",
+            by_step=True,
+            clips=clips,
+            returns_constant=True,
+            reference=reference,
         )
     else:
         # Relative actions never use quantiles.
         uses_quantiles = switches["use_percentiles"] and reference is None
         bounds = _bounds(statistics, uses_quantiles)
-        group = builder.group(key, bounds, "min_max", clips=clips, clips_back=True, reference=reference)
+        group = builder.group(
+            key, bounds, "min_max", by_step=True, clips=clips, clips_back=True, reference=reference
+        )
     if group is None:
         return None
     if group.size != width:
@@ -390,10 +415,13 @@ def _check_horizons(
     most = kwargs.get("max_action_horizon", DEFAULT_HORIZON.get(version or ""))
     if most is None:
         return
+    if type(most) is not int:
+        builder.problems.append(f"max_action_horizon: expected an integer, got {most!r:.60}")
+        return
     for tag, config in configs.items():
         action = config.get("action") if isinstance(config, Mapping) else None
         steps = action.get("delta_indices") if isinstance(action, Mapping) else None
-        if isinstance(steps, list) and type(most) is int and len(steps) > most:
+        if isinstance(steps, list) and len(steps) > most:
             builder.problems.append(
                 f"{tag} has chunks of {len(steps)} actions, expected at most {most} (max_action_horizon)"
             )

@@ -20,6 +20,7 @@ from saccade.robots.groups import Group, Robot
 from saccade.robots.isaac_processor import (
     Modality,
     check_reference,
+    checked_ids,
     modality,
     refuse_unknown_fields,
     single_row,
@@ -56,7 +57,7 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     taking, giving = pipeline.pack.config, pipeline.unpack.config
     tag = str(taking.get("embodiment_tag", "new_embodiment"))
     embodiment_id = _mapping(pipeline).get(tag, 0)  # as lerobot does with an unknown tag
-    options.check_only(tag, embodiment_id, pipeline.where)
+    options.check_only(tag, embodiment_id, "n1.7" if pipeline.is_n17 else "n1.5", pipeline.where)
     builder = Builder(pipeline.where, np.float32)
     for step in (pipeline.pack, pipeline.unpack):
         refuse_unknown_fields(builder, f"{step.name}: modality_config", step.config.get("modality_config"))
@@ -96,8 +97,8 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
 
 def _mapping(pipeline: Pipeline) -> dict[str, int]:
     given = pipeline.pack.config.get("embodiment_mapping")
-    if isinstance(given, Mapping):
-        return {tag: number for tag, number in given.items() if type(number) is int}
+    if given is not None:
+        return checked_ids(pipeline.where, given)
     return dict(N17_IDS) if pipeline.is_n17 else dict(N15_MAPPING)
 
 
@@ -202,14 +203,17 @@ def _strict(builder: Builder, about: Mapping[str, Any]) -> dict[str, Any]:
         )
         configs = []
     found = []
+    absolute = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT"}
     for config in configs:
-        form = str(config.get("format")).upper().replace("+", "_") if isinstance(config, Mapping) else ""
-        if form in POSES:
-            is_pose = str(config.get("type")).upper() == "EEF"
-            config = {**config, "format": form if is_pose else "DEFAULT"}
+        if isinstance(config, Mapping):
+            config = {**config, **{name: config.get(name) or absolute[name] for name in absolute}}
+            form = str(config["format"]).upper().replace("+", "_")
+            if form in POSES:
+                is_pose = str(config["type"]).upper() == "EEF"
+                config = {**config, "format": form if is_pose else "DEFAULT"}
         found.append(config)
     missing = len(keys) - len(found) if isinstance(keys, list) else 0
-    found += [{"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT"}] * missing
+    found += [absolute] * missing
     return {
         **about,
         "action": {**action, "action_configs": found, "delta_indices": action_steps(about) or [0]},
@@ -228,7 +232,9 @@ def _native_group(
     low, high = ("q01", "q99") if uses_quantiles and reference is None else ("min", "max")
     if isinstance(found, Mapping):
         found = {"min": found.get(low), "max": found.get(high)}
-    group = builder.group(key, found, "min_max", clips=True, clips_back=True, reference=reference)
+    group = builder.group(
+        key, found, "min_max", by_step=True, clips=True, clips_back=True, reference=reference
+    )
     if group is None or group.first is None:
         return group
     if group.size != width:

@@ -181,7 +181,7 @@ class Pipeline:
         if self.offset_names is None:
             return None
         names, excluded = self.offset_names
-        tokens = [token.lower() for token in excluded]
+        tokens = [token.lower() for token in excluded if token]
         left_out = [any(token in name.lower() for token in tokens) for name in names[:width]]
         return np.array([not out for out in left_out] + [True] * (width - len(left_out)))
 
@@ -259,7 +259,9 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
     offsets = _offsets(ends, steps, steps_after, relative)
     builder.check()
     ends.check()
-    config = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
+    if not (folder / "config.json").is_file():
+        raise CheckpointError(f"{folder / 'config.json'}: missing: it decides how lerobot's steps act")
+    config = read_json(folder / "config.json")
     policy = Builder(str(folder / "config.json"), np.float32)
     policy.refuse_unknown("the policy", config, CONFIG | CONFIG_OF_PARTS)
     policy.check()

@@ -198,7 +198,7 @@ class Normalizer(Robot):
             ShapeError, DtypeError, InputError: An argument does not fit or is not finite, or ``state`` is
                 missing.
         """
-        return self._to_head(actions, state, self.action_groups)
+        return self._to_head("actions", actions, state, self.action_groups)
 
     def previous_chunk(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
         """Converts a chunk to the ``previous_chunk`` of :meth:`saccade.ActionHead.sample`.
@@ -206,10 +206,12 @@ class Normalizer(Robot):
         This is :meth:`unactions` without clipping, so that frozen actions keep their values.
         """
         groups = tuple(replace(group, clips=False) for group in self.action_groups)
-        return self._to_head(actions, state, groups)
+        return self._to_head("previous_chunk", actions, state, groups)
 
-    def _to_head(self, actions: ArrayLike, state: ArrayLike | None, groups: tuple[Group, ...]) -> Array:
-        values = self._relative(self._robot("actions", actions, groups), state)
+    def _to_head(
+        self, name: str, actions: ArrayLike, state: ArrayLike | None, groups: tuple[Group, ...]
+    ) -> Array:
+        values = self._relative(self._robot(name, actions, groups), state)
         normalised = padded(_mapped(values, groups, Group.to_head), self.action_dim)
         return like_features(normalised, is_torch(actions))
 

@@ -29,6 +29,9 @@ BOUNDS = {name: 1.0 if size > 3 else float(np.pi) for name, size in SIZES.items(
 #: Numbers of a pose by its format: a translation, and a rotation as ``rotation_6d`` or ``axis_angle``.
 POSES = {"XYZ_ROT6D": (9, "rotation_6d"), "XYZ_ROTVEC": (6, "axis_angle")}
 
+#: Rows of ``rotation_6d`` are parallel below this sine of their angle: float32 numbers have an error of 6e-8.
+PARALLEL = 1e-6
+
 #: Below this angle, sin(t / 2) / t comes from its series.
 SMALL_ANGLE = 1e-6
 
@@ -130,7 +133,10 @@ def _of_rows(first: Float64Array, second: Float64Array) -> Float64Array:
     """The matrix whose first two rows are these after Gram-Schmidt."""
     one = first / np.linalg.norm(first, axis=-1, keepdims=True)
     rest = second - (one * second).sum(-1, keepdims=True) * one
-    two = rest / np.linalg.norm(rest, axis=-1, keepdims=True)
+    length = np.linalg.norm(rest, axis=-1, keepdims=True)
+    # Of parallel rows only rounding is left, which is no direction.
+    is_noise = length <= PARALLEL * np.linalg.norm(second, axis=-1, keepdims=True)
+    two = rest / np.where(is_noise, np.nan, length)
     return np.stack([one, two, np.cross(one, two)], axis=-2)
 
 

@@ -70,8 +70,11 @@ def _of_checkpoint(policy: Policy) -> Configs | None:
     path = processor_folder(hub.resolve(source)) / "processor_config.json"
     if not path.is_file():
         return None
+    values = read_json(path)
+    if "processor_kwargs" not in values:  # the processor of another transformers model
+        return None
     try:
-        robot = read_json(path)["processor_kwargs"]["modality_configs"][embodiment]
+        robot = values["processor_kwargs"]["modality_configs"][embodiment]
         found = {name: dict(robot[name]) for name in MODALITIES if name in robot}
         for config in found.values():
             _check(config["delta_indices"], int)

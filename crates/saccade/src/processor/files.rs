@@ -132,7 +132,7 @@ fn processor_kwargs(version: Version, directory: &Path) -> Result<Option<Object>
         let Some(mut file) = read_object("source", &path)? else {
             continue;
         };
-        let kwargs = match file.remove("processor_kwargs") {
+        let mut kwargs = match file.remove("processor_kwargs") {
             Some(Value::Object(kwargs)) => kwargs,
             Some(_) => return refused(&path, "processor_kwargs: expected an object"),
             // Another program's file of this name holds nothing of it.
@@ -154,6 +154,8 @@ fn processor_kwargs(version: Version, directory: &Path) -> Result<Option<Object>
         check_keys(&path, "processor_kwargs", &kwargs, &|key| {
             is_argument(version, key)
         })?;
+        // What another version calls by this name says nothing here, also where it is false.
+        kwargs.retain(|key, _| is_argument(version, key));
         return Ok(Some(kwargs));
     }
     Ok(None)
