@@ -472,13 +472,13 @@ class Policy:
             horizon = chunking.horizon or min(self.normalizer.action_horizon or most, most)
             if previous.ndim < 2 or previous.shape[-2] < horizon:
                 raise ShapeError(
-                    f"previous_chunk: expected a chunk of at least {horizon} actions, as many as go into chunking "
-                    f"(horizon), got shape {previous.shape}"
+                    f"previous_chunk: expected a chunk of at least {horizon} actions (horizon of chunking), got "
+                    f"shape {previous.shape}"
                 )
             if not chunking.overlap <= horizon <= most:
                 raise InputError(
-                    f"chunking: expected an overlap of at most {horizon} (horizon), and that of at most {most}, "
-                    f"which the head denoises, got an overlap of {chunking.overlap}"
+                    f"chunking: expected an overlap of at most {horizon} (horizon), and that to be at most "
+                    f"{most}, which the head denoises, got an overlap of {chunking.overlap}"
                 )
             if not chunking.overlap:  # nothing goes on
                 options["previous_chunk"] = options["chunking"] = None
