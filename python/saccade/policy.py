@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -13,7 +12,6 @@ from saccade._arrays import Array, ArrayLike, float32, integer
 from saccade.backbone import Backbone
 from saccade.backbone_features import BackboneFeatures
 from saccade.backbone_inputs import BackboneInputs
-from saccade.chunking import Chunking
 from saccade.context import Context
 from saccade.dialects import ObservationSources, Reading, Requirements, StateReading, read, read_state
 from saccade.errors import InputError, ShapeError
@@ -21,11 +19,11 @@ from saccade.head import ActionHead
 from saccade.options import PolicyOptions, SampleOptions
 from saccade.policy_context import PolicyContext, encoded
 from saccade.policy_example import example_observation
-from saccade.policy_head import Head, check_steps, embodiment_of
+from saccade.policy_head import Head, check_steps, continue_chunk, embodiment_of
 from saccade.policy_loading import load as load_parts
 from saccade.policy_observations import Observation, Observations, batched, is_observation, listed
 from saccade.processor import Preprocessing, Processor
-from saccade.robots import DataConfigLike, Normalizer, padded
+from saccade.robots import DataConfigLike, Normalizer
 from saccade.robots.embodiments import resolved
 
 if TYPE_CHECKING:
@@ -456,37 +454,9 @@ class Policy:
         if "out" in options:
             raise InputError("out: expected none, since it would contain the normalised actions of the head")
         if options.get("previous_chunk") is not None:
-            self._continue(options, state)
+            continue_chunk(self.head, self.normalizer, options, state)
         actions = self.head.sample(context, self.normalizer.state(state), self.embodiment_id, **options)
         return self.normalizer.actions(actions, state)
-
-    def _continue(self, options: SampleOptions, state: ArrayLike) -> None:
-        """Puts the part of the previous chunk that goes on, as the head takes it, into the options.
-
-        Its actions become the first of the new chunk, so they are normalised as these: each step may have
-        statistics of its own.
-        """
-        previous, chunking = float32("previous_chunk", options["previous_chunk"]), options.get("chunking")
-        if isinstance(chunking, Chunking):
-            most = self.head.config.action_horizon
-            horizon = chunking.horizon or min(self.normalizer.action_horizon or most, most)
-            if previous.ndim < 2 or previous.shape[-2] < horizon:
-                raise ShapeError(
-                    f"previous_chunk: expected a chunk of at least {horizon} actions (horizon of chunking), got "
-                    f"shape {previous.shape}"
-                )
-            if not chunking.overlap <= horizon <= most:
-                raise InputError(
-                    f"chunking: expected an overlap of at most {horizon} (horizon), and that to be at most "
-                    f"{most}, which the head denoises, got an overlap of {chunking.overlap}"
-                )
-            if not chunking.overlap:  # nothing goes on
-                options["previous_chunk"] = options["chunking"] = None
-                return
-            previous = previous[..., horizon - chunking.overlap : horizon, :]
-            options["chunking"] = replace(chunking, horizon=chunking.overlap)
-        normalised = np.asarray(self.normalizer.previous_chunk(previous, state))
-        options["previous_chunk"] = padded(normalised, self.head.config.encoder_action_dim)
 
     def _whole(self, what: str, part: Any) -> Any:
         """A part of a whole policy.

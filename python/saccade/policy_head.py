@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
-from saccade._arrays import Array, ArrayLike, integer
+import numpy as np
+
+from saccade._arrays import Array, ArrayLike, float32, integer
+from saccade.chunking import Chunking
 from saccade.config import HeadConfig
 from saccade.context import Context
-from saccade.errors import InputError
+from saccade.errors import InputError, ShapeError
 from saccade.options import SampleOptions
-from saccade.robots import Normalizer
+from saccade.robots import Normalizer, padded
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -118,3 +122,32 @@ def requested_id(normalizer: Normalizer, embodiment: str | int | None) -> int | 
     if chosen is not None and asked != chosen:
         raise InputError(f"embodiment: expected that of the normalizer, {chosen}, got {asked}")
     return asked
+
+
+def continue_chunk(head: Head, normalizer: Normalizer, options: SampleOptions, state: ArrayLike) -> None:
+    """Puts the part of the previous chunk that goes on, as the head takes it, into the options.
+
+    Its actions become the first of the new chunk, so they are normalised as these: each step may have
+    statistics of its own.
+    """
+    previous, chunking = float32("previous_chunk", options["previous_chunk"]), options.get("chunking")
+    if isinstance(chunking, Chunking):
+        most = head.config.action_horizon
+        horizon = chunking.horizon or min(normalizer.action_horizon or most, most)
+        if previous.ndim < 2 or previous.shape[-2] < horizon:
+            raise ShapeError(
+                f"previous_chunk: expected a chunk of at least {horizon} actions (horizon of chunking), got "
+                f"shape {previous.shape}"
+            )
+        if not chunking.overlap <= horizon <= most:
+            raise InputError(
+                f"chunking: expected an overlap of at most {horizon} (horizon), and that to be at most "
+                f"{most}, which the head denoises, got an overlap of {chunking.overlap}"
+            )
+        if not chunking.overlap:  # nothing goes on
+            options["previous_chunk"] = options["chunking"] = None
+            return
+        previous = previous[..., horizon - chunking.overlap : horizon, :]
+        options["chunking"] = replace(chunking, horizon=chunking.overlap)
+    normalised = np.asarray(normalizer.previous_chunk(previous, state))
+    options["previous_chunk"] = padded(normalised, head.config.encoder_action_dim)
