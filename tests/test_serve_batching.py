@@ -305,8 +305,7 @@ def test_a_session_continues_its_last_chunk() -> None:
         assert (info["session"], info["continued"]) == ("robot 1", False)
         second, info = client.get_action(observation(), {"session": "robot 1", "executed": 5, "frozen": 2})
         assert (info["session"], info["continued"]) == ("robot 1", True)
-        chunking = policy.chunkings[-1]
-        assert chunking is not None
+        *_, chunking = policy.chunkings
         assert (chunking.overlap, chunking.frozen, chunking.ramp_rate) == (HORIZON - 5, 2, 6.0)
         np.testing.assert_array_equal(second["arm"][:, :2], first["arm"][:, 5:7])
         third, _ = client.get_action(observation(), {"session": "robot 1", "executed": 7, "frozen": 4})

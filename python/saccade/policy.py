@@ -453,8 +453,9 @@ class Policy:
         """:meth:`sample` of a state."""
         if "out" in options:
             raise InputError("out: expected none, since it would contain the normalised actions of the head")
-        if options.get("previous_chunk") is not None:
-            continue_chunk(self.head, self.normalizer, options, state)
+        previous = options.get("previous_chunk")
+        if previous is not None:
+            continue_chunk(self.head, self.normalizer, previous, state, options)
         actions = self.head.sample(context, self.normalizer.state(state), self.embodiment_id, **options)
         return self.normalizer.actions(actions, state)
 

@@ -124,13 +124,15 @@ def requested_id(normalizer: Normalizer, embodiment: str | int | None) -> int | 
     return asked
 
 
-def continue_chunk(head: Head, normalizer: Normalizer, options: SampleOptions, state: ArrayLike) -> None:
-    """Puts the part of the previous chunk that goes on, as the head takes it, into the options.
+def continue_chunk(
+    head: Head, normalizer: Normalizer, given: ArrayLike, state: ArrayLike, options: SampleOptions
+) -> None:
+    """Puts the part of the given previous chunk that goes on, as the head takes it, into the options.
 
     Its actions become the first of the new chunk, so they are normalised as these: each step may have
     statistics of its own.
     """
-    previous, chunking = float32("previous_chunk", options["previous_chunk"]), options.get("chunking")
+    previous, chunking = float32("previous_chunk", given), options.get("chunking")
     if isinstance(chunking, Chunking):
         most = head.config.action_horizon
         horizon = chunking.horizon or min(normalizer.action_horizon or most, most)
