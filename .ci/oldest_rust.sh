@@ -23,4 +23,5 @@ else
     exit 1
 fi
 echo ".ci/oldest_rust.sh: ${cargo[*]} build, $("${cargo[@]}" --version)"
-exec "${cargo[@]}" build --locked --quiet
+# All four crates, linked as in a wheel: without this feature the binding needs a library of Python.
+exec "${cargo[@]}" build --locked --quiet -p saccade-python --features pyo3/extension-module

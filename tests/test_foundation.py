@@ -185,9 +185,9 @@ def test_every_problem_is_printed(
 @pytest.mark.parametrize(
     ("installed", "default", "built_with"),
     [
-        ("{oldest}.0", "1.999.0", "+{oldest}.0 build --locked --quiet"),
-        ("1.999.0", "{oldest}.3", "build --locked --quiet"),  # a toolchain may have any name
-        ("", "{oldest}.3", "build --locked --quiet"),
+        ("{oldest}.0", "1.999.0", "+{oldest}.0 build"),
+        ("1.999.0", "{oldest}.3", "build"),  # a toolchain may have any name
+        ("", "{oldest}.3", "build"),
         ("", "1.999.0", None),
     ],
 )
@@ -215,4 +215,4 @@ def test_the_declared_rust_is_what_builds(
         assert done.returncode == 1
         assert f"rustup toolchain install {oldest}.0" in done.stderr
     else:
-        assert done.stdout.splitlines()[-1] == f"ran {built_with.format(oldest=oldest)}"
+        assert done.stdout.splitlines()[-1].startswith(f"ran {built_with.format(oldest=oldest)} --locked ")
