@@ -167,9 +167,11 @@ def test_architecture_names_every_folder_and_nothing_that_is_not_there() -> None
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
     files = [Path(name) for name in listed.stdout.split("\0") if name]
     # The folders of a study hold what its commands wrote, and each case of a robot has one of its own.
-    cases = Path("tests/data/robots")
+    cases = (Path("tests/data/robots"), Path("tests/data/images"))
     folders = {
-        file.parent for file in files if file.parts[0] != "studies" and not file.is_relative_to(cases)
+        file.parent
+        for file in files
+        if file.parts[0] != "studies" and not any(file.is_relative_to(one) for one in cases)
     } - {Path()}
     assert [str(folder) for folder in sorted(folders - named)] == []
 

@@ -33,7 +33,7 @@ def test_import_runs_few_modules() -> None:
     # Modules are counted, not seconds: a busy machine makes every import slow.
     code = "import sys, numpy; before = set(sys.modules); import saccade; print(*set(sys.modules) - before)"
     loaded = python(code).split()
-    assert len(loaded) < 70, sorted(loaded)  # 45 of them are of the package
+    assert len(loaded) < 80, sorted(loaded)  # 52 of them are of the package
     parts = {name.split(".")[1] for name in loaded if name.startswith("saccade.")}
     heavy = {"bench", "cli", "integrations", "maps", "reference", "sim", "study", "torch"}
     assert parts & heavy == set()

@@ -53,7 +53,7 @@ def written(folder: Path, version: str) -> Path:
         shutil.copy(N16 / name, folder)
     theirs = json.loads((N16 / "processor_config.json").read_text())["processor_kwargs"]
     mine = json.loads((folder / "processor_config.json").read_text())["processor_kwargs"]
-    of_images = ("crop_fraction", "letter_box_transform", "shortest_image_edge", "use_albumentations")
+    of_images = ("crop_fraction", "shortest_image_edge", "use_albumentations")
     kwargs = {name: value for name, value in theirs.items() if not name.startswith("image_")}
     kwargs |= {name: mine[name] for name in of_images}
     edit(folder / "processor_config.json", processor_kwargs=kwargs)

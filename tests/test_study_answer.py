@@ -89,6 +89,7 @@ def test_the_first_stage(core: Path) -> None:
     kept = {path.name for path in (policies / "n-4-seed-1").rglob("*") if path.is_file()}
     assert kept == {
         "config.json",
+        "data_config.json",
         "history.json",
         "metadata.json",
         "model.safetensors",

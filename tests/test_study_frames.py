@@ -153,15 +153,15 @@ def test_the_hash_covers_what_the_policy_sees(frames: Path, tmp_path: Path) -> N
 
 
 def test_prompts_of_other_lengths_are_padded_exactly(tmp_path: Path) -> None:
-    """Frames of other sizes have other numbers of tokens in N1.6; each moment is as it is alone."""
+    """Frames of other sizes have other numbers of tokens in N1.7; each moment is as it is alone."""
     wide = write_moments(tmp_path / "both", "1", "2")
     for name in ("wrist", "front"):
         (wide / "2" / f"{name}.png").unlink()
     write_wide(wide / "2")
-    source = Moments(str(whole("n16")), str(wide), TOLD, embodiment=EMBODIMENT, num_threads=1)
+    source = Moments(str(whole("n17")), str(wide), TOLD, embodiment=EMBODIMENT, num_threads=1)
     assert source.all.drop_vl is not None
     for row, name in enumerate(("1", "2")):
-        alone = Moments(str(whole("n16")), str(wide / name), TOLD, embodiment=EMBODIMENT, num_threads=1)
+        alone = Moments(str(whole("n17")), str(wide / name), TOLD, embodiment=EMBODIMENT, num_threads=1)
         noise = source.observed("frames", row)
         expected = source.actions(noise, None)
         observation = alone.all

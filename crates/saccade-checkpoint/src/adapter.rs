@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::{Map, Value};
 
 use crate::error::{Error, Result};
+use crate::names::is_processor;
 use crate::source::read_text;
 
 /// The config of an adapter.
@@ -134,7 +135,7 @@ fn weights_in(directory: &Path) -> Option<PathBuf> {
     let is_weights = |name: &&String| {
         (name.ends_with(".safetensors") || name.ends_with(".safetensors.index.json"))
             && !is_adapter(name)
-            && !crate::companions::is_processor(name)
+            && !is_processor(name)
     };
     names.iter().find(is_weights).map(PathBuf::from)
 }

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use crate::adapter::{ADAPTER_CONFIG, is_adapter};
 use crate::error::{Error, Result};
+use crate::names::is_processor;
 use crate::source::open_regular;
 
 /// The part of a config that is saccade's own, for layouts whose `config.json` takes no other keys.
@@ -20,9 +21,6 @@ const ENDINGS: [&str; 10] = [
 
 /// What ends the name of a file of weights; a folder with one is another checkpoint.
 const WEIGHTS: [&str; 7] = ["safetensors", "bin", "pt", "pth", "ckpt", "gguf", "onnx"];
-
-/// Where lerobot keeps the statistics of its processors.
-const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
 
 /// Files, in the folders below, that describe robots: statistics, keys, cameras, ids.
 const ROBOTS: [&str; 5] = [
@@ -42,11 +40,6 @@ const MAX_FILES: usize = 1000;
 
 /// No published checkpoint has folders in folders in folders.
 const MAX_DEPTH: usize = 4;
-
-/// Whether a file of this name holds statistics in the weights' format.
-pub(crate) fn is_processor(name: &str) -> bool {
-    PROCESSORS.iter().any(|start| name.starts_with(start))
-}
 
 /// The files next to a checkpoint's weights.
 pub struct Companions {

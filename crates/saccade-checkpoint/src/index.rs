@@ -5,8 +5,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use crate::adapter::is_adapter;
-use crate::companions::is_processor;
 use crate::error::{Error, Result};
+use crate::names::is_processor;
 use crate::names::plain_name;
 use crate::source::read_text;
 use crate::unique_map::UniqueMap;

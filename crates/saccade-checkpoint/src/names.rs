@@ -1,4 +1,4 @@
-//! Names of tensors, without what wrappers of a model add to them.
+//! Names of tensors, without what wrappers of a model add to them, and of the files that hold no weights.
 
 use std::borrow::Cow;
 
@@ -49,4 +49,12 @@ mod tests {
             assert_eq!(plain_name(name), expected);
         }
     }
+}
+
+/// Where lerobot keeps the statistics of its processors.
+const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
+
+/// Whether a file of this name holds statistics in the weights' format.
+pub(crate) fn is_processor(name: &str) -> bool {
+    PROCESSORS.iter().any(|start| name.starts_with(start))
 }

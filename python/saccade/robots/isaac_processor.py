@@ -318,12 +318,13 @@ def _state_group(
     builder: Builder, key: str, numbers: Any, about: Modality, switches: Mapping[str, bool]
 ) -> Group | None:
     statistics = _entry(numbers, "state", key)
-    if switches["apply_sincos_state_encoding"] and key in about.sin_cos:
+    encoded = switches["apply_sincos_state_encoding"] and key in about.sin_cos
+    if encoded or switches["exclude_state"]:  # only the width is read
         size = width_of(statistics)
         if size is None:
             builder.problems.append(f"{key}: no statistics, of which the width is read")
             return None
-        return Group(key, size, "sin_cos")
+        return Group(key, size, "sin_cos" if encoded else "none")
     if key in about.mean_std:
         return builder.group(key, statistics, "mean_std", returns_constant=True)
     return builder.group(

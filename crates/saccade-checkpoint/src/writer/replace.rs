@@ -6,8 +6,9 @@ use std::io::{ErrorKind, Result as IoResult};
 use std::path::{Path, PathBuf};
 
 use super::temporary::{TemporaryDirectory, parent_of, unique};
-use crate::companions::{OWN_CONFIG, is_processor};
+use crate::companions::OWN_CONFIG;
 use crate::error::{Error, Result};
+use crate::names::is_processor;
 
 /// What a checkpoint may hold in addition to its weights and companions.
 const OWN_FILES: [&str; 3] = ["config.json", "model.safetensors.index.json", OWN_CONFIG];

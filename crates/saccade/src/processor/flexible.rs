@@ -3,7 +3,8 @@
 use saccade_kernels::{Image, Isa, WeightRounding, resize_area, resize_cubic_u8, resize_linear_u8};
 
 use super::frames::{Bytes, CHANNELS, PIXELS, View, kernel, normalized, planes};
-use super::settings::{Flexible, Geometry, MAX_AREA};
+use super::options::MAX_AREA;
+use super::settings::{Flexible, Geometry};
 use crate::alloc::{filled, product};
 use crate::array::OwnedArray;
 use crate::config::Version;

@@ -2,14 +2,13 @@
 
 use std::borrow::Cow;
 
-use saccade_kernels::{Image, Isa, WeightRounding, resize_cubic_u8, resize_linear_f32};
+use saccade_kernels::Image;
 
-use super::flexible::flexible_view;
-use super::settings::{Preprocessing, Settings, Sizes};
+use super::settings::{Preprocessing, Settings};
 use crate::alloc::{collected, filled};
 use crate::array::{Array, OwnedArray, first_not_finite};
 use crate::error::{Error, Result, show_shape};
-use crate::ops::{check_interrupted, refused};
+use crate::ops::refused;
 
 pub(super) const CHANNELS: usize = 3;
 
@@ -59,45 +58,12 @@ impl Bytes<'_> {
     }
 }
 
-/// The view that a frame becomes, which errors call `name`.
-///
-/// # Errors
-/// [`Error::Shape`] and [`Error::Input`] for a frame that is none; [`Error::Memory`].
-pub(super) fn view(settings: &Settings, isa: Isa, name: &str, frame: Frame<'_>) -> Result<View> {
-    let bytes = read(settings, name, frame)?;
-    match &settings.sizes {
-        Sizes::Square { size, tokens, crop } => {
-            let pixels = match settings.preprocessing {
-                Preprocessing::Lerobot => kernel(resize_cubic_u8(
-                    isa,
-                    bytes.image(),
-                    *size,
-                    *size,
-                    WeightRounding::Torch,
-                ))?,
-                Preprocessing::Isaac => {
-                    let centre = crop_half_to_even(bytes.image(), *crop);
-                    let resized = kernel(resize_linear_f32(isa, centre, *size, *size))?;
-                    kernel(resized.truncated())?
-                }
-            };
-            check_interrupted()?;
-            Ok(View {
-                pixels: planes(&pixels, &[CHANNELS, *size, *size])?,
-                tokens: *tokens,
-                grid: None,
-            })
-        }
-        Sizes::Flexible(sizes) => flexible_view(settings.version, sizes, isa, name, bytes),
-    }
-}
-
 pub(super) fn kernel<T>(result: std::result::Result<T, saccade_kernels::AllocError>) -> Result<T> {
     result.map_err(refused(PIXELS))
 }
 
 /// The bytes of a frame.
-fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Result<Bytes<'a>> {
+pub(super) fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Result<Bytes<'a>> {
     let takes_lerobot = settings.preprocessing == Preprocessing::Lerobot;
     let shape = match frame {
         Frame::U8(array) => array.shape(),
@@ -190,7 +156,7 @@ pub(super) fn planes(pixels: &[u8], shape: &[usize]) -> Result<OwnedArray> {
 }
 
 /// The centre of `fraction` of each side. Where it begins is rounded half to even.
-fn crop_half_to_even(image: Image<'_>, fraction: f64) -> Image<'_> {
+pub(super) fn crop_half_to_even(image: Image<'_>, fraction: f64) -> Image<'_> {
     let part = |side: usize| ((fraction * side as f64) as usize).max(1);
     let start = |side: usize| ((side - part(side)) as f64 / 2.0).round_ties_even() as usize;
     let (height, width) = (image.height(), image.width());

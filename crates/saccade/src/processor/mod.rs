@@ -11,6 +11,7 @@ mod source;
 #[cfg(test)]
 mod tests;
 mod tokenizer;
+mod view;
 
 use saccade_kernels::Isa;
 
@@ -18,10 +19,10 @@ use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
 use crate::config::Version;
 use crate::error::{Error, Result};
-use frames::view;
 use prompt::{SpecialIds, prompt};
 use settings::{Settings, Sizes};
 use tokenizer::check_length;
+use view::view;
 
 pub use frames::{Frame, View};
 pub use settings::{Preprocessing, ProcessorOptions};

@@ -2,9 +2,12 @@
 
 use serde_json::Value;
 
-use super::settings::{MAX_AREA, MAX_SIDE};
 use crate::config::{Object, Version};
 use crate::error::{Error, Result};
+
+/// Larger sides, and larger areas, are hostile: the greatest area that is published is this one.
+pub(super) const MAX_SIDE: usize = 1 << 12;
+pub(super) const MAX_AREA: usize = MAX_SIDE * MAX_SIDE;
 
 /// Keys of the released files that are read here: they decide about frames and words.
 const READ: [&str; 22] = [

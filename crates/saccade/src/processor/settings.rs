@@ -1,6 +1,6 @@
 //! How a processor prepares frames and words: by version, by path, and by the options that checkpoints carry.
 
-use super::options::Options;
+use super::options::{MAX_AREA, MAX_SIDE, Options};
 use crate::config::Version;
 use crate::error::{Error, Result};
 
@@ -120,10 +120,6 @@ const N16_EDGE: usize = 512;
 /// What lerobot writes for a checkpoint that says nothing.
 pub(super) const LEROBOT_TARGET: [usize; 2] = [256, 256];
 pub(super) const LEROBOT_CROP: [usize; 2] = [230, 230];
-
-/// Larger sides, and larger areas, are hostile: the greatest area that is published is this one.
-pub(super) const MAX_SIDE: usize = 1 << 12;
-pub(super) const MAX_AREA: usize = MAX_SIDE * MAX_SIDE;
 
 impl Settings {
     /// The settings of a version.
