@@ -36,7 +36,7 @@ COMMANDS: dict[str, str] = {
     "parity": "compare the Rust head with the torch reference",
     "inspect": "show what a checkpoint contains",
     "resize": "write a checkpoint with another number of future tokens",
-    "convert": "write a checkpoint with other embodiments, another dtype or other shards, or merge a LoRA adapter",
+    "convert": "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter",
     "quantize": "write a checkpoint with int8 weights",
 }
 

@@ -11,7 +11,7 @@ from saccade._arguments import UsageError
 from saccade.cli import EXIT_OK, _output
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
-HELP = "write a checkpoint with other embodiments, another dtype or other shards, or merge a LoRA adapter"
+HELP = "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter"
 
 EPILOG = """\
 Everything else is copied bit for bit: tensors, config.json, and other files of the checkpoint such as
