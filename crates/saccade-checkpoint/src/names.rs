@@ -23,6 +23,14 @@ pub fn plain_name(name: &str) -> Cow<'_, str> {
     Cow::Owned(path.join("."))
 }
 
+/// Where lerobot keeps the statistics of its processors.
+const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
+
+/// Whether a file of this name holds statistics in the weights' format.
+pub(crate) fn is_processor(name: &str) -> bool {
+    PROCESSORS.iter().any(|start| name.starts_with(start))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -49,12 +57,4 @@ mod tests {
             assert_eq!(plain_name(name), expected);
         }
     }
-}
-
-/// Where lerobot keeps the statistics of its processors.
-const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
-
-/// Whether a file of this name holds statistics in the weights' format.
-pub(crate) fn is_processor(name: &str) -> bool {
-    PROCESSORS.iter().any(|start| name.starts_with(start))
 }
