@@ -57,7 +57,7 @@ ACTION = {
     "format": ("DEFAULT", *POSES),
     "state_key": None,
 }
-#: ``rl_info`` may stand beside them; the released policy drops it.
+#: ``rl_info`` may be among them; the released policy drops it.
 MODALITIES = ("video", "state", "action", "language", "rl_info")
 
 #: The released defaults of widths and of the longest chunk.

@@ -30,7 +30,7 @@ from saccade.robots.rotations import POSES
 
 STATE, ACTION = "observation.state", "action"
 
-#: LIBERO's gripper is the last of at least so many numbers.
+#: LIBERO's gripper is the last number of an action with at least this many.
 LIBERO_WIDTH = 7
 
 #: The ids of lerobot's own tables, where a step has none.

@@ -19,7 +19,7 @@ from saccade.robots.isaac_metadata import metadata_robot
 from saccade.robots.isaac_processor import CLASSES, processor_robot
 from saccade.robots.lerobot import lerobot_robot
 
-#: Where a training leaves the processor's files, if not beside the weights.
+#: Where a training leaves the processor's files, if not next to the weights.
 PROCESSOR_FOLDER = "processor"
 
 #: The data config of a policy that saccade trained. Checkpoints of the released code have no such file.
