@@ -22,8 +22,8 @@ import torch
 from torch import nn
 
 from saccade.integrations import Accelerated, accelerate
-from saccade.reference import lerobot_head
-from saccade.reference.random_weights import n15_config, random_tensor, small_config
+from saccade_lab.reference import lerobot_head
+from saccade_lab.reference.random_weights import n15_config, random_tensor, small_config
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 

@@ -14,7 +14,8 @@ A setting is a number of processes, the threads of each, and the observations th
 `chunks`, processes act on random frames without pause. For `episodes`, they run the simulator, with as many
 robots each as the batch has observations. The policies are the bundled one and a random one of N1.5's
 published size, which is written to --work if it is not there (4.8 GB). saccade and torch, which is
-`saccade.reference`, take the same observations. A setting that does not fit into memory or time is left out,
+`saccade_lab.reference`, take the same observations. A setting that does not fit into memory or time is
+left out,
 and the tables say so.
 
 With `fork`, one process loads the policy and the others are forked from it; with `spawn`, each loads its own.
@@ -39,7 +40,7 @@ from benches import checkpoints, farm_report, pages
 from benches.farm_processes import Setting, measure
 from benches.peers import machine
 from benches.peers.results import rounded
-from saccade._files import write_json
+from saccade._internal.files import write_json
 
 SECTIONS = ("chunks", "episodes")
 POLICIES = ("demo", "full")
@@ -198,7 +199,7 @@ def checkpoint(name: str, args: argparse.Namespace) -> Path:
         return checkpoints.n15(args.work, small=args.small, given=args.checkpoint)
     if args.demo is not None:
         return checkpoints.existing(args.demo)
-    from saccade.sim.policy import DEMO_CHECKPOINT
+    from saccade_lab.sim.policy import DEMO_CHECKPOINT
 
     return DEMO_CHECKPOINT
 

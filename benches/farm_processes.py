@@ -186,14 +186,16 @@ def load(setting: Setting, checkpoint: Path) -> Any:
     """The policy: one of the simulator for `episodes`."""
     engine = "rust" if setting.engine == "saccade" else "torch"
     if setting.section == "episodes":
-        from saccade.sim.policy import Policy
+        from saccade_lab.sim.policy import Policy
 
-        return Policy.load(checkpoint, engine=engine, num_threads=setting.threads)
+        return Policy.from_pretrained(checkpoint, engine=engine, num_threads=setting.threads)
     if engine == "torch":
-        from saccade.sim.policy import load_whole
+        from saccade_lab.sim.policy import load_whole
 
         return load_whole(checkpoint, engine, setting.threads)
-    return saccade.Policy.load(checkpoint, precision=setting.precision, num_threads=setting.threads)
+    return saccade.Policy.from_pretrained(
+        checkpoint, precision=setting.precision, num_threads=setting.threads
+    )
 
 
 #: Computes a batch and returns its number of chunks; and a list of episodes that ended, `(success, chunks)`.
@@ -224,7 +226,7 @@ def episodes(policy: Any, setting: Setting, number: int) -> Made:
 
     Seeds and noise differ between processes, and are the same in every setting with as many.
     """
-    from saccade.sim.rollout import environment_for
+    from saccade_lab.sim.rollout import environment_for
 
     tasks = [task for task in TASKS if task in policy.config.tasks]
     order = ((task, seed) for seed in itertools.count(number * 1000) for task in tasks)

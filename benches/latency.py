@@ -67,9 +67,9 @@ def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path)
         arrays = inputs.inputs_of(case, saccade.HeadConfig.from_file(source / "config.json"))
         arrays["expected"] = arrays["noise"]  # of the result's shape
         if CONTENDERS[name].engine not in ("saccade_head", "lerobot"):
-            from saccade.reference import ActionHead
+            from saccade_lab.reference import ActionHead
 
-            arrays |= inputs.times_of(ActionHead.load(source), case.steps)
+            arrays |= inputs.times_of(ActionHead.from_pretrained(source), case.steps)
         engine = importlib.import_module(f"benches.peers.engines.{CONTENDERS[name].engine}")
         works = dict(engine.build(Task(case, dict(CONTENDERS[name].options), source, arrays, scratch)).works)
         encode, sample = works["encode"], works["sample"]
@@ -224,7 +224,7 @@ def callers(args: argparse.Namespace, before: Report) -> Report:
     for label, (config, name, num_vl_tokens, each) in heads.items():
         case = Case("head", args.threads, num_vl_tokens=num_vl_tokens)
         source = checkpoint(config, args.work / name)
-        head = saccade.ActionHead.load(source, num_threads=args.threads)
+        head = saccade.ActionHead.from_pretrained(source, num_threads=args.threads)
         arrays = inputs.inputs_of(case, head.config)
         context, noise = head.encode(arrays["features"]), arrays["noise"][:, 0]
         expected = head.sample(context, arrays["state"], inputs.EMBODIMENT, noise=noise)
@@ -331,7 +331,9 @@ def overhead(args: argparse.Namespace, before: Report) -> Report:
         "output_dim": 8,
     }
     config["vl_self_attention_cfg"] |= {"num_layers": 0}
-    head = saccade.ActionHead.load(checkpoint(config, args.work / "tiny"), num_threads=args.threads)
+    head = saccade.ActionHead.from_pretrained(
+        checkpoint(config, args.work / "tiny"), num_threads=args.threads
+    )
     case = Case("head", args.threads, num_vl_tokens=1)
     arrays = inputs.inputs_of(case, head.config)
     context, noise, state = head.encode(arrays["features"]), arrays["noise"][:, 0], arrays["state"]
@@ -372,7 +374,7 @@ def overhead_table(report: Report) -> list[str]:
 
 def policy_config() -> dict[str, Any]:
     """Config of the bundled policy's head, with the number of embodiments that `benches.peers` expects."""
-    file = importlib.resources.files("saccade") / "sim" / "demo" / "config.json"
+    file = saccade.demo_checkpoint() / "config.json"
     config: dict[str, Any] = json.loads(file.read_text())["action_head_cfg"]
     return config | {"max_num_embodiments": inputs.NUM_EMBODIMENTS}
 
@@ -392,7 +394,7 @@ def write(config: dict[str, Any], folder: Path) -> None:
     """Writes the checkpoint under a temporary name, then renames it."""
     import torch
 
-    from saccade.reference import random_weights
+    from saccade_lab.reference import random_weights
 
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)

@@ -18,8 +18,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from saccade.reference import ActionHead, random_weights
-from saccade.reference.layers import CategoryLinear
+from saccade_lab.reference import ActionHead, random_weights
+from saccade_lab.reference.layers import CategoryLinear
 
 VL, DIT = r"vl_self_attention\.transformer_blocks\.\d+\.", r"model\.transformer_blocks\.\d+\."
 EVEN, ODD = r"model\.transformer_blocks\.\d*[02468]\.", r"model\.transformer_blocks\.\d*[13579]\."
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     if args.checkpoint is not None:
-        head = ActionHead.load(args.checkpoint)
+        head = ActionHead.from_pretrained(args.checkpoint)
     else:
         config = random_weights.n15_config(num_embodiments=1) if args.full else random_weights.small_config()
         head = random_weights.random_head(config, args.seed)

@@ -42,10 +42,10 @@ import zmq
 import saccade
 from benches import checkpoints, pages, serve_report
 from benches.peers import machine
-from saccade._files import write_json
+from saccade._internal.files import write_json
 from saccade.serve.packing import pack
 
-DEMO = Path(saccade.__file__).parent / "sim" / "demo"
+DEMO = saccade.demo_checkpoint()
 #: Different observations; each client sends one after the other.
 OBSERVATIONS = 8
 #: Seconds of batches that are computed in process in each round.
@@ -101,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
     checkpoint = DEMO if args.random is None else checkpoints.written(args.random)
     options = {"precision": args.precision, "num_threads": args.num_threads}
-    policy = saccade.Policy.load(checkpoint, **options)
+    policy = saccade.Policy.from_pretrained(checkpoint, **options)
     observations = [policy.example_observation(seed) for seed in range(OBSERVATIONS)]
     rows = {clients: Row(clients) for clients in args.clients}
     latencies: dict[int, list[float]] = {clients: [] for clients in args.clients}

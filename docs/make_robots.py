@@ -302,7 +302,7 @@ def outcome(release: str, change: Change | str, options: Json) -> str:
         elif given["data_config"] is not None and given["data_config"].endswith(".json"):
             given["data_config"] = str(folder / given["data_config"])
         try:
-            use(saccade.Normalizer.load(folder, case["embodiment"], **given))
+            use(saccade.Normalizer.from_pretrained(folder, case["embodiment"], **given))
         except saccade.SaccadeError as error:
             return f"refused: {reason(str(error), folder)}"
     return "computed"

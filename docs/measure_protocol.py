@@ -24,7 +24,7 @@ from pathlib import Path
 from PIL import Image
 
 import saccade
-from saccade.environment import cpu_name
+from saccade._internal.environment import cpu_name
 
 PAGE = Path(__file__).resolve().parent / "protocol.md"
 WIDTH, HEIGHT = 640, 480
@@ -33,10 +33,10 @@ EPISODES = {"push": 0, "two-goals": 1}  # task and seed
 
 def render(args: argparse.Namespace) -> None:
     """Writes the pictures."""
-    from saccade.sim.cameras import DEFAULT_CAMERAS
-    from saccade.sim.environment import TaskEnvironment
+    from saccade_lab.sim.cameras import DEFAULT_CAMERAS
+    from saccade_lab.sim.environment import TaskEnvironment
 
-    cameras = saccade.Policy.load(args.checkpoint).requirements.cameras or ()
+    cameras = saccade.Policy.from_pretrained(args.checkpoint).requirements.cameras or ()
     for task, seed in EPISODES.items():
         world = TaskEnvironment(task, image_size=WIDTH, cameras=DEFAULT_CAMERAS[: len(cameras)])
         images, _ = world.reset(seed=seed)

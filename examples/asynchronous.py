@@ -35,17 +35,17 @@ from matplotlib.figure import Figure as Picture
 from numpy.typing import NDArray
 
 import saccade
-from saccade._files import writable_directory, write_json
-from saccade.environment import cpu_name
+from saccade._internal.environment import cpu_name
+from saccade._internal.files import writable_directory, write_json
 from saccade.errors import InputError
-from saccade.sim.environment import TaskEnvironment
-from saccade.sim.policy import Policy
-from saccade.sim.rollout import Episode, environment_for
-from saccade.sim.settings import EMBODIMENT_ID
-from saccade.sim.tasks import DEMO_TASKS, TASKS, check_evaluation_seeds
-from saccade.sim.video import VideoWriter
-from saccade.study.figures import COLOURS, WIDTH
-from saccade.study.statistics import Estimate, bootstrap, paired_difference, scaled, wilson
+from saccade_lab.sim.environment import TaskEnvironment
+from saccade_lab.sim.policy import Policy
+from saccade_lab.sim.rollout import Episode, environment_for
+from saccade_lab.sim.settings import EMBODIMENT_ID
+from saccade_lab.sim.tasks import DEMO_TASKS, TASKS, check_evaluation_seeds
+from saccade_lab.sim.video import VideoWriter
+from saccade_lab.study.figures import COLOURS, WIDTH
+from saccade_lab.study.statistics import Estimate, bootstrap, paired_difference, scaled, wilson
 
 Float32Array = NDArray[np.float32]
 ARMS = ("plain", "chunked")
@@ -62,7 +62,7 @@ class Thinker:
     """The bundled policy: from an observation to a chunk, with or without the previous chunk."""
 
     def __init__(self) -> None:
-        self.policy = Policy.load(num_threads=1)
+        self.policy = Policy.from_pretrained(num_threads=1)
 
     def chunk(
         self,
@@ -97,7 +97,7 @@ class Drive:
     Attributes:
         delay: Control ticks from an observation to its chunk.
         arm: One of `ARMS`.
-        task, seed, success, steps: As in `saccade.sim.rollout.Episode`.
+        task, seed, success, steps: As in `saccade_lab.sim.rollout.Episode`.
         commands: The executed commands, `(steps, 4)`.
         seams: Steps at which a new chunk took over.
     """

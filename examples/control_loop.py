@@ -288,7 +288,7 @@ def load(args: argparse.Namespace, stack: ExitStack) -> saccade.Policy:
     elif args.checkpoint is None and not DEFAULT_CHECKPOINT.exists():
         print(f"writing a random checkpoint of N1.5's size to {source}, 4.8 GB", file=sys.stderr)
         random_checkpoint.write(DEFAULT_CHECKPOINT)
-    return saccade.Policy.load(
+    return saccade.Policy.from_pretrained(
         source, precision=args.precision, num_threads=args.num_threads, cameras=args.cameras
     )
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from saccade.intervention import Intervention
-from saccade.study.arms import METRICS, Arm, Metric
-from saccade.study.questions.cuts import Cuts
-from saccade.study.recording import Recording
-from saccade.study.run import run
-from saccade.study.source import Source
-from saccade.study.table import provenance_path, read_provenance
+from saccade.head.intervention import Intervention
+from saccade_lab.study.arms import METRICS, Arm, Metric
+from saccade_lab.study.questions.cuts import Cuts
+from saccade_lab.study.recording import Recording
+from saccade_lab.study.run import run
+from saccade_lab.study.source import Source
+from saccade_lab.study.table import provenance_path, read_provenance
 
 Float32Array = npt.NDArray[np.float32]
 REMOVED = 2
@@ -50,7 +50,7 @@ def source_of(args: argparse.Namespace) -> Source:
     """The recording if one is given, otherwise episodes of a policy in the simulator."""
     if args.features is not None:
         return Recording(str(args.checkpoint), str(args.features))
-    from saccade.study.simulator import simulator  # needs the extra `sim` and OpenGL
+    from saccade_lab.study.simulator import simulator  # needs the extra `sim` and OpenGL
 
     return simulator(args.checkpoint, ["button-press-topdown"], range(args.episodes))
 

@@ -145,11 +145,11 @@ def histogram(title: str, seconds: list[float]) -> list[str]:
 def load(args: argparse.Namespace) -> saccade.ActionHead:
     """Loads the head of the chosen size."""
     if args.size == "demo":
-        with importlib.resources.as_file(importlib.resources.files("saccade") / "sim" / "demo") as folder:
-            return saccade.ActionHead.load(folder, num_threads=args.num_threads)
+        with importlib.resources.as_file(saccade.demo_checkpoint()) as folder:
+            return saccade.ActionHead.from_pretrained(folder, num_threads=args.num_threads)
     with tempfile.TemporaryDirectory(prefix="saccade-real-time-") as name:
         heads.write(Path(name), heads.sized("n1.5"))
-        return saccade.ActionHead.load(name, num_threads=args.num_threads)
+        return saccade.ActionHead.from_pretrained(name, num_threads=args.num_threads)
 
 
 def main() -> None:

@@ -16,10 +16,8 @@ from typing import Any, TypeAlias
 HERE = Path(__file__).resolve().parent
 TESTS = HERE.parent / "tests"
 DATA = TESTS / "data"
-sys.path.insert(0, str(TESTS))
-import layout_heads  # noqa: E402
-import layouts  # noqa: E402
-import reference_cases  # noqa: E402
+sys.path.insert(0, str(HERE.parent))
+from tests.helpers import layout_heads, layouts, reference_cases  # noqa: E402
 
 #: Name to dtype, shape and bytes.
 Tensors: TypeAlias = dict[str, tuple[str, list[int], bytes]]

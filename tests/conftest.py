@@ -6,9 +6,9 @@ import os
 
 import hypothesis
 import pytest
-from released import NAMES, Released, load_released
 
 from saccade import _saccade
+from tests.helpers.released import NAMES, Released, load_released
 
 # pytest-xdist tells its workers the width of the terminal. The programs under test see no terminal.
 os.environ.pop("COLUMNS", None)

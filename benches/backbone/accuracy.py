@@ -13,7 +13,7 @@ import numpy as np
 
 from benches.backbone import setup
 from benches.checkpoints import written
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 from saccade.checkpoints import head_configs, random_checkpoint
 from saccade.checkpoints.backbone_sizes import RELEASED
 
@@ -92,15 +92,17 @@ def _features(folder: Path, run: str, views: int) -> Any:
     if engine == "saccade":
         import saccade
 
-        return np.asarray(saccade.Backbone.load(folder, precision=precision)(inputs).backbone_features)
+        return np.asarray(
+            saccade.Backbone.from_pretrained(folder, precision=precision)(inputs).backbone_features
+        )
     import torch
 
     dtype = getattr(torch, precision)
     with torch.inference_mode():
         if engine == "reference":
-            from saccade.reference import Backbone
+            from saccade_lab.reference import Backbone
 
-            return Backbone.load(folder, dtype=dtype)(inputs).backbone_features.numpy()
+            return Backbone.from_pretrained(folder, dtype=dtype)(inputs).backbone_features.numpy()
         from benches.backbone import peer
 
         return peer.Peer.load(folder, sizes, dtype)(*peer.arguments(inputs, dtype)).float().numpy()

@@ -20,7 +20,7 @@ import numpy as np
 
 from benches.backbone import setup
 from benches.warm import warm_up
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 
 PAUSE = 0.2  # seconds of rest before a measurement; the threads of the one before have gone to sleep by then
 
@@ -61,7 +61,9 @@ def works_of(task: Task) -> dict[str, Call]:
     if engine == "saccade":
         import saccade
 
-        backbone = saccade.Backbone.load(task.checkpoint, precision=precision, num_threads=task.threads)
+        backbone = saccade.Backbone.from_pretrained(
+            task.checkpoint, precision=precision, num_threads=task.threads
+        )
 
         def ours(views: int) -> Call:
             return lambda: np.asarray(backbone(inputs[views]).backbone_features)

@@ -46,9 +46,9 @@ def _load(folder: Path, what: str, precision: str, threads: int) -> dict[str, An
     before = peak_memory()
     start = time.perf_counter()
     if what == "backbone":
-        loaded: Any = saccade.Backbone.load(folder, precision=precision, num_threads=threads)
+        loaded: Any = saccade.Backbone.from_pretrained(folder, precision=precision, num_threads=threads)
     else:
-        loaded = saccade.Policy.load(folder, precision=precision, num_threads=threads)
+        loaded = saccade.Policy.from_pretrained(folder, precision=precision, num_threads=threads)
     seconds = time.perf_counter() - start
     found: dict[str, Any] = {"before": before, "loaded": peak_memory(), "load": seconds}
     found["nbytes"] = getattr(loaded, "nbytes", None)

@@ -33,7 +33,7 @@ def measure(folder: Path, precision: str, threads: int, rounds: int) -> dict[str
 def _measure(folder: Path, precision: str, threads: int, rounds: int) -> dict[str, Any]:
     import saccade
 
-    policy = saccade.Policy.load(folder, precision=precision, num_threads=threads)
+    policy = saccade.Policy.from_pretrained(folder, precision=precision, num_threads=threads)
     before, other = (with_words(policy.example_observation(seed=seed)) for seed in (0, 1))
     held = policy.encode(before)
     names = sorted(before["video"])

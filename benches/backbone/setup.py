@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from saccade import BackboneInputs
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.checkpoints.prompt_tokenizer import FIRST_ADDED, WORDS, token_id
 
@@ -82,8 +82,8 @@ def expected(folder: Path, views: int, work: Path) -> Float32Array:
 def _write_expected(folder: Path, views: int, path: Path) -> None:
     import torch
 
-    from saccade.reference import Backbone
+    from saccade_lab.reference import Backbone
 
     with torch.inference_mode():
-        features = Backbone.load(folder)(inputs_of(sizes_of(folder), views)).backbone_features
+        features = Backbone.from_pretrained(folder)(inputs_of(sizes_of(folder), views)).backbone_features
     np.save(path, features.numpy())

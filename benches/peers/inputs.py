@@ -27,7 +27,7 @@ def config_of(case: Case) -> dict[str, Any]:
     "Four blocks" is a head without VL self-attention and with a narrow output, so that an engine that only
     has whole heads does almost nothing except the blocks.
     """
-    from saccade.reference import random_weights
+    from saccade_lab.reference import random_weights
 
     if case.size == "small":
         config = random_weights.small_config()
@@ -49,7 +49,7 @@ def checkpoint(case: Case, folder: Path, dtype: str = "float32") -> Path:
     if not path.exists():
         import torch
 
-        from saccade.reference import random_weights
+        from saccade_lab.reference import random_weights
 
         part = path.with_name(path.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
@@ -88,14 +88,14 @@ def inputs_of(case: Case, config: HeadConfig) -> Arrays:
 
 
 def expected_of(case: Case, folder: Path) -> Arrays:
-    """The inputs of the case, and as `expected` what `saccade.reference` in float32 makes of them.
+    """The inputs of the case, and as `expected` what `saccade_lab.reference` in float32 makes of them.
 
     With the arrays of `times_of`. Of four blocks `rows` is what enters the first one; the noise is that of
     one Euler step.
     """
     import torch
 
-    from saccade.reference import ActionHead
+    from saccade_lab.reference import ActionHead
 
     path = folder / f"expected-{_slug(case)}.npz"
     if path.exists():
@@ -104,7 +104,7 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     source = checkpoint(case, folder)  # also of the linear layers, which need nothing of it but its sizes
     arrays = inputs_of(case, HeadConfig.from_file(source / "config.json"))
     with torch.inference_mode():
-        head: Any = ActionHead.load(source)
+        head: Any = ActionHead.from_pretrained(source)
         arrays |= times_of(head, case.steps)
         if case.piece == "linear":
             products = [arrays[f"x{i}"] @ arrays[f"w{i}"].T for i in range(len(LINEAR_SHAPES))]

@@ -3,7 +3,7 @@
 They contain every optimisation that keeps the computation exact, so that engines are compared and not ways to
 write the model: keys and values are cached between Euler steps, time-only values are precomputed, unused rows
 of the last block are skipped, and linear layers with the same input are merged. Weights are those of
-`saccade.reference.ActionHead`.
+`saccade_lab.reference.ActionHead`.
 
 Shapes: B observations, S samples of each, R rows of a sequence, E the width, C the features' width, T_vl
 features.
@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saccade.reference import ActionHead, tables
+from saccade_lab.reference import ActionHead, tables
 
 Modules = Any  # reference modules, whose attributes torch does not type
 

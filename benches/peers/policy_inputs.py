@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benches.backbone.setup import INSTRUCTION_TEXT
 from benches.checkpoints import n15
 from benches.peers.cases import WORKS, Case
-from saccade.dialects import ObservationSources
+from saccade.observations import ObservationSources
 
 if TYPE_CHECKING:
     import saccade
@@ -75,7 +75,7 @@ def observation_of(policy: saccade.Policy) -> dict[str, Any]:
 
 def expected_of(case: Case, folder: Path) -> Arrays:
     """The arrays of `given`, and as `expected (works, horizon, action_dim)` the normalised actions of
-    `saccade.reference` in float32. They are kept under `folder`.
+    `saccade_lab.reference` in float32. They are kept under `folder`.
     """
     path = folder / f"expected-policy-{case.size}.npz"
     if path.exists():
@@ -93,9 +93,9 @@ def expected_of(case: Case, folder: Path) -> Arrays:
 def inputs_of(source: Path) -> Arrays:
     """The inputs as saccade's processor prepares them, and noise."""
     import saccade
-    from saccade.dialects import read_state
+    from saccade.observations import read_state
 
-    policy = saccade.Policy.load(source, precision="int8")
+    policy = saccade.Policy.from_pretrained(source, precision="int8")
     config = policy.head.config
     shape = (1, config.action_horizon, config.encoder_action_dim)
     arrays: Arrays = {
@@ -119,12 +119,12 @@ def reference_actions(source: Path, one: Given) -> NDArray[np.float32]:
     import torch
 
     import saccade
-    from saccade.reference import ActionHead, Backbone
+    from saccade_lab.reference import ActionHead, Backbone
 
     with torch.inference_mode():
         inputs = saccade.BackboneInputs(one.pixels, one.ids)
-        features = Backbone.load(source)(inputs).backbone_features
-        head = ActionHead.load(source)
+        features = Backbone.from_pretrained(source)(inputs).backbone_features
+        head = ActionHead.from_pretrained(source)
         actions = head.sample(
             head.encode(features), one.state, one.embodiment_id, noise=one.noise, num_steps=4
         )

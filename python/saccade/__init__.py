@@ -1,7 +1,7 @@
-"""saccade: the action head of GR00T-style robot policies on CPUs, exact and fast.
+"""saccade runs GR00T-style robot policies on CPUs: camera frames and an instruction in, actions out.
 
-The public names below need NumPy only. Submodules such as `saccade.reference` are imported when they are
-first used; some of them need optional packages.
+The public names are those of ``__all__`` and the submodules below it. All but :func:`accelerate` and
+:mod:`saccade.torch`, which work on torch's policies, need NumPy only.
 """
 
 from __future__ import annotations
@@ -9,16 +9,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from saccade._internal.environment import show_config
 from saccade._saccade import __version__
-from saccade.attention import CrossAttention, KeyValues
-from saccade.backbone import Backbone
-from saccade.backbone_config import BackboneConfig
-from saccade.backbone_features import BackboneFeatures, BackboneRecord
-from saccade.backbone_inputs import BackboneInputs
-from saccade.chunking import Chunking
-from saccade.config import HeadConfig
-from saccade.context import Context
-from saccade.environment import show_config
+from saccade.backbone.backbone import Backbone
+from saccade.backbone.config import BackboneConfig
+from saccade.backbone.features import BackboneFeatures, BackboneRecord
+from saccade.backbone.inputs import BackboneInputs
+from saccade.checkpoints.bundled import demo_checkpoint
+from saccade.checkpoints.inspection import inspect
+from saccade.checkpoints.rewriting import convert, quantize, resize
 from saccade.errors import (
     CheckpointError,
     DtypeError,
@@ -27,13 +26,20 @@ from saccade.errors import (
     SaccadeError,
     ShapeError,
 )
-from saccade.head import ActionHead
-from saccade.intervention import Intervention
-from saccade.policy import Policy
-from saccade.policy_context import PolicyContext
+from saccade.head.chunking import Chunking
+from saccade.head.config import HeadConfig
+from saccade.head.context import Context
+from saccade.head.cross_attention import CrossAttention, KeyValues
+from saccade.head.head import ActionHead
+from saccade.head.intervention import Intervention
+from saccade.head.trace import Record, Trace
+from saccade.policy.context import PolicyContext
+from saccade.policy.policy import Policy
 from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer
-from saccade.trace import Record, Trace
+
+if TYPE_CHECKING:
+    from saccade.integrations import accelerate as accelerate
 
 __all__ = [
     "ActionHead",
@@ -61,31 +67,24 @@ __all__ = [
     "ShapeError",
     "Trace",
     "__version__",
+    "accelerate",
+    "convert",
+    "demo_checkpoint",
+    "inspect",
+    "quantize",
+    "resize",
     "show_config",
 ]
 
-#: Submodules that are imported when they are first used.
-_SUBMODULES = (
-    "bench",
-    "checkpoints",
-    "cli",
-    "comparison",
-    "dialects",
-    "integrations",
-    "maps",
-    "observation",
-    "reference",
-    "robots",
-    "serve",
-    "sim",
-    "study",
-    "torch",
-)
+#: Public submodules, imported when they are first used.
+_SUBMODULES = ("checkpoints", "integrations", "observations", "robots", "serve", "torch")
 
-# Hidden from type checkers, so that they report names that do not exist; they need `import saccade.sim`.
+# Hidden from type checkers, so that they report names that do not exist; they need `import saccade.serve`.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
+        if name == "accelerate":  # needs torch
+            return importlib.import_module("saccade.integrations").accelerate
         if name in _SUBMODULES:
             return importlib.import_module(f"saccade.{name}")
         raise AttributeError(f"module 'saccade' has no attribute {name!r}")

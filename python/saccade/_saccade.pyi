@@ -6,7 +6,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from saccade._arrays import StoredTensor
+from saccade._internal.arrays import StoredTensor
 
 _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]

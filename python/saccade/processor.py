@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
-from saccade._arrays import ArrayLike, Float32Array, frame, int64, integer, text
-from saccade.backbone_inputs import BackboneInputs
+from saccade._internal.arrays import ArrayLike, Float32Array, frame, int64, integer, text
+from saccade.backbone.inputs import BackboneInputs
+from saccade.checkpoints.hub import PUBLISHED, cache, cached, resolve
 from saccade.errors import InputError, ShapeError
-from saccade.hub import PUBLISHED, cache, cached, resolve
 
 #: The views of one observation: by camera name, or in the order of the prompt.
 Frames: TypeAlias = "Mapping[str, ArrayLike] | Sequence[ArrayLike] | npt.NDArray[Any]"
@@ -86,7 +86,7 @@ class Processor:
         )
 
     @classmethod
-    def load(
+    def from_pretrained(
         cls,
         source: str | os.PathLike[str],
         *,
@@ -119,7 +119,7 @@ class Processor:
 
         Example:
             >>> import saccade
-            >>> saccade.Processor.load("n1.5-backbone.safetensors", tokenizer="tokenizer.json")
+            >>> saccade.Processor.from_pretrained("n1.5-backbone.safetensors", tokenizer="tokenizer.json")
             <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
         """
         held = _saccade.ProcessorSource(os.fspath(resolve(source)))
@@ -278,10 +278,10 @@ _text = text  # in a method with an argument of that name
 def tokenizer_path(
     source: str | os.PathLike[str], tokenizer: str | os.PathLike[str] | None = None
 ) -> Path | None:
-    """Where :meth:`Processor.load` finds the tokenizer, if that is outside the checkpoint.
+    """Where :meth:`Processor.from_pretrained` finds the tokenizer, if that is outside the checkpoint.
 
     Args:
-        source, tokenizer: As in :meth:`Processor.load`, which says what is raised.
+        source, tokenizer: As in :meth:`Processor.from_pretrained`, which says what is raised.
 
     Returns:
         A file or a directory. None: the checkpoint's own is used.

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade._extras import require
-from saccade.attention import CrossAttention as PackedAttention
+from saccade._internal.extras import SACCADE
 from saccade.errors import DtypeError, InputError, ShapeError
+from saccade.head.cross_attention import CrossAttention as PackedAttention
 
-require("torch")
+SACCADE.require("torch")
 
 import torch  # noqa: E402
 from torch import nn  # noqa: E402
@@ -69,7 +69,8 @@ class CrossAttention(nn.Module):
             ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
             ``to_out.0.bias (width,)``; floating point, on the CPU.
         heads: Number of attention heads, a divisor of the width.
-        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in :meth:`saccade.ActionHead.load`.
+        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in
+            :meth:`saccade.ActionHead.from_pretrained`.
         dropout: Probability of the dropout after ``to_out.0`` in training. It is not implemented: a call in
             training mode with a dropout other than 0 raises an error.
 
@@ -162,7 +163,8 @@ class CrossAttention(nn.Module):
         weights = self._weights()
         if torch.is_grad_enabled() and any(t.requires_grad for t in (hidden_states, encoder, *weights)):
             raise InputError(
-                "CrossAttention computes no gradient: call it under torch.no_grad(), or use saccade.reference"
+                "CrossAttention computes no gradient: call it under torch.no_grad(), or use "
+                "saccade_lab.reference"
             )
         if self.training and self.to_out[1].p > 0:  # type: ignore[operator]
             raise InputError(

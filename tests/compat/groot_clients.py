@@ -31,7 +31,7 @@ class Served:
     def __init__(self, version: str, folder: Path) -> None:
         command = [sys.executable, "-m", "saccade.checkpoints.random_checkpoint", str(folder), "--small"]
         subprocess.run([*command, "--version", version], check=True, stdout=subprocess.DEVNULL)
-        self.policy = saccade.Policy.load(folder)
+        self.policy = saccade.Policy.from_pretrained(folder)
         serve = [sys.executable, "-m", "saccade", "serve", str(folder), "--port", "0", "--log", "json"]
         self.process = subprocess.Popen([*serve, "--seed", str(SEED)], stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
@@ -142,7 +142,7 @@ def test_actions_are_those_of_act(release: str, served: Served, tmp_path: Path) 
 @pytest.mark.parametrize("release", [release for release in RELEASES if release not in PICKLES])
 def test_the_bundled_policy_drives_its_robot(release: str) -> None:
     """Through the server, by a client as released: the same episodes, bit for bit, as in process."""
-    demo = Path(saccade.__file__).parent / "sim" / "demo"
+    demo = saccade.demo_checkpoint()
     serve = [sys.executable, "-m", "saccade", "serve", str(demo), "--port", "0", "--log", "json"]
     with subprocess.Popen([*serve, "--seed", str(SEED)], stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None

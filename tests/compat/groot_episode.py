@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from saccade.sim.policy import Chunk, Policy
-from saccade.sim.rollout import environment_for, run_episode
-from saccade.sim.settings import GROUPS
+from saccade_lab.sim.policy import Chunk, Policy
+from saccade_lab.sim.rollout import environment_for, run_episode
+from saccade_lab.sim.settings import GROUPS
 
 #: Tasks and layouts.
 EPISODES = (("reach", 3), ("button-press-topdown", 4))
@@ -68,7 +68,7 @@ def flat(nested: dict[str, Any]) -> dict[str, Any]:
 
 def main(release: str, port: int, seed: int) -> None:
     """Runs the episodes both ways."""
-    own = Policy.load(num_threads=1)
+    own = Policy.from_pretrained(num_threads=1)
 
     def here(given: dict[str, Any], count: int) -> Mapping[str, Any]:
         if release != "n1.5":

@@ -21,8 +21,8 @@ from torch import Tensor
 from transformers.feature_extraction_utils import BatchFeature
 
 import saccade
-from saccade.reference import ActionHead
-from saccade.reference.random_weights import (
+from saccade_lab.reference import ActionHead
+from saccade_lab.reference.random_weights import (
     random_head,
     random_inputs,
     sized_config,
@@ -87,7 +87,7 @@ def backbone_of(inputs: dict[str, Tensor], num_vl_tokens: int) -> Any:
 def test_actions(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     write_checkpoint(tmp_path, case.config, seed=1)
-    head = ActionHead.load(tmp_path)
+    head = ActionHead.from_pretrained(tmp_path)
     inputs: dict[str, Any] = random_inputs(head.config, 2, batch=3, num_vl_tokens=case.num_vl_tokens)
     action_input = {"state": inputs["state"], "embodiment_id": inputs["embodiment_id"]}
     options: dict[str, Any] | None = None
@@ -114,7 +114,7 @@ def test_actions(name: str, tmp_path: Path) -> None:
     with torch.no_grad():
         actions = head(**inputs, **ours)
     assert (actions - expected).abs().max() <= TOLERANCE
-    in_rust = saccade.ActionHead.load(tmp_path)
+    in_rust = saccade.ActionHead.from_pretrained(tmp_path)
     assert (torch.as_tensor(in_rust(**inputs, **ours)) - expected).abs().max() <= TOLERANCE
 
 

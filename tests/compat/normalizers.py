@@ -10,12 +10,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import layouts
 import pytest
 import torch
 from lerobot.policies.groot import processor_groot as released
 
 from saccade import Normalizer
+from tests.helpers import layouts
 
 IS_N15 = importlib.metadata.version("lerobot").startswith(("0.4", "0.5"))
 BATCH, STEPS = 3, 7
@@ -50,7 +50,7 @@ def flat(seed: int) -> dict[str, dict[str, torch.Tensor]]:
 @pytest.mark.skipif(not IS_N15, reason="this lerobot has N1.7 only")
 def test_n15(tmp_path: Path) -> None:
     layouts.write(tmp_path, "lerobot", seed=2)
-    normalizer = Normalizer.load(tmp_path)
+    normalizer = Normalizer.from_pretrained(tmp_path)
     pack = released.GrootPackInputsStep(
         state_horizon=1, action_horizon=STEPS, max_state_dim=12, max_action_dim=8, stats=flat(2)
     )
@@ -70,7 +70,7 @@ def test_n15(tmp_path: Path) -> None:
 @pytest.mark.skipif(IS_N15, reason="this lerobot has N1.5 only")
 def test_n17_flat(tmp_path: Path) -> None:
     layouts.write(tmp_path, "lerobot-n17", seed=2)
-    normalizer = Normalizer.load(tmp_path)
+    normalizer = Normalizer.from_pretrained(tmp_path)
     pack = released.GrootN17PackInputsStep(max_state_dim=12, max_action_dim=10, stats=flat(2))
     unpack = released.GrootActionUnpackUnnormalizeStep(env_action_dim=6, stats=flat(2))
     state, action, chunk = draw(BATCH, 7, seed=0), draw(BATCH, 40, 6, seed=1), draw(BATCH, 40, 10, seed=2)
@@ -100,7 +100,7 @@ def test_n17_groups(relative: str, use_percentiles: bool, tmp_path: Path) -> Non
         numbers["relative_action"] = {"arm": own if relative == "a row a step" else rows[0]}
     layouts.write_json(tmp_path / "processor_config.json", config)
     layouts.write_json(tmp_path / "statistics.json", statistics)
-    normalizer = Normalizer.load(tmp_path, "new_embodiment")
+    normalizer = Normalizer.from_pretrained(tmp_path, "new_embodiment")
 
     about = {"raw_stats": numbers, "modality_config": modality, "use_percentiles": use_percentiles}
     stats = {

@@ -35,7 +35,7 @@ def test_lerobot_finds_policy_and_environment_by_the_name_of_the_package() -> No
         "assert 'saccade' not in sys.modules; register();"
         "from lerobot.configs.policies import PreTrainedConfig; from lerobot.envs.configs import EnvConfig;"
         "print(PreTrainedConfig.get_choice_class('saccade').__name__,"
-        "EnvConfig.get_choice_class('saccade').__name__, 'saccade.sim' in sys.modules)"
+        "EnvConfig.get_choice_class('saccade').__name__, 'saccade_lab.sim' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     # The simulation would decide how MuJoCo draws in other environments.

@@ -20,7 +20,7 @@ import torch
 from lerobot_policy_saccade import SaccadeConfig
 from lerobot_policy_saccade.modeling_saccade import SaccadePolicy
 from saccade.checkpoints import random_checkpoint
-from saccade.sim.cameras import DEFAULT_IMAGE_SIZE
+from saccade_lab.sim.cameras import DEFAULT_IMAGE_SIZE
 
 VIEWS = ("left", "right", "top")
 HORIZON, WIDTH = 16, 4

@@ -28,7 +28,7 @@ import lerobot_policy_saccade
 import saccade
 from lerobot_policy_saccade import SaccadeEnv
 from lerobot_policy_saccade.modeling_saccade import SaccadePolicy
-from saccade.sim.environment import TaskEnvironment
+from saccade_lab.sim.environment import TaskEnvironment
 
 # Fixtures.
 checkpoint, policy = plugin_cases.checkpoint, plugin_cases.policy

@@ -98,7 +98,7 @@ def test_a_saved_policy_has_its_data_config(
 
 
 def test_options_that_saccade_reads(checkpoint: Path, policy: SaccadePolicy, tmp_path: Path) -> None:
-    """They are given, saved and overridden as lerobot's programs do, and reach `saccade.Policy.load`."""
+    """They are given, saved and overridden as lerobot's programs do, and reach the policy."""
     policy.save_pretrained(tmp_path)
     arguments = [
         '--processor_options={"letter_box_transform": true}',
@@ -115,7 +115,7 @@ def test_options_that_saccade_reads(checkpoint: Path, policy: SaccadePolicy, tmp
     config._save_pretrained(tmp_path)
     assert PreTrainedConfig.from_pretrained(tmp_path).processor_options == given["processor_options"]
     with (
-        mock.patch("saccade.Policy.load", side_effect=RuntimeError("called")) as load,
+        mock.patch("saccade.Policy.from_pretrained", side_effect=RuntimeError("called")) as load,
         pytest.raises(RuntimeError, match="called"),
     ):
         SaccadePolicy.from_pretrained(checkpoint, config=config)

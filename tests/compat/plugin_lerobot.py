@@ -16,13 +16,13 @@ from typing import Any
 
 import pytest
 import torch
-import whole_checkpoints
 from lerobot.processor import RenameObservationsProcessorStep
 
 import saccade
 from lerobot_policy_saccade import SaccadeConfig
 from lerobot_policy_saccade.modeling_saccade import SaccadePolicy
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
+from tests.helpers import whole_checkpoints
 
 N15, N17 = "lerobot", "lerobot-n17"
 PACK = 2  # of the steps

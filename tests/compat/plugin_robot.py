@@ -14,7 +14,7 @@ import numpy as np
 from lerobot.robots import Robot, RobotConfig
 from plugin_cases import VIEWS, WIDTH
 
-from saccade.sim.cameras import DEFAULT_IMAGE_SIZE
+from saccade_lab.sim.cameras import DEFAULT_IMAGE_SIZE
 
 JOINTS = tuple(f"joint_{number}.pos" for number in range(WIDTH))
 TASK = "push the red ball"

@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import integration_cases as cases
 import pytest
 import torch
 from torch import Tensor, nn
 from transformers.feature_extraction_utils import BatchFeature
 
 from saccade.integrations import Accelerated, accelerate
-from saccade.reference.random_weights import sized_config, small_config
+from saccade_lab.reference.random_weights import sized_config, small_config
+from tests.helpers import integration_cases as cases
 
 LEROBOT = importlib.metadata.version("lerobot")
 KIND = "n1.5" if LEROBOT.startswith(("0.4", "0.5")) else "n1.7"

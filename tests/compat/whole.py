@@ -21,12 +21,12 @@ from typing import Any
 import policies
 import pytest
 import torch
-import whole_integration_cases as cases
-import whole_policies
 from torch import Tensor
 
 from saccade.integrations import accelerate
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
+from tests.helpers import whole_integration_cases as cases
+from tests.helpers import whole_policies
 
 KIND = policies.KIND
 

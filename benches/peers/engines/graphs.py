@@ -15,7 +15,7 @@ from benches.peers.cases import LINEAR_SHAPES
 from benches.peers.engines import Built, Task
 from benches.peers.inputs import EMBODIMENT
 from saccade import HeadConfig
-from saccade.reference import ActionHead
+from saccade_lab.reference import ActionHead
 
 WEIGHT_BYTES = 160 << 20  # of linear layers, in float32: several times any cache
 Graph = Callable[..., tuple[Any, ...]]
@@ -40,7 +40,7 @@ def build(engine: Engine, task: Task) -> Built:
 
     def loaded() -> ActionHead:
         if not head:
-            head.append(ActionHead.load(task.source).requires_grad_(False))
+            head.append(ActionHead.from_pretrained(task.source).requires_grad_(False))
         return head[0]
 
     with torch.no_grad():

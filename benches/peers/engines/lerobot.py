@@ -10,7 +10,7 @@ import torch
 
 from benches.peers.engines import Built, Task
 from benches.peers.inputs import EMBODIMENT
-from saccade.reference import ActionHead, lerobot_head, tables
+from saccade_lab.reference import ActionHead, lerobot_head, tables
 
 
 def build(task: Task) -> Built:
@@ -22,7 +22,7 @@ def build(task: Task) -> Built:
     head: Any = lerobot_head.build(config, device="meta")
     arithmetic = task.options["arithmetic"]
     dtype = torch.float32 if arithmetic == "float32" else torch.bfloat16
-    head.load_state_dict(ActionHead.load(task.source, dtype=dtype).state_dict(), assign=True)
+    head.load_state_dict(ActionHead.from_pretrained(task.source, dtype=dtype).state_dict(), assign=True)
     head.requires_grad_(False)
     # Copied, because a mapped file has no huge pages.
     for parameter in head.parameters():

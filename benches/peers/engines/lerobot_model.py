@@ -29,7 +29,7 @@ from transformers.modeling_utils import no_init_weights
 
 from benches.backbone.setup import sizes_of
 from benches.peers.policy_inputs import Given
-from saccade.reference import lerobot_backbone, lerobot_head
+from saccade_lab.reference import lerobot_backbone, lerobot_head
 
 GROOT = "lerobot.policies.groot"
 

@@ -25,9 +25,9 @@ from benches.peers import inputs, pieces
 from benches.peers.engines import Built, Task
 from benches.peers.policy_inputs import VIEWS, Arrays, given
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.reference import ActionHead, Backbone
-from saccade.reference.backbone.attention import split_heads
-from saccade.reference.backbone.rotary import rotate, text_angles
+from saccade_lab.reference import ActionHead, Backbone
+from saccade_lab.reference.backbone.attention import split_heads
+from saccade_lab.reference.backbone.rotary import rotate, text_angles
 
 STEPS = 4
 NAMES = ("tower", "language", "encode", "state", "step")
@@ -131,7 +131,7 @@ def write_backbone(source: Path, folder: Path, arrays: Arrays) -> NDArray[np.int
     """Exports tower and language model; returns the bits of the table of tokens in bfloat16."""
     from benches.peers.engines.onnx_runtime import export
 
-    eagle: Any = Backbone.load(source).requires_grad_(False).eagle_model
+    eagle: Any = Backbone.from_pretrained(source).requires_grad_(False).eagle_model
     decoder = eagle.language_model.model
     two = given(arrays, 2)
     tokens = torch.export.Dim("tokens", min=2, max=4096)
@@ -148,7 +148,7 @@ def write_head(source: Path, folder: Path, arrays: Arrays) -> Arrays:
     from benches.peers.engines.onnx_runtime import export
 
     two = given(arrays, 2)
-    head = ActionHead.load(source).requires_grad_(False)
+    head = ActionHead.from_pretrained(source).requires_grad_(False)
     config, num_tokens = head.config, two.ids.shape[1]
     tokens = torch.export.Dim("tokens", min=2, max=4096)
     features = torch.zeros(1, num_tokens, config.context_dim)

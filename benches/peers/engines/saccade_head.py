@@ -129,7 +129,7 @@ def cost(task: Task) -> Built:
 def load(task: Task) -> saccade.ActionHead:
     """The head, warmed up."""
     case = task.case
-    head = saccade.ActionHead.load(
+    head = saccade.ActionHead.from_pretrained(
         task.source,
         precision=task.options["precision"],
         num_threads=case.threads,

@@ -10,13 +10,13 @@ import numpy as np
 import saccade
 from benches.peers.engines import Built, Task
 from benches.peers.policy_inputs import VIEWS, given, observation_of, with_views
-from saccade._arrays import Float32Array
-from saccade.dialects import read_state
+from saccade._internal.arrays import Float32Array
+from saccade.observations import read_state
 
 
 def build(task: Task) -> Built:
     """Options: `precision`. Unlike in other engines, resizing, tokens and units are part of a work."""
-    policy = saccade.Policy.load(
+    policy = saccade.Policy.from_pretrained(
         task.source, precision=task.options["precision"], num_threads=task.case.threads
     )
     noise = task.arrays["noise"]

@@ -24,13 +24,13 @@ class SaccadeConfig(PreTrainedConfig):
         embodiment: Tag or id of the robot. Required if the checkpoint has statistics of several robots.
         precision: How the backbone computes, and the head: float32, bfloat16 or int8.
         head_precision: How the head computes. Default: as the backbone.
-        num_threads: Number of threads. Default: as :meth:`saccade.Policy.load`.
+        num_threads: Number of threads. Default: as :meth:`saccade.Policy.from_pretrained`.
         preprocessing: ``lerobot`` or ``isaac``: how frames and words are prepared. Default: as the
             checkpoint's training program did.
-        tokenizer: A ``tokenizer.json`` or its directory. Default: as :meth:`saccade.Policy.load`.
+        tokenizer: A ``tokenizer.json`` or its directory. Default: as :meth:`saccade.Policy.from_pretrained`.
         cameras: The names of the cameras in the order of the prompt. Default: those of the checkpoint.
         data_config: Name or file of the data config of an N1.5 checkpoint, as for
-            :meth:`saccade.Policy.load`.
+            :meth:`saccade.Policy.from_pretrained`.
         action_horizon: Number of actions that were trained, where the checkpoint says another one.
         processor_options: Options of :class:`saccade.Processor` that replace those of the checkpoint.
         rename_map: Keys of the environment's observations, and the keys that the checkpoint knows. For

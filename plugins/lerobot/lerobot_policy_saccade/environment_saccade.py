@@ -8,7 +8,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from saccade._extras import require
+from saccade._internal.extras import require
 
 
 @EnvConfig.register_subclass("saccade")
@@ -17,7 +17,7 @@ class SaccadeEnv(EnvConfig):
     """The options ``--env.*`` of ``--env.type=saccade``.
 
     Attributes:
-        task: A task of ``saccade.sim.tasks``.
+        task: A task of ``saccade_lab.sim.tasks``.
         fps: Frames a second of simulated time, for videos.
         image_size: Pixels along each side of the cameras' frames. Default: that of the bundled policy.
 
@@ -34,8 +34,8 @@ class SaccadeEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         # Not at the top: it chooses how MuJoCo draws, which concerns only those who use these tasks.
-        from saccade.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE
-        from saccade.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
+        from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE
+        from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 
         require("mujoco", "metaworld")
         find_task(self.task)
@@ -58,7 +58,7 @@ class SaccadeEnv(EnvConfig):
     @property
     def package_name(self) -> str:
         """The module that registers the environments."""
-        return "saccade.sim.lerobot"
+        return "saccade_lab.sim.lerobot"
 
     @property
     def gym_id(self) -> str:

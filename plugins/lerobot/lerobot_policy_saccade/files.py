@@ -9,8 +9,8 @@ from typing import Any
 from huggingface_hub import snapshot_download
 from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError, RevisionNotFoundError
 
+from saccade.checkpoints.hub import PUBLISHED, resolve
 from saccade.errors import InputError
-from saccade.hub import PUBLISHED, resolve
 from saccade.processor import tokenizer_path
 
 #: The folder of the checkpoint. It has a `config.json` of its own, as lerobot's policies do.
@@ -78,7 +78,8 @@ def copy_checkpoint(source: str, tokenizer: str | None, data_config: Path | None
 
     Args:
         source: The directory or id of a checkpoint, or its weights.
-        tokenizer: As :meth:`saccade.Policy.load` takes it. It is copied if the checkpoint has none.
+        tokenizer: As :meth:`saccade.Policy.from_pretrained` takes it. It is copied if the checkpoint has
+        none.
         data_config: The file of a data config, or None.
         folder: The policy's directory.
 

@@ -6,7 +6,7 @@ from typing import Any
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 import saccade
-from saccade.hub import resolve
+from saccade.checkpoints.hub import resolve
 from saccade.robots import read_json
 
 

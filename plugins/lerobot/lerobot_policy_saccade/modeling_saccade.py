@@ -55,7 +55,7 @@ class SaccadePolicy(PreTrainedPolicy):
     Raises:
         ValueError: No checkpoint is given, an option is out of range, or the environment's actions have
             another width.
-        FileNotFoundError, saccade.CheckpointError: As :meth:`saccade.Policy.load`.
+        FileNotFoundError, saccade.CheckpointError: As :meth:`saccade.Policy.from_pretrained`.
 
     Example:
         >>> import torch
@@ -75,7 +75,7 @@ class SaccadePolicy(PreTrainedPolicy):
             raise saccade.InputError("checkpoint: expected a path or an id, got none (--policy.checkpoint)")
         self._checkpoint, self._tokenizer = config.checkpoint, config.tokenizer
         self._data_config = config.data_config
-        self.policy = saccade.Policy.load(
+        self.policy = saccade.Policy.from_pretrained(
             config.checkpoint,
             embodiment=_embodiment(config.embodiment),
             preprocessing=config.preprocessing,  # type: ignore[arg-type]  # it is checked there

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import saccade._saccade as _saccade
 from saccade.bench.work import ATTENTION, Call, Work, Works, encode_work, sample_work
-from saccade.config import HeadConfig
+from saccade.head.config import HeadConfig
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 

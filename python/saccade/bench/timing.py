@@ -12,7 +12,7 @@ import numpy as np
 
 import saccade
 import saccade._saccade as _saccade
-from saccade.observation import Observation
+from saccade.observations.recorded import Observation
 
 #: What a user waits for: encoding an observation, sampling a chunk from its context, and both.
 PIECES = ("encode", "sample", "both")

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from saccade.config import HeadConfig
+from saccade.head.config import HeadConfig
 
 #: Parts whose operands are keys, values and probabilities rather than weights.
 ATTENTION = ("attention",)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import saccade._saccade as _saccade
-from saccade._arrays import Float32Array
-from saccade.config import HeadConfig, to_json
-from saccade.hub import resolve
+from saccade._internal.arrays import Float32Array
+from saccade.checkpoints.hub import resolve
+from saccade.head.config import HeadConfig, to_json
 
 #: A checkpoint: a directory, one ``.safetensors`` file, or a published id.
 Source = str | os.PathLike[str]
@@ -69,10 +69,11 @@ def describe(source: Source, config: Config = None) -> Description:
     """Describes a checkpoint by its ``config.json`` and the headers of its files. Reads no tensor.
 
     Args:
-        source, config: As for :meth:`saccade.ActionHead.load`.
+        source, config: As for :meth:`saccade.ActionHead.from_pretrained`.
 
     Raises:
-        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.load`, except that tensors need not
+        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that
+        tensors need not
             fit the config.
     """
     return description_of(open_published(source, config), source)

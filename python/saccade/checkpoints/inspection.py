@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
-from saccade._arrays import integer
+from saccade._internal.arrays import integer
 from saccade.bench.cost import PRECISIONS, Machine, measured_like, predict
 from saccade.bench.work import Call
 from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, MachineRates, Memory
+from saccade.checkpoints.hub import resolve
 from saccade.checkpoints.resemblance import Reference
 from saccade.checkpoints.survey import Piece, Survey
 from saccade.checkpoints.tokens import token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
-from saccade.config import HeadConfig, to_json
 from saccade.errors import InputError, SaccadeError
-from saccade.hub import resolve
+from saccade.head.config import HeadConfig, to_json
 from saccade.robots import DataConfigLike, read_json
 from saccade.robots.embodiments import IDS
 
@@ -39,12 +39,12 @@ def inspect(
     One tensor, or the slice of one embodiment of it, is in memory at a time.
 
     Args:
-        source, config: As for :meth:`saccade.ActionHead.load`.
+        source, config: As for :meth:`saccade.ActionHead.from_pretrained`.
         reference: A checkpoint to compare with, tensor by tensor; for example the one that ``source`` was
             trained from.
         num_vl_tokens: T_vl of the expected times. 296 is what one camera produces in N1.5.
         data_config: The data config of the robots of GR00T N1 and N1.5, as for
-            :meth:`saccade.Normalizer.load`.
+            :meth:`saccade.Normalizer.from_pretrained`.
         time: Whether to estimate times. This measures the CPU, which takes about a second.
         progress: Called with the number of bytes that are done and the total number of bytes.
 
@@ -53,7 +53,8 @@ def inspect(
         them to JSON values.
 
     Raises:
-        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.load`, except that values need not be
+        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that
+        values need not be
             finite.
         InputError: ``num_vl_tokens`` is not an integer of at least 1, or ``reference`` is of another version.
     """

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import saccade._saccade as _saccade
-from saccade._files import write_json
+from saccade._internal.files import write_json
 from saccade.checkpoints import head_configs
 from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes, eagle_config, merged
 from saccade.checkpoints.backbone_tensors import tensor_shapes, unread_tensor_shapes
@@ -127,7 +127,7 @@ def write(
         >>> import tempfile, saccade
         >>> folder = Path(tempfile.mkdtemp()) / "checkpoint"
         >>> _ = write(folder, "n1.5", backbone=small_backbone("n1.5"), head=small_head("n1.5"))
-        >>> saccade.ActionHead.load(folder).config.context_dim
+        >>> saccade.ActionHead.from_pretrained(folder).config.context_dim
         128
     """
     if head_dtype not in ("BF16", "F32"):

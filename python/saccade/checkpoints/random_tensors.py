@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 
 #: Numbers that are drawn at a time.

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
-from saccade._arrays import integer, optional_integers, text
-from saccade._files import sha256_of
+from saccade._internal.arrays import integer, optional_integers, text
+from saccade._internal.files import sha256_of
 from saccade.checkpoints.description import Config, Source
-from saccade.config import to_json
+from saccade.checkpoints.hub import resolve
 from saccade.errors import InputError
-from saccade.hub import resolve
+from saccade.head.config import to_json
 
 Progress = Callable[[int, int], object] | None
 
@@ -127,7 +127,8 @@ def quantize(
     row / 127. The result does not depend on the instruction set. All other tensors are copied bit for bit,
     and so are the other files of the directory: statistics, processors, tokenizers.
 
-    :meth:`saccade.ActionHead.load`, :meth:`saccade.Backbone.load` and :meth:`saccade.Policy.load` read the
+    :meth:`saccade.ActionHead.from_pretrained`, :meth:`saccade.Backbone.from_pretrained` and
+    :meth:`saccade.Policy.from_pretrained` read the
     copy at every precision. At ``"int8"`` it gives the same bits as
     the source at ``"int8"``. At the others, the weights are those that the integers represent. No other
     program reads these weights.
@@ -138,7 +139,7 @@ def quantize(
         source: A directory (``config.json`` and one or more ``.safetensors`` files) or one ``.safetensors``
             file. Other files are copied only from a directory.
         out: The directory to write. Parent directories are created.
-        config: As for :meth:`saccade.ActionHead.load`. It becomes the ``config.json`` of the copy.
+        config: As for :meth:`saccade.ActionHead.from_pretrained`. It becomes the ``config.json`` of the copy.
         head_only: Whether to leave out tensors outside the head.
         keep_backbone: Whether to copy the tensors of a backbone bit for bit.
         force: Whether to replace an existing checkpoint. A directory that contains other files is never

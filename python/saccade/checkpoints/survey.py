@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 import saccade._saccade as _saccade
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 from saccade.checkpoints.findings import Embodiment, Part
 from saccade.checkpoints.initialisation import Draw, draw, is_as_drawn, is_norm, sample
 from saccade.checkpoints.parts import UNUSED, in_order, part_of
-from saccade.config import HeadConfig
+from saccade.head.config import HeadConfig
 
 #: A median absolute deviation times this is the standard deviation of normally distributed numbers.
 MAD_TO_STD = 1.4826

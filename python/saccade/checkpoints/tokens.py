@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 from saccade.checkpoints.findings import Spread, TokenGeometry, TokenStatistics
 from saccade.checkpoints.initialisation import NORMAL_STD, Draw, distance, is_as_drawn, sample
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
-from saccade.backbone_config import BackboneConfig
-from saccade.dialects import Requirements, observation_sources
+from saccade.backbone.config import BackboneConfig
 from saccade.errors import CheckpointError, SaccadeError
+from saccade.observations import Requirements, observation_sources
 from saccade.processor import Processor
 from saccade.robots import DataConfigLike, Normalizer, read_json
 from saccade.robots.reading import OWN_DATA_CONFIG, processor_folder
@@ -68,7 +68,9 @@ def backbone_of(source: Path, config: str | None) -> BackboneFindings:
         return BackboneFindings(None, str(error), {}, None, None)
     processor, problem = None, None
     try:
-        processor = repr(Processor.load(source)).removeprefix("<saccade.Processor ").removesuffix(">")
+        processor = (
+            repr(Processor.from_pretrained(source)).removeprefix("<saccade.Processor ").removesuffix(">")
+        )
     except (SaccadeError, FileNotFoundError) as error:
         problem = str(error)
     return BackboneFindings(
@@ -88,7 +90,7 @@ def robots_of(
     Args:
         source: The checkpoint.
         state_history: Number of states that its head takes.
-        data_config: As for :meth:`saccade.Normalizer.load`; used for the robots of N1 and N1.5.
+        data_config: As for :meth:`saccade.Normalizer.from_pretrained`; used for the robots of N1 and N1.5.
     """
     try:
         tags = _tags(source)
@@ -104,7 +106,7 @@ def _robot_of(
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
-            normalizer = Normalizer.load(source, tag, data_config=data_config)
+            normalizer = Normalizer.from_pretrained(source, tag, data_config=data_config)
             sources = observation_sources(source, normalizer.embodiment, normalizer.data_config)
         except (SaccadeError, FileNotFoundError) as error:
             return RobotFindings(tag, None, None, (), str(error), None, None)
@@ -153,7 +155,8 @@ def _lerobot_tags(values: Mapping[str, Any]) -> list[str | None]:
     return [None] if values.get("steps") else []
 
 
-#: Files with statistics, in the order in which `Normalizer.load` tries them, and how their robots are listed.
+#: Files with statistics, in the order in which `Normalizer.from_pretrained` tries them, and how their
+#: robots are listed.
 TAGS: dict[str, Callable[[Mapping[str, Any]], list[str | None]]] = {
     "policy_preprocessor.json": _lerobot_tags,
     "processor_config.json": _processor_tags,

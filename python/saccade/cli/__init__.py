@@ -12,52 +12,50 @@ import argparse
 import contextlib
 import errno
 import importlib
+import importlib.metadata
 import os
 import signal
 import sys
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
+from types import ModuleType
 from typing import NoReturn, Protocol, runtime_checkable
 
-from saccade._arguments import UsageError
+from saccade._internal import extras
+from saccade._internal.flags import UsageError
 
 # A command is the module of its name in this package. Its line of help is repeated here, so that
 # `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
     "act": "run a whole checkpoint on pictures and an instruction",
-    "rollout": "run a policy on the simulated robot and report how often it succeeds",
     "serve": "serve a whole checkpoint to robots and simulators over the network",
-    "demos": "record demonstrations of the tasks with scripted experts",
-    "train": "train a policy on recorded demonstrations",
-    "attention": "show what the rows of the action head attend to",
-    "study": "measure what the parts of an action head contribute",
     "bench": "time the action head and compare it with the limits of this machine",
-    "parity": "compare the Rust head with the torch reference",
     "inspect": "show what a checkpoint contains",
     "resize": "write a checkpoint with another number of future tokens",
     "convert": "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter",
     "quantize": "write a checkpoint with int8 weights",
 }
+# The commands of saccade-vla-lab, found by its entry points. They are listed here so that help and the
+# message
+# that says what to install need no other package.
+LAB_COMMANDS: dict[str, str] = {
+    "rollout": "run a policy on the simulated robot and report how often it succeeds",
+    "demos": "record demonstrations of the tasks with scripted experts",
+    "train": "train a policy on recorded demonstrations",
+    "attention": "show what the rows of the action head attend to",
+    "study": "measure what the parts of an action head contribute",
+    "parity": "compare the Rust head with the torch reference",
+}
+LAB = "saccade-vla-lab"
+ENTRY_POINTS = "saccade.commands"
 
-_PICTURES = ("matplotlib", "PIL")
-_TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn", "threadpoolctl")
-_SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
 # The optional packages that each command needs, checked once its arguments have been: a message then names
-# all that are missing. Commands without an entry need NumPy only. See `saccade._extras` for the extras.
+# all that are missing. Commands without an entry need NumPy only.
 NEEDS: dict[str, tuple[str, ...]] = {
     "act": ("rich", "PIL"),
-    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
     "serve": ("zmq", "msgpack"),
-    "demos": ("rich", *_SIMULATOR),
-    "train": ("rich", "matplotlib", "torch", "safetensors"),
-    "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
-    "attention --frames": ("rich", *_PICTURES, "jinja2", "scipy"),
     "inspect --precision-check": ("PIL",),
-    "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib"),
-    "study --features": ("rich", *_PICTURES, *_TABLES, "joblib"),
-    "study report": (*_PICTURES, *_TABLES),
-    "parity": ("torch", "safetensors"),
 }
 
 # Failures of a path that the user named. Python raises these without an error number in places of our own.
@@ -117,17 +115,37 @@ def load_command(name: str) -> Command:
     """The module of a command.
 
     Args:
-        name: a key of `COMMANDS`.
+        name: a key of `COMMANDS` or `LAB_COMMANDS`.
 
     Raises:
         KeyError: there is no such command.
+        UsageError: it is a command of the lab, which is not installed.
         TypeError: its module lacks a part of `Command`.
     """
-    if name not in COMMANDS:
+    if name in COMMANDS:
+        module = importlib.import_module(f"saccade.cli.{name}")
+    elif name in LAB_COMMANDS:
+        module = lab_command(name)
+    else:
         raise KeyError(name)
-    module = importlib.import_module(f"saccade.cli.{name}")
     if not isinstance(module, Command):
         raise TypeError(f"{module.__name__}: expected HELP, add_arguments and run")
+    return module
+
+
+def lab_command(name: str) -> ModuleType:
+    """The module of a command of the lab.
+
+    Raises:
+        UsageError: the lab is not installed.
+    """
+    # Entry points of other distributions are not asked: a name has one meaning.
+    try:
+        (entry,) = importlib.metadata.distribution(LAB).entry_points.select(group=ENTRY_POINTS, name=name)
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        install = extras.SACCADE.install_lab()
+        raise UsageError(f"{name}: needs {LAB}, which is not installed. Install with: {install}") from None
+    module: ModuleType = entry.load()
     return module
 
 
@@ -147,7 +165,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="command", title="commands", parser_class=Parser)
-    for name, help_line in COMMANDS.items():
+    for name, help_line in {**COMMANDS, **LAB_COMMANDS}.items():
         sub = commands.add_parser(
             name, help=help_line, description=help_line[0].upper() + help_line[1:] + "."
         )
@@ -179,9 +197,7 @@ def require(command: str) -> None:
     Raises:
         MissingExtraError: names those that are missing and a command that installs them.
     """
-    from saccade import _extras
-
-    _extras.require(*NEEDS[command])
+    extras.SACCADE.require(*NEEDS[command])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -260,7 +276,7 @@ def plain_warnings() -> Iterator[None]:
 
 def dispatch(argv: list[str]) -> int:
     """Parses `argv`, runs the chosen command and turns bad input into one line and status 2."""
-    from saccade import SaccadeError, _extras
+    from saccade import SaccadeError
     from saccade.cli import _output
 
     # The program's own options take no value, so the first word that is no option is the command.
@@ -285,7 +301,7 @@ def dispatch(argv: list[str]) -> int:
     except MemoryError as error:
         return refuse(f"too large for this machine's memory: {error}".removesuffix(": "))
     except ModuleNotFoundError as error:
-        missing = _extras.explain(error)
+        missing = extras.SACCADE.explain(error)
         if missing is None:
             raise
         return refuse(describe(missing))

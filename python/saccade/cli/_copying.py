@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from saccade import _arguments as arguments
+from saccade._internal import flags as arguments
 from saccade.cli import _output
 
 if TYPE_CHECKING:

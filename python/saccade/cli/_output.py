@@ -13,7 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol
 
-from saccade._json import dumps
+from saccade._internal.json import dumps
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -6,12 +6,12 @@ import argparse
 import dataclasses
 from typing import TYPE_CHECKING
 
-from saccade._arguments import UsageError
+from saccade._internal.flags import UsageError
 from saccade.cli import EXIT_OK, _output, require
 from saccade.cli._tables import Section, show
 
 if TYPE_CHECKING:
-    from saccade.precision_check import Difference, PrecisionCheck
+    from saccade.checkpoints.precisions import Difference, PrecisionCheck
 
 #: The arguments that need `--precision-check`; None where they are not given.
 ARGUMENTS = (
@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) is not None:
             raise UsageError(f"--{name}: not with --precision-check")
     require("inspect --precision-check")
-    from saccade.precision_check import check_precisions
+    from saccade.checkpoints.precisions import check_precisions
 
     with _output.progress_bar("comparing", transient=True) as update:
         found = check_precisions(

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from saccade import _arguments as arguments
-from saccade._arguments import UsageError
-from saccade._policy_arguments import add_policy_options, policy_options
+from saccade._internal import flags as arguments
+from saccade._internal.flags import UsageError
+from saccade._internal.policy_flags import add_policy_options, policy_options
 from saccade.cli import EXIT_OK, _output, require
 from saccade.cli._tables import Section, show
 
 if TYPE_CHECKING:
     from saccade import Policy
-    from saccade._arrays import Float32Array
+    from saccade._internal.arrays import Float32Array
 
 HELP = "run a whole checkpoint on pictures and an instruction"
 EPILOG = """\
@@ -71,13 +71,13 @@ def run(args: argparse.Namespace) -> int:
     """Loads, looks, acts and prints."""
     require("act")
     import saccade
-    from saccade.frames import instruction_of, observation, read_state
+    from saccade.observations.pictures import instruction_of, observation, read_state
 
     pictures = named_pictures(args.image)
     state = None if args.state is None else read_state(args.state)
     clock = Clock()
     with _output.progress_bar("loading", transient=True):
-        policy = saccade.Policy.load(args.checkpoint, **policy_options(args))
+        policy = saccade.Policy.from_pretrained(args.checkpoint, **policy_options(args))
     clock.done("load")
     given = observation(policy, pictures, args.instruction, state)
     clock.done("frames")

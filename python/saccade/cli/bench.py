@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 import saccade
-from saccade import _arguments as arguments
-from saccade._arguments import UsageError
-from saccade._extras import require
+from saccade._internal import flags as arguments
+from saccade._internal.extras import SACCADE
+from saccade._internal.flags import UsageError
 from saccade.bench import heads, roofline
 from saccade.bench.cost import (
     PRECISIONS,
@@ -33,8 +33,8 @@ from saccade.bench.cost import (
 )
 from saccade.bench.timing import Counter, by_turns, pieces, profiled, quartiles
 from saccade.bench.work import Call, Works, encode_work, sample_work, total
+from saccade.checkpoints.hub import resolve
 from saccade.cli import EXIT_OK, _output
-from saccade.hub import resolve
 
 HELP = "time the action head and compare it with the limits of this machine"
 EPILOG = """\
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
         loaded = {}
         for precision in args.precisions:
             note(f"loading {name} in {precision}")
-            loaded[precision] = saccade.ActionHead.load(
+            loaded[precision] = saccade.ActionHead.from_pretrained(
                 source, precision=precision, num_threads=args.num_threads
             )
         report = measure(loaded, name, args, args.num_vl_tokens or default_vl_tokens(source))
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
 def check(args: argparse.Namespace) -> None:
     """Refuses arguments that contradict each other before anything long has run."""
     if args.figure is not None:
-        require("matplotlib")
+        SACCADE.require("matplotlib")
         if not args.figure.parent.is_dir():
             raise FileNotFoundError(f"{args.figure.parent}: no such directory")
     if args.checkpoint is not None and args.version is not None:
@@ -201,7 +201,7 @@ def head_source(args: argparse.Namespace) -> Iterator[tuple[Path, str]]:
             heads.write(Path(folder), heads.sized(args.version))
             yield Path(folder), f"random weights, size {args.version}"
     else:
-        with importlib.resources.as_file(importlib.resources.files("saccade") / "sim" / "demo") as demo:
+        with importlib.resources.as_file(saccade.demo_checkpoint()) as demo:
             yield demo, "the bundled policy"
 
 
@@ -218,7 +218,9 @@ def default_vl_tokens(source: Path) -> int:
         return DEFAULT_VL_TOKENS
     sizes = [(camera.height or FRAME_SIZE, camera.width or FRAME_SIZE) for camera in cameras]
     try:
-        inputs = Processor.load(source)([np.zeros((*size, 3), np.uint8) for size in sizes], INSTRUCTION)
+        inputs = Processor.from_pretrained(source)(
+            [np.zeros((*size, 3), np.uint8) for size in sizes], INSTRUCTION
+        )
     except (SaccadeError, FileNotFoundError):
         return DEFAULT_VL_TOKENS
     return int(inputs.input_ids.shape[1])

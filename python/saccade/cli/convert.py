@@ -6,8 +6,8 @@ import argparse
 import dataclasses
 import re
 
-from saccade import _arguments as arguments
-from saccade._arguments import UsageError
+from saccade._internal import flags as arguments
+from saccade._internal.flags import UsageError
 from saccade.cli import EXIT_OK, _output
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 

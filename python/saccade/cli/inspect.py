@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saccade import _arguments as arguments
-from saccade._arguments import UsageError
-from saccade._policy_arguments import add_data_config, add_overrides
+from saccade._internal import flags as arguments
+from saccade._internal.flags import UsageError
+from saccade._internal.policy_flags import add_data_config, add_overrides
 from saccade.cli import EXIT_OK, _output, _precisions
 from saccade.cli._tables import Section, show
 

@@ -14,9 +14,9 @@ EPILOG = """\
 The weights X.weight of the attention and feed-forward layers of all blocks become int8, with a float32 scale
 for each output in X.weight_scale: those of the head, and those of the backbone unless --keep-backbone or
 --head-only is given. All other tensors are copied bit for bit, and so are the other files of the checkpoint,
-such as statistics, processors and tokenizers. Policy.load(DIR, precision="int8") gives the same bits as
-loading CHECKPOINT at int8. The other precisions load it too, with the dequantized weights. docs/precision.md
-says how much int8 changes actions.
+such as statistics, processors and tokenizers. Policy.from_pretrained(DIR,
+precision="int8") gives the same bits as loading CHECKPOINT at int8. The other precisions load it too, with
+the dequantized weights. docs/precision.md says how much int8 changes actions.
 
 examples:
   saccade quantize GR00T-N1.5-3B/ --out GR00T-N1.5-3B-int8

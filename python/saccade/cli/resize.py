@@ -7,13 +7,13 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from saccade import _arguments as arguments
+from saccade._internal import flags as arguments
 from saccade.cli import EXIT_OK, _output
 from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
 
 if TYPE_CHECKING:
     from saccade.checkpoints import ResizeReport
-    from saccade.comparison import ActionChanges
+    from saccade.checkpoints.comparison import ActionChanges
 
 HELP = "write a checkpoint with another number of future tokens"
 
@@ -61,8 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains and how far actions move."""
     from saccade.checkpoints import describe, resize
-    from saccade.comparison import action_changes
-    from saccade.observation import read
+    from saccade.checkpoints.comparison import action_changes
+    from saccade.observations.recorded import read
 
     if args.features is not None:  # refused before anything is written
         read(Path(args.features), describe(args.checkpoint, args.config).config)

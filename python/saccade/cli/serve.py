@@ -7,9 +7,9 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from saccade import _arguments as arguments
-from saccade._arguments import UsageError
-from saccade._policy_arguments import add_policy_options, policy_options
+from saccade._internal import flags as arguments
+from saccade._internal.flags import UsageError
+from saccade._internal.policy_flags import add_policy_options, policy_options
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
     from saccade.serve.connections import bind
 
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
-    policy = saccade.Policy.load(args.checkpoint, **policy_options(args))
+    policy = saccade.Policy.from_pretrained(args.checkpoint, **policy_options(args))
     # What a first call sets up is not left to the first client.
     policy.act(policy.example_observation(), seed=0, num_steps=args.num_steps)
     log = make_log(args.log)

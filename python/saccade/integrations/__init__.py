@@ -1,8 +1,8 @@
 """Runs the action heads of other programs' policies in saccade. Needs torch, as these policies do."""
 
-from saccade._extras import require
+from saccade._internal.extras import SACCADE
 
-require("torch")
+SACCADE.require("torch")
 
 from saccade.integrations.accelerated import Accelerated, accelerate  # noqa: E402
 

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from saccade.backbone import Backbone
-from saccade.chunking import Chunking
-from saccade.config import HeadConfig
+from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
-from saccade.head import ActionHead
+from saccade.head.chunking import Chunking
+from saccade.head.config import HeadConfig
+from saccade.head.head import ActionHead
+from saccade.head.options import LoadOptions, precisions_of_parts
 from saccade.integrations import backbones, heads
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
 from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
 from saccade.integrations.weights import tensors_of
-from saccade.options import LoadOptions, precisions_of_parts
 
 if TYPE_CHECKING:
     import torch
@@ -53,16 +53,18 @@ def accelerate(
     random tokens and the backbone on a random view, and the results must agree.
 
     Parts are recognised by their structure: the heads of lerobot and Isaac-GR00T, N1.5 to N1.7, and forks
-    that :meth:`saccade.ActionHead.load` supports, and the backbones of N1.5 and N1.7. The torch weights stay
+    that :meth:`saccade.ActionHead.from_pretrained` supports, and the backbones of N1.5 and N1.7. The torch
+    weights stay
     in memory. The copies in saccade take ``handle.head.nbytes`` and ``handle.backbone.nbytes`` more.
 
     Args:
         policy: `GrootPolicy` of lerobot, the policy or model of Isaac-GR00T, or the head itself.
         backbone: Whether the backbone computes in saccade too.
-        precision: As in :meth:`saccade.ActionHead.load`: one name for both parts, or with `backbone` one for
+        precision: As in :meth:`saccade.ActionHead.from_pretrained`: one name for both parts, or with
+        `backbone` one for
             each, as in ``{"backbone": "int8", "head": "bfloat16"}``. ``"float32"`` is exact up to rounding
             for weights of any dtype.
-        num_threads: As in :meth:`saccade.ActionHead.load`.
+        num_threads: As in :meth:`saccade.ActionHead.from_pretrained`.
         embodiment_ids: The embodiments whose weights are copied. A call with another id is an error. Default:
             all.
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from saccade.backbone import Backbone
+from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
+from saccade.head.options import LoadOptions
 from saccade.integrations import backbones
 from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
 from saccade.integrations.weights import tensors_of
-from saccade.options import LoadOptions
 
 if TYPE_CHECKING:
     import torch

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from saccade.backbone_config import BackboneConfig
-from saccade.backbone_inputs import BackboneInputs
+from saccade.backbone.config import BackboneConfig
+from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.integrations import modules
 

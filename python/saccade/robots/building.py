@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import integer
+from saccade._internal.arrays import integer
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.data_configs import DataConfig, says_nothing
 from saccade.robots.embodiments import resolved
@@ -36,7 +36,7 @@ Dims = tuple[int | None, int | None]
 
 @dataclass(frozen=True)
 class Options:
-    """The arguments of :meth:`saccade.Normalizer.load`."""
+    """The arguments of :meth:`saccade.Normalizer.from_pretrained`."""
 
     embodiment: str | int | None
     state_dim: int | None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from saccade._arrays import integer
+from saccade._internal.arrays import integer
 from saccade.errors import InputError
 
 #: Isaac-GR00T N1 and N1.5. ``genie1_gripper`` is an old name of ``agibot_genie1``.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import integer
+from saccade._internal.arrays import integer
 from saccade.robots.building import Builder, Dims, Options, finished
 from saccade.robots.embodiments import N15_IDS
 from saccade.robots.groups import Robot
@@ -17,7 +17,7 @@ def flat_robot(values: Any, options: Options, where: str, dims: Dims) -> Robot:
     """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well.
 
     Raises:
-        CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
+        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
     """
     options.refuse_data_config(where)
     builder = Builder(where, np.float32)

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from saccade._arrays import Float32Array
+from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError, ShapeError
 from saccade.robots import rotations
 from saccade.robots.data_configs import DataConfig

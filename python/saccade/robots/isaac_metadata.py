@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._warning import warn
+from saccade._internal.warning import warn
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.building import Builder, Dims, Options, finished
 from saccade.robots.data_configs import RELEASED, DataConfig
@@ -57,7 +57,7 @@ def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims
     """The robot of a mapping of tags to ``statistics`` and ``modalities``.
 
     Raises:
-        CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
+        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
     """
     needs = {tag: _needs(entry) for tag, entry in values.items()}
     found = choose(options.embodiment, list(values), N15_IDS, "n1.5", where, needs)

@@ -102,7 +102,7 @@ def processor_robot(
         options: What was requested.
 
     Raises:
-        CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
+        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
     """
     options.refuse_data_config(where)
     configs = kwargs.get("modality_configs")

@@ -48,7 +48,7 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     """The robot of a checkpoint's directory; None if ``preprocessor`` has no step of GR00T.
 
     Raises:
-        FileNotFoundError, CheckpointError, InputError: As :meth:`saccade.Normalizer.load`.
+        FileNotFoundError, CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
     """
     pipeline = read_pipeline(folder, preprocessor)
     if pipeline is None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._arrays import (
+from saccade._internal.arrays import (
     Array,
     ArrayLike,
     Float32Array,
@@ -41,7 +41,8 @@ class Normalizer(Robot):
 
         >>> import numpy as np, saccade
         >>> statistics = {"min": [-1.0, 0.0, 0.5], "max": [1.0, 4.0, 0.5]}
-        >>> normalizer = saccade.Normalizer.load({"state": statistics, "action": statistics}, state_dim=5)
+        >>> both = {"state": statistics, "action": statistics}
+        >>> normalizer = saccade.Normalizer.from_pretrained(both, state_dim=5)
         >>> normalizer.state(np.array([[0.5, 1.0, 0.5]]))
         array([[ 0.5, -0.5,  0. ,  0. ,  0. ]], dtype=float32)
         >>> normalizer.actions(np.array([[[0.5, -0.5, 0.25]]]))
@@ -49,7 +50,7 @@ class Normalizer(Robot):
     """
 
     @classmethod
-    def load(
+    def from_pretrained(
         cls,
         source: str | os.PathLike[str] | Mapping[str, Any],
         embodiment: str | int | None = None,

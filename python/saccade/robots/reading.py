@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from saccade.checkpoints.hub import resolve
 from saccade.errors import CheckpointError
-from saccade.hub import resolve
 from saccade.robots.building import Dims, Options, size_of
 from saccade.robots.data_configs import data_config
 from saccade.robots.files import read_json
@@ -30,7 +30,7 @@ MODEL_TYPES = {"Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
 
 
 def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -> Robot:
-    """The robot that ``source`` describes; see :meth:`saccade.Normalizer.load`.
+    """The robot that ``source`` describes; see :meth:`saccade.Normalizer.from_pretrained`.
 
     Raises:
         FileNotFoundError, CheckpointError, InputError: As there.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from saccade._internal.extras import SACCADE
 from saccade.serve.limits import Limits
 
 if TYPE_CHECKING:
@@ -25,9 +26,7 @@ _MODULES = {"Client": "client", "ServerError": "client", "Server": "server"}
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        from saccade import _extras
-
         if name not in _MODULES:
             raise AttributeError(f"module 'saccade.serve' has no attribute {name!r}")
-        _extras.require("zmq", "msgpack")
+        SACCADE.require("zmq", "msgpack")
         return getattr(importlib.import_module(f"saccade.serve.{_MODULES[name]}"), name)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from saccade.dialects import Reading
+from saccade.observations import Reading
 from saccade.serve.requests import Call
 
 #: A client that asked within these seconds is expected to ask again.

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from saccade import _saccade
-from saccade._arrays import Float32Array
-from saccade.chunking import Chunking
-from saccade.options import PolicyOptions, noise_or_draw
+from saccade._internal.arrays import Float32Array
+from saccade.head.chunking import Chunking
+from saccade.head.options import PolicyOptions, noise_or_draw
 from saccade.serve.batching import Job
 from saccade.serve.requests import CHUNKING, RELEASED_CHUNKING
 from saccade.serve.sessions import Chunk, Session, Sessions
 
 if TYPE_CHECKING:
-    from saccade.policy import Policy
+    from saccade.policy.policy import Policy
 
 #: The parts of which the time is reported, in their order. "wait" is the time until a thread takes the
 #: request: its decoding, and the queue.

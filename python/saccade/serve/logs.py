@@ -14,7 +14,7 @@ import time
 from collections import deque
 from typing import Any, Protocol
 
-from saccade._json import dumps
+from saccade._internal.json import dumps
 from saccade.errors import printable
 from saccade.serve.statistics import line
 

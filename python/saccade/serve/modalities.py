@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from saccade import hub
-from saccade._json import dumps
+from saccade._internal.json import dumps
+from saccade.checkpoints import hub
 from saccade.errors import CheckpointError
 from saccade.robots import read_json
 from saccade.robots.reading import processor_folder
 
 if TYPE_CHECKING:
-    from saccade.policy import Policy
+    from saccade.policy.policy import Policy
 
 #: The forms of the answer: that of N1.5, and that of N1.6 and later.
 FORMS = ("text", "map")

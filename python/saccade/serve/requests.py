@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from saccade._arrays import integer
-from saccade.chunking import Chunking
+from saccade._internal.arrays import integer
 from saccade.errors import InputError
+from saccade.head.chunking import Chunking
 
 ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
 #: What the released servers answer, word for word.

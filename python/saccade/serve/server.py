@@ -15,7 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from saccade import dialects, hub
+from saccade import observations as dialects
+from saccade.checkpoints import hub
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import engine, modalities, pickles
 from saccade.serve.batching import Job, Queue
@@ -29,7 +30,7 @@ from saccade.serve.statistics import Statistics
 from saccade.serve.zmtp import Request
 
 if TYPE_CHECKING:
-    from saccade.policy import Policy
+    from saccade.policy.policy import Policy
 
 #: Characters of an error that are sent.
 LONGEST_ERROR = 4000

@@ -9,8 +9,8 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any
 
-from saccade.chunking import Chunking
 from saccade.errors import InputError
+from saccade.head.chunking import Chunking
 from saccade.serve.requests import RELEASED_CHUNKING, Options
 
 

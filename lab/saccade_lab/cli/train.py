@@ -1,0 +1,138 @@
+"""`saccade train`: trains the policy on recorded demonstrations."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from saccade._internal import flags as arguments
+from saccade._internal.files import writable_directory
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output
+from saccade_lab.extras import require
+
+if TYPE_CHECKING:
+    from saccade_lab.training.settings import TrainingSettings
+    from saccade_lab.training.train import Progress
+
+HELP = "train a policy on recorded demonstrations"
+
+EPILOG = """\
+Trains a small whole checkpoint of GR00T N1.5's kind, a SigLIP, a Qwen3 and an action head, and writes it in
+NVIDIA's layout for `saccade rollout --checkpoint DIR` and `saccade.Policy.from_pretrained`. DIR also receives
+settings.json, history.json, loss.png and training.pt. All are written about once a minute. If the command is
+interrupted, run it again: it continues where it stopped, and the weights at the end are the same as those of
+an uninterrupted run. The defaults are those of the bundled policy; `make demo-policy` trains it again.
+
+examples:
+  saccade train --demos out/demos --out out/policy
+  saccade train --demos out/more --start-from out/policy --learning-rate 3e-4 --out out/next
+  saccade train --demos out/demos --out out/n0 --num-future-tokens 0
+  saccade train --demos out/demos --out out/aligned --alignment-weight 0.2
+  saccade train --demos out/demos --out out/quick --training-steps 2000 --num-threads 2
+"""
+
+# Flag, its smallest value, and what it is.
+INTEGERS = (
+    ("--training-steps", 1, "optimiser steps"),
+    ("--batch-size", 1, "observations per step"),
+    ("--seed", 0, "seed of weights, order and noise"),
+    ("--num-future-tokens", 0, "number of learned query tokens, N"),
+    ("--patch-size", 2, "pixels along each side of the patch behind an image token, even"),
+    ("--vl-num-layers", 0, "blocks of the head's VL self-attention"),
+    ("--width", 8, "width of language model and head"),
+    ("--num-layers", 1, "blocks of the head"),
+)
+
+# Flag, its smallest value, what it is below, and what it is.
+NUMBERS = (
+    ("--learning-rate", 1e-9, 1.0, "learning rate of AdamW after the warm-up"),
+    ("--ema-decay", 0.0, 1.0, "decay of the averaged weights, which are those that are saved"),
+    (
+        "--absent-share",
+        0.0,
+        1.0,
+        "share of frames with the instruction of an absent object, for which the policy learns to keep still",
+    ),
+    (
+        "--alignment-weight",
+        0.0,
+        float("inf"),
+        "weight of the loss that aligns the future tokens' rows with the observation one horizon later; "
+        "FLARE uses 0.2",
+    ),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the arguments."""
+    from saccade_lab.training.settings import TrainingSettings
+
+    defaults = TrainingSettings()
+    parser.epilog = EPILOG
+    parser.add_argument(
+        "--demos", type=Path, required=True, metavar="DIR", help="directory written by `saccade demos`"
+    )
+    arguments.add_out(parser, None, "directory of the run")
+    arguments.add_num_threads(parser, "threads of torch", 1)
+    for flag, smallest, what in INTEGERS:
+        default = getattr(defaults, setting(flag))
+        arguments.add_integer(parser, flag, minimum=smallest, default=default, help=what)
+    for flag, lowest, limit, what in NUMBERS:
+        default = getattr(defaults, setting(flag))
+        arguments.add_number(parser, flag, minimum=lowest, below=limit, default=default, help=what)
+    parser.add_argument(
+        "--start-from", type=Path, metavar="DIR", help="policy to start from (default: random weights)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Checks the arguments, then trains."""
+    from saccade_lab.sim.demos import recorded_tasks
+
+    if args.start_from is not None and not (args.start_from / "model.safetensors").is_file():
+        raise FileNotFoundError(f"{args.start_from}: no policy there")
+    recorded_tasks(args.demos)
+    settings = training_settings(args)
+    require("train")
+    import torch
+
+    from saccade_lab.training import train
+
+    writable_directory(args.out)
+    torch.set_num_threads(args.num_threads)
+    try:
+        with _output.progress_bar("reading", settings.steps) as update:
+
+            def on_step(now: Progress) -> None:
+                held_out = "" if now.validation_loss is None else f", held out {now.validation_loss:.3f}"
+                update(now.step, description=f"loss {now.loss:.3f}{held_out}")
+
+            train.train(args.demos, args.out, settings, on_step, start=args.start_from)
+    except KeyboardInterrupt:
+        print(f"stopped; the same command continues from {args.out / train.STATE_FILE}")
+        return EXIT_INTERRUPTED
+    print(f"policy in {args.out}; try it: saccade rollout --checkpoint {args.out}")
+    return EXIT_OK
+
+
+def training_settings(args: argparse.Namespace) -> TrainingSettings:
+    """The settings that the arguments ask for.
+
+    Raises:
+        InputError: they do not fit each other.
+    """
+    from saccade_lab.training.settings import TrainingSettings
+
+    flags = [flag for flag, *_ in (*INTEGERS, *NUMBERS)]
+    return TrainingSettings(**{setting(flag): getattr(args, destination(flag)) for flag in flags})
+
+
+def destination(flag: str) -> str:
+    """The name of a flag's value."""
+    return flag.removeprefix("--").replace("-", "_")
+
+
+def setting(flag: str) -> str:
+    """The setting that a flag sets."""
+    return "steps" if flag == "--training-steps" else destination(flag)

@@ -1,0 +1,65 @@
+"""The optional dependencies of the lab, and what each of its commands needs."""
+
+from __future__ import annotations
+
+from saccade._internal.extras import Extras
+
+#: The extras of saccade-vla-lab.
+LAB = Extras(
+    "saccade-vla-lab",
+    "lab",
+    {
+        "sim": {
+            "rich": "rich",
+            "PIL": "pillow",
+            "gymnasium": "gymnasium",
+            "metaworld": "metaworld",
+            "mujoco": "mujoco",
+            "packaging": "packaging",
+            "imageio": "imageio",
+            "imageio_ffmpeg": "imageio-ffmpeg",
+            "matplotlib": "matplotlib",
+            "jinja2": "jinja2",
+            "scipy": "scipy",
+            "joblib": "joblib",
+        },
+        "study": {
+            "torch": "torch",
+            "safetensors": "safetensors",
+            "markdown_it": "markdown-it-py",
+            "pandas": "pandas",
+            "sklearn": "scikit-learn",
+            "threadpoolctl": "threadpoolctl",
+        },
+        "ray": {"ray": "ray"},
+    },
+    {"study": ("sim",), "ray": ("study", "sim")},
+)
+
+_PICTURES = ("matplotlib", "PIL")
+_TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn", "threadpoolctl")
+_SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
+#: The optional packages of each command, checked together once its arguments have been parsed.
+NEEDS: dict[str, tuple[str, ...]] = {
+    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
+    "demos": ("rich", *_SIMULATOR),
+    "train": ("rich", "matplotlib", "torch", "safetensors"),
+    "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
+    "attention --frames": ("rich", *_PICTURES, "jinja2", "scipy"),
+    "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib"),
+    "study --features": ("rich", *_PICTURES, *_TABLES, "joblib"),
+    "study report": (*_PICTURES, *_TABLES),
+    "parity": ("torch", "safetensors"),
+}
+
+
+def require(command: str) -> None:
+    """Checks that the optional packages of a command are installed, without importing them.
+
+    Args:
+        command: A key of :data:`NEEDS`.
+
+    Raises:
+        MissingExtraError: Some are missing; the message has a command that installs them.
+    """
+    LAB.require(*NEEDS[command])

@@ -1,0 +1,16 @@
+"""The same action head and backbone in plain torch: they are trained, and the Rust ones tested against them.
+
+They favour clarity over speed: nothing is cached, and every row is computed in every block. `head` is the
+sampler and the loss, `layers` the modules, `intervene` the effect of an intervention in each block;
+`backbone` is what turns frames and words into features. Needs torch and safetensors.
+"""
+
+from saccade_lab.extras import LAB
+
+LAB.require("torch", "safetensors")
+
+from saccade_lab.reference.backbone import Backbone, BackboneFeatures  # noqa: E402
+from saccade_lab.reference.head import ActionHead  # noqa: E402
+from saccade_lab.reference.training import TimeDistribution  # noqa: E402
+
+__all__ = ["ActionHead", "Backbone", "BackboneFeatures", "TimeDistribution"]

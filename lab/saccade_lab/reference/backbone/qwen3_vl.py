@@ -1,0 +1,216 @@
+"""What N1.7 does in another way: Qwen3-VL's vision tower and the positions of its prompts.
+
+Module names follow the checkpoint. Shapes in comments: P are the patches of all views.
+"""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from saccade.checkpoints.backbone_sizes import BackboneSizes, VisionSizes
+from saccade.errors import InputError
+from saccade_lab.reference.backbone.attention import attend, split_heads
+from saccade_lab.reference.backbone.rotary import grid_angles, rotate
+
+
+class PatchEmbedding(nn.Module):
+    """A linear layer of a patch, stored as a convolution."""
+
+    def __init__(self, sizes: VisionSizes) -> None:
+        super().__init__()
+        self.shape = (3, sizes.temporal_patch_size, sizes.patch_size, sizes.patch_size)
+        self.proj = nn.Conv3d(3, sizes.width, kernel_size=self.shape[1:], stride=self.shape[1:])
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """`(P, values)` to `(P, vision_width)`."""
+        return self.proj(patches.unflatten(1, self.shape)).flatten(1)
+
+
+class SelfAttention(nn.Module):
+    """Attention of all patches of a view to each other, with rotary positions."""
+
+    def __init__(self, sizes: VisionSizes) -> None:
+        super().__init__()
+        self.head_dim = sizes.width // sizes.num_heads
+        self.qkv = nn.Linear(sizes.width, 3 * sizes.width)
+        self.proj = nn.Linear(sizes.width, sizes.width)
+
+    def forward(self, x: Tensor, angles: Tensor, lengths: list[int]) -> Tensor:
+        """`x (P, vision_width)`, `angles (P, head_dim / 2)`, the patches of each view; to `x`'s shape."""
+        q, k, v = (split_heads(part, self.head_dim) for part in self.qkv(x).chunk(3, dim=-1))
+        q, k = rotate(q, angles), rotate(k, angles)  # (heads, P, head_dim)
+        views = zip(q.split(lengths, 1), k.split(lengths, 1), v.split(lengths, 1), strict=True)
+        return self.proj(torch.cat([attend(*view) for view in views]))
+
+
+class Mlp(nn.Module):
+    """Two linear layers with GELU, approximated by tanh, between them."""
+
+    def __init__(self, sizes: VisionSizes) -> None:
+        super().__init__()
+        self.linear_fc1 = nn.Linear(sizes.width, sizes.mlp_width)
+        self.linear_fc2 = nn.Linear(sizes.mlp_width, sizes.width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(P, vision_width)` to the same shape."""
+        return self.linear_fc2(F.gelu(self.linear_fc1(x), approximate="tanh"))
+
+
+class Block(nn.Module):
+    """Attention and feed-forward layer, each after a LayerNorm and with a residual."""
+
+    def __init__(self, sizes: VisionSizes) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(sizes.width, eps=sizes.eps)
+        self.attn = SelfAttention(sizes)
+        self.norm2 = nn.LayerNorm(sizes.width, eps=sizes.eps)
+        self.mlp = Mlp(sizes)
+
+    def forward(self, x: Tensor, angles: Tensor, lengths: list[int]) -> Tensor:
+        """`x (P, vision_width)` to the same shape; the others are as in `SelfAttention`."""
+        x = x + self.attn(self.norm1(x), angles, lengths)
+        return x + self.mlp(self.norm2(x))
+
+
+class Merger(nn.Module):
+    """Joins the patches of each square into an image token.
+
+    The merger after the last block normalises patches, the "deepstack" ones normalise joined patches.
+    """
+
+    def __init__(self, sizes: BackboneSizes, *, norm_joined: bool) -> None:
+        super().__init__()
+        width = sizes.vision.width
+        self.joined = width * sizes.merge**2
+        self.norm_joined = norm_joined
+        self.norm = nn.LayerNorm(self.joined if norm_joined else width, eps=sizes.vision.eps)
+        self.linear_fc1 = nn.Linear(self.joined, self.joined)
+        self.linear_fc2 = nn.Linear(self.joined, sizes.text.width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(P, vision_width)`, the patches of a square together, to `(image tokens, width)`."""
+        joined = (-1, self.joined)
+        x = self.norm(x.reshape(joined)) if self.norm_joined else self.norm(x).reshape(joined)
+        return self.linear_fc2(F.gelu(self.linear_fc1(x)))  # the exact GELU, by erf
+
+
+class VisionTower(nn.Module):
+    """The vision tower with its mergers."""
+
+    def __init__(self, sizes: BackboneSizes) -> None:
+        super().__init__()
+        vision = sizes.vision
+        self.merge = sizes.merge
+        self.deepstack = vision.deepstack
+        self.head_dim = vision.width // vision.num_heads
+        self.patch_embed = PatchEmbedding(vision)
+        self.pos_embed = nn.Embedding(vision.num_positions, vision.width)
+        self.blocks = nn.ModuleList(Block(vision) for _ in range(vision.num_layers))
+        self.merger = Merger(sizes, norm_joined=False)
+        self.deepstack_merger_list = nn.ModuleList(Merger(sizes, norm_joined=True) for _ in vision.deepstack)
+
+    def forward(self, patches: Tensor, grids: list[tuple[int, int]]) -> tuple[Tensor, list[Tensor]]:
+        """The image tokens of all views.
+
+        Args:
+            patches: `(P, values)`, square after square.
+            grids: rows and columns of patches of each view.
+
+        Returns:
+            The image tokens `(N, width)`, and as many again for each deepstack layer.
+        """
+        places = [patch_places(rows, columns, self.merge) for rows, columns in grids]
+        x = self.patch_embed(patches)
+        x = x + torch.cat(
+            [self.positions(*grid, *place) for grid, place in zip(grids, places, strict=True)]
+        )  # (P, vision_width)
+        rows, columns = (torch.cat(axis) for axis in zip(*places, strict=True))  # (P,) each
+        angles = grid_angles(rows, columns, self.head_dim // 2, x.dtype)  # (P, head_dim / 2)
+        lengths = [rows * columns for rows, columns in grids]
+        stacked = []
+        for index, block in enumerate(self.blocks):
+            x = block(x, angles, lengths)
+            if index in self.deepstack:
+                stacked.append(self.deepstack_merger_list[self.deepstack.index(index)](x))
+        return self.merger(x), stacked
+
+    def positions(self, num_rows: int, num_columns: int, rows: Tensor, columns: Tensor) -> Tensor:
+        """The table at places of a view, bilinear between its entries.
+
+        Args:
+            num_rows, num_columns: the grid of the view, stretched over the whole table.
+            rows, columns: places on that grid, `(patches,)`.
+
+        Returns:
+            `(patches, vision_width)`.
+        """
+        table = self.pos_embed.weight
+        side = round(table.shape[0] ** 0.5)
+        y = torch.linspace(0, side - 1, num_rows, dtype=table.dtype)[rows]
+        x = torch.linspace(0, side - 1, num_columns, dtype=table.dtype)[columns]
+        top, left = y.long(), x.long()
+        down, right = (y - top)[:, None], (x - left)[:, None]  # shares of the next entries, (patches, 1)
+        bottom, next_column = (top + 1).clamp(max=side - 1), (left + 1).clamp(max=side - 1)
+        above = table[top * side + left] * (1 - right) + table[top * side + next_column] * right
+        below = table[bottom * side + left] * (1 - right) + table[bottom * side + next_column] * right
+        return above * (1 - down) + below * down
+
+
+def patch_places(rows: int, columns: int, merge: int) -> tuple[Tensor, Tensor]:
+    """Row and column of each patch of a view, square after square as in the inputs, `(patches,)`."""
+    row = torch.arange(rows)[:, None].expand(rows, columns)
+    column = torch.arange(columns).expand(rows, columns)
+
+    def by_square(x: Tensor) -> Tensor:
+        return x.unflatten(1, (-1, merge)).unflatten(0, (-1, merge)).transpose(1, 2).flatten()
+
+    return by_square(row), by_square(column)
+
+
+def prompt_positions(
+    input_ids: Tensor, attention_mask: Tensor, grids: list[tuple[int, int]], sizes: BackboneSizes
+) -> Tensor:
+    """Positions of tokens on the axes of time, height and width.
+
+    A text token takes the next number on all axes. An image that starts at p has its token (r, c) at
+    (p, p + r, p + c), and the next number is p plus the longer side of its grid. Padding has 1.
+
+    Args:
+        input_ids: `(B, T)`.
+        attention_mask: bool `(B, T)`.
+        grids: rows and columns of patches of each view, those of the first prompt first.
+        sizes: of the backbone.
+
+    Returns:
+        int64 `(3, B, T)`.
+
+    Raises:
+        InputError: the image tokens of a prompt are not those of its views.
+    """
+    positions = torch.ones((3, *input_ids.shape), dtype=torch.long)
+    remaining = iter(grids)
+    for row, (ids, attended) in enumerate(zip(input_ids, attention_mask, strict=True)):
+        number, column = 0, 0
+        kept = attended.nonzero()[:, 0]
+        tokens = ids[kept].tolist()
+        while column < len(tokens):
+            if tokens[column] != sizes.image_token:
+                positions[:, row, kept[column]] = number
+                number, column = number + 1, column + 1
+                continue
+            height, width = (side // sizes.merge for side in next(remaining, (0, 0)))
+            found = tokens[column : column + height * width]
+            if found != [sizes.image_token] * (height * width) or not found:
+                raise InputError(
+                    f"input_ids: expected {height} x {width} image tokens of a view from position "
+                    f"{int(kept[column])} of prompt {row}"
+                )
+            r = torch.arange(height)[:, None].expand(height, width).flatten()
+            c = torch.arange(width).expand(height, width).flatten()
+            places = kept[column : column + height * width]
+            positions[:, row, places] = number + torch.stack((torch.zeros_like(r), r, c))
+            number, column = number + max(height, width), column + height * width
+    return positions

@@ -1,0 +1,505 @@
+"""The GR00T action heads as one torch module: N1, N1.5, N1.6, N1.7 and a fork.
+
+They are one architecture with different sizes and switches. Module names follow the checkpoint, so that
+`state_dict()` has the released tensor names. Shapes in comments: B is the batch, R the rows of the query
+sequence (H state rows, N future rows, T action rows), S the vision-language tokens.
+"""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from saccade._internal.arrays import integer
+from saccade.errors import InputError
+from saccade.head.chunking import Chunking
+from saccade.head.config import HeadConfig
+from saccade.head.integrator import INTEGRATORS, check_integrator
+from saccade.head.intervention import Intervention, Tokens
+from saccade.head.trace import Trace
+from saccade_lab.reference import loading
+from saccade_lab.reference.checks import as_embodiment, check_shape
+from saccade_lab.reference.chunking import start_of
+from saccade_lab.reference.intervene import Mask, Run, removal_bias, token_mask
+from saccade_lab.reference.layers import (
+    NORM_EPS,
+    ActionEncoder,
+    CategoryMlp,
+    DiffusionTransformer,
+    VlSelfAttention,
+    token_table,
+)
+from saccade_lab.reference.state_dropout import STATE_DROPOUT, check_probabilities, drops_states, seen_state
+from saccade_lab.reference.training import TimeDistribution, flow_matching_error, hold_unused, is_unused
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from saccade_lab.reference.options import Conditions, RunOptions, SampleOptions
+
+
+class ActionHead(nn.Module):
+    """A GR00T action head in torch.
+
+    The head computes in the dtype of its parameters (`.double()` for float64) and is differentiable. Inputs
+    may be NumPy arrays and are converted to that dtype. Wrap calls in `torch.no_grad()` if no gradient is
+    needed. A new head has the initial distribution of the released code. Unlike the released training, there
+    is no dropout, and states are not made noisy, nor dropped except by `dropout_prob_by_embodiment`.
+
+    Args:
+        config: sizes and switches.
+        time_distribution: the distribution of `sample_time`.
+        unused: names of parameters that only the released training uses (`task_log_sigma.NAME`,
+            `mask_token`). They are kept, so that a checkpoint stays complete.
+        has_state_dropout: whether there is `dropout_prob_by_embodiment`, `(num_embodiments,)`, zeros at
+            first. The states of embodiments with an entry above 0.999 are set to zero.
+
+    Example:
+        >>> from saccade_lab.reference import random_weights
+        >>> head = random_weights.random_head(random_weights.small_config(), seed=0, dtype=torch.float64)
+        >>> inputs = random_weights.random_inputs(head.config, seed=1, batch=2, num_vl_tokens=7)
+        >>> vl_embs = head.encode(inputs["backbone_features"])
+        >>> head.sample(vl_embs, inputs["state"], 2, noise=inputs["noise"]).shape
+        torch.Size([2, 16, 32])
+
+        How much the action rows attend to each of the 32 future rows in block 1 of the first Euler step:
+
+        >>> trace = head.trace(vl_embs, inputs["state"], 2, noise=inputs["noise"])
+        >>> trace.attention[0, 1][:, :, trace.rows["action"], trace.rows["future"]].shape
+        torch.Size([2, 2, 16, 32])
+    """
+
+    mask_token: nn.Parameter  # if it is among `unused`
+    dropout_prob_by_embodiment: Tensor  # with `has_state_dropout`
+
+    def __init__(
+        self,
+        config: HeadConfig,
+        *,
+        time_distribution: TimeDistribution | None = None,
+        unused: Iterable[str] = (),
+        has_state_dropout: bool = False,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.time_distribution = time_distribution or TimeDistribution()
+        categories, hidden, width = config.num_embodiments, config.hidden_dim, config.width
+        self.model = DiffusionTransformer(config)
+        self.state_encoder = CategoryMlp(categories, config.state_history * config.state_dim, hidden, width)
+        self.action_encoder = ActionEncoder(categories, config.encoder_action_dim, width)
+        for name, decoded in config.decoders:
+            self.add_module(name, CategoryMlp(categories, hidden, hidden, decoded))
+        if config.version == "n1.5":  # the released code has the table even if it has no rows
+            self.future_tokens = token_table(config.num_future_tokens, width)
+        if config.use_vlln:
+            self.vlln = nn.LayerNorm(config.context_dim, eps=NORM_EPS)
+        if config.vl_num_layers > 0:
+            self.vl_self_attention = VlSelfAttention(config)
+        if config.add_pos_embed:
+            self.position_embedding = token_table(config.max_positions, width)
+        for name in unused:
+            hold_unused(self, name, config)
+        self.drops_states = has_state_dropout
+        if has_state_dropout:
+            self.register_buffer(STATE_DROPOUT, torch.zeros(config.num_embodiments))
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        source: str | PathLike[str],
+        *,
+        config: Mapping[str, Any] | str | PathLike[str] | None = None,
+        num_states: int | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> ActionHead:
+        """Loads the head from a checkpoint.
+
+        Args:
+            source: a directory or a file in any layout that :meth:`saccade.ActionHead.from_pretrained`
+            reads, or the id
+                of a repository in the local Hugging Face cache.
+            config: the config of the checkpoint or of the head, as a dict or a path. Default: the
+                `config.json` in the same directory, or else the `config` entry in the metadata of a single
+                file.
+            num_states: number of states in an observation, as for :meth:`saccade.ActionHead.from_pretrained`.
+            dtype: dtype of the parameters. Narrower stored dtypes are widened, which is exact.
+
+        Raises:
+            FileNotFoundError: a path does not exist.
+            CheckpointError: there is no config, or tensors are missing, unknown or of the wrong shape. The
+                message lists all of them.
+            InputError: `num_states` is out of range.
+        """
+        checkpoint = loading.described(source, config)
+        whole, names = checkpoint.head_config, loading.tensor_names(checkpoint)
+        has_state_dropout = STATE_DROPOUT in names
+        drops = drops_states(whole, has_state_dropout)
+        with torch.device("meta"):  # no memory and no time for an initialisation that is replaced
+            head = cls(
+                HeadConfig.from_dict(whole, num_states=num_states),
+                time_distribution=TimeDistribution.from_dict(whole),
+                unused=filter(is_unused, names),
+                has_state_dropout=has_state_dropout,
+            )
+        shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}
+        head.load_state_dict(loading.read_tensors(checkpoint, shapes, dtype), assign=True)
+        head.drops_states = drops
+        if drops:
+            check_probabilities(head.dropout_prob_by_embodiment)
+        return head
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the parameters, in which everything is computed."""
+        return self.model.proj_out_2.weight.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the parameters."""
+        return self.model.proj_out_2.weight.device
+
+    @property
+    def learned_tokens(self) -> Tensor:
+        """The future tokens, `(N, width)`. Only N1.5 has any."""
+        if self.config.version == "n1.5":
+            return self.future_tokens.weight
+        return torch.empty(0, self.config.width, dtype=self.dtype, device=self.device)
+
+    def encode(self, backbone_features: Tensor | np.ndarray, *, drop_vl: Mask = None) -> Tensor:
+        """Computes the vision-language tokens that the blocks attend to, once per observation.
+
+        Every token attends to every other one. The masks of N1.6 and N1.7 apply to the later blocks only.
+
+        Args:
+            backbone_features: `(B, S, context_dim)`.
+            drop_vl: bool `(B, S)`, True for tokens that are removed, as if they were not in the input. Their
+                places remain and are zero, so `velocity`, `sample` and `trace` need `drop_vl` as well.
+
+        Returns:
+            `vl_embs (B, S, context_dim)`. These are the features themselves if the head has neither `vlln`
+            nor VL self-attention.
+        """
+        features = self.as_input(backbone_features)
+        check_shape("backbone_features", features, (None, None, self.config.context_dim))
+        removed = token_mask("drop_vl", drop_vl, features)
+        if self.config.use_vlln:
+            features = self.vlln(features)
+        if self.config.vl_num_layers > 0:
+            bias = None if removed is None else removal_bias(removed, self.dtype)
+            features = self.vl_self_attention(features, bias)
+        return features if removed is None else features.masked_fill(removed[..., None], 0.0)
+
+    def velocity(
+        self,
+        vl_embs: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        timestep: int | Tensor | np.ndarray,
+        **conditions: Unpack[Conditions],
+    ) -> Tensor:
+        """The velocity of the flow at noisy actions.
+
+        Args:
+            vl_embs: `(B, S, context_dim)`, from `encode`.
+            state: `(B, num_states, state_dim)`, or `(B, state_dim)` for one state; normalised and padded.
+            embodiment_id: an int, or `(B,)`.
+            actions: `(B, T, encoder_action_dim)`.
+            timestep: time bucket, an int or `(B,)`.
+            **conditions: `drop_vl`, `attention_mask`, `image_mask`, `intervention` and `stop_gradient` as in
+                `trace`. This evaluation is step 0 of 1.
+
+        Returns:
+            `(B, T, action_dim)`.
+
+        Raises:
+            ShapeError: an array has the wrong shape.
+            InputError: the head does not have the embodiment, or a place of an intervention.
+        """
+        vl_embs = self.as_input(vl_embs)
+        check_shape("vl_embs", vl_embs, (None, None, self.config.context_dim))
+        run = Run(self.config, vl_embs, num_steps=1, **conditions)
+        return self.velocity_in(run, 0, vl_embs, state, embodiment_id, actions, timestep)
+
+    def velocity_in(
+        self,
+        run: Run,
+        evaluation: int,
+        vl_embs: Tensor,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        timestep: int | Tensor | np.ndarray,
+    ) -> Tensor:
+        """One velocity evaluation of a run. Arguments and result are as in `velocity`."""
+        config, horizon = self.config, self.config.action_horizon
+        actions, state = self.as_input(actions), self.as_input(state)
+        batch = vl_embs.shape[0]
+        check_shape("actions", actions, (batch, horizon, config.encoder_action_dim))
+        state = state[:, None] if state.ndim == 2 else state
+        check_shape("state", state, (batch, config.num_states, config.state_dim))
+        state = state.reshape(batch, config.num_state_rows, -1)  # (B, H, state_history * state_dim)
+        embodiment_id = as_embodiment(embodiment_id, batch, config.num_embodiments, self.device)
+        timestep = torch.as_tensor(timestep, device=self.device).expand(batch)  # (B,)
+        if self.drops_states:
+            state = seen_state(state, self.dropout_prob_by_embodiment, embodiment_id)
+
+        state_rows = self.state_encoder(state, embodiment_id)  # (B, H, width)
+        tokens = self.learned_tokens if run.future_tokens is None else run.future_tokens  # (N, width)
+        future_rows = tokens.expand(batch, -1, -1)  # (B, N, width)
+        action_rows = self.action_encoder(actions, timestep, embodiment_id)  # (B, T, width)
+        if config.add_pos_embed:
+            action_rows = action_rows + self.position_embedding.weight[:horizon]
+        rows = torch.cat((state_rows, future_rows, action_rows), dim=1)  # (B, R, width)
+
+        changes = [run.change(evaluation, block) for block in range(config.num_layers)]
+        hidden = self.model(rows[:, run.first_row(evaluation) :], vl_embs, timestep, changes)[
+            :, -horizon:
+        ]  # (B, T, hidden_dim)
+        decoded = [self.get_submodule(name)(hidden, embodiment_id) for name, _ in config.decoders]
+        return torch.cat(decoded, dim=-1)  # (B, T, action_dim)
+
+    def sample(
+        self,
+        vl_embs: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        num_steps: int | None = None,
+        integrator: str | None = None,
+        future_refresh: int | None = None,
+        previous_chunk: Tensor | np.ndarray | None = None,
+        chunking: Chunking | None = None,
+        **conditions: Unpack[Conditions],
+    ) -> Tensor:
+        """Follows the flow from noise (time 0) to actions (time 1) in equal steps.
+
+        Args:
+            vl_embs, state, embodiment_id: as in `velocity`.
+            noise: `(B, T, encoder_action_dim)`, standard normal.
+            num_steps: number of steps. Default: that of the config.
+            integrator: "euler" (default), or "midpoint", which evaluates the velocity twice in each step.
+            future_refresh: the state rows and the future rows are recomputed every `future_refresh` velocity
+                evaluations, starting with the first. At the others, self-attention reads them as they were.
+                Default: at every evaluation.
+            previous_chunk: the chunk that the robot is executing, `(B, rows, action_dim)` or `(B, rows,
+                encoder_action_dim)`, normalised, with at least `chunking.horizon` rows. Required with
+                `chunking`.
+            chunking: how this chunk continues the previous one. `velocity_strength` is the factor of the
+                velocity, in both evaluations of a midpoint step.
+            **conditions: `drop_vl`, `attention_mask`, `image_mask`, `intervention` and `stop_gradient` as in
+                `trace`. All evaluations of a step belong to that step. A patch of rows at a step where they
+                are not always computed is an error.
+
+        Returns:
+            Actions `(B, T, action_dim)`, normalised.
+
+        Raises:
+            ShapeError, DtypeError: an array does not fit.
+            InputError: a value is out of range, or an intervention does not fit the head.
+        """
+        vl_embs = self.as_input(vl_embs)
+        run = self.run_of(
+            vl_embs,
+            num_steps,
+            in_step=INTEGRATORS[check_integrator(integrator)],
+            future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
+            **conditions,
+        )
+        previous = None if previous_chunk is None else self.as_input(previous_chunk)
+        start, strength = start_of(self.as_input(noise), previous, chunking, self.config)
+        return self.follow(run, vl_embs, state, embodiment_id, start, strength)
+
+    def trace(
+        self,
+        vl_embs: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        num_steps: int | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
+        record: Iterable[str] = ("attention",),
+        blocks: Sequence[int] | int | None = None,
+        steps: Sequence[int] | int | None = None,
+    ) -> Trace[Tensor]:
+        """Samples as `sample` does, and records attention and hidden states, which are part of the graph.
+
+        The gradient with stopped edges is the sum over all paths from the result back to an input that use
+        none of these edges. With `[("state", "future"), ("action", "future")]`, it is the part that does not
+        pass through future rows. The total gradient minus this is the part that does.
+
+        Args:
+            vl_embs, state, embodiment_id, noise, num_steps: as in `sample`.
+            drop_vl: bool `(B, S)`, as given to `encode`: no row attends to these tokens.
+            attention_mask: bool `(B, S)`, True where a token is attended. Default: everywhere. A head that
+                ignores padding accepts an all-true mask only.
+            image_mask: bool `(B, S)`, True for image tokens. Required for N1.6 and N1.7, whose
+                cross-attention blocks attend to text and images in turn.
+            intervention: one or several :class:`saccade.Intervention`.
+            stop_gradient: pairs (reader, source) as in `Intervention.cut`, in all blocks, steps and heads.
+                The result is unchanged up to rounding, but in the backward pass the rows of the reader treat
+                the keys and values of the source as constants.
+            record: what is recorded, any of "attention" and "hidden".
+            blocks: the blocks that are recorded. Default: all.
+            steps: the steps that are recorded. Default: all.
+
+        Returns:
+            Attention probabilities, rows after the blocks, and the actions of `sample` up to rounding.
+
+        Raises:
+            ShapeError, DtypeError: an array does not fit.
+            InputError: a value is out of range, or an intervention does not fit the head.
+        """
+        vl_embs = self.as_input(vl_embs)
+        run = self.run_of(
+            vl_embs,
+            num_steps,
+            intervention=intervention,
+            drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
+            stop_gradient=stop_gradient,
+            record=record,
+            blocks=blocks,
+            steps=steps,
+        )
+        actions = self.follow(run, vl_embs, state, embodiment_id, self.as_input(noise))
+        return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
+
+    def run_of(self, vl_embs: Tensor, num_steps: int | None, **options: Unpack[RunOptions]) -> Run:
+        """A run with this number of steps, or that of the config.
+
+        Raises:
+            InputError: The number of steps is out of range, or an option does not fit the head.
+        """
+        config = self.config
+        num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
+        if not 1 <= num_steps <= config.num_timestep_buckets:
+            raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
+        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
+        return Run(config, vl_embs, num_steps=num_steps, **options)
+
+    def follow(
+        self,
+        run: Run,
+        vl_embs: Tensor,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        start: Tensor,
+        strength: Tensor | None = None,
+    ) -> Tensor:
+        """The steps of `sample` from `start (B, T, encoder_action_dim)` to `(B, T, action_dim)`.
+
+        `strength (T, 1)` multiplies the velocity. If the head decodes fewer dimensions than it encodes, the
+        others are kept at 0.
+        """
+        config = self.config
+        check_shape("noise", start, (len(vl_embs), config.action_horizon, config.encoder_action_dim))
+        rest = (0, config.encoder_action_dim - config.action_dim)
+
+        def velocity(evaluation: int, actions: Tensor) -> Tensor:
+            time = evaluation / (run.num_steps * run.in_step)
+            bucket = int(time * config.num_timestep_buckets)
+            direction = self.velocity_in(run, evaluation, vl_embs, state, embodiment_id, actions, bucket)
+            return F.pad(direction if strength is None else strength * direction, rest)
+
+        actions = F.pad(start[..., : config.action_dim], rest)
+        for step in range(run.num_steps):
+            direction = velocity(step * run.in_step, actions)
+            if run.in_step == 2:  # the midpoint rule
+                direction = velocity(2 * step + 1, actions + direction / (2 * run.num_steps))
+            actions = actions + direction / run.num_steps
+        return actions[..., : config.action_dim]
+
+    def forward(
+        self,
+        backbone_features: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        **options: Unpack[SampleOptions],
+    ) -> Tensor:
+        """`encode` followed by `sample`, whose keyword arguments it accepts; `noise` is required."""
+        vl_embs = self.encode(backbone_features, drop_vl=options.get("drop_vl"))
+        return self.sample(vl_embs, state, embodiment_id, **options)
+
+    def sample_time(self, batch: int, generator: torch.Generator | None = None) -> Tensor:
+        """Draws flow times for training.
+
+        Args:
+            batch: number of times.
+            generator: default torch's own.
+
+        Returns:
+            `(batch,)`, in [0, scale].
+        """
+        drawn = self.time_distribution.draw(batch, generator)
+        return torch.as_tensor(drawn, dtype=self.dtype, device=self.device)
+
+    def loss(
+        self,
+        backbone_features: Tensor | np.ndarray,
+        state: Tensor | np.ndarray,
+        embodiment_id: int | Tensor | np.ndarray,
+        actions: Tensor | np.ndarray,
+        *,
+        noise: Tensor | np.ndarray,
+        time: Tensor | np.ndarray,
+        action_mask: Tensor | np.ndarray | None = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
+        drop_vl: Mask = None,
+    ) -> Tensor:
+        """Flow-matching loss: between noise and actions, the velocity should be `actions - noise`.
+
+        Dimensions that the head encodes and does not decode are 0, as in `sample`. All decoders have the same
+        weight, unlike in a fork that learns the weights (`task_log_sigma`).
+
+        Args:
+            backbone_features: `(B, S, context_dim)`.
+            state, embodiment_id: as in `velocity`.
+            actions: the demonstrated chunk, `(B, T, action_dim)`, normalised.
+            noise: the same shape, standard normal.
+            time: `(B,)`, from `sample_time`.
+            action_mask: weights of the squared errors, broadcast to `actions`. Default: equal weights.
+            attention_mask, image_mask, drop_vl: as in `trace`.
+
+        Returns:
+            A scalar.
+        """
+        actions, noise, time = self.as_input(actions), self.as_input(noise), self.as_input(time)
+        t = time[:, None, None]  # (B, 1, 1)
+        noisy = (1 - t) * noise + t * actions  # (B, T, action_dim)
+        bucket = torch.floor(time * self.config.num_timestep_buckets).long()  # (B,)
+        predicted = self.velocity(
+            self.encode(backbone_features, drop_vl=drop_vl),
+            state,
+            embodiment_id,
+            F.pad(noisy, (0, self.config.encoder_action_dim - self.config.action_dim)),
+            bucket,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
+            drop_vl=drop_vl,
+        )
+        mask = None if action_mask is None else self.as_input(action_mask)
+        return flow_matching_error(predicted, actions, noise, mask)
+
+    def as_input(self, array: Tensor | np.ndarray) -> Tensor:
+        """The array as a tensor in the dtype and on the device of the head."""
+        if isinstance(array, Tensor):
+            return array.to(dtype=self.dtype, device=self.device)
+        return torch.tensor(array, dtype=self.dtype, device=self.device)  # copies: the array may be read-only

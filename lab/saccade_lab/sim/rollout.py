@@ -1,0 +1,103 @@
+"""Closed loop: observe, compute a chunk, execute its first actions, observe again."""
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from saccade_lab.sim.environment import TaskEnvironment
+from saccade_lab.sim.policy import Interventions, Policy
+from saccade_lab.sim.tasks import TASKS, find_task
+
+PARTS = ("render", "backbone", "encode", "sample")
+
+
+@dataclass
+class Episode:
+    """One episode and its outcome.
+
+    Attributes:
+        task: The task that was judged.
+        seed: Seed of layout, wording and noise.
+        instruction: The instruction that the policy got.
+        success: Whether the task was done within its `max_steps`.
+        steps: Control steps until success, or until the end.
+        chunks: Number of chunks that the policy computed.
+        milliseconds: Mean time per chunk over the episode, by part of `PARTS`.
+        video: Path of its video relative to the result file, if one was written.
+    """
+
+    task: str
+    seed: int
+    instruction: str
+    success: bool = False
+    steps: int = 0
+    chunks: int = 0
+    milliseconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
+    video: str | None = None
+
+
+def instruction_for(task: str, seed: int, instruction_from: str | None) -> str:
+    """The instruction of an episode; with `instruction_from`, that of another task."""
+    return find_task(instruction_from or task).instruction(seed)
+
+
+def run_episode(
+    environment: TaskEnvironment,
+    policy: Policy,
+    seed: int,
+    *,
+    instruction_from: str | None = None,
+    intervention: Interventions | Callable[[int, int], Interventions] = None,
+    on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
+) -> Episode:
+    """Runs one episode to its first success or to the task's `max_steps`.
+
+    Args:
+        environment: an environment with the cameras and image size of the policy, see `environment_for`.
+        policy: policy that computes the chunks.
+        seed: seed of layout, wording and noise, which are the same with every engine.
+        instruction_from: a task whose instruction the policy gets instead (a control: it should then fail).
+        intervention: a change inside the head at every chunk; or a function that returns it, called with the
+            index of the chunk and the seed.
+        on_step: called after the first observation and after every control step, for videos.
+    """
+    task = environment.task
+    environment.restart(seed)
+    environment.instruction = instruction_for(task.name, seed, instruction_from)
+    rng = np.random.default_rng((list(TASKS).index(task.name), seed))
+    episode = Episode(task.name, seed, environment.instruction)
+    total = dict.fromkeys(PARTS, 0.0)
+    while episode.steps < task.max_steps and not episode.success:
+        start = time.perf_counter()
+        observation = environment.observe()
+        total["render"] += 1e3 * (time.perf_counter() - start)
+        change = intervention(episode.chunks, seed) if callable(intervention) else intervention
+        chunk = policy.act(observation, noise=policy.noise(rng), intervention=change)
+        for part, spent in chunk.milliseconds.items():
+            total[part] += spent
+        episode.chunks += 1
+        if episode.steps == 0:
+            on_step(environment, episode)
+        for action in chunk.actions[: min(policy.config.execute_steps, task.max_steps - episode.steps)]:
+            episode.success = environment.advance(action).success
+            episode.steps += 1
+            on_step(environment, episode)
+            if episode.success:
+                break
+    episode.milliseconds = {part: total[part] / episode.chunks for part in PARTS}
+    return episode
+
+
+def environment_for(
+    policy: Policy, task: str, *, render_mode: str | None = None, blanked: Collection[str] = ()
+) -> TaskEnvironment:
+    """The task with the policy's cameras and image size; images of the cameras in `blanked` are black."""
+    return TaskEnvironment(
+        task,
+        image_size=policy.config.image_size,
+        cameras=policy.config.cameras,
+        render_mode=render_mode,
+        blanked=blanked,
+    )

@@ -1,0 +1,135 @@
+"""The same policy in torch: `saccade_lab.reference` behind the interfaces that `saccade.Policy` uses."""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import saccade
+from saccade._internal.arrays import ArrayLike, Float32Array
+from saccade.backbone.inputs import BackboneInputs
+from saccade.head.config import HeadConfig
+from saccade.observations import observation_sources
+from saccade.processor import Processor
+from saccade.robots import Normalizer
+from saccade_lab.reference import ActionHead, Backbone
+
+
+@dataclass(frozen=True)
+class TorchContext:
+    """What the head encoded: its tokens `(batch, T_vl, context_dim)`, and which of them are removed."""
+
+    vl_embs: torch.Tensor
+    drop_vl: np.ndarray | None
+
+    @property
+    def batch(self) -> int:
+        """Number of observations."""
+        return int(self.vl_embs.shape[0])
+
+    @property
+    def num_vl_tokens(self) -> int:
+        """Number of vision-language tokens."""
+        return int(self.vl_embs.shape[1])
+
+
+class TorchHead:
+    """`saccade_lab.reference.ActionHead` as a `saccade.policy.head.Head`."""
+
+    def __init__(self, checkpoint: Path) -> None:
+        self._head = ActionHead.from_pretrained(checkpoint)
+        self.source = str(checkpoint)
+
+    @property
+    def config(self) -> HeadConfig:
+        """Sizes and switches."""
+        return self._head.config
+
+    @property
+    def embodiment_ids(self) -> tuple[int, ...]:
+        """All embodiments."""
+        return tuple(range(self.config.num_embodiments))
+
+    @property
+    def num_threads(self) -> int:
+        """Number of threads of torch."""
+        return torch.get_num_threads()
+
+    def encode(
+        self,
+        backbone_features: ArrayLike,
+        *,
+        attention_mask: ArrayLike | None = None,
+        image_mask: ArrayLike | None = None,
+        drop_vl: ArrayLike | None = None,
+    ) -> Any:
+        """See `saccade.ActionHead.encode`. The other masks change nothing in N1.5, and are not read."""
+        removed = None if drop_vl is None else np.asarray(drop_vl)
+        with torch.no_grad():
+            return TorchContext(self._head.encode(np.asarray(backbone_features), drop_vl=removed), removed)
+
+    def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
+        """See `saccade.ActionHead.sample`; `noise` is required."""
+        with torch.no_grad():
+            found = self._head.sample(
+                context.vl_embs, np.asarray(state), embodiment_id, drop_vl=context.drop_vl, **options
+            )
+        return np.asarray(found.numpy())
+
+
+@dataclass(frozen=True)
+class TorchFeatures:
+    """Features of one observation: `(1, T_vl, width)`, and where its image tokens are, `(1, T_vl)`."""
+
+    backbone_features: Float32Array
+    image_mask: Any
+
+
+class TorchBackbone:
+    """`saccade_lab.reference.Backbone` as `saccade.Policy` calls its backbone."""
+
+    def __init__(self, checkpoint: Path) -> None:
+        self._backbone = Backbone.from_pretrained(checkpoint)
+
+    def _ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[TorchFeatures] = ()
+    ) -> list[TorchFeatures]:
+        """See `saccade.Backbone._ragged`. Nothing is taken from `previous`."""
+        with torch.no_grad():
+            found = [self._backbone(given) for given in inputs]
+        return [TorchFeatures(one.backbone_features.numpy(), one.image_mask.numpy()) for one in found]
+
+
+def load_policy(checkpoint: Path, num_threads: int | None = None) -> saccade.Policy:
+    """The policy of a checkpoint with backbone and head in torch.
+
+    Args:
+        checkpoint: a directory.
+        num_threads: threads of torch, for the whole process; None leaves torch's default.
+    """
+    if num_threads is not None:
+        torch.set_num_threads(num_threads)
+    head = TorchHead(checkpoint)
+    normalizer = Normalizer.from_pretrained(
+        checkpoint, state_dim=head.config.state_dim, action_dim=head.config.encoder_action_dim
+    )
+    return saccade.Policy(
+        head,
+        normalizer,
+        backbone=TorchBackbone(checkpoint),  # type: ignore[arg-type]
+        processor=Processor.from_pretrained(checkpoint),
+        sources=observation_sources(checkpoint, normalizer.embodiment, normalizer.data_config),
+    )
+
+
+def describe() -> dict[str, Any]:
+    """The engine, for a result file."""
+    return {"name": "torch", "torch": torch.__version__, "num_threads": torch.get_num_threads()}

@@ -1,0 +1,249 @@
+"""Pictures as a source: a whole checkpoint, and directories of what its robot saw, without a simulator."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from saccade._internal.files import checkpoint_identity
+from saccade.backbone.config import BackboneConfig
+from saccade.backbone.inputs import BackboneInputs
+from saccade.errors import InputError
+from saccade.head.config import HeadConfig
+from saccade.head.head import ActionHead
+from saccade.observations import read
+from saccade.observations.pictures import Moment, read_frames
+from saccade.observations.recorded import Observation
+from saccade.policy.context import longer
+from saccade.policy.parts import as_head_takes_it, parts_of
+from saccade.policy.policy import Policy
+from saccade_lab.maps.grid import layout_of
+from saccade_lab.maps.layout import Layout
+from saccade_lab.study.recording import NOISES, Recorded, num_episodes
+
+Preprocessing = Literal["lerobot", "isaac"]
+
+
+@dataclass(frozen=True)
+class Moments(Recorded):
+    """A whole checkpoint, and pictures of moments for it.
+
+    The policy encodes all moments once in a process, and is then let go. Where a study needs the head, it is
+    loaded alone, in float32: what computes gradients in torch has the memory for itself.
+
+    Attributes:
+        checkpoint: A checkpoint that `saccade.Policy.from_pretrained` reads.
+        frames: Directory of the pictures, see `saccade.observations.pictures.read_frames`.
+        instruction, state: As `read_frames` takes them.
+        other_frames, other_instruction: Of the moments to compare with. Where one is None, it is that of the
+            moments themselves; with both None there are none.
+        embodiment, preprocessing, tokenizer: As `saccade.Policy.from_pretrained` takes them.
+        precision: How the backbone computes.
+        seed: Seed of random tokens and of the noise.
+        num_threads: Number of threads. Default: that of the engine.
+        on_moment: Called with the number of encoded moments and that of all, while the policy encodes them.
+    """
+
+    checkpoint: str
+    frames: str
+    instruction: str | None = None
+    state: str | None = None
+    other_frames: str | None = None
+    other_instruction: str | None = None
+    embodiment: str | int | None = None
+    precision: str = "float32"
+    preprocessing: Preprocessing | None = None
+    tokenizer: str | None = None
+    seed: int = 0
+    num_threads: int | None = None
+    on_moment: Callable[[int, int], None] | None = field(default=None, compare=False, repr=False)
+    task: ClassVar[str] = "frames"
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """See `Source`."""
+        read = (self.frames, self.other_frames, self.state, self.tokenizer)
+        return (*super().files, *(path for path in read if path is not None and Path(path).exists()))
+
+    def describe(self) -> dict[str, Any]:
+        """See `Source`."""
+        encoded = encode(self)
+        other = described(self.other_frames or self.frames, encoded.others) if encoded.others else None
+        return {
+            "checkpoint": self.describe_head(encoded.identity),
+            "frames": {
+                **described(self.frames, encoded.moments),
+                "episodes": num_episodes(encoded.observation),
+                "noise": f"{NOISES} draws an observation",
+                "precision": self.precision,
+                "preprocessing": encoded.preprocessing,
+                "embodiment_id": int(encoded.observation.embodiment_id[0]),
+                "action_width": encoded.action_width,
+                "other": other,
+            },
+            "seed": self.seed,
+        }
+
+    def head(self, precision: str = "float32") -> ActionHead:
+        """See `Source`."""
+        if precision != "float32":
+            raise InputError(f"precision: expected float32 for a head on pictures, got {precision}")
+        (embodiment_id,) = set(self.all.embodiment_id.tolist())
+        return head_of(self.checkpoint, embodiment_id, self.num_threads)
+
+    @property
+    def config(self) -> HeadConfig:
+        """See `Source`."""
+        return encode(self).config
+
+    @property
+    def action_width(self) -> int:
+        """Those of the robot: nothing was learned for the others."""
+        return encode(self).action_width
+
+    @property
+    def all(self) -> Observation:
+        """See `Recorded`; raises as `read_frames` and `saccade.Policy.from_pretrained`."""
+        return encode(self).observation
+
+    @property
+    def others(self) -> Observation | None:
+        """For each moment the one in the same place of the other directory, or with the other instruction."""
+        return encode(self).other_observation
+
+    def labels(self, task: str, seed: int) -> dict[str, Any]:
+        """See `Source`; with the name of the moment."""
+        return {**super().labels(task, seed), "moment": encode(self).moments[seed].name}
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """What a policy made of the moments of a source.
+
+    Attributes:
+        config: Config of the head.
+        identity: Name and hash of the checkpoint.
+        preprocessing: How frames and words were prepared.
+        action_width: Number of the head's action dimensions that the robot uses.
+        moments, others: The moments, and those to compare them with.
+        observation, other_observation: The same as the head takes them; None without others.
+        inputs: What the backbone was given for each of `moments`.
+        layouts: What is at each position of each of `moments`.
+        backbone_config: Config of the backbone.
+    """
+
+    config: HeadConfig
+    identity: dict[str, str]
+    preprocessing: str
+    action_width: int
+    moments: Sequence[Moment]
+    others: Sequence[Moment]
+    observation: Observation
+    other_observation: Observation | None
+    inputs: Sequence[BackboneInputs]
+    layouts: Sequence[Layout]
+    backbone_config: BackboneConfig
+
+
+@functools.lru_cache(maxsize=1)
+def encode(source: Moments) -> Encoded:
+    """Loads the policy and encodes all moments; cached for the next cell."""
+    policy = Policy.from_pretrained(
+        source.checkpoint,
+        embodiment=source.embodiment,
+        preprocessing=source.preprocessing,
+        tokenizer=source.tokenizer,
+        precision={"backbone": source.precision, "head": "float32"},
+        num_threads=source.num_threads,
+    )
+    parts = parts_of(policy)
+    moments = moments_of(source, policy, source.frames, source.instruction)
+    others: list[Moment] = []
+    if (source.other_frames, source.other_instruction) != (None, None):
+        told = source.instruction if source.other_instruction is None else source.other_instruction
+        found = moments_of(source, policy, source.other_frames or source.frames, told)
+        others = [found[place % len(found)] for place in range(len(moments))]
+    seen, compared, given, layouts = [], [], [], []
+    for place, moment in enumerate(moments):
+        (inputs,) = policy.inputs(moment.observation)
+        context = policy.context(policy.features([inputs]))
+        seen.append(as_head_takes_it(policy, moment.observation, context.features[0]))
+        given.append(inputs)
+        frames = read(moment.observation, policy.requirements).frames[0]
+        layouts.append(layout_of(policy, frames, inputs, context.features[0].views))
+        if others:  # views with the same frames are not computed again
+            other = others[place].observation
+            (features,) = policy.features(policy.inputs(other), previous=context)
+            compared.append(as_head_takes_it(policy, other, features))
+        if source.on_moment is not None:
+            source.on_moment(place + 1, len(moments))
+    return Encoded(
+        config=parts.head.config,
+        identity=checkpoint_identity(Path(source.checkpoint)),
+        preprocessing=parts.processor.preprocessing,
+        action_width=policy.normalizer.head_action_width,
+        moments=moments,
+        others=others,
+        observation=joined(seen, moments),
+        other_observation=joined(compared, others) if others else None,
+        inputs=given,
+        layouts=layouts,
+        backbone_config=parts.backbone.config,
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def head_of(checkpoint: str, embodiment_id: int, num_threads: int | None) -> ActionHead:
+    """The head with the layers of one embodiment."""
+    return ActionHead.from_pretrained(checkpoint, embodiment_ids=[embodiment_id], num_threads=num_threads)
+
+
+def moments_of(source: Moments, policy: Policy, directory: str, instruction: str | None) -> list[Moment]:
+    """The moments of a directory, with the state of the source."""
+    state = None if source.state is None else Path(source.state)
+    return read_frames(Path(directory), policy, instruction=instruction, state=state)
+
+
+def joined(observations: Sequence[Observation], moments: Sequence[Moment]) -> Observation:
+    """Observations of one row each as one, the shorter ones padded and their padding dropped.
+
+    The head drops padding exactly: each has the bits that it has alone.
+    """
+    lengths = np.array([one.num_vl_tokens for one in observations])
+    longest = int(lengths.max())
+    masks = [longer(one.image_mask, longest) for one in observations if one.image_mask is not None]
+    dropped = np.arange(longest) >= lengths[:, None]
+    episodes = [moment.episode for moment in moments]
+    return Observation(
+        np.concatenate([longer(one.backbone_features, longest) for one in observations]),
+        np.concatenate([one.state for one in observations]),
+        np.concatenate([one.embodiment_id for one in observations]),
+        image_mask=np.concatenate(masks) if masks else None,
+        drop_vl=dropped if dropped.any() else None,
+        episode=None if None in episodes else np.unique(np.array(episodes), return_inverse=True)[1],
+    )
+
+
+def described(directory: str, moments: Sequence[Moment]) -> dict[str, Any]:
+    """What identifies moments, as JSON values; the hash covers names, pixels, states and instruction."""
+    digest = hashlib.sha256()
+    for moment in moments:
+        given = moment.observation
+        values = {key: np.asarray(state).tolist() for key, state in given["state"].items()}
+        digest.update(json.dumps([moment.name, moment.instruction, values]).encode())
+        for name, frames in given["video"].items():
+            digest.update(f"{name} {frames.shape}".encode())
+            digest.update(frames.tobytes())
+    return {
+        "name": Path(directory).resolve().name,
+        "sha256": digest.hexdigest(),
+        "observations": len(moments),
+        "instruction": moments[0].instruction,
+    }

@@ -1,0 +1,141 @@
+"""The table of a study: tidy CSV, one row per measurement, and JSON with its provenance."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from saccade._internal.files import sha256_of, write_atomically, write_json
+from saccade.errors import InputError
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The provenance of a table; `OUT/<study>.json`.
+
+    Attributes:
+        study: Its name.
+        settings: What the whole table depends on: checkpoint and its hash, engine, seeds, and so on.
+        done, total: Number of finished cells, and of all.
+        failed: Key and error of each cell that failed.
+        cell_seconds: Total time of the finished cells.
+        packages: Versions of the packages that computed it.
+        machine: CPU, system and Python of the process that wrote the table; each row has its own CPU.
+        table_sha256: Hash of the table as written; empty if unknown.
+    """
+
+    study: str
+    settings: Mapping[str, Any]
+    done: int
+    total: int
+    failed: list[dict[str, Any]] = field(default_factory=list)
+    cell_seconds: float = 0.0
+    packages: Mapping[str, str] = field(default_factory=dict)
+    machine: Mapping[str, str] = field(default_factory=dict)
+    table_sha256: str = ""
+
+    @property
+    def complete(self) -> bool:
+        """Whether all cells are in the table."""
+        return self.done == self.total
+
+
+def write_table(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
+    """Writes rows as CSV with the columns of all rows, in the order of their first occurrence.
+
+    A value that is missing, None or NaN is an empty field.
+    """
+    with write_atomically(path) as temporary:
+        pd.DataFrame(list(rows)).to_csv(temporary, index=False)
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Reads what `write_table` wrote; empty fields are NaN.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        InputError: the file is not CSV.
+    """
+    if path.stat().st_size <= 1:  # a table without rows has no columns
+        return pd.DataFrame()
+    try:
+        # Words like "none" or "NA" are names here, not missing values.
+        return pd.read_csv(path, keep_default_na=False, na_values=[""], low_memory=False)
+    except (pd.errors.ParserError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a table: {error}") from None
+
+
+def write_provenance(provenance: Provenance, path: Path) -> None:
+    """Writes it as JSON, with `complete`."""
+    write_json(path, {**asdict(provenance), "complete": provenance.complete})
+
+
+def read_provenance(path: Path) -> Provenance:
+    """Reads what `write_provenance` wrote.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        InputError: the file has other content.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        values.pop("complete")
+        return Provenance(**values)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not written by a study: {error}") from None
+
+
+def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
+    """The table of a study and its provenance.
+
+    Raises:
+        FileNotFoundError: one of the two files does not exist.
+        InputError: the table is not the one that the study wrote.
+    """
+    provenance = read_provenance(provenance_path(out, study))
+    path = table_path(out, study)
+    table = read_table(path)
+    if provenance.table_sha256 not in ("", sha256_of(path)):
+        raise InputError(
+            f"{path}: not as its study wrote it (edited, truncated, or the run was killed while writing); "
+            "run the study again: finished cells are not repeated"
+        )
+    return table, provenance
+
+
+def truths(column: pd.Series) -> pd.Series:
+    """A column of True and False as booleans.
+
+    Raises:
+        InputError: the column contains another value.
+    """
+    values = column.map({True: True, False: False, "True": True, "False": False})
+    if values.isna().any():
+        wrong = column[values.isna()].iloc[0]
+        raise InputError(f"{column.name}: expected True or False in every row, got {wrong!r}")
+    return values.astype(bool)
+
+
+def table_path(out: Path, study: str) -> Path:
+    """Path of the table of a study."""
+    return out / f"{study}.csv"
+
+
+def provenance_path(out: Path, study: str) -> Path:
+    """Path of the provenance of a study."""
+    return out / f"{study}.json"
+
+
+def clusters_of(table: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """The bootstrap cluster of each row: task and episode; the episode of the simulator is its seed."""
+    return list(zip(table["task"], table["episode" if "episode" in table else "seed"], strict=True))
+
+
+def is_recorded(provenance: Provenance) -> bool:
+    """Whether a table was measured on recorded observations: a file of features, or pictures."""
+    return "features" in provenance.settings or "frames" in provenance.settings

@@ -1,0 +1,105 @@
+"""Features of a backbone that is not trained: computed once for a recording, and shared by the runs on it."""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from saccade._internal.arrays import Float32Array
+from saccade._internal.files import write_atomically
+from saccade.backbone.inputs import BackboneInputs
+from saccade_lab.reference.backbone import Backbone, BackboneFeatures
+from saccade_lab.training.dataset import PIXEL_CENTRE, Samples
+
+FRAMES_AT_ONCE = 64
+
+
+def padded(
+    prompts: Sequence[npt.NDArray[np.int64]], length: int = 0
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Prompts padded on the left, as the released processors do, and which tokens are not padding.
+
+    Args:
+        prompts: the token ids of each.
+        length: tokens to pad to at least. Default: those of the longest prompt.
+
+    Returns:
+        `(B, T)` each.
+
+    Example:
+        >>> ids, mask = padded([np.array([5, 6]), np.array([7])])
+        >>> ids.tolist(), mask.tolist()
+        ([[5, 6], [0, 7]], [[True, True], [False, True]])
+    """
+    length = max(length, *map(len, prompts))
+    ids, mask = np.zeros((len(prompts), length), np.int64), np.zeros((len(prompts), length), np.bool_)
+    for row, prompt in enumerate(prompts):
+        ids[row, length - len(prompt) :], mask[row, length - len(prompt) :] = prompt, True
+    return ids, mask
+
+
+def pixel_values(images: npt.NDArray[np.uint8]) -> Float32Array:
+    """Frames `(B, cameras, 3, H, W)` as the vision tower takes them, `(B * cameras, 3, H, W)` in [-1, 1]."""
+    pixels: Float32Array = (images.astype(np.float32) - PIXEL_CENTRE) / PIXEL_CENTRE
+    return pixels.reshape(-1, *pixels.shape[2:])
+
+
+class FrozenFeatures:
+    """Features of every frame of a recording, float16, in a file that is mapped into memory.
+
+    A frame has one of the wordings of its task here, in turn, so that it has one row of features.
+
+    Args:
+        samples: the samples, whose frames are computed.
+        prompts: the token ids of every wording of every task in `TASKS`.
+        backbone: the backbone.
+        path: the file. It is written if it is not there; its name has to identify backbone and recording.
+    """
+
+    def __init__(
+        self,
+        samples: Samples,
+        prompts: Sequence[Sequence[npt.NDArray[np.int64]]],
+        backbone: Backbone,
+        path: Path,
+    ) -> None:
+        self._images = samples.images
+        self._backbone = backbone
+        tasks = np.zeros(len(samples.images), np.int64)
+        tasks[samples.now] = tasks[samples.later] = samples.tasks
+        self._prompts = [
+            prompts[task][frame % len(prompts[task])] for frame, task in enumerate(tasks.tolist())
+        ]
+        self._length = max(map(len, self._prompts))
+        if not path.exists():
+            self._write(path)
+        self._features = np.load(path, mmap_mode="r")  # (frames, T, width)
+
+    @torch.no_grad()
+    def _write(self, path: Path) -> None:
+        shape = (len(self._images), self._length, self._backbone.sizes.features_width)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as temporary:
+            array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
+            for first in range(0, len(array), FRAMES_AT_ONCE):
+                frames = np.arange(first, min(first + FRAMES_AT_ONCE, len(array)))
+                array[frames] = self._backbone(self._inputs(frames)).backbone_features.numpy()
+            array.flush()
+
+    def _inputs(self, frames: npt.NDArray[np.int64]) -> BackboneInputs:
+        prompts = [self._prompts[frame] for frame in frames]
+        return BackboneInputs(pixel_values(self._images[frames]), *padded(prompts, self._length))
+
+    def __call__(self, frames: npt.NDArray[np.int64]) -> BackboneFeatures:
+        """The features of some frames, as the backbone itself returns them."""
+        ids, mask = padded([self._prompts[frame] for frame in frames])
+        features = self._features[frames, -ids.shape[1] :].astype(np.float32)
+        image_mask = ids == self._backbone.sizes.image_token
+        return BackboneFeatures(*map(torch.from_numpy, (features, mask, image_mask)))

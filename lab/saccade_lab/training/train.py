@@ -1,0 +1,494 @@
+"""Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
+
+A run is a directory with `training.pt` (all that is needed to continue), the policy so far (`config.json`,
+`model.safetensors`, `tokenizer.json`, `experiment_cfg/metadata.json`), `settings.json` (settings and
+demonstrations), `history.json` and `loss.png`. They are written about once a minute, each under a temporary
+name that is then renamed, so that a run can be interrupted at any time and continued. Every step draws its
+samples and noise from the seed and the number of the step, so that a continued run gives the same weights as
+an uninterrupted one.
+"""
+
+# Calls of torch modules are untyped.
+# mypy: disable-error-code="no-untyped-call"
+
+import io
+import json
+import math
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from safetensors.torch import load_file
+from safetensors.torch import save as serialize
+from torch import Tensor
+
+from saccade._internal.arrays import Float32Array
+from saccade._internal.files import sha256_of, write_atomically, write_json
+from saccade._internal.json import changed
+from saccade.backbone.inputs import BackboneInputs
+from saccade.errors import InputError
+from saccade.processor import Processor
+from saccade_lab.reference.backbone import BackboneFeatures
+from saccade_lab.sim import demos
+from saccade_lab.sim.allocator import keep_freed_memory
+from saccade_lab.sim.settings import (
+    CONFIG_FILE,
+    EMBODIMENT,
+    METADATA_FILE,
+    TENSOR_FILE,
+    PolicyConfig,
+    SimulationConfig,
+    backbone_config,
+    head_config,
+    statistics_of,
+)
+from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
+from saccade_lab.training.dataset import Samples, describe, load_samples, normalized_actions
+from saccade_lab.training.frozen import FrozenFeatures, padded, pixel_values
+from saccade_lab.training.learner import Batch, Learner, new_learner
+from saccade_lab.training.settings import STATE_FILE as STATE_FILE
+from saccade_lab.training.settings import TrainingSettings, features_name
+
+CHECKPOINT_SECONDS = 60.0
+VALIDATION_FRAMES = 256
+WARMUP_STEPS = 200
+MAX_GRADIENT_NORM = 1.0
+WEIGHT_DECAY = 0.01
+BETAS = (0.9, 0.95)
+TRAINING, VALIDATION = "training", "validation"  # names of the two parts of the samples
+SMALLEST_DEVIATION = 1e-3  # metres; added where a position never changes
+
+
+@dataclass
+class Progress:
+    """The state of a run, for a progress bar."""
+
+    step: int
+    steps: int
+    loss: float
+    validation_loss: float | None
+
+
+@dataclass
+class Run:
+    """A training run in memory."""
+
+    settings: TrainingSettings
+    config: PolicyConfig
+    learner: Learner
+    optimizer: torch.optim.Optimizer
+    average: dict[str, Tensor]
+    demonstrations: dict[str, Any]
+    step: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+def policy_config(
+    settings: TrainingSettings, recording: demos.RecordingSettings, tasks: list[str]
+) -> PolicyConfig:
+    """The config of the policy that a run trains, without statistics."""
+    said = " ".join(text for name in tasks for text in find_task(name).instructions)
+    vocabulary = tuple(sorted(set(re.findall("[a-z]+", said))))
+    return PolicyConfig(
+        head=head_config(
+            width=settings.width,
+            features_width=settings.features_width,
+            num_layers=settings.num_layers,
+            num_heads=settings.num_heads,
+            vl_num_layers=settings.vl_num_layers,
+            num_future_tokens=settings.num_future_tokens,
+            horizon=settings.horizon,
+            num_steps=settings.num_steps,
+            state_dim=PROPRIO_DIM,
+            action_dim=ACTION_DIM,
+        ),
+        backbone=backbone_config(
+            width=settings.features_width,
+            num_layers=settings.language_layers,
+            num_heads=settings.num_heads,
+            vision_width=settings.vision_width,
+            vision_layers=settings.vision_layers,
+            vision_heads=settings.vision_heads,
+            image_size=recording.image_size,
+            patch_size=settings.patch_size,
+            words=vocabulary,
+        ),
+        simulation=SimulationConfig(
+            tasks=tuple(tasks),
+            cameras=recording.cameras,
+            image_size=recording.image_size,
+            execute_steps=settings.execute_steps,
+        ),
+        words=vocabulary,
+    )
+
+
+def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
+    """The config with the statistics of states and of valid actions."""
+    valid = samples.mask[..., 0] > 0
+    recorded = {"state": samples.state, "action": samples.actions[valid]}
+    return replace(config, statistics={kind: statistics_of(values) for kind, values in recorded.items()})
+
+
+def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
+    """A run before its first step; for `demonstrations` see `dataset.describe`."""
+    learner = new_learner(settings, config)
+    matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
+    others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
+    optimizer = torch.optim.AdamW(
+        [{"params": matrices, "weight_decay": WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}],
+        lr=settings.learning_rate,
+        betas=BETAS,
+        foreach=True,
+    )
+    average = {name: tensor.detach().clone() for name, tensor in learner.policy_tensors().items()}
+    return Run(settings, config, learner, optimizer, average, demonstrations)
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """Linear warm-up, then a half cosine to zero."""
+    warmup = min(1.0, (step + 1) / WARMUP_STEPS)
+    return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+
+
+class Batches:
+    """Draws batches.
+
+    Args:
+        samples: the samples to draw from.
+        config: config of the policy.
+        prompts: what `prompts_of` returns.
+        targets: mean and standard deviation of the positions, `(6,)` each.
+        batch_size: frames per batch.
+        absent_share: see `TrainingSettings`.
+        frozen: the features of the samples' frames, if the backbone is not trained.
+        with_later: whether batches contain the observations after the chunk was executed.
+    """
+
+    def __init__(
+        self,
+        samples: Samples,
+        config: PolicyConfig,
+        prompts: list[list[npt.NDArray[np.int64]]],
+        targets: tuple[Float32Array, Float32Array],
+        batch_size: int,
+        *,
+        absent_share: float = 0.0,
+        frozen: FrozenFeatures | None = None,
+        with_later: bool = False,
+    ) -> None:
+        self._samples = samples
+        self._frozen = frozen
+        self._with_later = with_later
+        self._batch_size = batch_size
+        self._absent_share = absent_share
+        normalizer = config.normalizer
+        self._state = np.asarray(normalizer.state(samples.state))
+        self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
+        self._targets = (samples.targets - targets[0]) / targets[1]
+        self._prompts = prompts
+        known = [list(TASKS).index(name) for name in config.simulation.tasks]
+        self._impossible = [
+            [other for other in known if list(TASKS.values())[other].objects != task.objects]
+            for task in TASKS.values()
+        ]  # per task, the tasks that cannot be done in its scene
+        self._still = normalized_actions(normalizer, np.zeros(samples.actions.shape[1:], np.float32))
+
+    def draw(self, *key: int) -> Batch:
+        """The batch of `key`, with a wording drawn for each frame."""
+        rng = np.random.default_rng(key)
+        rows = rng.integers(len(self._samples), size=self._batch_size)
+        tasks, later = self._samples.tasks[rows], self._samples.later[rows]
+        actions, mask = self._actions[rows], self._samples.mask[rows]
+        for row in np.flatnonzero(rng.random(len(rows)) < self._absent_share):
+            if self._impossible[tasks[row]]:
+                tasks[row] = rng.choice(self._impossible[tasks[row]])
+                actions[row], mask[row] = self._still, 1.0
+                later[row] = self._samples.now[rows[row]]
+        said = [self._prompts[task] for task in tasks]
+        prompts = [prompts[rng.integers(len(prompts))] for prompts in said]
+        return Batch(
+            inputs=self._inputs(self._samples.now[rows], prompts),
+            state=torch.from_numpy(self._state[rows]),
+            actions=torch.from_numpy(actions),
+            mask=torch.from_numpy(mask),
+            targets=torch.from_numpy(self._targets[rows]),
+            later=self._inputs(later, prompts) if self._with_later else None,
+        )
+
+    def _inputs(
+        self, frames: npt.NDArray[np.int64], prompts: list[npt.NDArray[np.int64]]
+    ) -> BackboneInputs | BackboneFeatures:
+        if self._frozen is not None:
+            return self._frozen(frames)
+        return BackboneInputs(pixel_values(self._samples.images[frames]), *padded(prompts))
+
+
+def prompts_of(config: PolicyConfig, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:
+    """The token ids `(T,)` of every wording of every task in `TASKS`."""
+    shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
+    frames = [shown] * len(config.simulation.cameras)
+    return [[processor(frames, text).input_ids[0] for text in task.instructions] for task in TASKS.values()]
+
+
+def train_step(run: Run, batches: Batches) -> dict[str, float]:
+    """One optimiser step; returns the losses by name."""
+    settings = run.settings
+    for group in run.optimizer.param_groups:
+        group["lr"] = learning_rate(settings, run.step)
+    generator = torch.Generator().manual_seed(
+        int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
+    )
+    losses = run.learner.losses(batches.draw(settings.seed, run.step), generator, run.average)
+    weights = {"target_loss": settings.target_weight, "alignment_loss": settings.alignment_weight}
+    total = losses["loss"]
+    for name, weight in weights.items():
+        if name in losses:
+            total = total + weight * losses[name]
+    run.optimizer.zero_grad(set_to_none=True)
+    total.backward()
+    torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
+    run.optimizer.step()
+    # A short memory at first, so that the initial weights do not dominate the average.
+    decay = min(settings.ema_decay, (1 + run.step) / (10 + run.step))
+    with torch.no_grad():
+        current = run.learner.policy_tensors()
+        torch._foreach_lerp_(list(run.average.values()), list(current.values()), 1.0 - decay)
+    run.step += 1
+    return {name: loss.item() for name, loss in losses.items()}
+
+
+@torch.no_grad()
+def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
+    """The losses of the averaged weights, each time on the same held-out frames and noise."""
+    current = {name: tensor.clone() for name, tensor in run.learner.policy_tensors().items()}
+    run.learner.load_state_dict(run.average, strict=False)
+    losses = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0), run.average)
+    run.learner.load_state_dict(current, strict=False)
+    return {name: loss.item() for name, loss in losses.items()}
+
+
+def export(run: Run, out: Path) -> None:
+    """Writes the averaged weights as a policy.
+
+    They are stored as bfloat16, which halves the size. The rounding is far below the noise of training.
+    """
+    tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
+    with write_atomically(out / TENSOR_FILE) as temporary:
+        temporary.write_bytes(serialize(tensors, metadata={"format": "pt"}))
+    run.config.write(out)
+
+
+def described(config: PolicyConfig) -> Any:
+    """Config and statistics as they are read from JSON."""
+    return json.loads(json.dumps([config.to_dict(), config.metadata()]))
+
+
+def save(run: Run, out: Path) -> None:
+    """Writes all files of the run."""
+    out.mkdir(parents=True, exist_ok=True)
+    state = {
+        "settings": run.settings.to_dict(),
+        "config": described(run.config),
+        "step": run.step,
+        "history": run.history,
+        "learner": run.learner.state_dict(),
+        "optimizer": run.optimizer.state_dict(),
+        "average": run.average,
+    }
+    serialized = io.BytesIO()  # writing to a full disk itself, torch raises a RuntimeError
+    torch.save(state, serialized)
+    with write_atomically(out / STATE_FILE) as temporary:
+        temporary.write_bytes(serialized.getbuffer())
+    export(run, out)
+    write_json(out / "settings.json", {**run.settings.to_dict(), "demonstrations": run.demonstrations})
+    write_json(out / "history.json", run.history)
+    plot_history(run.history, out / "loss.png")
+
+
+def resume(run: Run, path: Path) -> None:
+    """Continues a run from a saved state.
+
+    Raises:
+        InputError: it was started with other settings or other demonstrations.
+    """
+    state = torch.load(path, weights_only=True)
+    settings = run.settings.to_dict()
+    if state["settings"] != settings:
+        other = ", ".join(changed(state["settings"], settings))
+        raise InputError(f"{path}: the run was started with other settings ({other})")
+    if state["config"] != described(run.config):
+        raise InputError(f"{path}: the run was started with other demonstrations")
+    run.step, run.history = state["step"], state["history"]
+    run.learner.load_state_dict(state["learner"])
+    run.optimizer.load_state_dict(state["optimizer"])
+    run.average = state["average"]
+
+
+def config_of_start(config: PolicyConfig, policy: Path, only: str = "") -> PolicyConfig:
+    """The config with the statistics of the policy to start from: its weights know no others.
+
+    Raises:
+        FileNotFoundError: there is no policy.
+        InputError: the policy has other sizes, tasks or cameras. The head may have other sizes where it alone
+            is trained.
+    """
+    found, statistics = (json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE))
+    expected = described(config)[0]
+    if only == "head":
+        found, expected = (
+            {key: one.get(key) for key in ("backbone_cfg", "simulation_cfg")} for one in (found, expected)
+        )
+    if found != expected:
+        raise InputError(f"{policy}: was trained with other sizes, tasks or cameras")
+    return replace(config, statistics=statistics[EMBODIMENT]["statistics"])
+
+
+def start_from(run: Run, policy: Path) -> None:
+    """Starts from the weights of a policy; from those of its backbone where only the head is trained."""
+    prefix = "backbone." if run.settings.only == "head" else ""
+    tensors = {
+        name: tensor.float()
+        for name, tensor in load_file(policy / TENSOR_FILE).items()
+        if name.startswith(prefix)
+    }
+    run.learner.load_state_dict(tensors, strict=False)
+    run.average = {name: tensor.detach().clone() for name, tensor in run.learner.policy_tensors().items()}
+
+
+def features_of(samples: str, settings: TrainingSettings, recorded: dict[str, Any], out: Path) -> Path:
+    """The file with the features of the training or validation frames; see `FrozenFeatures`."""
+    shown = f"{samples}-blind" if settings.blind else samples
+    return out.parent / features_name(settings.start_sha256, recorded["sha256"], shown)
+
+
+def train(
+    demonstrations: Path,
+    out: Path,
+    settings: TrainingSettings,
+    on_step: Callable[[Progress], None],
+    *,
+    start: Path | None = None,
+) -> PolicyConfig:
+    """Trains a policy, or continues the run in `out`. With glibc, the process then keeps freed memory.
+
+    Args:
+        demonstrations: directory written by `saccade demos`.
+        out: directory of the run.
+        settings: settings of the run.
+        on_step: called after each step.
+        start: a policy to start from; None for random weights. Where only the head is trained, the features
+            of its backbone are kept in files beside `out`, for other runs.
+
+    Returns:
+        The config of the policy.
+
+    Raises:
+        FileNotFoundError: there are no demonstrations, or no policy to start from.
+        InputError: demonstrations with different settings, or `out` contains a run with other settings.
+    """
+    if settings.only == "head" and start is None:
+        raise InputError("start: given none, expected a policy, since only the head is trained")
+    keep_freed_memory()
+    tasks = demos.recorded_tasks(demonstrations)
+    recording = demos.read_settings(demonstrations, tasks)
+    config = policy_config(settings, recording, tasks)
+    processor = config.processor()
+    recorded = describe(demonstrations, tasks)
+    if start is not None:
+        settings = replace(settings, start_sha256=sha256_of(start / TENSOR_FILE))
+    features = {name: features_of(name, settings, recorded, out) for name in (TRAINING, VALIDATION)}
+    computed = settings.only == "head" and all(path.exists() for path in features.values())
+    training, validation = load_samples(
+        demonstrations, tasks, settings.horizon, None if computed else processor
+    )
+    if settings.blind:
+        training, validation = (
+            replace(samples, images=np.zeros_like(samples.images)) for samples in (training, validation)
+        )
+    config = (
+        with_statistics(config, training) if start is None else config_of_start(config, start, settings.only)
+    )
+    run = new_run(settings, config, recorded)
+    if start is not None:
+        start_from(run, start)
+    if (out / STATE_FILE).exists():
+        resume(run, out / STATE_FILE)
+    targets = (training.targets.mean(axis=0), training.targets.std(axis=0) + SMALLEST_DEVIATION)
+
+    prompts = prompts_of(config, processor)
+
+    def batches_of(samples: Samples, name: str, size: int, absent_share: float) -> Batches:
+        frozen = None
+        if settings.only == "head":
+            frozen = FrozenFeatures(samples, prompts, run.learner.backbone, features[name])
+        return Batches(
+            samples,
+            config,
+            prompts,
+            targets,
+            size,
+            absent_share=absent_share,
+            frozen=frozen,
+            with_later=settings.aligned_block is not None,
+        )
+
+    batches = batches_of(training, TRAINING, settings.batch_size, settings.absent_share)
+    held_out = batches_of(validation, VALIDATION, VALIDATION_FRAMES, 0.0)
+    try:
+        loop(run, batches, held_out, out, on_step)
+    finally:
+        if run.step:
+            save(run, out)
+    return config
+
+
+def loop(
+    run: Run, batches: Batches, held_out: Batches, out: Path, on_step: Callable[[Progress], None]
+) -> None:
+    """Trains to the last step and saves about once a minute."""
+    saved, steps = time.monotonic(), list[dict[str, float]]()
+    latest: float | None = None
+    while run.step < run.settings.steps:
+        steps.append(train_step(run, batches))
+        means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
+        if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == run.settings.steps:
+            held_out_losses = validation_losses(run, held_out)
+            validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
+            run.history.append({"step": run.step, **means, **validation})
+            save(run, out)
+            latest = held_out_losses["loss"]
+            saved, steps = time.monotonic(), []
+        on_step(Progress(run.step, run.settings.steps, means["loss"], latest))
+
+
+def plot_history(history: list[dict[str, Any]], path: Path) -> None:
+    """Plots the losses over the steps on a logarithmic scale."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    names = {
+        "loss": "velocity, training",
+        "validation_loss": "velocity, held out",
+        "target_loss": "positions, training",
+        "validation_target_loss": "positions, held out",
+        "alignment_loss": "1 - cosine of the future rows, training",
+        "validation_alignment_loss": "1 - cosine of the future rows, held out",
+    }
+    for key, label in names.items():
+        if all(key in entry for entry in history):
+            axes.plot([entry["step"] for entry in history], [entry[key] for entry in history], label=label)
+    axes.set(xlabel="step", ylabel="mean squared error", yscale="log")
+    axes.legend()
+    with write_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+    pyplot.close(figure)

@@ -1,0 +1,1 @@
+"""What several packages share: arrays, files, JSON, optional packages, command-line flags."""

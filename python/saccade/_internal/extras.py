@@ -1,0 +1,169 @@
+"""Optional dependencies: which are missing, and a command that installs them here."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from saccade.errors import MissingExtraError
+
+#: Number of missing modules that a message names.
+SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Extras:
+    """The extras of a distribution. A test compares them with its pyproject.toml.
+
+    Attributes:
+        distribution: Name of the distribution.
+        folder: Its folder in a checkout.
+        modules: The modules that each extra adds, and the distribution that contains each module.
+        includes: The extras that an extra includes, of this distribution.
+    """
+
+    distribution: str
+    folder: str
+    modules: Mapping[str, Mapping[str, str]]
+    includes: Mapping[str, tuple[str, ...]]
+
+    def require(self, *modules: str) -> None:
+        """Checks that optional modules are installed, without importing them.
+
+        Call it once with everything that a command or a module needs. The message then names every extra that
+        is needed, and not only the extra of the first missing module.
+
+        Args:
+            modules: Names of modules in :attr:`modules`, such as ``"jinja2"`` or ``"PIL"``.
+
+        Raises:
+            MissingExtraError: At least one of them is not installed. The message contains a command that
+                installs them. ``error.name`` is the first missing module.
+
+        Example:
+            >>> SACCADE.require()
+            >>> SACCADE.require("rich", "no_such_module")
+            Traceback (most recent call last):
+            KeyError: 'no_such_module'
+        """
+        extras = sorted({self._extra_of(module) for module in modules})
+        missing = [module for module in modules if importlib.util.find_spec(module) is None]
+        if missing:
+            raise self._missing(missing, extras)
+
+    def explain(self, error: ModuleNotFoundError) -> MissingExtraError | None:
+        """The error that :meth:`require` would have raised for a module that an import did not find.
+
+        Returns:
+            None if the module belongs to no extra.
+        """
+        module = (error.name or "").partition(".")[0]
+        if not any(module in modules for modules in self.modules.values()):
+            return None
+        return self._missing([module], [self._extra_of(module)])
+
+    def install_command(self, extras: list[str], modules: list[str]) -> str:
+        """A shell command that installs extras, or what is missing of them.
+
+        In a checkout the command installs the extras from the checkout. Elsewhere it names the missing
+        packages, with the versions that the metadata of the distribution asks for.
+
+        Args:
+            extras: Names of extras.
+            modules: The missing modules.
+        """
+        included = {name for extra in extras for name in self.includes.get(extra, ())}
+        wanted = ",".join(extra for extra in extras if extra not in included)
+        checkout = _checkout()
+        if checkout is None:
+            return pip_install(*map(self._requirement, modules))
+        shown = _shown(checkout / self.folder)
+        return pip_install("--editable", f"{shown}[{wanted}]")
+
+    def install_lab(self) -> str:
+        """A shell command that installs saccade-vla-lab with what its simulation needs."""
+        checkout = _checkout()
+        if checkout is None:
+            return pip_install("saccade-vla-lab[sim]")
+        return pip_install("--editable", f"{_shown(checkout / 'lab')}[sim]")
+
+    def _missing(self, modules: list[str], extras: list[str]) -> MissingExtraError:
+        """The error for these missing modules of these extras."""
+        more = len(modules) - SHOWN
+        names = [*modules[:SHOWN], f"{more} more"] if more > 0 else modules
+        listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+        verb = "is" if len(modules) == 1 else "are"
+        command = self.install_command(extras, modules)
+        return MissingExtraError(f"{listed} {verb} not installed. Install with: {command}", name=modules[0])
+
+    def _extra_of(self, module: str) -> str:
+        for extra, modules in self.modules.items():
+            if module in modules:
+                return extra
+        raise KeyError(module)
+
+    def _requirement(self, module: str) -> str:
+        """The distribution of a module with the versions that are accepted, such as ``"jinja2>=3.1"``."""
+        distribution = self.modules[self._extra_of(module)][module]
+        try:
+            required = importlib.metadata.requires(self.distribution) or []
+        except importlib.metadata.PackageNotFoundError:
+            required = []
+        for line in required:
+            found = re.match(rf"{re.escape(distribution)}\s*([^\w\s;\[-][^;]*)?(;|$)", line, re.IGNORECASE)
+            if found is not None:
+                return distribution + (found[1] or "").strip()
+        return distribution
+
+
+#: The extras of saccade-vla.
+SACCADE = Extras(
+    "saccade-vla",
+    ".",
+    {
+        "cli": {"rich": "rich", "PIL": "pillow"},
+        "torch": {"torch": "torch", "safetensors": "safetensors"},
+        "serve": {"zmq": "pyzmq", "msgpack": "msgpack"},
+        "hub": {"huggingface_hub": "huggingface_hub"},
+    },
+    {"serve": ("cli",)},
+)
+
+
+def pip_install(*arguments: str) -> str:
+    """The shell command ``pip install ARGUMENTS`` for the Python that is running.
+
+    This is plain ``pip`` only if the first ``pip`` on ``PATH`` belongs to this Python. Otherwise packages
+    would go to another environment.
+    """
+    folder = Path(sys.executable).parent
+    found = shutil.which("pip")
+    if importlib.util.find_spec("pip") is None:  # environments that uv creates have no pip
+        command = ["uv", "pip", "install", "--python", _shown(Path(sys.executable))]
+    elif found is not None and Path(found).parent == folder:
+        command = ["pip", "install"]
+    else:
+        command = [_shown(Path(sys.executable)), "-m", "pip", "install"]
+    return " ".join(map(shlex.quote, [*command, *arguments]))
+
+
+def _checkout() -> Path | None:
+    """The checkout that this package is imported from; None if it was installed from a wheel or a copy."""
+    folder = Path(__file__).resolve().parents[3]
+    return folder if (folder / "pyproject.toml").is_file() and (folder / "crates").is_dir() else None
+
+
+def _shown(path: Path) -> str:
+    """A path for a command: relative if it is below the working directory, with a leading dot."""
+    below = os.path.relpath(path)
+    if below.startswith(os.pardir):
+        return str(path)
+    return below if below == os.curdir else f"{os.curdir}{os.sep}{below}"

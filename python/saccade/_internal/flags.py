@@ -1,0 +1,352 @@
+"""The flags that commands and studies share: each has one name, one meaning and one way to be read.
+
+A command that needs a checkpoint takes it as its first argument, one that has a default takes
+``--checkpoint``. A list takes commas, spaces or both. A number outside its range is refused while the
+arguments are parsed, before anything is imported, loaded or written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from saccade.errors import InputError
+
+#: A parser, or a group of its arguments.
+Arguments: TypeAlias = argparse._ActionsContainer
+
+PRECISIONS = ("float32", "bfloat16", "int8")
+
+
+class UsageError(Exception):
+    """Arguments that a command cannot follow; printed as one line, without a traceback."""
+
+
+class StoreNumber(argparse.Action):
+    """Stores a number and refuses one outside `minimum <= number < below`.
+
+    Raises:
+        UsageError: when the argument is parsed; names the flag, the number given and the range.
+    """
+
+    def __init__(
+        self, *args: Any, minimum: float = -math.inf, below: float = math.inf, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.minimum, self.below = minimum, below
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """See argparse."""
+        if not self.minimum <= values < self.below:  # not so either if it is NaN
+            if self.below < math.inf:
+                expected = f"{self.minimum:g} to below {self.below:g}"
+            elif values == math.inf:
+                expected = "a finite number"
+            else:
+                expected = f"at least {self.minimum:g}"
+            raise UsageError(f"{option_string}: given {values}, expected {expected}")
+        setattr(namespace, self.dest, values)
+
+
+class StoreList(argparse.Action):
+    """Stores the items of a list as a tuple, in the order given, each once.
+
+    Args:
+        item: converts a word to an item; raises `ValueError` for a word that is not a number.
+        minimum: smallest value, for items that are numbers.
+
+    Raises:
+        UsageError: when the argument is parsed: the list is empty, or contains something other than numbers
+            of at least `minimum`.
+    """
+
+    def __init__(
+        self, *args: Any, item: Callable[[str], Any] = str, minimum: float | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.item, self.minimum = item, minimum
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """See argparse."""
+        items = []
+        for word in split_list(values):
+            try:
+                items.append(self.item(word))
+            except ValueError:
+                raise UsageError(f"{option_string}: given {word!r}, expected numbers") from None
+        if not items:
+            kind = "name" if self.item is str else "number"
+            raise UsageError(f"{option_string}: expected at least one {kind}")
+        if self.minimum is not None and not all(number >= self.minimum for number in items):
+            given = ", ".join(map(str, items))
+            raise UsageError(f"{option_string}: given {given}, expected numbers from {self.minimum:g} on")
+        setattr(namespace, self.dest, tuple(dict.fromkeys(items)))
+
+
+def split_list(words: Iterable[str]) -> list[str]:
+    """The items of a list that is separated by commas, spaces or both.
+
+    Example:
+        >>> split_list(["reach,push", "fork"]), split_list(["reach, push"])
+        (['reach', 'push', 'fork'], ['reach', 'push'])
+    """
+    return [item for word in words for item in re.split(r"[,\s]+", word) if item]
+
+
+def add_integer(
+    parser: Arguments,
+    flag: str,
+    *,
+    minimum: int = 1,
+    default: int | None = None,
+    required: bool = False,
+    help: str,
+) -> None:
+    """Declares a whole number of at least `minimum`; the help text ends with the default, if there is one."""
+    parser.add_argument(
+        flag,
+        type=int,
+        action=StoreNumber,
+        minimum=minimum,
+        default=default,
+        required=required,
+        metavar="N",
+        help=help if default is None else f"{help} (default: {default})",
+    )
+
+
+def add_number(
+    parser: Arguments,
+    flag: str,
+    *,
+    minimum: float = -math.inf,
+    below: float = math.inf,
+    default: float | None = None,
+    help: str,
+) -> None:
+    """Declares a number with `minimum <= number < below`; the help text ends with the default, if any."""
+    parser.add_argument(
+        flag,
+        type=float,
+        action=StoreNumber,
+        minimum=minimum,
+        below=below,
+        default=default,
+        metavar="X",
+        help=help if default is None else f"{help} (default: {default:g})",
+    )
+
+
+def add_list(
+    parser: Arguments,
+    flag: str,
+    *,
+    item: Callable[[str], Any] = str,
+    metavar: str = "NAME",
+    minimum: float | None = None,
+    default: Sequence[Any] | None = None,
+    help: str,
+) -> None:
+    """Declares a list, see `StoreList`; `args` then holds a tuple, or `default` where the flag is absent.
+
+    Args:
+        parser: parser of the command.
+        flag: its name, in the plural.
+        item: converts a word to an item, for example `int`.
+        metavar: what an item is called.
+        minimum: smallest value, for items that are numbers.
+        default: value of `args` without the flag.
+        help: help text, which must state the default.
+    """
+    parser.add_argument(
+        flag,
+        action=StoreList,
+        nargs="+",
+        item=item,
+        minimum=minimum,
+        metavar=metavar,
+        default=default,
+        help=help,
+    )
+
+
+def add_checkpoint_argument(parser: Arguments) -> None:
+    """Declares the checkpoint of a command that needs one."""
+    parser.add_argument(
+        "checkpoint",
+        type=Path,
+        metavar="CHECKPOINT",
+        help="directory, .safetensors file or published id (read from the local Hugging Face cache)",
+    )
+
+
+def add_checkpoint(
+    parser: Arguments,
+    help: str = "directory of a policy (default: the bundled policy)",
+) -> None:
+    """Declares the checkpoint of a command that has a default for it."""
+    parser.add_argument("--checkpoint", type=Path, metavar="PATH", help=help)
+
+
+def add_config(parser: Arguments) -> None:
+    """Declares the head's config."""
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="config of the head (default: config.json in the checkpoint's directory)",
+    )
+
+
+def add_features(parser: Arguments, help: str) -> None:
+    """Declares a file of recorded observations."""
+    parser.add_argument("--features", type=Path, metavar="FILE", help=help)
+
+
+def add_seed(parser: Arguments, help: str) -> None:
+    """Declares the seed."""
+    add_integer(parser, "--seed", minimum=0, default=0, help=help)
+
+
+def add_preprocessing(parser: Arguments) -> None:
+    """Declares what a whole checkpoint may not say: the robot, preprocessing and tokenizer."""
+    parser.add_argument(
+        "--embodiment", type=embodiment, metavar="TAG", help="tag or id of the robot, if there are several"
+    )
+    parser.add_argument(
+        "--preprocessing",
+        choices=("lerobot", "isaac"),
+        help="the way in which frames and words are prepared (default: by version and layout)",
+    )
+    parser.add_argument(
+        "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
+    )
+
+
+def embodiment(word: str) -> str | int:
+    """A tag, or an id if it is a number."""
+    return int(word) if word.isdecimal() else word
+
+
+#: The flags that `add_frames` declares besides `--frames`.
+WITH_FRAMES = (
+    *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
+    *("other_frames", "other_instruction"),  # of `saccade study patching`
+)
+
+
+def add_moments(parser: Arguments, flag: str) -> None:
+    """Declares a directory of pictures, an instruction and a state, for `read_frames`.
+
+    Args:
+        parser: parser or group.
+        flag: flag of the directory.
+    """
+    parser.add_argument(
+        flag,
+        type=Path,
+        metavar="DIR",
+        help="a picture for each camera, named after it (front.png), or a folder of them for each moment",
+    )
+    parser.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
+    parser.add_argument(
+        "--state",
+        type=Path,
+        metavar="FILE",
+        help="JSON: the robot's state in its own units, for moments without a state.json (default: the "
+        "middle of its range)",
+    )
+
+
+def check_frames(args: argparse.Namespace, *refused: str) -> None:
+    """Checks the flags of `add_frames`.
+
+    Args:
+        args: Parsed arguments.
+        refused: Names of arguments that cannot be combined with `--frames`: they are None where not given.
+
+    Raises:
+        UsageError: One needs `--frames`, or cannot be combined with it.
+    """
+    wrong, rule = (WITH_FRAMES, "only with") if args.frames is None else (refused, "not with")
+    given = [name for name in wrong if getattr(args, name, None) is not None]
+    if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise UsageError(f"{flags}: {rule} --frames")
+
+
+def add_num_threads(
+    parser: Arguments,
+    help: str = "threads of the action head (default: the physical cores)",
+    default: int | None = None,
+) -> None:
+    """Declares the number of threads."""
+    add_integer(parser, "--num-threads", default=default, help=help)
+
+
+def add_num_steps(parser: Arguments, help: str = "Euler steps (default: those of the checkpoint)") -> None:
+    """Declares the number of Euler steps."""
+    add_integer(parser, "--num-steps", help=help)
+
+
+def add_num_vl_tokens(parser: Arguments, default: int | None, help: str) -> None:
+    """Declares T_vl."""
+    add_integer(parser, "--num-vl-tokens", default=default, help=help)
+
+
+def add_out(parser: Arguments, default: str | None, help: str = "directory of the results") -> None:
+    """Declares the directory to write; without a default it must be given."""
+    text = help if default is None else f"{help} (default: {default})"
+    path = None if default is None else Path(default)
+    parser.add_argument("--out", type=Path, metavar="DIR", default=path, required=default is None, help=text)
+
+
+def add_json(parser: Arguments, help: str = "print JSON instead of text") -> None:
+    """Declares whether JSON is printed."""
+    parser.add_argument("--json", action="store_true", help=help)
+
+
+def check_known(flag: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Checks names.
+
+    Raises:
+        InputError: one is unknown; lists those that are known.
+    """
+    known = list(known)
+    for name in given:
+        if name not in known:
+            raise InputError(f"{flag}: unknown name {name!r}, expected one of {', '.join(known)}")
+
+
+def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:
+    """Distinct indices below `count` in increasing order; None gives all of them.
+
+    Raises:
+        InputError: one is out of range.
+
+    Example:
+        >>> indices("--blocks", (3, 0), 4), indices("--blocks", None, 4)
+        ((0, 3), (0, 1, 2, 3))
+    """
+    if given is None:
+        return tuple(range(count))
+    found = tuple(sorted(set(given)))
+    if found and (found[0] < 0 or found[-1] >= count):
+        raise InputError(f"{flag}: given {', '.join(map(str, found))}, expected 0 to {count - 1}")
+    return found

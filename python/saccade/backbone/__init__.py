@@ -1,0 +1,1 @@
+"""The vision-language backbone: its sizes, inputs and features."""

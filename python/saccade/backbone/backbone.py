@@ -1,0 +1,266 @@
+"""The vision-language backbone of GR00T N1.5, N1.6 and N1.7: camera views and words in, features out."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import saccade._saccade as _saccade
+from saccade._internal.arrays import ArrayLike, as_stored, check_precision, mask_bytes
+from saccade.backbone.config import BackboneConfig
+from saccade.backbone.features import BackboneFeatures, check_backbone_record, made
+from saccade.backbone.inputs import BackboneInputs
+from saccade.checkpoints.hub import resolve
+from saccade.errors import DtypeError, InputError
+from saccade.head.config import to_json
+from saccade.head.options import optional_integer
+
+
+class Backbone:
+    """A loaded backbone. Create one with :meth:`load` or :meth:`from_tensors`.
+
+    A backbone is immutable: any number of threads may call it at the same time. The features of an
+    observation have the same bits whatever else is in the batch, as long as it has the same padding, and with
+    any number of threads.
+
+    Example:
+        >>> import saccade
+        >>> backbone = saccade.Backbone.from_pretrained("nvidia/GR00T-N1.5-3B")  # doctest: +SKIP
+        >>> features = backbone(inputs)  # doctest: +SKIP
+        >>> features.backbone_features.shape  # doctest: +SKIP
+        (1, 287, 2048)
+    """
+
+    def __init__(
+        self,
+        backbone: _saccade.Backbone,
+        source: str | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        self._backbone = backbone
+        self._source = source
+        self._options = options
+        self._config = BackboneConfig(**backbone.config())
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        source: str | os.PathLike[str],
+        *,
+        config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
+        precision: str = "float32",
+        num_threads: int | None = None,
+    ) -> Backbone:
+        """Loads the backbone of a checkpoint.
+
+        The tensors of the backbone have the prefix ``backbone.``, ``_groot_model.backbone.`` or none. Their
+        names say the version. Tensors outside the prefix are ignored. Inside it every tensor must be known,
+        present and of the right shape. Known and not read are the pooling head of SigLIP, ``lm_head`` if
+        ``embed_tokens`` is there too, and layers of the language model from ``select_layer`` on.
+
+        Args:
+            source: A directory (``config.json`` and one or more ``.safetensors`` files, with or without an
+                index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache of
+                ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``. Nothing is downloaded.
+            config: A dict or the path of a JSON file: the config of a whole checkpoint, whose
+                ``backbone_cfg.eagle_config`` may hold sizes, or that of a backbone alone (``vision_config``,
+                ``text_config``, ``eagle``, ``select_layer``, ``project_to_dim``). Sizes that it does not hold
+                are those of the published model. Default: the ``config.json`` in the directory of the
+                weights, if there is one.
+            precision: How the backbone computes. The residual stream, norms, softmax and all sums of floating
+                point products are float32 at every precision.
+
+                - ``"float32"``: exact up to rounding. Weights stored as bfloat16 stay bfloat16 in memory,
+                  which loses nothing.
+                - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16.
+                - ``"int8"``: the large layers of all blocks multiply 8-bit integers, with a scale for each
+                  output of the weights and one for each row of the inputs. Everything else is as in
+                  ``"bfloat16"``.
+
+                The table of embeddings is held in bfloat16, or in float32 if it is stored so and the
+                precision is float32.
+            num_threads: Number of threads that a call uses. Default: the environment variable
+                ``SACCADE_NUM_THREADS``, else the number of physical cores that the process may use.
+
+        Raises:
+            FileNotFoundError: ``source`` or the config does not exist.
+            CheckpointError: The config or the weights are damaged or do not fit each other, or there is no
+                backbone. The message lists every problem.
+            InputError: An option is out of range.
+        """
+        check_precision(precision)
+        path = os.fspath(resolve(source))
+        config_text = None if config is None else to_json(config)
+        threads = optional_integer("num_threads", num_threads)
+        backbone = _saccade.Backbone.load(path, config_text, precision, threads)
+        options = {"config": config_text, "precision": precision, "num_threads": threads}
+        return cls(backbone, str(Path(path).absolute()), options)
+
+    @classmethod
+    def from_tensors(
+        cls,
+        tensors: Mapping[str, ArrayLike],
+        *,
+        config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
+        precision: str = "float32",
+        num_threads: int | None = None,
+    ) -> Backbone:
+        """Creates a backbone from tensors in memory.
+
+        The result is bit for bit the backbone that :meth:`load` reads from a file with these tensors. The
+        backbone keeps no reference to the tensors. A tensor that is not C-contiguous is copied first. Such a
+        backbone cannot be pickled, because it has no file to be loaded from.
+
+        Args:
+            tensors: The tensors by their names in a checkpoint, with or without the prefix, as NumPy arrays
+                or torch CPU tensors of float32, bfloat16 or float16.
+            config: As for :meth:`load`. Default: that of the published model.
+            precision, num_threads: As for :meth:`load`.
+
+        Raises:
+            DtypeError: A tensor has another dtype, or is not on the CPU.
+            ShapeError: Shapes do not fit the config.
+            CheckpointError: Tensors are missing or unknown, or the config is damaged. This message and those
+                of the two errors above list every problem.
+            FileNotFoundError: The config does not exist.
+            InputError: An option is out of range, or a name is not valid Unicode.
+        """
+        check_precision(precision)
+        config_text = None if config is None else to_json(config)
+        threads = optional_integer("num_threads", num_threads)
+        held = as_stored(tensors)
+        return cls(_saccade.Backbone.from_tensors(held, config_text, precision, threads))
+
+    @property
+    def config(self) -> BackboneConfig:
+        """Sizes and switches of the backbone."""
+        return self._config
+
+    @property
+    def source(self) -> str | None:
+        """Absolute path of the checkpoint that it was loaded from; None after :meth:`from_tensors`."""
+        return self._source
+
+    @property
+    def num_threads(self) -> int:
+        """Number of threads that a call uses."""
+        return self._backbone.num_threads
+
+    @property
+    def precision(self) -> str:
+        """How the backbone computes: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
+        return self._backbone.precision
+
+    @property
+    def isa(self) -> str:
+        """Instruction set of the kernels, one of those that :func:`saccade.show_config` lists."""
+        return self._backbone.isa
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the weights in memory, in bytes."""
+        return self._backbone.nbytes
+
+    def __call__(
+        self,
+        inputs: BackboneInputs,
+        *,
+        previous: BackboneFeatures | None = None,
+        record: Sequence[str] = (),
+    ) -> BackboneFeatures:
+        """Computes the features of observations.
+
+        Args:
+            inputs: Pixels and token ids, as :class:`saccade.Processor` makes them. Padding is reproduced as
+                the released code computes it with scaled dot product attention: a row that may not attend to
+                anything gets zeros from the attention. In N1.5 and N1.6 padding counts in the positions.
+            previous: Features that this backbone computed before. Views whose pixels are the same, byte for
+                byte, are not encoded again, and of a prompt that begins in the same way (the same ids,
+                padding and views) only the rest is computed. The features have the same bits as without.
+            record: What to keep in ``features.record``, any of ``"hidden"`` (the rows after each layer of the
+                language model), ``"vision"`` (the patches of each view after the vision tower) and
+                ``"image_tokens"`` (the tokens of each view). With a record nothing is taken from
+                ``previous``.
+
+        Returns:
+            The features, masks, and where the tokens of each view are.
+
+        Raises:
+            ShapeError, DtypeError, InputError: The inputs do not fit the backbone or each other, are not
+                finite, or ``previous`` is of another backbone.
+            MemoryError: There is not enough memory.
+        """
+        return self._encode([inputs], [] if previous is None else [previous], record)[0]
+
+    def _ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[BackboneFeatures] = ()
+    ) -> list[BackboneFeatures]:
+        """Computes the features of several inputs, whose prompts may differ in length, in one pass.
+
+        For internal use: :class:`saccade.Policy` never pads. All rows share the linear layers, and all views
+        the vision tower. The features of each have the bits that it has alone.
+
+        Args:
+            inputs: Pixels and token ids.
+            previous: Features that any of the inputs may take from, as in :meth:`__call__`.
+
+        Raises:
+            ShapeError, DtypeError, InputError, MemoryError: As :meth:`__call__`.
+        """
+        return self._encode(list(inputs), list(previous), ())
+
+    def _encode(
+        self, inputs: list[BackboneInputs], previous: list[BackboneFeatures], record: Sequence[str]
+    ) -> list[BackboneFeatures]:
+        for name, values, kind in (
+            ("inputs", inputs, BackboneInputs),
+            ("previous", previous, BackboneFeatures),
+        ):
+            for value in values:
+                if not isinstance(value, kind):
+                    raise InputError(f"{name}: expected saccade.{kind.__name__}, got {type(value).__name__}")
+        keep = check_backbone_record(record)
+        encoded = self._backbone.encode(
+            [_plain(given) for given in inputs], [given._held for given in previous], *keep
+        )
+        token = self._config.image_token_id
+        return [
+            made(held, recorded if any(keep) else None, given, token)
+            for (held, recorded), given in zip(encoded, inputs, strict=True)
+        ]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._source is None:
+            raise DtypeError(
+                "a backbone made by Backbone.from_tensors cannot be pickled or copied, because it has no "
+                "file to be loaded from: write its tensors to a checkpoint and use Backbone.from_pretrained"
+            )
+        return _load, (self._source, self._options)
+
+    def __repr__(self) -> str:
+        config = self._config
+        return (
+            f"<saccade.Backbone {config.version} width={config.width} num_layers={config.num_layers} "
+            f"vision_num_layers={config.vision_num_layers} precision={self.precision} isa={self.isa} "
+            f"num_threads={self.num_threads}>"
+        )
+
+
+def _load(source: str, options: dict[str, Any]) -> Backbone:
+    """Unpickles a backbone by loading its checkpoint again."""
+    config, rest = options["config"], {name: value for name, value in options.items() if name != "config"}
+    return Backbone.from_pretrained(source, config=None if config is None else json.loads(config), **rest)
+
+
+def _plain(inputs: BackboneInputs) -> dict[str, Any]:
+    """The inputs as the engine takes them."""
+    pixels = inputs.pixel_values
+    return {
+        "pixel_values": list(pixels) if isinstance(pixels, tuple) else [pixels],
+        "input_ids": inputs.input_ids,
+        "attention_mask": mask_bytes("attention_mask", inputs.attention_mask),
+        "image_grid_thw": inputs.image_grid_thw,
+    }

@@ -1,0 +1,199 @@
+"""What a backbone returns: features, and what a later call may take from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+import saccade._saccade as _saccade
+from saccade._internal.arrays import Array, like_features
+from saccade.errors import DtypeError, InputError
+
+#: What can be recorded.
+RECORDS = ("hidden", "vision", "image_tokens")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BackboneRecord:
+    """What one call of a backbone recorded. ``repr`` lists what it holds.
+
+    Arrays are float32, NumPy or torch like the inputs.
+
+    Attributes:
+        hidden: The rows after each layer of the language model, ``(batch, T, width)``, by layer. In N1.7 this
+            is before tokens of the vision tower are added.
+        vision: The patches of each view after the vision tower, ``(patches, vision_width)``, by observation
+            and name of the view. In N1.5 and N1.6 this is after the last norm.
+        image_tokens: The tokens of each view as the language model reads them, ``(tokens, width)``, by
+            observation and name of the view.
+    """
+
+    hidden: Mapping[int, Array]
+    vision: Mapping[tuple[int, str], Array]
+    image_tokens: Mapping[tuple[int, str], Array]
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory, in bytes."""
+        parts = (self.hidden, self.vision, self.image_tokens)
+        return sum(int(array.nbytes) for part in parts for array in part.values())
+
+    def __repr__(self) -> str:
+        counts = [f"{name}={len(getattr(self, name))}" for name in RECORDS]
+        return f"<saccade.BackboneRecord {' '.join(counts)} {self.nbytes / 1e6:,.1f} MB>"
+
+
+class BackboneFeatures:
+    """The features of observations. Returned by :class:`saccade.Backbone`.
+
+    Besides the features it holds what a later call may take from it (``previous``): the pixels and tokens of
+    each view, and the keys and values of every layer. It is immutable: any number of calls and threads may
+    use it at the same time. ``copy.copy`` and ``copy.deepcopy`` return the object itself. It cannot be
+    pickled.
+    """
+
+    def __init__(
+        self,
+        held: _saccade.BackboneFeatures,
+        arrays: tuple[Array, Array, Array],
+        views: dict[str, npt.NDArray[np.int64]],
+        record: BackboneRecord | None,
+    ) -> None:
+        self._held = held
+        self._arrays = arrays
+        self._views = views
+        self._record = record
+
+    @property
+    def backbone_features(self) -> Array:
+        """The features, ``(batch, T, feature_dim)`` float32; a torch tensor if the inputs were torch."""
+        return self._arrays[0]
+
+    @property
+    def attention_mask(self) -> Array:
+        """bool ``(batch, T)``, True where a token is not padding, as it was given."""
+        return self._arrays[1]
+
+    @property
+    def image_mask(self) -> Array:
+        """bool ``(batch, T)``, True for tokens of views."""
+        return self._arrays[2]
+
+    @property
+    def views(self) -> dict[str, npt.NDArray[np.int64]]:
+        """The positions in T of the tokens of each view, int64 ``(batch, tokens)``, by name.
+
+        The names are those of ``inputs.view_names``. If an observation has fewer tokens of a view than
+        others, its row ends with -1.
+        """
+        return dict(self._views)
+
+    @property
+    def record(self) -> BackboneRecord | None:
+        """What was recorded, or None."""
+        return self._record
+
+    @property
+    def batch(self) -> int:
+        """Number of observations."""
+        return int(self._arrays[0].shape[0])
+
+    @property
+    def num_tokens(self) -> int:
+        """Number of tokens of each observation (T)."""
+        return int(self._arrays[0].shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory, in bytes. What several features share is counted in each of them."""
+        shown = sum(int(array.nbytes) for array in self._arrays)
+        return self._held.nbytes + shown + (0 if self._record is None else self._record.nbytes)
+
+    def __copy__(self) -> BackboneFeatures:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> BackboneFeatures:
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise DtypeError(
+            "BackboneFeatures cannot be pickled, because they belong to one loaded backbone: pickle the "
+            "array backbone_features"
+        )
+
+    def __repr__(self) -> str:
+        views = ", ".join(self._views)
+        return (
+            f"<saccade.BackboneFeatures batch={self.batch} num_tokens={self.num_tokens} views=[{views}] "
+            f"nbytes={self.nbytes}>"
+        )
+
+
+def check_backbone_record(record: Any) -> tuple[bool, bool, bool]:
+    """Whether to record hidden rows, patches of views, and tokens of views.
+
+    Raises:
+        InputError: ``record`` contains anything but the names in ``RECORDS``.
+    """
+    try:
+        names = None if isinstance(record, str) else list(record)
+    except TypeError:
+        names = None
+    if names is None or any(not isinstance(name, str) or name not in RECORDS for name in names):
+        raise InputError(f"record: expected a tuple of names among {', '.join(RECORDS)}, got {record!r}")
+    return "hidden" in names, "vision" in names, "image_tokens" in names
+
+
+def made(
+    held: _saccade.BackboneFeatures,
+    recorded: _saccade._BackboneRecorded | None,
+    inputs: Any,
+    image_token_id: int,
+) -> BackboneFeatures:
+    """The features of ``inputs``, as Python has them."""
+    use_torch = inputs._is_torch
+    arrays = (
+        like_features(held.features(), use_torch),
+        like_features(inputs.attention_mask.copy(), use_torch),
+        like_features(inputs.input_ids == image_token_id, use_torch),
+    )
+    places = held.views()
+    names = view_names(inputs.view_names, max(map(len, places), default=0))
+    views = {}
+    for index, name in enumerate(names):
+        rows = [row[index] if index < len(row) else np.empty(0, np.int64) for row in places]
+        table = np.full((len(rows), max(map(len, rows))), -1, np.int64)
+        for to, row in zip(table, rows, strict=True):
+            to[: len(row)] = row
+        views[name] = table
+    record = None
+    if recorded is not None:
+        hidden, vision, tokens = recorded
+
+        def by_view(rows: list[list[npt.NDArray[np.float32]]]) -> dict[tuple[int, str], Array]:
+            return {
+                (row, names[index]): like_features(array, use_torch)
+                for row, arrays in enumerate(rows)
+                for index, array in enumerate(arrays)
+            }
+
+        layers = {layer: like_features(array, use_torch) for layer, array in enumerate(hidden)}
+        record = BackboneRecord(layers, by_view(vision), by_view(tokens))
+    return BackboneFeatures(held, arrays, views, record)
+
+
+def view_names(given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:
+    """The names of ``count`` views.
+
+    Raises:
+        InputError: Another number of names was given.
+    """
+    if given is None:
+        return tuple(f"view_{index + 1}" for index in range(count))
+    if len(given) != count:
+        raise InputError(f"view_names: expected {count} names, one a view, got {list(given)!r}")
+    return given

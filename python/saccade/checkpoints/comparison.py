@@ -1,0 +1,121 @@
+"""Compares the actions of two runs, for example of a checkpoint and its resized copy."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from saccade._internal.arrays import Float32Array, integer
+from saccade.checkpoints.description import Config, Source, open_published
+from saccade.head.head import ActionHead
+from saccade.head.intervention import Intervention
+from saccade.head.options import LoadOptions
+from saccade.observations.recorded import Observation, from_arrays, read_arrays
+
+
+@dataclass(frozen=True)
+class Change:
+    """The difference of actions over all observations."""
+
+    largest: float
+    """The largest absolute difference in any dimension of any action."""
+    mean: float
+    """The mean absolute difference."""
+
+
+@dataclass(frozen=True)
+class ActionChanges:
+    """What :func:`action_changes` measured, in the normalised actions of the head."""
+
+    observations: int
+    """Number of observations."""
+    in_saccade: Change
+    """The difference in saccade, which applies the copy's ``future_key_bias``."""
+    in_other_programs: Change
+    """The difference in programs that do not read it."""
+    of_other_noise: Change
+    """The difference of the source's actions when sampling starts from other noise, for scale."""
+    actions_rms: float
+    """Root mean square of the source's actions."""
+
+
+def change(before: Float32Array, after: Float32Array) -> Change:
+    """The difference of two arrays of actions of the same shape, computed in float64."""
+    difference = np.abs(after.astype(np.float64) - before)
+    return Change(largest=float(difference.max()), mean=float(difference.mean()))
+
+
+def action_changes(
+    source: Source,
+    resized: Source,
+    *,
+    config: Config = None,
+    features: str | os.PathLike[str] | None = None,
+    seed: int = 0,
+    num_observations: int = 4,
+    num_vl_tokens: int = 296,
+    num_threads: int | None = None,
+) -> ActionChanges:
+    """Compares the actions of a checkpoint with those of its copy by :func:`saccade.checkpoints.resize`.
+
+    Both run in float32 on the same observations from the same noise. One head at a time is in memory.
+
+    Args:
+        source: The checkpoint.
+        resized: The copy.
+        config: Config of the source, as in ``resize``.
+        features: A file of recorded observations, ``.npz`` or ``.safetensors``, see
+            :func:`saccade.observations.recorded.read_arrays`. Default: random observations of the first
+            embodiment,
+            which are less informative, because no robot produces them.
+        seed: Seed of random observations, and of noise that the file does not contain.
+        num_observations: Number of random observations.
+        num_vl_tokens: Their number of vision-language tokens. 296 is what one camera produces in N1.5.
+        num_threads: As for :meth:`saccade.ActionHead.from_pretrained`.
+
+    Raises:
+        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`.
+        InputError, ShapeError: An option is out of range, or the recorded observations do not fit the head.
+    """
+    rng = np.random.default_rng(integer("seed", seed, least=0))
+    arrays = None if features is None else read_arrays(Path(features))
+    kept = open_published(source, config).kept_embodiments() or [0]
+    ids = kept[:1] if arrays is None else np.unique(arrays["embodiment_id"]).tolist()
+    loading: LoadOptions = {"embodiment_ids": ids, "num_threads": num_threads}
+    head = ActionHead.from_pretrained(source, config=config, **loading)
+    if arrays is None:
+        observations = [
+            Observation.random(head.config, num_vl_tokens, rng, head.embodiment_ids[0])
+            for _ in range(num_observations)
+        ]
+    else:
+        recorded = from_arrays(arrays, head.config, str(features))
+        observations = list(recorded.with_noise(rng, head.config).rows())
+    before = _actions(head, observations)
+    others = [dataclasses.replace(one, noise=None).with_noise(rng, head.config) for one in observations]
+    of_other_noise = change(before, _actions(head, others))
+    del head
+    head = ActionHead.from_pretrained(resized, **loading)
+    after = _actions(head, observations)
+    plain = after
+    if head.config.future_key_bias is not None:
+        # Replacing the tokens by themselves leaves their bias out.
+        plain = _actions(head, observations, Intervention(future_tokens=head.future_tokens))
+    return ActionChanges(
+        observations=len(observations),
+        in_saccade=change(before, after),
+        in_other_programs=change(before, plain),
+        of_other_noise=of_other_noise,
+        actions_rms=float(np.sqrt(np.mean(np.square(before, dtype=np.float64)))),
+    )
+
+
+def _actions(
+    head: ActionHead, observations: Sequence[Observation], intervention: Intervention | None = None
+) -> Float32Array:
+    return np.concatenate([one.sample(head, intervention=intervention) for one in observations])

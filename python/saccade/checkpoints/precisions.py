@@ -1,0 +1,253 @@
+"""Compares the precisions of a whole checkpoint on a user's own pictures, and recommends one."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade._internal.arrays import Float32Array, integer
+from saccade.observations.pictures import Moment, read_frames
+from saccade.policy.parts import parts_of
+from saccade.policy.policy import Policy
+from saccade.processor import Preprocessing
+from saccade.robots import Group
+
+#: The precisions that are compared, the exact one first.
+PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "float32": {"backbone": "float32", "head": "float32"},
+        "bfloat16": {"backbone": "bfloat16", "head": "bfloat16"},
+        "int8, head bfloat16": {"backbone": "int8", "head": "bfloat16"},
+        "int8": {"backbone": "int8", "head": "int8"},
+    }
+)
+
+#: Largest difference of an action, relative to its range, at which a precision is recommended. The head of
+#: the policy bundled until November 2026 differs in int8 by up to 0.021 in actions from -1 to 1, 1 % of their
+#: range (docs/precision.md). With that, 300 paired episodes of a task that is sensitive to such errors
+#: excluded a loss of 2 points (docs/fast.md). Nothing larger was tested in closed loop.
+TOLERANCE = 0.01
+
+#: Number of chunks that are compared for each moment, from different noise.
+NUM_SAMPLES = 4
+
+#: Standard deviations that stand for the range of an action, if the statistics are mean and deviation.
+DEVIATIONS = 4.0
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The largest difference of actions over all moments, samples, steps and numbers."""
+
+    largest: dict[str, float]
+    """By key of the action, in the robot's units."""
+    of_range: dict[str, float]
+    """By key, relative to the range of each number: maximum minus minimum, 99 % minus 1 % quantile, or
+    four standard deviations, whatever the statistics are. Numbers that are constant do not count."""
+
+    @property
+    def worst(self) -> float:
+        """The largest of ``of_range``."""
+        return max(self.of_range.values(), default=0.0)
+
+
+@dataclass(frozen=True)
+class PrecisionError:
+    """One precision, compared with float32."""
+
+    name: str
+    precision: dict[str, str]
+    """Of ``backbone`` and ``head``."""
+    features: float
+    """Error of the backbone's features: the norm of the difference of a token, relative to the token's norm,
+    and of that the mean over tokens and moments."""
+    actions: Difference
+    nbytes: int
+    """Size of the weights in memory, in bytes."""
+    milliseconds: float
+    """Time of one chunk, from frames to actions: the median over moments."""
+
+
+@dataclass(frozen=True)
+class PrecisionCheck:
+    """What :func:`check_precisions` found."""
+
+    source: str
+    moments: int
+    samples: int
+    """Chunks for each moment."""
+    precisions: tuple[PrecisionError, ...]
+    other_noise: Difference
+    """Of float32 with itself, from other noise: how much the policy leaves to chance."""
+    tolerance: float
+    recommended: str
+    """The name of the precision with the smallest weights among those whose actions differ by at most
+    ``tolerance`` of the range."""
+
+
+@dataclass(frozen=True)
+class _Results:
+    """What one precision computes on each moment."""
+
+    features: list[Float32Array]
+    actions: list[dict[str, Float32Array]]
+    milliseconds: float
+
+
+def check_precisions(
+    source: str | os.PathLike[str],
+    directory: Path,
+    *,
+    instruction: str | None = None,
+    state: Path | None = None,
+    embodiment: str | int | None = None,
+    preprocessing: Preprocessing | None = None,
+    tokenizer: str | os.PathLike[str] | None = None,
+    data_config: str | os.PathLike[str] | Mapping[str, Any] | None = None,
+    action_horizon: int | None = None,
+    processor_options: Mapping[str, Any] | None = None,
+    num_threads: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> PrecisionCheck:
+    """Runs a whole checkpoint at every precision on the same pictures from the same noise.
+
+    One precision at a time is in memory.
+
+    Args:
+        source: The checkpoint, as for :meth:`saccade.Policy.from_pretrained`.
+        directory: Pictures, as :func:`saccade.observations.pictures.read_frames` reads them.
+        instruction, state: As for :func:`saccade.observations.pictures.read_frames`.
+        embodiment, preprocessing, tokenizer, data_config, action_horizon, processor_options, num_threads: As
+            for :meth:`saccade.Policy.from_pretrained`.
+        seed: Seed of the noise, at least 0.
+        progress: Called with the number of precisions that are done, and of all.
+
+    Raises:
+        FileNotFoundError, CheckpointError, InputError, ShapeError, DtypeError: As
+        :meth:`saccade.Policy.from_pretrained`
+            and :func:`saccade.observations.pictures.read_frames`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from saccade.checkpoints.precisions import check_precisions
+        >>> def best(checkpoint: str) -> str:
+        ...     return check_precisions(checkpoint, Path("frames"), instruction="open the drawer").recommended
+    """
+    seed = integer("seed", seed, least=0)
+    moments: list[Moment] = []
+    found: list[PrecisionError] = []
+    exact: _Results | None = None
+    other_noise = Difference({}, {})
+    for index, (name, precision) in enumerate(PRECISIONS.items()):
+        if progress is not None:
+            progress(index, len(PRECISIONS))
+        policy = Policy.from_pretrained(
+            source,
+            embodiment=embodiment,
+            preprocessing=preprocessing,
+            tokenizer=tokenizer,
+            data_config=data_config,
+            action_horizon=action_horizon,
+            processor_options=processor_options,
+            precision=precision,
+            num_threads=num_threads,
+        )
+        groups = policy.normalizer.action_groups
+        if exact is None:
+            moments = read_frames(directory, policy, instruction=instruction, state=state)
+            results = exact = run(policy, moments, seed)
+            others = run(policy, moments, seed + len(moments))
+            other_noise = difference(exact.actions, others.actions, groups)
+        else:
+            results = run(policy, moments, seed)
+        parts = parts_of(policy)
+        found.append(
+            PrecisionError(
+                name=name,
+                precision=dict(precision),
+                features=features_error(exact.features, results.features),
+                actions=difference(exact.actions, results.actions, groups),
+                nbytes=parts.backbone.nbytes + parts.head.nbytes,
+                milliseconds=results.milliseconds,
+            )
+        )
+        del policy, parts  # before the next one is loaded
+    return PrecisionCheck(
+        source=os.fspath(source),
+        moments=len(moments),
+        samples=NUM_SAMPLES,
+        precisions=tuple(found),
+        other_noise=other_noise,
+        tolerance=TOLERANCE,
+        recommended=recommended(found),
+    )
+
+
+def recommended(found: Sequence[PrecisionError]) -> str:
+    """The name of the smallest precision whose actions differ by at most `TOLERANCE` of the range."""
+    close = [one for one in found if one.actions.worst <= TOLERANCE]
+    return min(close, key=lambda one: one.nbytes).name
+
+
+def run(policy: Policy, moments: Sequence[Moment], seed: int) -> _Results:
+    """Features, chunks from `NUM_SAMPLES` draws of noise, and the time of a chunk."""
+    features, actions, seconds = [], [], []
+    policy.act(moments[0].observation, seed=seed)  # claims memory
+    for index, moment in enumerate(moments):
+        started = time.perf_counter()
+        computed = policy.features(policy.inputs(moment.observation))
+        context = policy.context(computed)
+        policy.sample(context, moment.observation, seed=seed + index)
+        seconds.append(time.perf_counter() - started)
+        chunks = policy.sample(context, moment.observation, seed=seed + index, num_samples=NUM_SAMPLES)
+        features.append(np.asarray(computed[0].backbone_features[0]))
+        actions.append({key: np.asarray(chunk[0]) for key, chunk in chunks.items()})
+    return _Results(features, actions, 1e3 * float(np.median(seconds)))
+
+
+def features_error(exact: Sequence[Float32Array], given: Sequence[Float32Array]) -> float:
+    """The mean over tokens of the norm of the difference, relative to the token's norm."""
+    rows = []
+    for expected, got in zip(exact, given, strict=True):
+        norms = np.linalg.norm(expected.astype(np.float64), axis=-1)
+        differences = np.linalg.norm(got.astype(np.float64) - expected, axis=-1)
+        rows.append(differences / np.maximum(norms, np.finfo(np.float64).tiny))
+    return float(np.concatenate(rows).mean())
+
+
+def difference(
+    exact: Sequence[Mapping[str, Float32Array]],
+    given: Sequence[Mapping[str, Float32Array]],
+    groups: Sequence[Group],
+) -> Difference:
+    """The largest differences of chunks `(samples, T, size)` by key, over all moments."""
+    largest = {group.key: 0.0 for group in groups}
+    of_range = dict(largest)
+    for expected, got in zip(exact, given, strict=True):
+        for group in groups:
+            apart = np.abs(got[group.key].astype(np.float64) - expected[group.key])
+            span = range_of(group, apart.shape[-2])
+            scaled = np.divide(apart, span, out=np.zeros_like(apart), where=span > 0)
+            largest[group.key] = max(largest[group.key], float(apart.max()))
+            of_range[group.key] = max(of_range[group.key], float(scaled.max()))
+    return Difference(largest, of_range)
+
+
+def range_of(group: Group, steps: int) -> npt.NDArray[Any]:
+    """The range of each number of an action, ``(size,)`` or ``(steps, size)``; 0 if it is constant."""
+    if group.first is None or group.second is None or group.moving is None:
+        # Normalised actions are from -1 to 1, and binary ones 0 or 1.
+        return np.full(group.size, 1.0 if group.mode == "binary" else 2.0)
+    first, second = np.asarray(group.first, np.float64), np.asarray(group.second, np.float64)
+    span = DEVIATIONS * second if group.mode == "mean_std" else second - first
+    span = np.where(group.moving, span, 0.0)
+    return span[:steps] if span.ndim > 1 else span

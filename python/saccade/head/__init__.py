@@ -1,0 +1,1 @@
+"""The action head: its sizes, contexts, options, interventions and traces."""

@@ -1,0 +1,77 @@
+"""Real-time chunking: a chunk that continues the previous one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from saccade._internal.arrays import integer
+from saccade.errors import InputError
+
+
+@dataclass(frozen=True)
+class Chunking:
+    """How a chunk continues the previous one.
+
+    While a robot executes a chunk, the next one is computed. The first actions of the next chunk must agree
+    with the actions that the robot executes meanwhile. Otherwise the robot jerks at the transition.
+
+    The last ``overlap`` of the first ``horizon`` actions of the previous chunk become the first actions of
+    the new one, in place of noise. The velocity of action ``j`` is multiplied by a factor: 0 for the first
+    ``frozen`` actions, which do not change; ``(1 - exp(-a r)) / (1 - exp(-a))`` for the rest of the overlap,
+    with ``a = ramp_rate`` and ``r = (j - frozen + 1) / (overlap - frozen + 1)``, which increases from 0 to 1;
+    and 1 from ``overlap`` on. This is the rule of GR00T N1.7 (its options ``rtc_overlap_steps``,
+    ``rtc_frozen_steps`` and ``rtc_ramp_rate``), here available for every head. With
+    ``integrator="midpoint"`` the factor applies to both velocities of a step.
+
+    Attributes:
+        overlap: Number of actions that are taken from the previous chunk, at most ``horizon``.
+        frozen: Number of these that do not change, counted from the first, at most ``overlap``. The robot
+            executes them before the new chunk is available.
+        ramp_rate: How fast the factor increases; above 0. A smaller rate gives a straighter ramp.
+        horizon: Number of actions of the previous chunk that are used, at most the head's ``action_horizon``.
+            Default: all.
+
+    Raises:
+        InputError: A number is out of range.
+
+    Example:
+        A robot executes 8 actions of a chunk of 16 and then needs the next chunk, which takes as long to
+        compute as 3 actions take to execute. Therefore the next chunk is requested after 5 of the 8 actions.
+        It begins with the last 11 actions of the old one, the first 3 of which are executed while it is
+        computed:
+
+        >>> import importlib.resources
+        >>> import numpy as np, saccade
+        >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
+        >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
+        >>> state = np.zeros((1, head.config.state_dim), np.float32)
+        >>> before = head.sample(context, state, 0, seed=7)
+        >>> chunking = saccade.Chunking(overlap=11, frozen=3)
+        >>> chunk = head.sample(context, state, 0, seed=8, previous_chunk=before, chunking=chunking)
+        >>> np.array_equal(chunk[:, :3], before[:, 5:8])
+        True
+    """
+
+    overlap: int
+    frozen: int
+    ramp_rate: float = 6.0
+    horizon: int | None = None
+
+    def __post_init__(self) -> None:
+        horizon = None if self.horizon is None else integer("chunking: horizon", self.horizon)
+        overlap = integer("chunking: overlap", self.overlap, least=0)
+        frozen = integer("chunking: frozen", self.frozen, least=0)
+        if horizon is not None and overlap > horizon:
+            raise InputError(f"chunking: overlap: expected at most {horizon} (horizon), got {overlap}")
+        if frozen > overlap:
+            raise InputError(f"chunking: frozen: expected at most {overlap} (overlap), got {frozen}")
+        try:
+            ramp_rate = float(self.ramp_rate)
+        except (TypeError, ValueError, OverflowError):
+            ramp_rate = math.nan
+        if not (math.isfinite(ramp_rate) and ramp_rate > 0):
+            raise InputError(f"chunking: ramp_rate: expected a finite number above 0, got {self.ramp_rate!r}")
+        plain = {"overlap": overlap, "frozen": frozen, "ramp_rate": ramp_rate, "horizon": horizon}
+        for name, value in plain.items():
+            object.__setattr__(self, name, value)

@@ -1,0 +1,138 @@
+"""The options of heads' and policies' methods: their types, and the form that the engine takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
+
+import numpy as np
+
+from saccade._internal.arrays import ArrayLike, Float32Array, apart, does_not_fit, float32, integer
+from saccade.errors import InputError
+from saccade.head.chunking import Chunking
+from saccade.head.intervention import Intervention, as_interventions
+
+#: The parts of a policy that have a precision.
+PARTS = ("backbone", "head")
+
+
+class _Sampling(TypedDict, total=False):
+    noise: ArrayLike | None
+    seed: Any
+    num_steps: int | None
+    integrator: str | None
+    num_samples: int | None
+    future_refresh: int | None
+    intervention: Intervention | Sequence[Intervention] | None
+    chunking: Chunking | None
+    out: ArrayLike | None
+
+
+class SampleOptions(_Sampling, total=False):
+    """The keyword arguments of :meth:`saccade.ActionHead.sample`, which documents them.
+
+    Functions that pass them on are annotated ``**options: Unpack[SampleOptions]``.
+    """
+
+    previous_chunk: ArrayLike | None
+
+
+class PolicyOptions(_Sampling, total=False):
+    """The keyword arguments of :meth:`saccade.Policy.sample`, which documents them."""
+
+    previous_chunk: Any  # an array, or actions by name
+
+
+class TraceOptions(TypedDict, total=False):
+    """The keyword arguments of :meth:`saccade.ActionHead.trace`, which documents them."""
+
+    noise: ArrayLike | None
+    seed: Any
+    num_steps: int | None
+    intervention: Intervention | Sequence[Intervention] | None
+    record: Sequence[str]
+    blocks: int | Sequence[int] | None
+    steps: int | Sequence[int] | None
+    max_bytes: int
+
+
+class LoadOptions(TypedDict, total=False):
+    """How a head is loaded: keyword arguments of ``ActionHead.from_pretrained`` and ``from_tensors``."""
+
+    embodiment_ids: Sequence[int] | None
+    num_states: int | None
+    precision: str
+    num_threads: int | None
+
+
+def optional_integer(name: str, value: int | None) -> int | None:
+    """``value`` as an integer of at least 1. None stays None."""
+    return None if value is None else integer(name, value)
+
+
+def precisions_of_parts(precision: str | Mapping[str, str]) -> dict[str, str]:
+    """The precision of each part of a policy. The parts check the names.
+
+    Raises:
+        InputError: It is a mapping of other parts.
+    """
+    if isinstance(precision, Mapping):
+        if set(precision) != set(PARTS):
+            raise InputError(
+                f"precision: expected a name, or names for {' and '.join(PARTS)}, got {dict(precision)!r}"
+            )
+        return dict(precision)
+    return dict.fromkeys(PARTS, precision)
+
+
+def noise_or_draw(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float32Array:
+    """The noise that sampling starts from: the given array, or standard normal float32 of this shape.
+
+    Raises:
+        DtypeError, ShapeError: ``noise`` is not a floating point array.
+        InputError: Both ``noise`` and ``seed`` are given, or NumPy cannot use ``seed``.
+        MemoryError: There is no memory for the noise.
+    """
+    if noise is not None:
+        if seed is not None:
+            raise InputError("noise, seed: expected at most one of them, got both")
+        return float32("noise", noise)
+    try:
+        generator = np.random.default_rng(seed)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"seed: expected what numpy.random.default_rng takes, got {seed!r} ({error})"
+        ) from None
+    try:
+        return generator.standard_normal(shape, dtype=np.float32)
+    except (MemoryError, ValueError):
+        raise does_not_fit("noise", shape) from None
+
+
+def plain_chunking(
+    previous_chunk: ArrayLike | None, chunking: Chunking | None, output: Float32Array
+) -> tuple[Float32Array | None, tuple[int, int, float, int | None] | None]:
+    """The previous chunk and the fields of a ``Chunking``; both None without them.
+
+    Raises:
+        InputError: One is given without the other, or ``chunking`` is not a ``Chunking``.
+    """
+    if previous_chunk is None and chunking is None:
+        return None, None
+    if previous_chunk is None or chunking is None:
+        given, missing = ("chunking", "previous_chunk") if chunking else ("previous_chunk", "chunking")
+        raise InputError(f"previous_chunk, chunking: expected both or neither, got {given} without {missing}")
+    if not isinstance(chunking, Chunking):
+        raise InputError(f"chunking: expected a saccade.Chunking, got {type(chunking).__name__}")
+    numbers = (chunking.overlap, chunking.frozen, chunking.ramp_rate, chunking.horizon)
+    return apart(float32("previous_chunk", previous_chunk), output), numbers
+
+
+def plain_interventions(given: Intervention | Sequence[Intervention] | None) -> list[dict[str, Any]]:
+    """Interventions as dicts whose mappings are lists of items."""
+    return [_plain(one) for one in as_interventions(given)]
+
+
+def _plain(one: Any) -> dict[str, Any]:
+    patches = [(place, *item) for place, groups in (one.patch or {}).items() for item in groups.items()]
+    return {**vars(one), "key_bias": list((one.key_bias or {}).items()), "patch": patches}

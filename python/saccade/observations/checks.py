@@ -1,0 +1,241 @@
+"""Checks that the forms of observations share: frames, states, instructions, batch axes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from saccade._internal.arrays import Float32Array, UInt8Array, exact_float32, inexact, is_torch
+from saccade._internal.warning import warn
+from saccade.errors import DtypeError, ShapeError
+from saccade.observations.requirements import Camera, Requirements
+
+#: Key and width of each part of a state.
+StateParts: TypeAlias = Sequence[tuple[str, int]]
+
+NUMBERS = "floating point values, or integers that float32 holds exactly: convert with astype(np.float32)"
+
+
+def find_cameras(
+    prefix: str, given: Iterable[str], needs: Requirements, *, sort: bool
+) -> list[tuple[Camera, str]]:
+    """The cameras of an observation in the order of the prompt, each with the name that it has there.
+
+    Cameras that the robot does not need are left out, unless it takes extra ones.
+
+    Args:
+        prefix: What the keys of cameras begin with, for messages.
+        given: The cameras of the observation, without prefix.
+        needs: What the robot needs.
+        sort: Whether cameras that the checkpoint does not name are sorted by name.
+
+    Raises:
+        InputError: A camera is missing, or there is none.
+    """
+    names = list(given)
+    chosen, missing = [], []
+    for camera in needs.cameras or ():
+        found = next((name for name in (camera.name, camera.alias) if name in names), None)
+        if found is None:
+            missing.append(camera.name)
+        else:
+            chosen.append((camera, found))
+    if missing:
+        keys = ", ".join(prefix + name for name in missing)
+        expected = ", ".join(camera.name for camera in needs.cameras or ())
+        raise needs.input_error(keys, f"cameras {expected}", ", ".join(names) or "none")
+    if not names:
+        raise needs.input_error(f"{prefix}*", "at least one camera", "none")
+    if needs.cameras is not None and not needs.takes_extra_cameras:
+        return chosen
+    listed = {name: camera for camera, name in chosen}
+    ordered = sorted(names) if sort or needs.takes_extra_cameras else names
+    return [(listed.get(name, Camera(name)), name) for name in ordered]
+
+
+def on_cpu(name: str, value: Any, needs: Requirements) -> Any:
+    """A torch tensor without its gradient, or anything else as it is.
+
+    Raises:
+        DtypeError: A tensor is on another device.
+    """
+    if not is_torch(value):
+        return value
+    if value.device.type != "cpu":
+        raise needs.dtype_error(name, "an array on the CPU", f"a tensor on {value.device}")
+    return value.detach()
+
+
+def check_frames(
+    name: str, frames: Any, axes: tuple[int, ...], camera: Camera, needs: Requirements
+) -> UInt8Array:
+    """Frames of one camera, with colours last.
+
+    Args:
+        name: The key, for messages.
+        frames: uint8, with three colours in the last axis.
+        axes: The numbers of axes that they may have, those of batch and time included.
+        camera: The camera.
+        needs: What the robot needs.
+
+    Raises:
+        ShapeError, DtypeError: They do not fit.
+    """
+    shape = f"uint8 of {' or '.join(map(str, axes))} axes that end in (height, width, 3)"
+    frames = on_cpu(name, frames, needs)
+    if is_torch(frames):
+        frames = frames.numpy()
+    if not isinstance(frames, np.ndarray):
+        raise needs.dtype_error(name, f"an array, {shape}", type(frames).__name__)
+    if frames.dtype != np.uint8:
+        raise needs.dtype_error(name, shape, frames.dtype)
+    if frames.ndim not in axes or frames.shape[-1] != 3 or 0 in frames.shape:
+        raise needs.shape_error(name, shape, f"shape {frames.shape}")
+    height, width = frames.shape[-3:-1]
+    if camera.height is not None and (height, width) != (camera.height, camera.width):
+        raise needs.shape_error(
+            name, f"frames of {camera.height} x {camera.width} pixels", f"{height} x {width}"
+        )
+    return frames
+
+
+def check_horizons(
+    prefix: str, horizons: Mapping[str, int], expected: int | None, needs: Requirements
+) -> None:
+    """Checks the number of frames of each camera.
+
+    Raises:
+        ShapeError: It is not the expected one, or not the same everywhere.
+    """
+    wrong = [name for name, horizon in horizons.items() if expected not in (None, horizon)]
+    if wrong or len(set(horizons.values())) > 1:
+        keys = ", ".join(prefix + name for name in wrong) or f"{prefix}*"
+        listed = ", ".join(f"{name} {horizon}" for name, horizon in horizons.items())
+        wanted = "as many of every camera" if expected is None else str(expected)
+        raise needs.shape_error(f"{keys}: frames along the time axis", wanted, listed)
+
+
+def shape_of(name: str, value: Any, needs: Requirements) -> tuple[int, ...]:
+    """The shape of an array, a tensor or a nested list.
+
+    Raises:
+        ShapeError: It is a ragged list.
+    """
+    try:
+        return tuple(value.shape) if hasattr(value, "shape") else np.shape(value)
+    except (TypeError, ValueError):
+        raise needs.shape_error(name, "an array", type(value).__name__) from None
+
+
+def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requirements) -> Float32Array:
+    """One part of the state, or several side by side: ``(..., width)`` of ``axes`` axes.
+
+    Integers are taken if float32 holds them exactly.
+
+    Args:
+        name: The key, for messages.
+        state: The numbers: an array, a tensor or nested lists.
+        axes: The number of axes, those of batch and time included.
+        parts: Key and width of each part.
+        needs: What the robot needs.
+
+    Raises:
+        ShapeError, DtypeError, InputError: It does not fit or is not finite.
+    """
+    width = sum(size for _, size in parts)
+    shape_of(name, state, needs)
+    try:
+        values = exact_float32(name, on_cpu(name, state, needs))
+    except (DtypeError, ShapeError):
+        wrong = inexact(state)
+        got = getattr(state, "dtype", type(state).__name__)
+        raise needs.dtype_error(name, NUMBERS, got if wrong is None else f"{got} {wrong}") from None
+    if values.ndim != axes or values.shape[-1] != width or 0 in values.shape:
+        raise needs.shape_error(name, f"{axes} axes, the last of {width}", f"shape {values.shape}")
+    if not np.isfinite(values).all():
+        raise needs.input_error(name, "finite numbers", f"NaN or infinity in {_not_finite(values, parts)}")
+    return values
+
+
+def _not_finite(values: Float32Array, parts: StateParts) -> str:
+    """The columns that are not finite, with the keys of their parts where there are several parts."""
+    bad = np.flatnonzero(~np.isfinite(values).reshape(-1, values.shape[-1]).all(axis=0)).tolist()
+    columns = f"column{'s' if len(bad) > 1 else ''} {', '.join(map(str, bad))}"
+    if len(parts) == 1:
+        return columns
+    keys = [key for key, size in parts for _ in range(size)]
+    return f"{columns} ({', '.join(dict.fromkeys(keys[column] for column in bad))})"
+
+
+def check_batch(sizes: Mapping[str, int], needs: Requirements) -> int:
+    """The batch size that all parts of an observation have.
+
+    Raises:
+        ShapeError: They differ.
+    """
+    if len(set(sizes.values())) != 1:
+        listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise needs.shape_error("observation", "the same batch size everywhere", listed)
+    return next(iter(sizes.values()))
+
+
+def views(cameras: Sequence[Camera], frames: Mapping[str, UInt8Array]) -> tuple[dict[str, UInt8Array], ...]:
+    """The views of each observation, from frames ``(batch, time, height, width, 3)`` by camera."""
+    ordered = {camera.name: frames[camera.name] for camera in cameras}
+    places = view_places(ordered)
+    return tuple(
+        {view: frames[name][row, time] for view, (name, time) in places.items()}
+        for row in range(len(frames[cameras[0].name]))
+    )
+
+
+def view_places(frames: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
+    """The camera and the time of each view, by its name, in the order of the prompt: by time before camera.
+
+    Args:
+        frames: Frames ``(batch, time, height, width, 3)`` by camera.
+
+    Example:
+        >>> view_places({"front": np.zeros((1, 2, 8, 8, 3), np.uint8)})
+        {'front[0]': ('front', 0), 'front[1]': ('front', 1)}
+    """
+    horizon = next(iter(frames.values())).shape[1]
+    return {
+        name if horizon == 1 else f"{name}[{time}]": (name, time)
+        for time in range(horizon)
+        for name in frames
+    }
+
+
+def as_text(name: str, value: Any, needs: Requirements) -> str:
+    """One instruction.
+
+    Raises:
+        InputError: It is not a string, or not valid Unicode.
+    """
+    if not isinstance(value, str):
+        raise needs.input_error(name, "an instruction", repr(value))
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise needs.input_error(name, "valid Unicode", f"{value!r} ({error.reason})") from None
+    return str(value)
+
+
+def default_instructions(name: str, count: int, needs: Requirements) -> tuple[None, ...]:
+    """The released default for this many observations, with a warning.
+
+    Args:
+        name: The key under which there is no instruction.
+        count: The number of observations.
+        needs: What the robot needs.
+
+    Raises:
+        InputError: The release has no default.
+    """
+    if needs.requires_language:
+        raise needs.input_error(name, "an instruction", "none")
+    warn(f"{name}: there is no instruction; the released default is used")
+    return (None,) * count

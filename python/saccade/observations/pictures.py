@@ -1,0 +1,303 @@
+"""Pictures, words and states from files, as observations of a whole policy. Needs Pillow."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from saccade._internal.arrays import UInt8Array
+from saccade.errors import InputError, SaccadeError
+from saccade.observations import read
+
+if TYPE_CHECKING:
+    from saccade.policy.policy import Policy
+
+#: Endings of the files that are taken for pictures. Others are left alone.
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
+
+#: Kinds of pictures with eight bits a colour, as Pillow names them. Transparency is dropped.
+MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
+
+STATE = "state.json"
+LARGEST = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What the robot sees, feels and is told at one moment.
+
+    Attributes:
+        name: The folder of its pictures, relative to the directory: ``"0001"`` or ``"pour/0001"``; for a
+            directory that is itself one moment, the directory's own name.
+        episode: The folder that holds the moment's folder, ``"pour"``, or None. Moments of one episode are
+            alike.
+        observation: In Isaac-GR00T's nested form, with a batch of one; see
+            :meth:`saccade.Policy.example_observation`.
+    """
+
+    name: str
+    episode: str | None
+    observation: dict[str, Any]
+
+    @property
+    def instruction(self) -> str:
+        """What the robot is told."""
+        return instruction_of(self.observation)
+
+
+def read_frames(
+    directory: Path, policy: Policy, *, instruction: str | None = None, state: Path | None = None
+) -> list[Moment]:
+    """The observations of a directory, in the order of their names (2 before 10).
+
+    A folder with one picture for each camera, named after it, is a moment: ``front.png``, ``wrist.jpg``. It
+    may also hold ``state.json``, see :func:`read_state`. The directory is
+
+    - one moment: ``DIR/front.png``;
+    - or a folder for each moment: ``DIR/0001/front.png``, ``DIR/0002/front.png``;
+    - or one for each episode, with a folder for each moment: ``DIR/pour/0001/front.png``.
+
+    Hidden files and files that are no pictures are ignored. If the checkpoint does not name its cameras, all
+    pictures of a folder are views, in the order of their names. Where a robot sees several frames of a camera
+    at a time, the picture stands for all of them.
+
+    Args:
+        directory: The directory.
+        policy: The policy that is to accept the observations.
+        instruction: What the robot is told. Default: that of :meth:`saccade.Policy.example_observation`.
+        state: File with the state of moments that have no ``state.json``. Default: the middle of the robot's
+            range.
+
+    Returns:
+        At least one moment.
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: There is no such directory or file.
+        InputError, ShapeError, DtypeError: There are no pictures, one of a camera is missing, cannot be read
+            or does not fit, or a state does not fit. The message names the folder.
+
+    Example:
+        >>> import saccade
+        >>> from saccade.observations.pictures import read_frames
+        >>> def chunks(checkpoint: str, directory: Path) -> dict:
+        ...     policy = saccade.Policy.from_pretrained(checkpoint)
+        ...     moments = read_frames(directory, policy, instruction="open the drawer")
+        ...     return {moment.name: policy.act(moment.observation, seed=0) for moment in moments}
+    """
+    if not directory.is_dir():
+        kind = NotADirectoryError if directory.exists() else FileNotFoundError
+        raise kind(f"{directory}: no such directory; expected one with a picture for each camera")
+    otherwise = None if state is None else read_state(state)
+    found = []
+    for folder in moment_folders(directory, policy):
+        own = folder / STATE
+        try:
+            given = observation(
+                policy,
+                pictures_in(folder, policy),
+                instruction,
+                read_state(own) if own.is_file() else otherwise,
+            )
+            read(given, policy.requirements)
+        except SaccadeError as error:
+            if str(error).startswith((f"{folder}{os.sep}", f"{folder}:")):
+                raise
+            raise type(error)(f"{folder}: {error}") from None
+        parts = folder.relative_to(directory).parts
+        found.append(
+            Moment(
+                name="/".join(parts) or folder.resolve().name,
+                episode=parts[0] if len(parts) == 2 else None,
+                observation=given,
+            )
+        )
+    return found
+
+
+def moment_folders(directory: Path, policy: Policy) -> list[Path]:
+    """The folders of a directory that are moments, see `read_frames`.
+
+    Raises:
+        InputError: There is none, or a folder has both pictures and folders.
+    """
+
+    def below(folder: Path, levels: int) -> list[Path]:
+        has_pictures = bool(pictures_of(folder))
+        inside = folders_of(folder)
+        if has_pictures and inside:
+            raise InputError(
+                f"{folder}: expected pictures or folders of pictures, got pictures and the folder "
+                f"{inside[0].name}"
+            )
+        if has_pictures:
+            return [folder]
+        if not inside or not levels:
+            raise InputError(
+                f"{folder}: expected pictures named after the cameras ({example_names(policy)}), or a folder "
+                "of them for each moment, got no pictures"
+            )
+        return [moment for one in inside for moment in below(one, levels - 1)]
+
+    return below(directory, 2)
+
+
+def pictures_in(folder: Path, policy: Policy) -> dict[str, Path]:
+    """The picture of each camera in a folder, in the order of the prompt.
+
+    Raises:
+        InputError: A picture is missing, or of no camera, or a camera has two.
+    """
+    given = pictures_of(folder)
+    by_name: dict[str, Path] = {}
+    for path in given:
+        if path.stem in by_name:
+            raise InputError(
+                f"{folder}: expected one picture of {path.stem}, got {by_name[path.stem].name} and "
+                f"{path.name}"
+            )
+        by_name[path.stem] = path
+    cameras = policy.requirements.cameras
+    names = list(by_name) if cameras is None else [camera.name for camera in cameras]
+    if set(by_name) != set(names):
+        listed = ", ".join(path.name for path in given)
+        raise InputError(
+            f"{folder}: expected one picture for each camera ({example_names(policy)}), got {listed}"
+        )
+    return {name: by_name[name] for name in names}
+
+
+def example_names(policy: Policy) -> str:
+    """What the pictures of a moment may be called."""
+    cameras = policy.requirements.cameras
+    names = ["front"] if cameras is None else [camera.name for camera in cameras]
+    return ", ".join(f"{name}.png" for name in names)
+
+
+def pictures_of(folder: Path) -> list[Path]:
+    """The files of a folder that are taken for pictures, by name."""
+    return [
+        path
+        for path in sorted(folder.iterdir(), key=by_number)
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+    ]
+
+
+def folders_of(folder: Path) -> list[Path]:
+    """The folders in a folder, by name."""
+    return [
+        path
+        for path in sorted(folder.iterdir(), key=by_number)
+        if not path.name.startswith(".") and path.is_dir()
+    ]
+
+
+def by_number(path: Path) -> list[tuple[int, str]]:
+    """A key that sorts numbers in names by their size.
+
+    Example:
+        >>> [path.name for path in sorted([Path("step10"), Path("step9"), Path("a")], key=by_number)]
+        ['a', 'step9', 'step10']
+    """
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(part), "") if index % 2 else (0, part) for index, part in enumerate(parts)]
+
+
+def observation(
+    policy: Policy, pictures: Mapping[str, Path], instruction: str | None, state: Any
+) -> dict[str, Any]:
+    """An observation in Isaac-GR00T's nested form, with a batch of one.
+
+    Args:
+        policy: The policy that is to accept it.
+        pictures: Files by camera. The name may be empty if there is one camera. Empty: random frames.
+        instruction: What the robot is told, or None.
+        state: What :func:`read_state` returned, or None. What is None is that of
+            :meth:`saccade.Policy.example_observation`.
+
+    Raises:
+        FileNotFoundError, InputError: A picture cannot be read, or a list of the state is too short or long.
+    """
+    given = policy.example_observation()
+    if pictures:
+        cameras = policy.requirements.cameras
+        only = cameras[0].name if cameras is not None and len(cameras) == 1 else next(iter(given["video"]))
+        horizon = policy.requirements.video_horizon or 1
+        given["video"] = {
+            name or only: np.repeat(read_picture(path)[None, None], horizon, axis=1)
+            for name, path in pictures.items()
+        }
+    if isinstance(state, list):
+        width = policy.requirements.state_width
+        if len(state) != width:
+            keys = ", ".join(f"{key} ({size})" for key, size in policy.requirements.state)
+            raise InputError(f"state: expected {width} numbers ({keys}), got {len(state)}")
+        state = {key: state[where] for key, where in policy.normalizer.state_slices.items()}
+    if state is not None:
+        history = policy.requirements.state_history
+        given["state"] = {
+            key: np.tile(np.asarray(values, np.float32), (1, history, 1)) for key, values in state.items()
+        }
+    if instruction is not None:
+        given["language"] = {key: [[instruction]] for key in given["language"]}
+    return given
+
+
+def instruction_of(given: Mapping[str, Any]) -> str:
+    """The instruction of an observation of `observation`."""
+    return str(next(iter(given["language"].values()))[0][0])
+
+
+def read_state(path: Path) -> Any:
+    """The state in a JSON file: numbers by key, ``{"arm": [0, 0.1], "hand": [1]}``, or one list of all.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        InputError: It contains something else.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON: {error}") from None
+    rows = list(values.values()) if isinstance(values, dict) else [values]
+    if not rows or not all(is_numbers(row) for row in rows):
+        raise InputError(f"{path}: expected lists of numbers by key, or one list of numbers")
+    return values
+
+
+def is_numbers(row: Any) -> bool:
+    """Whether a value of JSON is a list of numbers that float32 can hold."""
+    return isinstance(row, list) and all(
+        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
+        for value in row
+    )
+
+
+def read_picture(path: Path) -> UInt8Array:
+    """The picture in a file, ``(height, width, 3)``, turned as a camera's orientation tag says.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        InputError: It is no picture, is damaged, has more than eight bits a colour, or is too large.
+    """
+    from PIL import Image, ImageOps
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with Image.open(path) as picture:
+            if picture.mode not in MODES:
+                raise InputError(f"{path}: expected a picture with 8 bits a colour, got mode {picture.mode}")
+            turned = ImageOps.exif_transpose(picture)
+            return cast("UInt8Array", np.asarray(turned.convert("RGB")))
+    except InputError:
+        raise
+    # Pillow raises SyntaxError and others for files that are damaged in their own ways.
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: cannot be read as a picture: {error}") from None

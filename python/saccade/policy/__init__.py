@@ -1,0 +1,1 @@
+"""Policies in the robot's units: observation, prepare, encode, sample, units."""

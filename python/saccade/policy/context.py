@@ -1,0 +1,78 @@
+"""What a whole policy encoded of an observation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from saccade.backbone.features import BackboneFeatures
+from saccade.head.context import Context
+from saccade.policy.head import Head
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyContext:
+    """What a whole policy encoded of an observation. Returned by :meth:`saccade.Policy.encode`.
+
+    It is a value: the policy keeps nothing of it. Pass it to :meth:`saccade.Policy.sample` for actions, and
+    as ``previous`` with the next observation, so that what did not change is not computed again.
+
+    Attributes:
+        context: What the head encoded: the keys and values of its cross-attention. ``batch`` observations,
+            those with fewer tokens than the longest padded, and the padding dropped.
+        features: The backbone's features of each observation, a batch of one each.
+
+    Example:
+        >>> import saccade
+        >>> def act_twice(policy: saccade.Policy, first: dict, second: dict) -> list:
+        ...     context = policy.encode(first)
+        ...     actions = [policy.sample(context, first, seed=0)]
+        ...     context = policy.encode(second, previous=context)
+        ...     return [*actions, policy.sample(context, second, seed=0)]
+    """
+
+    context: Context
+    features: tuple[BackboneFeatures, ...]
+
+    @property
+    def batch(self) -> int:
+        """Number of observations."""
+        return len(self.features)
+
+    @property
+    def num_vl_tokens(self) -> int:
+        """Number of vision-language tokens of the longest observation."""
+        return self.context.num_vl_tokens
+
+    def __repr__(self) -> str:
+        return f"<saccade.PolicyContext batch={self.batch} num_vl_tokens={self.num_vl_tokens}>"
+
+
+def encoded(head: Head, features: Sequence[BackboneFeatures]) -> PolicyContext:
+    """What a head encodes of features of any lengths, each a batch of one."""
+    # Shorter ones are padded, and their padding is dropped, which gives the bits without padding.
+    lengths = [one.backbone_features.shape[1] for one in features]
+    longest = max(lengths)
+    dropped = np.arange(longest) >= np.array(lengths)[:, None]
+    context = head.encode(
+        _joined([longer(one.backbone_features, longest) for one in features]),
+        image_mask=_joined([longer(one.image_mask, longest) for one in features]),
+        drop_vl=dropped if dropped.any() else None,
+    )
+    return PolicyContext(context, tuple(features))
+
+
+def _joined(arrays: list[Any]) -> Any:
+    """Batches of one as one batch. A single one is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def longer(array: Any, length: int) -> Any:
+    """``(1, T, ...)`` zero-padded to ``(1, length, ...)``."""
+    missing = length - array.shape[1]
+    if missing == 0:
+        return array
+    return np.concatenate([array, np.zeros((1, missing, *array.shape[2:]), array.dtype)], axis=1)

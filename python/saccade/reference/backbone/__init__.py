@@ -1,8 +1,0 @@
-"""The vision-language backbones in plain torch: trainable, and what the Rust backbone is tested against.
-
-`model` puts a backbone together, `siglip` and `qwen3_vl` are its vision towers, `qwen3` its language model.
-"""
-
-from saccade.reference.backbone.model import Backbone, BackboneFeatures
-
-__all__ = ["Backbone", "BackboneFeatures"]

@@ -1,0 +1,48 @@
+"""saccade.Backbone against the torch backbone in float64: random sizes, padded batches, instruction sets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import saccade
+from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes
+from saccade_lab.reference import Backbone
+from tests.helpers.reference_backbone_cases import config_of, random_inputs, random_sizes, randomised
+
+#: Root mean square of the error relative to that of the features; of few channels some are badly conditioned.
+TOLERANCE = {"float32": 5e-6, "bfloat16": 0.04, "int8": 0.12}
+
+
+def test_the_configs_are_those_of_the_sizes() -> None:
+    for version in RELEASED:
+        sizes = random_sizes(version, np.random.default_rng(0))
+        assert BackboneSizes.from_config(config_of(sizes)) == sizes
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("version", RELEASED)
+def test_random_sizes(version: str, seed: int, isa: str) -> None:
+    rng = np.random.default_rng(seed)
+    sizes = random_sizes(version, rng)
+    if version == "n1.6":
+        sizes = replace(sizes, merge=2, connector_layers=2)
+    if version == "n1.5" and seed % 2:
+        sizes = replace(sizes, project_to_dim=13)
+    reference = randomised(Backbone(sizes), seed)
+    inputs = random_inputs(sizes, rng, batch=2, views=1 + seed % 2)
+    if version == "n1.6":
+        inputs.pixel_values = tuple(np.split(np.asarray(inputs.pixel_values), len(inputs.pixel_values)))
+    tensors = dict(reference.state_dict())
+    with torch.no_grad():
+        expected = reference.double()(inputs).backbone_features.numpy()
+    for precision, tolerance in TOLERANCE.items():
+        backbone = saccade.Backbone.from_tensors(tensors, config=config_of(sizes), precision=precision)
+        features = backbone(inputs)
+        assert features.backbone_features.shape == expected.shape
+        error = np.square(features.backbone_features - expected).mean() / np.square(expected).mean()
+        assert error < tolerance**2, (precision, isa)
+        np.testing.assert_array_equal(features.image_mask, inputs.input_ids == sizes.image_token)

@@ -1,0 +1,175 @@
+"""The program that measures the backbone: counts of work, inputs, the peer's correctness, and the page."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import saccade
+import saccade._saccade as _saccade
+from benches.backbone import __main__ as program
+from benches.backbone import accuracy, memory, peer, report, setup
+from benches.backbone.work import backbone_work, floor_seconds
+from saccade.bench.cost import Machine
+from saccade.bench.work import total
+from saccade.checkpoints import random_checkpoint
+from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.reference import Backbone
+
+PUBLISHED = BackboneSizes.from_config({"kind": "n1.5 backbone"})
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return random_checkpoint.write(
+        tmp_path_factory.mktemp("backbone") / "n15",
+        backbone=random_checkpoint.small_backbone("n1.5"),
+        head=random_checkpoint.small_head("n1.5"),
+    )
+
+
+@pytest.mark.parametrize(("views", "tokens", "expected"), [(1, 287, 285.5), (2, 550, 559.8), (3, 813, 837.6)])
+def test_multiply_adds_are_those_of_the_specification(views: int, tokens: int, expected: float) -> None:
+    works = backbone_work(PUBLISHED, [(16, 16)] * views, tokens)
+    assert round(total(works).multiply_adds / 1e9, 1) == expected
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_prompts_have_the_published_length(views: int) -> None:
+    inputs = setup.inputs_of(PUBLISHED, views)
+    assert inputs.input_ids.shape == (1, {1: 287, 2: 550}[views])
+    assert (inputs.input_ids == 151669).sum() == 256 * views
+    assert np.asarray(inputs.pixel_values).shape == (views, 3, 224, 224)
+
+
+def test_multiply_adds_are_those_of_the_engine(checkpoint: Path) -> None:
+    sizes = setup.sizes_of(checkpoint)
+    inputs = setup.inputs_of(sizes, 2)
+    backbone = saccade.Backbone.from_pretrained(checkpoint)
+    with _saccade.profile() as profile:
+        backbone(inputs)
+    counted = sum(counter[2] for counter in profile.counters().values())
+    side = math.isqrt(sizes.vision.num_positions)
+    works = backbone_work(sizes, [(side, side)] * 2, inputs.input_ids.shape[1])
+    # The engine counts the squares of causal attention in blocks.
+    linear = sum(work.multiply_adds for part, work in works.items() if "attention" not in part)
+    assert linear <= counted < 1.2 * total(works).multiply_adds
+
+
+def test_the_peer_computes_the_same_features(checkpoint: Path) -> None:
+    sizes = setup.sizes_of(checkpoint)
+    inputs = setup.inputs_of(sizes, 2)
+    model = peer.Peer.load(checkpoint, sizes, torch.float32)
+    with torch.inference_mode():
+        expected = Backbone.from_pretrained(checkpoint)(inputs).backbone_features
+        for attention in ("sdpa", "eager"):
+            model.use_attention(attention)
+            got = model(*peer.arguments(inputs, torch.float32))
+            assert (got - expected).abs().max() < 1e-5 * expected.abs().max()
+
+
+def test_the_floor_is_the_longer_of_two_times() -> None:
+    works = backbone_work(PUBLISHED, [(16, 16)], 287)
+    macs = {"float32": 1e9, "bfloat16": 2e9, "int8": 4e9}
+    slow_memory, slow_arithmetic = Machine("avx512", 2, macs, 1.0), Machine("avx512", 2, macs, 1e15)
+    assert floor_seconds(works, slow_memory, "bfloat16") == pytest.approx(2 * 1.018e9, rel=1e-3)
+    assert floor_seconds(works, slow_arithmetic, "bfloat16") == pytest.approx(285.46 / 2, rel=1e-3)
+    # Attention of an int8 model is bfloat16.
+    assert floor_seconds(works, slow_arithmetic, "int8") == pytest.approx(279.4 / 4 + 6.1 / 2, rel=1e-2)
+
+
+def test_errors_are_relative() -> None:
+    values = np.array([[3.0, 4.0], [0.0, 2.0]])
+    assert accuracy.rms(values) == pytest.approx(math.sqrt(29 / 4))
+    np.testing.assert_allclose(accuracy.rms(values, axis=-1), [math.sqrt(12.5), math.sqrt(2)])
+    assert memory.peak_memory() > 10**7
+
+
+def test_the_page(checkpoint: Path) -> None:
+    peaks = {"macs_per_second": {"avx512": {"float32": 1e11, "bfloat16": 2e11, "int8": 4e11}}}
+    measured = {"error": 1e-3, "seconds": [2.0, 1.0, 3.0]}
+    wrong = {"error": 0.5, "seconds": [0.1, 0.1, 0.1]}
+    results: dict[str, Any] = {
+        "machine": {
+            "cpu": "A CPU",
+            "family": "family 1",
+            "isa": "avx512",
+            "cores": 2,
+            "memory_gb": 8,
+            "kernel": "6",
+            "flags": ["avx2"],
+            "versions": {"saccade": "1"},
+            "commit": "abc",
+        },
+        "speed": [
+            {
+                "threads": 2,
+                "group": "usual",
+                "config": {"kind": "n1.5 backbone"},
+                "tokens": {"1": 287},
+                "peaks": [{**peaks, "read_bytes_per_second": 1e10}],
+                "contenders": {
+                    "saccade-bfloat16": {"1": {"error": 1e-3, "seconds": [1.0, 0.5, 1.5]}},
+                    "saccade-int8": {"failed": "no reason"},
+                    "transformers-bfloat16": {"sdpa, 1": measured, "eager, 1": wrong},
+                },
+            }
+        ],
+        "reuse": [
+            {
+                "threads": 2,
+                "precision": "int8",
+                "seconds": {
+                    "full step": [1.0],
+                    "first view unchanged": [0.6],
+                    "second view unchanged": [0.9],
+                    "nothing changed": [0.2],
+                },
+                "same_bits": dict.fromkeys(
+                    ("first view unchanged", "second view unchanged", "nothing changed"), True
+                ),
+            }
+        ],
+        "memory": [
+            {
+                "what": "policy",
+                "precision": "int8",
+                "runs": [
+                    {"nbytes": None, "before": 3e7, "loaded": 2e9, "called": 2.5e9, "load": 2.6, "read": 2.0}
+                ],
+            }
+        ],
+        "accuracy": [
+            {
+                "model": "plain",
+                "layers": None,
+                "runs": {"saccade-int8": {"largest": 0.01, "rms": 0.02, "worst": 0.03}},
+            }
+        ],
+    }
+    page = report.document(results)
+    # The wrong setting of transformers is faster and is not the one that is compared with.
+    assert (
+        "| saccade bfloat16 against transformers bfloat16 (sdpa) | 1 | 2 | 2.00 (2.00 to 2.00) | 1.3 | 1.8 |"
+        in page
+    )
+    assert "5e-01, wrong" in page
+    assert "saccade-int8 failed: no reason." in page
+    assert "| int8, 2 threads | 1000 (1000 to 1000) | 600 (60 %) | 900 (90 %) | 200 (20 %) |" in page
+    assert "| policy, int8 |  | 0.03 | 2.00 | 2.50 | 2.6 | 2.0 | 1.30 |" in page
+    assert "| plain | saccade int8 | 1.0e-02 | 2.0e-02 | 3.0e-02 |" in page
+
+
+def test_arguments() -> None:
+    assert program.parse([]).sections == list(program.SECTIONS)
+    assert program.parse(["speed", "--threads", "1"]).threads == [1]
+    for wrong in (["unknown"], ["report", "speed"], ["--rounds", "0"]):
+        with pytest.raises(SystemExit):
+            program.parse(wrong)

@@ -1,0 +1,240 @@
+"""The benchmark of the whole policy: engines compute what the reference does, and the report is right."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benches.checkpoints import n15
+from benches.peers import __main__ as command
+from benches.peers import policy_inputs, policy_report
+from benches.peers.cases import Case
+from benches.peers.contenders import CONTENDERS, POLICY_GROUPS, PROCESSES
+from benches.peers.engines import Task, vla_cpp
+from benches.peers.processes import difference, sharing
+from benches.peers.results import RECORDS, Results, records
+from tests.benches.test_bench_peers import run
+
+CASE = Case("policy", 2)
+SMALL = Case("policy", 1, size="small")
+PACKAGES = {
+    "lerobot_policy": ["lerobot"],
+    "open_vino": ["onnxscript", "openvino"],
+    "onnx_runtime": ["onnxscript", "onnxruntime"],
+}
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("policy")
+
+
+@pytest.mark.parametrize("name", [name for group in POLICY_GROUPS.values() for name in group])
+def test_every_engine_computes_what_the_reference_does(name: str, work: Path) -> None:
+    contender = CONTENDERS[name]
+    for package in PACKAGES.get(contender.options.get("opened_by", contender.engine), ()):
+        pytest.importorskip(package, reason="in the environment of make bench-peers")
+    if contender.engine == "vla_cpp":
+        pytest.skip("vla.cpp has only the published size")
+    arrays = policy_inputs.expected_of(SMALL, work)
+    source = n15(work, small=True)
+    task = Task(SMALL, dict(contender.options), source, arrays, work)
+    built = importlib.import_module(f"benches.peers.engines.{contender.engine}").build(task)
+    error, scale = difference(built.result(), arrays["expected"])
+    exact = name.endswith("float32")
+    assert 0.0 < error <= (1e-5 if exact else 0.04) * scale
+    assert tuple(built.works) == SMALL.works
+    for call in built.works.values():
+        call()
+
+
+def test_what_is_not_built_says_how(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SACCADE_PEERS_VLA", str(work / "nowhere"))
+    arrays = policy_inputs.expected_of(SMALL, work)
+    task = Task(SMALL, {}, n15(work, small=True), arrays, work)
+    with pytest.raises(FileNotFoundError, match="make bench-peers VLA_SOURCE"):
+        vla_cpp.build(task)
+
+
+def test_one_view_and_two_are_different_questions(work: Path) -> None:
+    arrays = policy_inputs.expected_of(SMALL, work)
+    one, two = (policy_inputs.given(arrays, views) for views in policy_inputs.VIEWS)
+    assert (len(one.pixels), len(two.pixels)) == (1, 2)
+    np.testing.assert_array_equal(one.pixels[0], two.pixels[0])
+    assert one.ids.shape[1] < two.ids.shape[1]
+    assert arrays["expected"].shape == (2, *one.noise.shape[1:])
+    assert np.abs(arrays["expected"][0] - arrays["expected"][1]).max() > 1e-3
+
+
+def measured(path: Path) -> Results:
+    """Two rounds of a few contenders on 2 threads."""
+    results = Results(path)
+    results.data["machine"] = {
+        "cpu": "Some CPU",
+        "name": "Some CPU",
+        "family": "family 1, model 2",
+        "isa": "avx512",
+        "cores": 2,
+        "memory_gb": 24,
+        "kernel": "6.1",
+        "flags": ["fma"],
+        "versions": {"torch": "2"},
+        "commit": "abc",
+    }
+    rates = {"avx512": {"float32": 1e11, "bfloat16": 2e11, "int8": 4e11}}
+    results.data["peaks"] = [{"threads": 2, "macs_per_second": rates, "read_bytes_per_second": 2e10}]
+    contenders = results.open(CASE)["contenders"]
+    for name, first, error in (
+        ("policy-saccade-bfloat16", 1.0, 0.01),
+        ("policy-saccade-int8", 0.5, 0.1),
+        ("policy-lerobot-bfloat16-pure", 2.0, 0.05),
+        ("policy-lerobot-bfloat16", 1.9, 0.05),
+        ("policy-accelerate-bfloat16", 1.1, 0.05),
+    ):
+        seconds = {"1 view": [first, 2 * first], "2 views": [2 * first, 4 * first]}
+        contenders[name] = {"error": error, "scale": 4.0, "notes": "", "seconds": seconds}
+    contenders["policy-lerobot-float32"] = {"failed": "MemoryError: no"}
+    return results
+
+
+def test_the_report_of_known_numbers(tmp_path: Path) -> None:
+    results = measured(tmp_path / "policy.json")
+    rows = [row.split(" | ") for row in policy_report.goals(results).splitlines()[2:]]
+    autocast = CONTENDERS["policy-lerobot-bfloat16"].label
+    assert [(row[0], *row[1:]) for row in rows if "1 view" in row[0]] == [
+        (
+            "| frames + words to a chunk, int8, 1 view",
+            autocast,
+            "2",
+            "3.0 x (4.5 x)",
+            "3.80 x (3.80 to 3.80)",
+            "yes |",
+        ),
+        (
+            "| frames + words to a chunk, bfloat16, 1 view",
+            autocast,
+            "2",
+            "1.7 x (2.5 x)",
+            "1.90 x (1.90 to 1.90)",
+            "yes |",
+        ),
+        (
+            "| accelerate(policy, backbone=True), bfloat16, 1 view",
+            autocast,
+            "2",
+            "1.6 x (2.3 x)",
+            "1.73 x (1.73 to 1.73)",
+            "yes |",
+        ),
+    ]
+    policy_report.write(results, tmp_path)
+    page = (tmp_path / "policy-report.md").read_text()
+    assert (
+        "| saccade int8 | 750.0 (625.0 to 875.0) | 3.80 x | 1500 (1250 to 1750) | 3.80 x | 2.5e-02 |" in page
+    )
+    assert "- lerobot 0.4.4 float32 could not run: MemoryError: no" in page
+    assert "Peaks of 2 threads: float32 100, bfloat16 200, int8 400 GMAC/s, 20 GB/s." in page
+
+
+def test_a_wrong_result_is_not_compared_with(tmp_path: Path) -> None:
+    results = measured(tmp_path / "policy.json")
+    for entry in results.entries(CASE, "policy-lerobot-bfloat16"):
+        entry["error"] = 1.0
+    for entry in results.entries(CASE, "policy-saccade-int8"):
+        entry["error"] = 1.0
+    rows = policy_report.goals(results).splitlines()[2:]
+    assert all("no autocast" in row for row in rows)
+    assert [row.endswith("**not correct** |") for row in rows] == [True, True, False, False, False, False]
+    assert "2.5e-01, **not correct**" in "\n".join(policy_report.section(results, CASE))
+
+
+def test_the_page_contains_what_was_measured() -> None:
+    measured = records(RECORDS / "policy")
+    for results in measured:
+        assert results.path.name == f"{results.slug}.json"
+    assert not measured or policy_report.PAGE.read_text() == policy_report.page(measured)
+
+
+def test_what_matters_most_is_measured_together_and_first(tmp_path: Path) -> None:
+    args = command.parse(["--only", "policy"])
+    assert args.results == Path("out/peers/policy.json")
+    assert args.record == RECORDS / "policy"
+    assert 2 in args.threads
+    args.memory = 19.0
+    found = command.batches(Results(tmp_path / "policy.json"), CASE, args, args.contenders)
+    names = [goal.ours for goal in policy_report.GOALS] + list(policy_report.LEROBOT_BF16)
+    assert set(names) <= set(found[0])
+    for batch in found:
+        assert command.gigabytes(CASE, batch) <= args.memory
+    assert {name for batch in found for name in batch} == {
+        name for group in POLICY_GROUPS.values() for name in group
+    }
+    for wrong in (["head"], ["--steps", "8"], ["--num-vl-tokens", "74"]):
+        with pytest.raises(SystemExit):
+            command.parse(["--only", "policy", *wrong])
+    assert "policy" not in command.parse(["--full"]).only
+
+
+def test_contenders_of_one_process_share_it() -> None:
+    together = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
+    assert sharing([together[0], "policy-saccade-int8", together[1]]) == {
+        together[0]: together,
+        "policy-saccade-int8": ("policy-saccade-int8",),
+    }
+
+
+def test_shared_weights_count_once_and_for_whoever_is_left() -> None:
+    pure, autocast, int8 = "policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16", "policy-saccade-int8"
+    alone = [command.gigabytes(CASE, [name]) for name in (pure, autocast, int8)]
+    assert min(alone[:2]) > PROCESSES["lerobot-bfloat16"]
+    together = command.gigabytes(CASE, [pure, autocast, int8])
+    assert together == pytest.approx(sum(alone) - PROCESSES["lerobot-bfloat16"])
+    assert {one.process for one in CONTENDERS.values()} == {"", *PROCESSES}
+
+
+def test_objects_of_files_of_the_same_name_are_kept_apart(tmp_path: Path) -> None:
+    clone, environment, tools = tmp_path / "clone", tmp_path / "environment", tmp_path / "tools"
+    sources = ("model.cpp", "modules/head.cpp", "models/head.cpp")
+    for source in sources:
+        (clone / "src" / source).parent.mkdir(parents=True, exist_ok=True)
+        (clone / "src" / source).touch()
+    for folder in (clone / "scripts", environment / "ggml" / "source/vendor/llama.cpp/gguf-py", tools):
+        folder.mkdir(parents=True)
+    # A compiler that writes nothing but what it was asked for.
+    (tools / "c++").write_text(
+        '#!/bin/sh\nall="$*"\nuntil [ "$1" = -o ]; do shift; done\necho "$all" > "$2"\n'
+    )
+    (tools / "c++").chmod(0o755)
+    script = Path(command.__file__).with_name("build_vla.sh")
+    path = f"{tools}:{os.environ['PATH']}"
+    subprocess.run(["sh", script, environment, clone], check=True, env={"PATH": path})
+    objects = list((environment / "vla" / "objects").iterdir())
+    found = {source for source in sources for one in objects if f"src/{source}" in one.read_text()}
+    assert found == set(sources)
+
+
+def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    pytest.importorskip("lerobot")
+    names = ["policy-saccade-int8", "policy-lerobot-float32", "policy-lerobot-default"]
+    chosen = ["--only", "policy", "--contenders", *names, "--record", str(tmp_path / "record")]
+    for rounds, records_made in ((1, 2), (1, 2)):
+        done = run(tmp_path, *chosen, "--rounds", str(rounds))
+        assert done.returncode == 0, done.stderr
+        found = json.loads((tmp_path / "policy.json").read_text())["records"]
+        assert len(found) == records_made
+    entries: dict[str, Any] = {name: one for record in found for name, one in record["contenders"].items()}
+    assert set(entries) == set(names)
+    for entry in entries.values():
+        assert {work: len(seconds) for work, seconds in entry["seconds"].items()} == {
+            "1 view": 1,
+            "2 views": 1,
+        }
+    assert (tmp_path / "policy-report.md").exists()
+    assert not (tmp_path / "record").exists()  # small sizes are not kept

@@ -1,0 +1,160 @@
+"""Whole checkpoints that are quantised, converted and resized still act, and keep what is not touched."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from saccade import ActionHead, CheckpointError, Policy, cli
+from saccade.checkpoints import convert, quantize, resize
+from tests.helpers import layouts, whole_checkpoints
+from tests.helpers.whole_checkpoints import EMBODIMENT, whole
+
+PREFIXES = {"lerobot": "_groot_model.backbone.", "lerobot-n17": "_groot_model.backbone."}
+#: A weight of a block of each part of a backbone, by layout.
+BLOCKS = {
+    "isaac": ("eagle_model.vision_model.vision_model.encoder.layers.1.mlp.fc2",
+              "eagle_model.language_model.model.layers.2.mlp.down_proj"),
+    "n16": ("model.vision_model.vision_model.encoder.layers.0.self_attn.q_proj",
+            "model.language_model.model.layers.0.self_attn.o_proj"),
+    "n17": ("model.model.visual.blocks.3.attn.qkv", "model.model.language_model.layers.1.mlp.gate_proj"),
+}  # fmt: skip
+BLOCKS |= {"nvidia": BLOCKS["isaac"], "lerobot": BLOCKS["isaac"], "lerobot-n17": BLOCKS["n17"]}
+
+
+def act(folder: Path, precision: str = "float32") -> dict[str, Any]:
+    policy = Policy.from_pretrained(folder, embodiment=EMBODIMENT, precision=precision)
+    actions: dict[str, Any] = policy.act(policy.example_observation(seed=1), seed=2)
+    return actions
+
+
+def same(found: dict[str, Any], expected: dict[str, Any]) -> bool:
+    return all(np.array_equal(found[key], expected[key]) for key in expected)
+
+
+def backbone(folder: Path, layout: str) -> dict[str, torch.Tensor]:
+    return layouts.read(folder, PREFIXES.get(layout, "backbone."))
+
+
+def sidecars(folder: Path) -> dict[str, bytes]:
+    """The contents of all files but weights and `config.json`."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith("model") and path.name != "config.json"
+    }
+
+
+@pytest.mark.parametrize("layout", whole_checkpoints.LAYOUTS)
+def test_quantize_stores_the_blocks_of_backbone_and_head(layout: str, tmp_path: Path) -> None:
+    source, out = whole(layout), tmp_path / "int8"
+    report = quantize(source, out)
+    assert report.backbone_copied is None
+    assert 0 < report.num_quantized_backbone < report.num_quantized
+    tensors, before = backbone(out, layout), backbone(source, layout)
+    added = set(tensors) - set(before)
+    assert len(added) == report.num_quantized_backbone
+    assert all(name.endswith(".weight_scale") for name in added)
+    for block in BLOCKS[layout]:
+        weight, scale = tensors[f"{block}.weight"], tensors[f"{block}.weight_scale"]
+        assert weight.dtype == torch.int8
+        # The largest magnitude of each row is 127 times its scale.
+        largest = before[f"{block}.weight"].abs().amax(dim=1)
+        assert torch.allclose(127 * scale, largest, rtol=1e-6)
+        error = (weight * scale[:, None] - before[f"{block}.weight"]).abs()
+        assert bool((error <= scale[:, None] * 0.5001).all())
+    untouched = [name for name in before if f"{name}_scale" not in added]
+    assert all(torch.equal(tensors[name], before[name]) for name in untouched)
+    assert report.backbone_bytes_after == sum(tensor.nbytes for tensor in tensors.values())
+    assert sidecars(out) == sidecars(source)
+    assert json.loads((out / "config.json").read_text()) == json.loads((source / "config.json").read_text())
+    assert same(act(out, "int8"), act(source, "int8"))
+    exact, dequantised = act(source), act(out)
+    assert all(np.allclose(dequantised[key], exact[key], atol=0.3) for key in exact)
+    with pytest.raises(CheckpointError, match="quantised already"):
+        quantize(out, tmp_path / "again")
+
+
+def test_quantize_may_keep_the_backbone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, out = whole("isaac"), tmp_path / "int8"
+    assert cli.main(["quantize", str(source), "--out", str(out), "--keep-backbone"]) == 0
+    assert "outside the head were copied as they are: as requested" in capsys.readouterr().out
+    tensors, before = backbone(out, "isaac"), backbone(source, "isaac")
+    assert set(tensors) == set(before)
+    assert all(torch.equal(tensors[name], before[name]) for name in before)
+    assert cli.main(["quantize", str(source), "--out", str(out), "--force"]) == 0
+    assert "the backbone has" in capsys.readouterr().out
+    assert cli.main(["quantize", str(source), "--out", str(out), "--force", "--head-only", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["num_dropped"], report["num_quantized_backbone"]) == (len(before), 0)
+    with pytest.raises(CheckpointError, match="an action head without a backbone"):
+        Policy.from_pretrained(out)
+
+
+def test_a_backbone_of_an_unknown_kind_is_copied(tmp_path: Path) -> None:
+    source = layouts.write(tmp_path / "source", "isaac")
+    report = quantize(source, tmp_path / "out")
+    assert report.num_quantized_backbone == report.backbone_bytes_before == 0
+    assert report.backbone_copied is not None
+    assert "is missing" in report.backbone_copied
+    before, after = backbone(source, "isaac"), backbone(tmp_path / "out", "isaac")
+    assert all(torch.equal(after[name], before[name]) for name in before)
+
+
+@pytest.mark.parametrize("layout", ["isaac", "n17", "lerobot"])
+def test_a_backbone_alone_is_named(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "backbone"
+    shutil.copytree(whole(layout), source, ignore=shutil.ignore_patterns("model*"))
+    prefix = PREFIXES.get(layout, "backbone.")
+    save_file(
+        {prefix + name: one for name, one in backbone(whole(layout), layout).items()},
+        source / "model.safetensors",
+    )
+    out = ["--out", str(tmp_path / "out")]
+    for command in (
+        ["inspect"],
+        ["quantize", *out],
+        ["convert", *out],
+        ["resize", *out, "--num-future-tokens", "3"],
+    ):
+        assert cli.main([command[0], str(source), *command[1:]]) == 2
+        error = capsys.readouterr().err
+        assert "there is no action head among the" in error
+        assert "this is a backbone alone" in error
+    with pytest.raises(CheckpointError, match="a backbone alone"):
+        ActionHead.from_pretrained(source)
+
+
+@pytest.mark.parametrize("layout", ["isaac", "lerobot", "n16", "n17"])
+def test_convert_keeps_what_acts(layout: str, tmp_path: Path) -> None:
+    source = whole(layout)
+    policy = Policy.from_pretrained(source, embodiment=EMBODIMENT)
+    convert(source, tmp_path / "one", embodiment_ids=[policy.embodiment_id], max_shard_bytes=2_000_000)
+    assert len(list((tmp_path / "one").glob("model-*.safetensors"))) > 2
+    assert same(act(tmp_path / "one"), act(source))
+    assert sidecars(tmp_path / "one") == sidecars(source)
+    convert(source, tmp_path / "bf16", dtype="bfloat16")
+    assert all(tensor.dtype == torch.bfloat16 for tensor in backbone(tmp_path / "bf16", layout).values())
+    exact, found = act(source), act(tmp_path / "bf16")
+    assert all(np.allclose(found[key], exact[key], atol=0.1) for key in exact)
+
+
+@pytest.mark.parametrize("layout", ["nvidia", "lerobot"])
+def test_resize_keeps_the_backbone(layout: str, tmp_path: Path) -> None:
+    source, out = whole(layout), tmp_path / "64"
+    resize(source, out, num_future_tokens=64)
+    before, after = backbone(source, layout), backbone(out, layout)
+    assert set(after) == set(before)
+    assert all(torch.equal(after[name], before[name]) for name in before)
+    kept = sidecars(out)
+    kept.pop("saccade.json", None)
+    assert kept == sidecars(source)
+    exact, found = act(source), act(out)
+    assert all(np.allclose(found[key], exact[key], atol=1e-4) for key in exact)

@@ -1,0 +1,125 @@
+"""`saccade act`: pictures and words in, a chunk and its times out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from saccade import Policy, cli
+from tests.helpers.whole_checkpoints import EMBODIMENT, HEIGHT, WIDTH, whole
+
+PARTS = ["load", "frames", "processor", "backbone", "encode", "sample"]
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> dict[str, Path]:
+    """A picture of each camera, of several kinds."""
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (2, HEIGHT, WIDTH, 3), np.uint8)
+    paths = {"front": tmp_path / "front.png", "wrist": tmp_path / "wrist=1.png"}
+    Image.fromarray(frames[0]).save(paths["front"])
+    Image.fromarray(frames[1]).convert("RGBA").save(paths["wrist"])
+    return paths
+
+
+def act(*words: object, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    assert cli.main(["act", *map(str, words), "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_it_prints_what_the_policy_answers(
+    pictures: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = {"arm": [0.1, -0.2, 0.3, 0.4, 0.5], "hand": [0.0, 1.0]}
+    (tmp_path / "state.json").write_text(json.dumps(state))
+    words: tuple[object, ...] = (
+        whole("isaac"),
+        "--image",
+        f"front={pictures['front']}",
+        "--image",
+        f"wrist={pictures['wrist']}",
+    )
+    words += ("--instruction", "open the drawer", "--state", tmp_path / "state.json", "--seed", 5)
+    found = act(*words, capsys=capsys)
+    policy = Policy.from_pretrained(whole("isaac"))
+    observation = {
+        "video": {name: np.asarray(Image.open(path).convert("RGB"))[None] for name, path in pictures.items()},
+        "state": {key: np.array([values], np.float32) for key, values in state.items()},
+        "language": {"task": ["open the drawer"]},
+    }
+    expected = policy.act(observation, seed=5)
+    assert {key: np.float32(part).tolist() for key, part in found["actions"].items()} == {
+        key: part.tolist() for key, part in expected.items()
+    }
+    assert list(found["milliseconds"]) == PARTS
+    assert (found["embodiment"], found["embodiment_id"]) == (EMBODIMENT, 31)
+    assert found["num_vl_tokens"] == policy.encode(observation).num_vl_tokens
+    (tmp_path / "list.json").write_text(json.dumps([*state["arm"], *state["hand"]]))
+    again = act(*words[:-3], tmp_path / "list.json", "--seed", 5, capsys=capsys)
+    assert again["actions"] == found["actions"]
+    other = act(
+        *words, "--precision", "int8", "--head-precision", "bfloat16", "--num-steps", 2, capsys=capsys
+    )
+    assert other["precision"] == {"backbone": "int8", "head": "bfloat16"}
+    assert other["actions"] != found["actions"]
+
+
+def test_it_prints_tables_and_says_what_it_assumed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["act", str(whole("n17")), "--embodiment", "10"]) == 0
+    out, err = capsys.readouterr()
+    assert "Actions of new_embodiment, in its units" in out
+    assert all(part in out for part in PARTS)
+    assert "random frames" in err
+    assert "a state in the middle of the robot's range" in err
+    assert '"pick up the red block"' in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--image", "front={front}"], "expected cameras wrist, front, got front"),
+        (["--image", "{front}"], "expected cameras wrist, front, got wrist"),
+        (["--image", "{front}", "{front}"], "--image: expected CAMERA=FILE"),
+        (["--image", "a={front}", "a={front}"], "--image: expected CAMERA=FILE"),
+        (["--image", "front=missing.png"], "missing.png: no such file"),
+        (["--image", "front={text}"], "cannot be read as a picture"),
+        (["--image", "front={deep}"], "expected a picture with 8 bits a colour, got mode I;16"),
+        (
+            ["--image", "front={small}", "wrist={front}"],
+            f"expected frames of {HEIGHT} x {WIDTH} pixels, got 3 x 2",
+        ),
+        (["--state", "missing.json"], "missing.json: No such file"),
+        (["--state", "{text}"], "cannot be read as JSON"),
+        (["--state", "{words}"], "expected lists of numbers"),
+        (["--state", "{short}"], r"state: expected 7 numbers (arm (5), hand (2)), got 1"),
+        (["--state", "{part}"], "state.hand: expected hand too, got arm"),
+        (["--embodiment", "walker"], "got 'walker'"),
+        (["--tokenizer", "missing"], "missing"),
+    ],
+)
+def test_bad_input_is_one_line(
+    words: list[str],
+    message: str,
+    pictures: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    files = {name: tmp_path / name for name in ("text", "deep.png", "small.png", "words", "short", "part")}
+    files["text"].write_text("no picture")
+    Image.fromarray(np.zeros((4, 4), np.uint16)).save(files["deep.png"])
+    Image.fromarray(np.zeros((3, 2, 3), np.uint8)).save(files["small.png"])
+    files["words"].write_text('{"arm": "high"}')
+    files["short"].write_text("[1.0]")
+    files["part"].write_text('{"arm": [0, 0, 0, 0, 0]}')
+    given = {name.partition(".")[0]: path for name, path in files.items()} | pictures
+    status = cli.main(["act", str(whole("isaac")), *(word.format(**given) for word in words)])
+    error = capsys.readouterr().err
+    assert status == 2
+    assert message in error
+    assert error.count("\n") == 1

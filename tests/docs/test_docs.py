@@ -1,0 +1,232 @@
+"""The documentation is tested: examples in docstrings and pages, commands, links, pictures."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import os
+import pkgutil
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import saccade
+from saccade import cli
+from saccade._internal.extras import SACCADE
+from saccade_lab.extras import LAB
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "ARCHITECTURE.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "studies" / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+#: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
+NEED_CHECKPOINTS = (
+    *("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md", "robots.md"),
+    *("frames.md", "protocol.md"),
+)
+MODULES = sorted(
+    info.name
+    for info in pkgutil.walk_packages(saccade.__path__, "saccade.")
+    if info.name not in ("saccade._saccade", "saccade.__main__")
+)
+
+
+def code_blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def command_lines(text: str, program: str) -> list[list[str]]:
+    """The arguments of each line of `text` that calls `program`, without comments after two blanks."""
+    lines = (
+        re.split(r"\s{2,}|\s#", line.strip())[0] for line in re.sub(r"\s*\\\n\s*", " ", text).splitlines()
+    )
+    return [shlex.split(line)[1:] for line in lines if line.split(" ")[0] == program]
+
+
+def page_id(page: Path) -> str:
+    """A page's path as a test id."""
+    return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_in_docstrings(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    # Files that examples name.
+    backbone = ROOT / "tests" / "data" / "backbone"
+    shutil.copy(backbone / "tiny_tokenizer.json", "tokenizer.json")
+    shutil.copy(backbone / "n15_two_views.safetensors", "n1.5-backbone.safetensors")
+    result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.failed == 0
+
+
+def test_the_public_classes_have_examples() -> None:
+    finder = doctest.DocTestFinder()
+    for public in (saccade.ActionHead, saccade.CrossAttention, saccade.show_config):
+        assert any(test.examples for test in finder.find(public)), f"{public} has no example"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_rows_of_a_table_have_as_many_cells_as_its_head(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        bars = {line: len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}
+        assert len(set(bars.values())) == 1, bars
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in NEED_CHECKPOINTS], ids=page_id)
+def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
+    blocks = code_blocks(page, "python")
+    if blocks:  # one program from top to bottom, as a reader would paste it
+        code = "\n".join(blocks)
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/usage.md"])
+def test_the_first_pages_need_numpy_only(page: str, tmp_path: Path) -> None:
+    modules = sorted(set().union(*SACCADE.modules.values(), *LAB.modules.values()))
+    hidden = f"import sys; sys.modules.update(dict.fromkeys({modules}))\n"
+    code = hidden + "\n".join(code_blocks(ROOT / page, "python"))
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_commands_on_pages_exist(page: Path) -> None:
+    targets = set(re.findall(r"^([\w-]+):(?!=)", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for block in code_blocks(page, "bash"):
+        for arguments in command_lines(block, "make"):
+            assert {word for word in arguments if "=" not in word} <= targets  # variables aside
+        for arguments in command_lines(block, "saccade"):
+            assert_parses(arguments)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_examples_of_commands_parse(name: str) -> None:
+    parser = cli.Parser(prog=f"saccade {name}")
+    cli.load_command(name).add_arguments(parser)
+    examples = command_lines(parser.epilog or "", "saccade")
+    assert examples
+    for arguments in examples:
+        assert arguments[0] == name
+        assert_parses(arguments)
+
+
+def assert_parses(arguments: list[str]) -> None:
+    """Fails if the command line does not accept these arguments."""
+    parser = cli.build_parser(arguments[0])
+    if "--help" not in arguments:
+        parser.parse_args(arguments)  # a SystemExit fails the test; its message is on standard error
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#\s]+)", page.read_text()) + re.findall(r'src="([^"]+)"', page.read_text())
+    for target in targets:
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+def tree_of_architecture() -> set[Path]:
+    """The files and folders that the tree in ARCHITECTURE.md names; each belongs to the last folder above it
+    that is indented less.
+    """
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    block = text.split("```")[1]
+    found: set[Path] = set()
+    above: list[tuple[int, Path]] = []
+    for line in filter(str.strip, block.splitlines()):
+        indent = len(line) - len(line.lstrip())
+        above = [(depth, folder) for depth, folder in above if depth < indent]
+        base = above[-1][1] if above else Path()
+        names = [base / name for name in re.split(r"\s{2,}", line.strip())[0].split()]
+        found |= set(names)
+        above.append((indent, names[0]))
+    return found
+
+
+def test_architecture_names_every_folder_and_nothing_that_is_not_there() -> None:
+    named = tree_of_architecture()
+    assert [str(path) for path in sorted(named) if not (ROOT / path).exists()] == []
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    files = [Path(name) for name in listed.stdout.split("\0") if name]
+    # The folders of a study hold what its commands wrote, and each case of a robot has one of its own.
+    cases = (Path("tests/data/robots"), Path("tests/data/images"))
+    folders = {
+        file.parent
+        for file in files
+        if file.parts[0] != "studies" and not any(file.is_relative_to(one) for one in cases)
+    } - {Path()}
+    assert [str(folder) for folder in sorted(folders - named)] == []
+
+
+def test_pictures_of_the_readme_are_made_from_what_commands_write(tmp_path: Path) -> None:
+    shades = np.linspace(0, 255, 9).astype(np.uint8)
+    frames = [np.full((64, 96, 3), shade, np.uint8) for shade in shades]
+    imageio.mimwrite(tmp_path / "one.mp4", frames, fps=20, macro_block_size=16)  # type: ignore[arg-type]
+    Image.new("RGB", (40, 30), "red").save(tmp_path / "sheet.png")
+    script = [sys.executable, str(ROOT / "docs" / "make_pictures.py")]
+    gif = ["gif", str(tmp_path / "one.mp4"), "--out", str(tmp_path / "one.gif"), "--width", "48"]
+    crop = [
+        "map",
+        str(tmp_path / "sheet.png"),
+        "--out",
+        str(tmp_path / "map.png"),
+        "--top",
+        "5",
+        "--bottom",
+        "25",
+    ]
+    for arguments in (gif, crop, ["step", "--out", str(tmp_path / "step.png")]):
+        subprocess.run([*script, *arguments], check=True, capture_output=True)
+    with Image.open(tmp_path / "one.gif") as made:
+        assert made.size == (48, 32)
+        assert len(list(ImageSequence.Iterator(made))) == 5  # every second of eight, and the last
+        assert made.info["loop"] == 0
+    with Image.open(tmp_path / "map.png") as made:
+        assert made.size == (40, 20)
+    with (
+        Image.open(tmp_path / "step.png") as made,
+        Image.open(ROOT / "docs" / "images" / "step.png") as shown,
+    ):
+        assert made.size == shown.size
+
+
+def test_nothing_names_a_package_registry_or_a_path_of_one_machine() -> None:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    words = [
+        "py" + "pi.org",
+        "python" + "hosted.org",
+        "index.cra" + "tes.io",
+        "/ro" + "ot/",
+        os.sep + "work" + os.sep,
+    ]
+    found = []
+    for name in filter(None, listed.stdout.split("\0")):
+        path = ROOT / name
+        if (
+            path.suffix in (".safetensors", ".png", ".gif", ".mp4")
+            or path.name == "Cargo.lock"
+            or not path.is_file()
+        ):
+            continue
+        text = path.read_text(errors="replace")
+        found += [f"{name}: {word}" for word in words if word in text]
+    assert found == []

@@ -1,0 +1,82 @@
+"""Policies whose backbone and processor stand in for the real ones, for tests of everything around these."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import saccade
+from saccade import BackboneInputs, Policy
+from saccade.observations import ObservationSources, observation_sources
+from tests.helpers import whole_checkpoints
+
+#: The id that stands for an image token, and how many there are of a view.
+IMAGE, TOKENS = 300, 4
+
+
+class StandInProcessor:
+    """A token for each byte of the instruction, and a few for each view. Remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str | None, bool]] = []
+
+    def __call__(
+        self, frames: Sequence[NDArray[np.uint8]], instruction: str | None, *, plain_text: bool = False
+    ) -> BackboneInputs:
+        self.seen.append((instruction, plain_text))
+        instruction = instruction or "default"
+        pixels = np.stack([np.resize(view, (3, 4, 4)) / np.float32(255) for view in frames])
+        ids = np.concatenate([np.full(TOKENS * len(frames), IMAGE), list(instruction.encode())])
+        return BackboneInputs(pixels.astype(np.float32), ids[None])
+
+
+@dataclass(frozen=True)
+class StandInFeatures:
+    backbone_features: NDArray[np.float32]
+    image_mask: NDArray[np.bool_]
+
+
+class StandInBackbone:
+    """A row of features for each token, which for image tokens depends on the pixels."""
+
+    def __init__(self, width: int) -> None:
+        self.table = np.random.default_rng(0).standard_normal((IMAGE + 1, width), np.float32)
+        self.previous: list[Any] = []
+
+    def _ragged(
+        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()
+    ) -> list[StandInFeatures]:
+        self.previous.append(previous)
+        return [self._features(one) for one in inputs]
+
+    def _features(self, inputs: BackboneInputs) -> StandInFeatures:
+        image = inputs.input_ids == IMAGE
+        features = self.table[inputs.input_ids]
+        features[image] += np.repeat(np.mean(np.asarray(inputs.pixel_values), (1, 2, 3)), TOKENS)[:, None]
+        return StandInFeatures(features, image)
+
+
+@functools.cache
+def head(layout: str) -> saccade.ActionHead:
+    """The head of a whole checkpoint."""
+    return saccade.ActionHead.from_pretrained(whole_checkpoints.whole(layout))
+
+
+def policy(layout: str, sources: ObservationSources | None = None) -> Policy:
+    """A policy with the head, the statistics and the cameras of a whole checkpoint, and stand-ins."""
+    folder = whole_checkpoints.whole(layout)
+    found = observation_sources(folder, whole_checkpoints.EMBODIMENT) if sources is None else sources
+    backbone: Any = StandInBackbone(head(layout).config.context_dim)
+    processor: Any = StandInProcessor()
+    return Policy(
+        head(layout),
+        embodiment=whole_checkpoints.EMBODIMENT,
+        backbone=backbone,
+        processor=processor,
+        sources=found,
+    )
