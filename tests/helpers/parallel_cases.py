@@ -1,4 +1,4 @@
-"""Pieces of work for the tests of processes: they die, fail, or say where they ran."""
+"""Items of work for the tests of processes: they die, fail, or say where they ran."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Reads:
 
     Attributes:
         path: The file or directory.
-        hold: Seconds that each piece takes.
+        hold: Seconds that each item takes.
     """
 
     path: str

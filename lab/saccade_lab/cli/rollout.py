@@ -116,13 +116,13 @@ class Session:
         """Runs all episodes and writes the result file after each of them, in the order of one process."""
         from saccade_lab.sim.episodes import Rolled
 
-        pieces = [(task, seed) for task in self.tasks for seed in self.seeds]
-        order = {piece: position for position, piece in enumerate(pieces)}
+        items = [(task, seed) for task in self.tasks for seed in self.seeds]
+        order = {item: position for position, item in enumerate(items)}
         files = [self.episodes.checkpoint]
         config = self.episodes.data_config
         if config is not None and Path(config).is_file():
             files.append(config)
-        for (task, seed), rolled in each(self.episodes, pieces, self.workers, files):
+        for (task, seed), rolled in each(self.episodes, items, self.workers, files):
             if isinstance(rolled, Lost):
                 self.lost.append(f"{task} {seed}: {rolled.reason}")
                 continue

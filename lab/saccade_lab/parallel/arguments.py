@@ -7,19 +7,19 @@ import argparse
 from saccade_lab.parallel.workers import Workers
 
 
-def add_arguments(parser: argparse.ArgumentParser, pieces: str) -> None:
+def add_arguments(parser: argparse.ArgumentParser, items: str) -> None:
     """Declares where a command runs.
 
     Args:
         parser: parser of the command.
-        pieces: what is computed at the same time, in the plural.
+        items: what is computed at the same time, in the plural.
     """
     group = parser.add_argument_group("several processes")
     group.add_argument(
         "--jobs",
         type=int,
         metavar="N",
-        help=f"{pieces} computed at the same time, in processes of their own; -1 for one per core; with 1 "
+        help=f"{items} computed at the same time, in processes of their own; -1 for one per core; with 1 "
         "the command itself computes (default: 1; with ray -1)",
     )
     group.add_argument(
@@ -40,7 +40,7 @@ def workers_of(args: argparse.Namespace, num_threads: int | None = None) -> Work
 
     Args:
         args: the parsed arguments.
-        num_threads: threads of one piece; None for 1.
+        num_threads: threads of one item; None for 1.
 
     Raises:
         InputError: as `Workers`.

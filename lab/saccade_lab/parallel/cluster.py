@@ -1,4 +1,4 @@
-"""Pieces in the processes of a Ray cluster. Those of processes and machines that died are repeated."""
+"""Items in the processes of a Ray cluster. Those of processes and machines that died are repeated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import saccade
 from saccade.errors import InputError, SaccadeError
 from saccade_lab.extras import LAB
 from saccade_lab.parallel.files import Shipment, located, pack, place, relocated
-from saccade_lab.parallel.workers import RETRIES, Lost, Piece, Result, Workers
+from saccade_lab.parallel.workers import RETRIES, Lost, Item, Result, Workers
 
 SECONDS_TO_CONNECT = 10.0
 
@@ -29,7 +29,7 @@ class ClusterError(SaccadeError):
 
 @dataclass(frozen=True)
 class Job:
-    """What all pieces of a run share. It is sent to each process once.
+    """What all items of a run share. It is sent to each process once.
 
     Attributes:
         work: See `saccade_lab.parallel.each`.
@@ -43,14 +43,14 @@ class Job:
 
 
 def each(
-    work: Callable[[Piece], Result],
-    pieces: Sequence[Piece],
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
     workers: Workers,
     files: Sequence[str | Path],
-) -> Iterator[tuple[Piece, Result | Lost]]:
+) -> Iterator[tuple[Item, Result | Lost]]:
     """As `saccade_lab.parallel.each`.
 
-    Files are put into Ray's object store here; each machine fetches them when its first piece begins. A piece
+    Files are put into Ray's object store here; each machine fetches them when its first item begins. A item
     whose process, machine or result was lost is given to Ray again after the others, which leaves time for
     memory to become free. Ray itself would repeat one that ran out of memory without limit.
     """
@@ -59,44 +59,44 @@ def each(
         check_cluster(ray, workers)
         sources, work = located(work, files)
         shipments = {path: pack(source, ray.put) for path, source in sources.items()}
-        # In a list, because Ray would replace the reference by the job, once for every piece.
+        # In a list, because Ray would replace the reference by the job, once for every item.
         job = [ray.put(Job(work, shipments, saccade.__version__))]
-        task = ray.remote(run_piece).options(
+        task = ray.remote(run_item).options(
             num_cpus=workers.num_threads, max_retries=0, scheduling_strategy="SPREAD"
         )
-        attempts = [0] * len(pieces)
-        waiting = deque(range(len(pieces)))
+        attempts = [0] * len(items)
+        waiting = deque(range(len(items)))
         running: dict[Any, int] = {}
         try:
             while waiting or running:
                 while waiting and len(running) < most_at_once(ray, workers):
                     index = waiting.popleft()
                     attempts[index] += 1
-                    running[task.remote(job, pieces[index])] = index
+                    running[task.remote(job, items[index])] = index
                 (done,), _ = ray.wait(list(running), num_returns=1)
                 index = running.pop(done)
                 result = result_of(ray, done)
                 if not isinstance(result, Died):
-                    yield pieces[index], result
+                    yield items[index], result
                 elif attempts[index] <= RETRIES:
                     waiting.append(index)
                 else:
                     died = f"its process or machine died in each of {RETRIES + 1} attempts: {result.reason}"
-                    yield pieces[index], Lost(died)
+                    yield items[index], Lost(died)
         finally:
             for reference in running:
                 with contextlib.suppress(Exception):  # of a cluster that is gone, which another error says
                     ray.cancel(reference)
 
 
-def run_piece(job: list[Any], piece: Any) -> Any:
-    """What a process of the cluster runs: the work on one piece."""
-    return received(job[0])(piece)
+def run_item(job: list[Any], item: Any) -> Any:
+    """What a process of the cluster runs: the work on one item."""
+    return received(job[0])(item)
 
 
 @functools.lru_cache(maxsize=1)
 def received(reference: Any) -> Callable[[Any], Any]:
-    """The work with the paths of this machine. It is kept for the next piece.
+    """The work with the paths of this machine. It is kept for the next item.
 
     Raises:
         InputError: this machine has another version of saccade.
@@ -117,7 +117,7 @@ def received(reference: Any) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Died:
-    """What takes the place of a result if the process or the machine of a piece died.
+    """What takes the place of a result if the process or the machine of a item died.
 
     Attributes:
         reason: What Ray says of it.
@@ -161,7 +161,7 @@ def check_reachable(address: str | None) -> None:
 
 
 def check_cluster(ray: ModuleType, workers: Workers) -> None:
-    """Raises `InputError` if no machine has the cores of one piece: Ray would wait for one forever."""
+    """Raises `InputError` if no machine has the cores of one item: Ray would wait for one forever."""
     cores = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if max(cores, default=0) < workers.num_threads:
         raise InputError(
@@ -171,7 +171,7 @@ def check_cluster(ray: ModuleType, workers: Workers) -> None:
 
 
 def most_at_once(ray: ModuleType, workers: Workers) -> int:
-    """Number of pieces that are handed to Ray. For all cores twice as many, so that none has to wait.
+    """Number of items that are handed to Ray. For all cores twice as many, so that none has to wait.
 
     Machines may join or leave at any time.
     """
@@ -182,7 +182,7 @@ def most_at_once(ray: ModuleType, workers: Workers) -> int:
 
 
 def result_of(ray: ModuleType, reference: Any) -> Any:
-    """The result of a piece, or `Died`.
+    """The result of a item, or `Died`.
 
     Raises:
         ClusterError: Ray cannot go on.

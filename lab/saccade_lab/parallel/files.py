@@ -18,7 +18,7 @@ import numpy as np
 
 from saccade._internal.arrays import UInt8Array
 
-PIECE = 1 << 28  # bytes of a file that travel as one object
+CHUNK_BYTES = 1 << 28  # bytes of a file that travel as one object
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Shipment:
         name: Its name, which it keeps there.
         sha256: Hash of names and contents.
         files: For each file, by its path below the directory that contains `name`, what `put` returned for
-            each of its pieces.
+            each of its chunks.
     """
 
     name: str
@@ -63,17 +63,17 @@ def walked(directory: Path) -> list[Path]:
 
 
 def pack(path: Path, put: Callable[[UInt8Array], Any]) -> Shipment:
-    """Reads a file or directory and hands its bytes to `put`, in pieces of at most `PIECE`."""
+    """Reads a file or directory and hands its bytes to `put`, in chunks of at most `CHUNK_BYTES`."""
     digest, files = hashlib.sha256(), {}
     for name, file in files_of(path).items():
         size = file.stat().st_size
         digest.update(f"{name}\0{size}\0".encode())
-        pieces = []
-        for start in range(0, size, PIECE):
-            piece = np.fromfile(file, np.uint8, PIECE, offset=start)
-            digest.update(piece.data)
-            pieces.append(put(piece))
-        files[name] = tuple(pieces)
+        chunks = []
+        for start in range(0, size, CHUNK_BYTES):
+            chunk = np.fromfile(file, np.uint8, CHUNK_BYTES, offset=start)
+            digest.update(chunk.data)
+            chunks.append(put(chunk))
+        files[name] = tuple(chunks)
     # A link to a file keeps its own name, as its key does.
     return Shipment(path.resolve().name if path.is_dir() else path.name, digest.hexdigest(), files)
 
@@ -86,7 +86,7 @@ def place(shipment: Shipment, get: Callable[[Any], UInt8Array]) -> Path:
 
     Args:
         shipment: what `pack` returned.
-        get: the bytes of a piece.
+        get: the bytes of a chunk.
 
     Raises:
         OSError: it cannot be written, or what arrived is not what was packed.
@@ -115,12 +115,12 @@ def place(shipment: Shipment, get: Callable[[Any], UInt8Array]) -> Path:
 def _unpack(shipment: Shipment, get: Callable[[Any], UInt8Array], folder: Path) -> None:
     """Writes the files and checks their hash."""
     digest = hashlib.sha256()
-    for name, pieces in shipment.files.items():
+    for name, chunks in shipment.files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as file:
-            for piece in pieces:
-                file.write(get(piece).data)
+            for chunk in chunks:
+                file.write(get(chunk).data)
         digest.update(f"{name}\0{path.stat().st_size}\0".encode())
         with path.open("rb") as file:
             while read := file.read(1 << 24):

@@ -1,4 +1,4 @@
-"""Pieces in processes of this machine, by joblib's loky. When a process dies, its pieces are repeated."""
+"""Items in processes of this machine, by joblib's loky. When a process dies, its items are repeated."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from itertools import islice
 from typing import Any
 
 from saccade_lab.extras import LAB
-from saccade_lab.parallel.workers import RETRIES, Lost, Piece, Result
+from saccade_lab.parallel.workers import RETRIES, Lost, Item, Result
 
 LOST = Lost(f"a worker process died in each of {RETRIES + 1} attempts, perhaps out of memory")
 IDLE = 300  # seconds after which a process that has nothing to do ends
@@ -18,35 +18,35 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # of t
 
 
 def each(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int
-) -> Iterator[tuple[Piece, Result | Lost]]:
+    work: Callable[[Item], Result], items: Sequence[Item], jobs: int
+) -> Iterator[tuple[Item, Result | Lost]]:
     """As `saccade_lab.parallel.each`, in `jobs` processes, never in this one; -1 for one per core.
 
-    loky says that a process died, but not in which piece. The pieces that were given out then wait until the
+    loky says that a process died, but not in which item. The items that were given out then wait until the
     others are done, and are computed in one process, one after the other: now it is known which one ends its
-    process, and pieces that only ran at the same time are not given up.
+    process, and items that only ran at the same time are not given up.
     """
     LAB.require("joblib")
     from joblib import cpu_count
 
     processes = cpu_count() if jobs == -1 else jobs
     suspects: list[int] = []
-    left = dict.fromkeys(range(len(pieces)))
+    left = dict.fromkeys(range(len(items)))
     while left:
-        for index, result in _spread(work, pieces, list(left), processes):
+        for index, result in _spread(work, items, list(left), processes):
             del left[index]
             if result is LOST:
                 suspects.append(index)
             else:
-                yield pieces[index], result
+                yield items[index], result
     for index in suspects:
-        yield pieces[index], _alone(work, pieces, index)
+        yield items[index], _alone(work, items, index)
 
 
 def _spread(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], chosen: Sequence[int], processes: int
+    work: Callable[[Item], Result], items: Sequence[Item], chosen: Sequence[int], processes: int
 ) -> Iterator[tuple[int, Result | Lost]]:
-    """Index and result of chosen pieces. If a process dies, those that were given out are `LOST`: the end."""
+    """Index and result of chosen items. If a process dies, those that were given out are `LOST`: the end."""
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -56,16 +56,16 @@ def _spread(
     running: dict[Any, int] = {}
     try:
         while True:
-            # Twice as many as processes, so that none has to wait for its next piece.
+            # Twice as many as processes, so that none has to wait for its next item.
             for index in islice(waiting, 2 * processes - len(running)):
-                running[pool.submit(work, pieces[index])] = index
+                running[pool.submit(work, items[index])] = index
             if not running:
                 return
             for done in wait(running, return_when=FIRST_COMPLETED).done:
                 result = done.result()
                 yield running.pop(done), result
     except BrokenProcessPool as error:
-        # loky also raises this for a piece that a process cannot unpickle, or a result that it cannot pickle.
+        # loky also raises this for a item that a process cannot unpickle, or a result that it cannot pickle.
         if not isinstance(error, TerminatedWorkerError):
             raise
         for index in running.values():
@@ -83,10 +83,10 @@ def _threads(processes: int) -> int:
     return max(1, int(cpu_count()) // processes)
 
 
-def _alone(work: Callable[[Piece], Result], pieces: Sequence[Piece], index: int) -> Result | Lost:
-    """The result of one piece in one process that does nothing else at the same time."""
+def _alone(work: Callable[[Item], Result], items: Sequence[Item], index: int) -> Result | Lost:
+    """The result of one item in one process that does nothing else at the same time."""
     for _ in range(RETRIES):  # one attempt has been made
-        ((_, result),) = _spread(work, pieces, [index], 1)
+        ((_, result),) = _spread(work, items, [index], 1)
         if result is not LOST:
             return result
     return LOST

@@ -1,4 +1,4 @@
-"""Where pieces of work run."""
+"""Where work items run."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import TypeVar
 from saccade.errors import InputError
 
 BACKENDS = ("loky", "ray")
-RETRIES = 3  # of a piece whose process died, before it is given up
+RETRIES = 3  # of a item whose process died, before it is given up
 
-Piece = TypeVar("Piece")
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes that pieces of work run in.
+    """The processes that work items run in.
 
     Attributes:
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
-        jobs: Number of pieces at the same time. -1: one for each core, of this machine or of the cluster.
-            With loky 1 stands for this process, which a piece may then end; -1 never does, also on one core.
+        jobs: Number of items at the same time. -1: one for each core, of this machine or of the cluster.
+            With loky 1 stands for this process, which a item may then end; -1 never does, also on one core.
         address: Address of the Ray cluster. Default: that of the environment variable `RAY_ADDRESS`, then a
             cluster that runs on this machine, then one that is started here for this run.
-        num_threads: Threads of one piece, which it reserves on a Ray cluster.
+        num_threads: Threads of one item, which it reserves on a Ray cluster.
 
     Raises:
         InputError: an unknown backend, a number out of range, or an address without Ray.
@@ -51,17 +51,17 @@ class Workers:
 
     @property
     def alone(self) -> bool:
-        """Whether the pieces run one after the other in this process."""
+        """Whether the items run one after the other in this process."""
         return self.backend == "loky" and self.jobs == 1
 
 
-#: One piece after the other in this process.
+#: One item after the other in this process.
 ALONE = Workers()
 
 
 @dataclass(frozen=True)
 class Lost:
-    """What takes the place of a result if the processes that computed a piece died again and again.
+    """What takes the place of a result if the processes that computed a item died again and again.
 
     Attributes:
         reason: What is known about it.

@@ -140,11 +140,11 @@ class Recorder:
 
     settings: RecordingSettings
 
-    def __call__(self, piece: tuple[str, int]) -> bytes | None:
+    def __call__(self, item: tuple[str, int]) -> bytes | None:
         """The file of the episode of a task and a seed; None if the expert did not succeed."""
         from saccade_lab.sim.environment import TaskEnvironment  # not at the top: reading needs no simulator
 
-        task, seed = piece
+        task, seed = item
         settings = self.settings
         environment = environment_cache.cached_environment(
             (task, settings),
@@ -241,12 +241,12 @@ def record_tasks(
     lost = []
     try:
         # Failures of the experts are known only after a round; the next one makes up for them.
-        while pieces := [
+        while items := [
             (name, seed)
             for name, task in tasks.items()
             for seed in task.next_seeds(functools.partial(on_episode, name))
         ]:
-            for (name, seed), file in each(Recorder(settings), pieces, workers):
+            for (name, seed), file in each(Recorder(settings), items, workers):
                 task = tasks[name]
                 if isinstance(file, Lost):
                     lost.append(f"{name} {seed}: {file.reason}")

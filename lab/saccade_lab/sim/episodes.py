@@ -1,4 +1,4 @@
-"""Episodes as independent pieces of work, for `saccade rollout` in one process or in many."""
+"""Episodes as independent work items, for `saccade rollout` in one process or in many."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ class Episodes:
         """The policy. The first call in a process loads it; raises as `Policy.from_pretrained`."""
         return policy_of(self.checkpoint, self.engine, self.num_threads, json.dumps(self.overrides))
 
-    def __call__(self, piece: tuple[str, int]) -> Rolled:
+    def __call__(self, item: tuple[str, int]) -> Rolled:
         """Runs the episode of a task and a seed."""
-        task, seed = piece
+        task, seed = item
         policy = self.policy
         environment = cached_environment(
             (self.checkpoint, task), lambda: environment_for(policy, task, render_mode="rgb_array")

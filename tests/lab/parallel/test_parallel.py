@@ -1,4 +1,4 @@
-"""Pieces of work in processes of this machine: those that die are repeated; and files for other machines."""
+"""Items of work in processes of this machine: those that die are repeated; and files for other machines."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Unreadable:
     def __reduce__(self) -> tuple[Any, ...]:
         return (missing_file, ())
 
-    def __call__(self, piece: int) -> int:
-        return piece
+    def __call__(self, item: int) -> int:
+        return item
 
 
 def missing_file() -> None:
@@ -124,7 +124,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_directory_arrives_as_it_was(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "PIECE", 5)
+    monkeypatch.setattr(files, "CHUNK_BYTES", 5)
     source = tmp_path / "policy"
     (source / "more").mkdir(parents=True)
     contents = {"config.json": b"{}", "weights.bin": bytes(range(13)), "more/empty": b""}
@@ -133,12 +133,12 @@ def test_a_directory_arrives_as_it_was(tmp_path: Path, cache: Path, monkeypatch:
     (source / ".hidden").write_text("stays")
     sent: list[UInt8Array] = []
 
-    def put(piece: UInt8Array) -> int:
-        sent.append(piece)
+    def put(item: UInt8Array) -> int:
+        sent.append(item)
         return len(sent) - 1
 
     shipment = files.pack(source, put)
-    assert [len(piece) for piece in sent] == [2, 5, 5, 3]
+    assert [len(item) for item in sent] == [2, 5, 5, 3]
     placed = files.place(shipment, sent.__getitem__)
     assert placed.name == "policy"
     assert placed.is_relative_to(cache)
@@ -150,26 +150,26 @@ def test_a_directory_arrives_as_it_was(tmp_path: Path, cache: Path, monkeypatch:
         raise AssertionError("it is there already")
 
     assert files.place(shipment, nothing) == placed
-    assert files.pack(source, lambda piece: None).sha256 == shipment.sha256
+    assert files.pack(source, lambda item: None).sha256 == shipment.sha256
     (source / "weights.bin").write_bytes(bytes(12) + b"x")
-    assert files.pack(source, lambda piece: None).sha256 != shipment.sha256
+    assert files.pack(source, lambda item: None).sha256 != shipment.sha256
 
 
 def test_what_arrives_damaged_or_half_is_not_kept(tmp_path: Path, cache: Path) -> None:
     source = tmp_path / "weights.bin"
     source.write_bytes(b"weights")
-    shipment = files.pack(source, lambda piece: piece)
+    shipment = files.pack(source, lambda item: item)
     with pytest.raises(OSError, match=r"weights\.bin: expected the hash"):
-        files.place(shipment, lambda piece: np.flip(piece).copy())
+        files.place(shipment, lambda item: np.flip(item).copy())
     (cache / f"{shipment.sha256}.part" / "old").mkdir(parents=True, exist_ok=True)  # of a process that died
-    assert files.place(shipment, lambda piece: piece).read_bytes() == b"weights"
+    assert files.place(shipment, lambda item: item).read_bytes() == b"weights"
     assert not list(cache.glob("*.part"))
 
 
 def test_a_checkpoint_in_one_file_takes_its_config_along(tmp_path: Path, cache: Path) -> None:
     for name in ("model.safetensors", "config.json", "other.json"):
         (tmp_path / name).write_text(name)
-    placed = files.place(files.pack(tmp_path / "model.safetensors", lambda piece: piece), lambda piece: piece)
+    placed = files.place(files.pack(tmp_path / "model.safetensors", lambda item: item), lambda item: item)
     assert sorted(path.name for path in placed.parent.iterdir()) == ["config.json", "model.safetensors"]
 
 
@@ -244,6 +244,6 @@ def test_a_link_to_a_file_keeps_its_own_name(tmp_path: Path) -> None:
     given = [str(tmp_path / name / "model.safetensors") for name in ("one", "two")]
     sources, _ = files.located((), given)
     assert list(sources) == given
-    shipments = [files.pack(path, lambda piece: piece) for path in sources.values()]
+    shipments = [files.pack(path, lambda item: item) for path in sources.values()]
     assert {shipment.name for shipment in shipments} == {"model.safetensors"}
     assert shipments[0].sha256 != shipments[1].sha256  # each has the config beside it

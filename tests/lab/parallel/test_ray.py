@@ -66,19 +66,19 @@ class TwoNodes:
         return {"num_cpus": 2, "env_vars": environment, "include_dashboard": False}
 
     def processes(self, name: str) -> list[int]:
-        """The processes of a node that work on a piece at this moment."""
+        """The processes of a node that work on a item at this moment."""
         node = self.cluster.head_node if name == "first" else self.second
         raylet = node.all_processes["raylet"][0].process.pid
         children = Path(f"/proc/{raylet}/task/{raylet}/children").read_text().split()
-        return [pid for pid in map(int, children) if title(pid) == "ray::run_piece"]
+        return [pid for pid in map(int, children) if title(pid) == "ray::run_item"]
 
     def kill_process(self, name: str) -> None:
-        """Kills a process of a node in the middle of a piece."""
+        """Kills a process of a node in the middle of a item."""
         wait_for(lambda: bool(self.processes(name)))
         os.kill(self.processes(name)[0], signal.SIGKILL)
 
     def kill_node(self) -> None:
-        """Kills the second node with everything that runs on it, in the middle of pieces."""
+        """Kills the second node with everything that runs on it, in the middle of items."""
         wait_for(lambda: bool(self.processes("second")))
         self.cluster.remove_node(self.second, allow_graceful=False)
 
@@ -121,7 +121,7 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoNodes]
 
 
 class Deaths:
-    """Kills a process when `process` pieces are done, and a node when `node` are."""
+    """Kills a process when `process` items are done, and a node when `node` are."""
 
     def __init__(self, nodes: TwoNodes, process: int, node: int) -> None:
         self.nodes, self.process, self.node, self.done = nodes, process, node, 0
@@ -248,7 +248,7 @@ def test_pieces_that_kill_their_process_are_given_up_and_errors_are_raised(
 
 
 def test_pieces_that_run_out_of_memory_are_given_up_too(tmp_path: Path) -> None:
-    # Ray's own monitor ends every piece, since more than no memory is in use.
+    # Ray's own monitor ends every item, since more than no memory is in use.
     monitor = {"RAY_memory_usage_threshold": "0.0", "RAY_memory_monitor_refresh_ms": "100"}
     work = Square(tmp_path / "log", holds=60.0)
     counted = mock.patch.object(parallel_cluster, "result_of", wraps=parallel_cluster.result_of)

@@ -1,29 +1,29 @@
-"""The one function that runs pieces of work."""
+"""The one function that runs work items."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from saccade_lab.parallel.workers import Lost, Piece, Result, Workers
+from saccade_lab.parallel.workers import Lost, Item, Result, Workers
 
 
 def each(
-    work: Callable[[Piece], Result],
-    pieces: Sequence[Piece],
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
     workers: Workers,
     files: Sequence[str | Path] = (),
-) -> Iterator[tuple[Piece, Result | Lost]]:
-    """Computes pieces, in this process or in others, and yields each with its result when it is done.
+) -> Iterator[tuple[Item, Result | Lost]]:
+    """Computes items, in this process or in others, and yields each with its result when it is done.
 
-    A piece whose process or machine died, for whatever reason, is computed again, so its result must not
+    A item whose process or machine died, for whatever reason, is computed again, so its result must not
     depend on how often it is begun. If its processes die `RETRIES` + 1 times, its result is `Lost`, and the
     others go on.
 
     Args:
-        work: function from a piece to its result. In other processes it is pickled, and keeps nothing from
+        work: function from a item to its result. In other processes it is pickled, and keeps nothing from
             one call to the next but what its module keeps.
-        pieces: arguments of `work`.
+        items: arguments of `work`.
         workers: where they run.
         files: files and directories that `work` reads. Its fields name them by strings or paths, also in
             dataclasses, sequences and mappings; relative paths and links mean what they mean here. They are
@@ -31,23 +31,23 @@ def each(
             not exist are left as they are.
 
     Yields:
-        Piece and result, in the order of `pieces` if `workers.alone`, otherwise in any order.
+        Item and result, in the order of `items` if `workers.alone`, otherwise in any order.
 
     Raises:
         MissingExtraError: joblib or ray is needed and not installed.
         InputError: there is no cluster at the address, or its machines have another version of saccade.
-        Exception: what `work` raised. Pieces that were begun are abandoned.
+        Exception: what `work` raised. Items that were begun are abandoned.
 
     Example:
         >>> sorted(each(abs, [-1, 2, -3], Workers()))
         [(-3, 3), (-1, 1), (2, 2)]
     """
     if workers.alone:
-        return ((piece, work(piece)) for piece in pieces)
+        return ((item, work(item)) for item in items)
     if workers.backend == "ray":
         from saccade_lab.parallel import cluster
 
-        return cluster.each(work, pieces, workers, files)
+        return cluster.each(work, items, workers, files)
     from saccade_lab.parallel import local
 
-    return local.each(work, pieces, workers.jobs)
+    return local.each(work, items, workers.jobs)
