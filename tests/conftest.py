@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import hypothesis
 import pytest
 
 from saccade import _saccade
 from tests.helpers.released import NAMES, Released, load_released
+from tests.helpers.tiers import TIERS, tier_of
 
 # pytest-xdist tells its workers the width of the terminal. The programs under test see no terminal.
 os.environ.pop("COLUMNS", None)
@@ -37,3 +39,25 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Each instruction set that this machine has. Heads built in the test use it."""
     monkeypatch.setenv("SACCADE_ISA", request.param)
     return str(request.param)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m core` or `-m "core or torch"`, modules of other tiers are not imported: packages may be missing."""
+    asked = config.option.markexpr.split(" or ")
+    if set(asked) <= set(TIERS) and _is_test(collection_path) and tier_of(collection_path) not in asked:
+        return True
+    return None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks each test with its tier."""
+    for item in items:
+        if _is_test(item.path):
+            item.add_marker(tier_of(item.path))
+
+
+def _is_test(path: Path) -> bool:
+    """Whether a path is that of a test module below this directory."""
+    return (
+        path.name.startswith("test_") and path.suffix == ".py" and path.is_relative_to(Path(__file__).parent)
+    )

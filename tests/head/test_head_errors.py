@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import load_file
 
 import saccade
 from saccade._internal.arrays import does_not_fit
 from tests.helpers.released import load_released
+from tests.helpers.tensor_files import read_tensor_file
 
 TINY = load_released("n15_tiny")
 HEAD = saccade.ActionHead.from_pretrained(TINY.path, config=TINY.config)
@@ -217,7 +217,8 @@ def test_names_that_are_not_valid_unicode() -> None:
 
 
 def test_a_head_of_tensors_cannot_be_pickled() -> None:
-    tensors = {name.removeprefix("action_head."): value for name, value in load_file(TINY.path).items()}
+    _, stored = read_tensor_file(TINY.path)
+    tensors = {name.removeprefix("action_head."): value for name, value in stored.items()}
     tensors = {name: value for name, value in tensors.items() if not name.startswith("_")}
     head = saccade.ActionHead.from_tensors(tensors, config=TINY.config)
     with pytest.raises(Dtype, match=r"use ActionHead\.load"):

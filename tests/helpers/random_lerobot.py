@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
-from safetensors.numpy import save_file
 
 from tests.helpers import oracle_lerobot
 from tests.helpers.random_processor import offsets
 from tests.helpers.random_robots import F32, JOINTS, rotation, statistics_row, write
+from tests.helpers.tensor_files import write_tensor_file
 
 MAPPING = {
     "n1.5": {
@@ -76,7 +76,7 @@ class Robot:
             write(folder / f"{name}.json", pipeline)
             for step in pipeline["steps"]:
                 if file := step.get("state_file"):
-                    save_file(self.states[step["registry_name"]], folder / file)
+                    write_tensor_file(folder / file, self.states[step["registry_name"]])
         return folder
 
     def state(self) -> F32:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import safe_open
 
 from saccade import Chunking
+from tests.helpers.paths import DATA
+from tests.helpers.tensor_files import read_tensor_file
 
-DATA = Path(__file__).parents[1] / "data"
 NAMES = ("n15_tiny", "n15_single_view", "n15_bf16")
 VARIANTS = ("n17_tiny", "n17_rtc", "fork_two_decoders")
 
@@ -57,11 +57,7 @@ class Released:
 def load_released(name: str) -> Released:
     """The file of that name; read-only arrays, since all tests share them."""
     path = DATA / f"{name}.safetensors"
-    with safe_open(path, framework="np") as file:
-        metadata = file.metadata()
-        arrays = {key: file.get_tensor(key) for key in file.keys() if key.startswith("_")}  # noqa: SIM118
-    for array in arrays.values():
-        array.flags.writeable = False
+    metadata, arrays = read_tensor_file(path, "_")
     optional = ("attention_mask", "image_mask", "previous_chunk")
     options: dict[str, Any] = {name: arrays[f"_in.{name}"] for name in optional if f"_in.{name}" in arrays}
     if "rtc" in metadata:

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import safe_open
 
 import saccade
+from tests.helpers import paths
+from tests.helpers.tensor_files import read_tensor_file
 
-DATA = Path(__file__).parents[1] / "data" / "backbone"
+DATA = paths.DATA / "backbone"
 N15 = ("n15_one_view", "n15_two_views", "n15_batch_padded", "n15_bf16", "n15_pixel_shuffle")
 N17 = ("n17_one_view", "n17_two_views", "n17_batch_padded")
 NAMES = (*N15, "n16_two_views", *N17)
@@ -74,12 +75,8 @@ class ReleasedBackbone:
 @functools.cache
 def released_backbone(name: str) -> ReleasedBackbone:
     """The file of that name; read-only arrays, since all tests share them."""
-    with safe_open(DATA / f"{name}.safetensors", framework="np") as file:
-        about = json.loads(file.metadata()["about"])
-        arrays = {key: file.get_tensor(key) for key in file.keys() if key.startswith("_")}  # noqa: SIM118
-    for array in arrays.values():
-        array.flags.writeable = False
-    return ReleasedBackbone(name, about, arrays)
+    metadata, arrays = read_tensor_file(DATA / f"{name}.safetensors", "_")
+    return ReleasedBackbone(name, json.loads(metadata["about"]), arrays)
 
 
 def relative_error(given: NDArray[Any], expected: NDArray[Any]) -> float:

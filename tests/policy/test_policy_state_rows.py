@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from safetensors.numpy import load_file
 
 import saccade
 from saccade.checkpoints import describe, random_checkpoint
@@ -23,6 +22,7 @@ from saccade.checkpoints.whole import robots_of
 from saccade_lab.reference import ActionHead as Reference
 from tests.helpers import released
 from tests.helpers.reference_cases import relative_error
+from tests.helpers.tensor_files import read_tensor_file
 
 ROBOTS = released.DATA / "robots"
 N15, N16 = ROBOTS / "n15" / "13-history", ROBOTS / "n16_n17" / "14-n16-history"
@@ -67,7 +67,7 @@ def data_config(*cameras: str) -> dict[str, Any]:
 
 @functools.cache
 def tensors_of(case: Path) -> Arrays:
-    return load_file(case / "case.safetensors")
+    return read_tensor_file(case / "case.safetensors")[1]
 
 
 def observation(policy: saccade.Policy, case: Path) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from safetensors.numpy import load_file
 
 import saccade
 from tests.helpers import released
+from tests.helpers.tensor_files import read_tensor_file
 
 DATA = released.DATA / "robots"
 
@@ -55,7 +55,7 @@ def is_taken(case: dict[str, Any]) -> bool:
     "folder", [one for one in cases("n15", "n16_n17") if is_taken(case_of(one.values[0]))]
 )
 def test_isaac_gr00t(folder: Path) -> None:
-    case, tensors = case_of(folder), load_file(folder / "case.safetensors")
+    case, tensors = case_of(folder), read_tensor_file(folder / "case.safetensors")[1]
     normalizer = load(folder, case)
     assert normalizer.embodiment_id == case["embodiment_id"]
     assert normalizer.action_horizon == case.get("action_horizon", case.get("horizon"))
@@ -71,7 +71,7 @@ def test_isaac_gr00t(folder: Path) -> None:
 
 @pytest.mark.parametrize("folder", cases("lerobot"))
 def test_lerobot(folder: Path) -> None:
-    case, tensors = case_of(folder), load_file(folder / "case.safetensors")
+    case, tensors = case_of(folder), read_tensor_file(folder / "case.safetensors")[1]
     normalizer = load(folder, case)
     assert normalizer.embodiment_id == case["embodiment_id"]
     assert normalizer.action_horizon == case["horizon"]
@@ -116,7 +116,7 @@ def test_a_chunk_in_the_robots_units_goes_back(folder: Path) -> None:
     if not is_taken(case):
         return
     normalizer = load(folder, case)
-    tensors = load_file(folder / "case.safetensors")
+    tensors = read_tensor_file(folder / "case.safetensors")[1]
     if folder.parent.name == "lerobot":
         state = tensors["observation.state"].astype(np.float32)
     else:
