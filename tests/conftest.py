@@ -42,7 +42,10 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """With `-m core` or `-m "core or torch"`, modules of other tiers are not imported: packages may be missing."""
+    """With `-m core` or `-m "core or torch"`, modules of other tiers are not imported.
+
+    The packages that they need may be missing.
+    """
     asked = config.option.markexpr.split(" or ")
     if set(asked) <= set(TIERS) and _is_test(collection_path) and tier_of(collection_path) not in asked:
         return True

@@ -221,5 +221,5 @@ def test_a_head_of_tensors_cannot_be_pickled() -> None:
     tensors = {name.removeprefix("action_head."): value for name, value in stored.items()}
     tensors = {name: value for name, value in tensors.items() if not name.startswith("_")}
     head = saccade.ActionHead.from_tensors(tensors, config=TINY.config)
-    with pytest.raises(Dtype, match=r"use ActionHead\.load"):
+    with pytest.raises(Dtype, match=r"use ActionHead\.from_pretrained"):
         pickle.dumps(head)

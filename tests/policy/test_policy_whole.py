@@ -212,7 +212,9 @@ def test_half_a_checkpoint_is_named(layout: str, tmp_path: Path) -> None:
             Policy.from_pretrained(folder, embodiment=EMBODIMENT)
     alone = tmp_path / "alone"
     layouts.write(alone, "saccade")
-    with pytest.raises(CheckpointError, match=r"saccade\.ActionHead\.load\(checkpoint\)\.policy\(\)"):
+    with pytest.raises(
+        CheckpointError, match=r"saccade\.ActionHead\.from_pretrained\(checkpoint\)\.policy\(\)"
+    ):
         Policy.from_pretrained(alone)
 
 
