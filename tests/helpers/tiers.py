@@ -1,9 +1,9 @@
 """The tier of a test module, from what it imports: `core`, `torch` or `lab`.
 
-`core` needs the wheel, NumPy, pytest and Hypothesis. `torch` also needs torch, the reference implementation of
-the model, or the programs that saccade is compared with. `lab` needs the rest of saccade_lab, or the programs of
-`benches`. A module belongs to the highest tier of what it and its helpers import, also inside functions, and of
-its folder: some tests run programs that import more.
+`core` needs the wheel, NumPy, pytest and Hypothesis. `torch` also needs torch, the reference implementation
+of the model, or programs that saccade is compared with. `lab` needs the rest of saccade_lab, or the programs
+of `benches`. A module belongs to the highest tier of what it and its helpers import, also inside functions,
+and of its folder: some tests run programs that import more.
 """
 
 from __future__ import annotations
@@ -63,4 +63,5 @@ def _imports(path: Path) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
