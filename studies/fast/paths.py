@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.patches import Circle
+
+from saccade._internal.files import write_atomically
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.rollout import Episode, run_episode
 from saccade_lab.sim.scenarios import TOUCH, Fork
@@ -15,8 +17,6 @@ from saccade_lab.study import figures
 from saccade_lab.study.questions.fast_engine import policy_in
 from saccade_lab.study.questions.fast_modes import Calibration, Mode
 from saccade_lab.study.simulator import environment_of
-
-from saccade._internal.files import write_atomically
 
 EPISODES = 40
 MODES = {"one Euler step": "float32-euler-1", "four Euler steps": "float32-euler-4"}

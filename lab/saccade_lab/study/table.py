@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import lzma
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from saccade._internal.files import sha256_of, write_atomically, write_json
+from saccade._internal.files import write_atomically, write_json
 from saccade.errors import InputError
 
 
@@ -55,17 +58,38 @@ def write_table(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Reads what `write_table` wrote; empty fields are NaN.
+    """Reads what `write_table` wrote, or the same compressed with `xz`; empty fields are NaN.
 
     Raises:
         FileNotFoundError: the file does not exist.
         InputError: the file is not CSV.
     """
-    if path.stat().st_size <= 1:  # a table without rows has no columns
+    return parse_table(table_content(path), path)
+
+
+def table_content(path: Path) -> bytes:
+    """The bytes of a table, decompressed if its name ends in `.xz`.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        InputError: it cannot be decompressed.
+    """
+    content = path.read_bytes()
+    if path.suffix != ".xz":
+        return content
+    try:
+        return lzma.decompress(content)
+    except lzma.LZMAError as error:
+        raise InputError(f"{path}: cannot be decompressed: {error}") from None
+
+
+def parse_table(content: bytes, path: Path) -> pd.DataFrame:
+    """The table in the bytes of a CSV file; `path` names it in an `InputError`."""
+    if len(content) <= 1:  # a table without rows has no columns
         return pd.DataFrame()
     try:
         # Words like "none" or "NA" are names here, not missing values.
-        return pd.read_csv(path, keep_default_na=False, na_values=[""], low_memory=False)
+        return pd.read_csv(io.BytesIO(content), keep_default_na=False, na_values=[""], low_memory=False)
     except (pd.errors.ParserError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a table: {error}") from None
 
@@ -91,7 +115,7 @@ def read_provenance(path: Path) -> Provenance:
 
 
 def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
-    """The table of a study and its provenance.
+    """The table of a study and its provenance. The table may be compressed: `OUT/<study>.csv.xz`.
 
     Raises:
         FileNotFoundError: one of the two files does not exist.
@@ -99,8 +123,11 @@ def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
     """
     provenance = read_provenance(provenance_path(out, study))
     path = table_path(out, study)
-    table = read_table(path)
-    if provenance.table_sha256 not in ("", sha256_of(path)):
+    packed = path.with_name(f"{path.name}.xz")
+    path = packed if packed.exists() and not path.exists() else path
+    content = table_content(path)
+    table = parse_table(content, path)
+    if provenance.table_sha256 not in ("", hashlib.sha256(content).hexdigest()):
         raise InputError(
             f"{path}: not as its study wrote it (edited, truncated, or the run was killed while writing); "
             "run the study again: finished cells are not repeated"

@@ -34,7 +34,7 @@ def released_std(width: int) -> float:
 
     What a linear layer returns grows with the square root of the width of its input. With the released 0.02,
     the encoded actions of a head of width 64 begin much smaller than their positions, which they do not in
-    GR00T N1.5 (`studies/answer/initial_scale.py`).
+    GR00T N1.5 (`studies/why-32/initial_scale.py`).
 
     Example:
         >>> released_std(1536), round(released_std(64), 3)
