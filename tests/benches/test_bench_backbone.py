@@ -36,7 +36,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("views", "tokens", "expected"), [(1, 287, 285.5), (2, 550, 559.8), (3, 813, 837.6)])
-def test_multiply_adds_are_those_of_the_specification(views: int, tokens: int, expected: float) -> None:
+def test_multiply_adds_are_those_that_were_counted_by_hand(views: int, tokens: int, expected: float) -> None:
     works = backbone_work(PUBLISHED, [(16, 16)] * views, tokens)
     assert round(total(works).multiply_adds / 1e9, 1) == expected
 

@@ -224,9 +224,7 @@ def test_options_and_config() -> None:
 def test_such_a_head_is_not_pickled(tmp_path: Path) -> None:
     head = made(weights())
     for action in (pickle.dumps, copy.copy, copy.deepcopy):
-        with pytest.raises(
-            TypeError, match=r"from_tensors cannot be pickled .* ActionHead\.from_pretrained"
-        ):
+        with pytest.raises(TypeError, match=r"from_tensors cannot be pickled .* ActionHead\.from_pretrained"):
             action(head)
     save(tmp_path, random_head(CONFIG, 1), CONFIG)
     from_file = saccade.ActionHead.from_pretrained(tmp_path)

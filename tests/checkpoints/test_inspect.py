@@ -29,7 +29,7 @@ from saccade.errors import CheckpointError, InputError
 from saccade_lab.reference.random_weights import CONFIGS, whole_config
 from tests.helpers import layout_heads, layouts
 
-#: Of the fork's head, at published sizes: the specification, section 2.3.
+#: Of the fork's head, at published sizes: counted by hand from the released code's shapes.
 N15_PARTS = {
     "DiT blocks": (224, 541_335_552),
     "timestep encoder": (4, 2_755_584),

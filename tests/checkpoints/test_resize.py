@@ -160,7 +160,7 @@ def test_a_bias_counts_in_merging(source: Path, tmp_path: Path) -> None:
 
 
 def test_none_at_all(source: Path, tmp_path: Path) -> None:
-    """As if all that looks at future tokens were cut (spec I5), which another part of the engine does."""
+    """As if all that looks at future tokens were cut, which another part of the engine does."""
     report = resize(source, tmp_path / "out", num_future_tokens=0)
     assert (report.sources, report.future_key_bias, report.is_exact) == ((), None, False)
     assert tokens_of(tmp_path / "out").shape == (0, 96)

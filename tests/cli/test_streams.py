@@ -17,6 +17,7 @@ from saccade._internal import json as _json
 from saccade._internal.files import write_atomically, write_json
 from saccade.cli import _output, main
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
+from tests.helpers.systems import IS_ROOT
 
 INSPECT = [sys.executable, "-m", "saccade", "inspect", str(DEMO_CHECKPOINT), "--no-time"]
 #: Prints what no ASCII stream can take, through rich and without.
@@ -79,7 +80,7 @@ def test_closed_errors_are_no_error() -> None:
     assert b"future tokens" in done.stdout
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
+@pytest.mark.skipif(not IS_ROOT, reason="only root mounts")
 @pytest.mark.parametrize("options", ["size=8k", "ro"])
 def test_disks_that_refuse_are_one_line(options: str, tmp_path: Path) -> None:
     disk, recording = tmp_path / "disk", str(tmp_path / "demos")

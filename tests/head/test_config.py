@@ -34,7 +34,7 @@ def test_a_version_is_told_by_the_keys_of_its_head(kind: str) -> None:
     assert read(whole) == read(alone)
 
 
-#: Table 5.1 of the specification, and section 1.11 for the fork's heads.
+#: What the published configs say, and the fork's code for its heads.
 PUBLISHED: dict[str, Config] = {
     "n1": {"context_dim": 1536, "num_future_tokens": 0, "use_vlln": False, "vl_num_layers": 0},
     "n1.5": {"context_dim": 2048, "num_future_tokens": 32, "use_vlln": True, "vl_num_layers": 4},

@@ -1,7 +1,6 @@
 """Interventions in the Rust head: the properties they must have.
 
-Properties I1 to I13 are those of section 6 of the specification. Where the same numbers are computed in the
-same order, bits are compared; elsewhere to 1e-5 * max(1, |value|).
+Where the same numbers are computed in the same order, bits are compared; elsewhere to 1e-5 * max(1, |value|).
 """
 
 from __future__ import annotations

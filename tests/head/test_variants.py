@@ -1,7 +1,7 @@
 """Every kind of head: N1, N1.5, N1.6, N1.7, forks with several decoders, a bias on future tokens.
 
-Properties of the Rust head on each instruction set and of the torch reference (numbers I… are those of
-section 6 of the specification), masks that are refused, and what only training uses.
+Properties of the Rust head on each instruction set and of the torch reference, masks that are refused, and
+what only training uses.
 """
 
 # Calls of torch modules are untyped.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import json
-import resource
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -59,14 +58,16 @@ def names(folder: Path) -> set[str]:
 
 
 @contextlib.contextmanager
-def limited(kind: int, soft: int) -> Iterator[None]:
-    """A limit of this process, for a while."""
-    before = resource.getrlimit(kind)
-    resource.setrlimit(kind, (soft, before[1]))
+def limited(kind: str, soft: int) -> Iterator[None]:
+    """A limit of this process, such as `"RLIMIT_NOFILE"`, for a while. Skips where there are none."""
+    resource = pytest.importorskip("resource")
+    number = getattr(resource, kind)
+    before = resource.getrlimit(number)
+    resource.setrlimit(number, (soft, before[1]))
     try:
         yield
     finally:
-        resource.setrlimit(kind, before)
+        resource.setrlimit(number, before)
 
 
 class Meddler:

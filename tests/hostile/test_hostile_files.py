@@ -9,7 +9,6 @@ import functools
 import json
 import math
 import os
-import resource
 import struct
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from saccade.checkpoints import describe, quantize, read_tensors
 from saccade.errors import CheckpointError
 from tests.helpers import hostile_cases
 from tests.helpers.hostile_cases import TINY, WRITERS, limited, names, refused
+from tests.helpers.systems import IS_ROOT
 
 # Fixtures.
 good, no_hang = hostile_cases.good, hostile_cases.no_hang
@@ -356,7 +356,7 @@ def sharded(folder: Path, count: int) -> None:
 def test_more_files_than_may_be_open(entry: str, good: Path) -> None:
     sharded(good, 40)
     out = good.parent / "out"
-    with limited(resource.RLIMIT_NOFILE, len(list(Path("/proc/self/fd").iterdir())) + 10):
+    with limited("RLIMIT_NOFILE", len(list(Path("/proc/self/fd").iterdir())) + 10):
         refused(
             lambda: READERS[entry](good) if entry in READERS else WRITERS[entry](good, out),
             "Too many open files",
@@ -399,7 +399,7 @@ def test_more_than_there_is_memory_for(entry: str, dtype: str, tmp_path: Path) -
     assert "cannot allocate" in done.stdout
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="changing to a user who may not read needs root")
+@pytest.mark.skipif(not IS_ROOT, reason="changing to a user who may not read needs root")
 def test_files_that_may_not_be_read(good: Path) -> None:
     (good / "model.safetensors").chmod(0)
     code = (

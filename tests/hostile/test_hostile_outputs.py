@@ -7,7 +7,6 @@ leaves nothing behind.
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -19,6 +18,7 @@ import pytest
 import saccade
 from tests.helpers import hostile_cases
 from tests.helpers.hostile_cases import TINY, WRITERS, Meddler, limited, names, refused
+from tests.helpers.paths import ROOT
 
 # Fixtures.
 good, no_hang = hostile_cases.good, hostile_cases.no_hang
@@ -26,7 +26,7 @@ good, no_hang = hostile_cases.good, hostile_cases.no_hang
 
 @pytest.mark.parametrize("entry", WRITERS)
 def test_a_disk_that_is_full(entry: str, good: Path) -> None:
-    with limited(resource.RLIMIT_FSIZE, 50_000):
+    with limited("RLIMIT_FSIZE", 50_000):
         refused(lambda: WRITERS[entry](good, good.parent / "out"), "out: .* cannot be written")
     assert names(good.parent) == {"good"}
 
@@ -182,12 +182,12 @@ def test_a_folder_in_the_source_is_written_and_changes_nothing_there(entry: str,
 @pytest.mark.parametrize("entry", WRITERS)
 def test_a_killed_writer_leaves_no_checkpoint(entry: str, good: Path, tmp_path: Path) -> None:
     code = (
-        "import os, signal, sys; sys.path.insert(0, os.environ['TESTS']);"
-        "import hostile_cases as t; from pathlib import Path;"
+        "import os, signal, sys; sys.path.insert(0, os.environ['ROOT']);"
+        "from tests.helpers import hostile_cases as t; from pathlib import Path;"
         "kill = lambda: os.kill(os.getpid(), signal.SIGKILL);"
         "t.WRITERS[sys.argv[1]](Path('good'), Path('out'), progress=t.Meddler(kill))"
     )
-    environment = os.environ | {"TESTS": str(Path(__file__).parents[1])}
+    environment = os.environ | {"ROOT": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", code, entry], cwd=tmp_path, env=environment, capture_output=True, check=False
     )

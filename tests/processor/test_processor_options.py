@@ -95,7 +95,7 @@ def test_lerobots_n15_leaves_the_resizing_to_eagle() -> None:
 
 
 def torchvision(frame: npt.NDArray[np.uint8], target: list[int], crop: list[int]) -> npt.NDArray[np.uint8]:
-    """Resize, centre crop, resize, as the specification words it."""
+    """Resize, centre crop, resize."""
     import torch
 
     def resized(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

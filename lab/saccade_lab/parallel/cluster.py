@@ -7,9 +7,9 @@ import functools
 import logging
 import os
 import socket
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,7 +18,7 @@ import saccade
 from saccade.errors import InputError, SaccadeError
 from saccade_lab.extras import LAB
 from saccade_lab.parallel.files import Shipment, located, pack, place, relocated
-from saccade_lab.parallel.workers import RETRIES, Lost, Item, Result, Workers
+from saccade_lab.parallel.workers import RETRIES, Item, Lost, Result, Workers
 
 SECONDS_TO_CONNECT = 10.0
 
@@ -50,9 +50,9 @@ def each(
 ) -> Iterator[tuple[Item, Result | Lost]]:
     """As `saccade_lab.parallel.each`.
 
-    Files are put into Ray's object store here; each machine fetches them when its first item begins. A item
-    whose process, machine or result was lost is given to Ray again after the others, which leaves time for
-    memory to become free. Ray itself would repeat one that ran out of memory without limit.
+    Files are put into Ray's object store here; each machine fetches them when its first item begins. Ray's
+    `runtime_env` cannot bring them: it is one message of at most 512 MiB. Ray repeats an item whose process,
+    machine or result was lost.
     """
     LAB.require("ray")
     with connected(workers.address) as ray:
@@ -62,27 +62,19 @@ def each(
         # In a list, because Ray would replace the reference by the job, once for every item.
         job = [ray.put(Job(work, shipments, saccade.__version__))]
         task = ray.remote(run_item).options(
-            num_cpus=workers.num_threads, max_retries=0, scheduling_strategy="SPREAD"
+            num_cpus=workers.num_threads, max_retries=RETRIES, scheduling_strategy="SPREAD"
         )
-        attempts = [0] * len(items)
-        waiting = deque(range(len(items)))
-        running: dict[Any, int] = {}
+        waiting = iter(items)
+        running: dict[Any, Any] = {}
         try:
-            while waiting or running:
-                while waiting and len(running) < most_at_once(ray, workers):
-                    index = waiting.popleft()
-                    attempts[index] += 1
-                    running[task.remote(job, items[index])] = index
+            while True:
+                for item in islice(waiting, max(0, most_at_once(ray, workers) - len(running))):
+                    running[task.remote(job, item)] = item
+                if not running:
+                    return
                 (done,), _ = ray.wait(list(running), num_returns=1)
-                index = running.pop(done)
-                result = result_of(ray, done)
-                if not isinstance(result, Died):
-                    yield items[index], result
-                elif attempts[index] <= RETRIES:
-                    waiting.append(index)
-                else:
-                    died = f"its process or machine died in each of {RETRIES + 1} attempts: {result.reason}"
-                    yield items[index], Lost(died)
+                item = running.pop(done)
+                yield item, result_of(ray, done)
         finally:
             for reference in running:
                 with contextlib.suppress(Exception):  # of a cluster that is gone, which another error says
@@ -115,17 +107,6 @@ def received(reference: Any) -> Callable[[Any], Any]:
     return work
 
 
-@dataclass(frozen=True)
-class Died:
-    """What takes the place of a result if the process or the machine of a item died.
-
-    Attributes:
-        reason: What Ray says of it.
-    """
-
-    reason: str
-
-
 @contextlib.contextmanager
 def connected(address: str | None) -> Iterator[ModuleType]:
     """Ray, connected to a cluster; disconnected at the end, unless it was connected before.
@@ -134,6 +115,8 @@ def connected(address: str | None) -> Iterator[ModuleType]:
         InputError: there is no cluster at the address.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster that is started here reports to nobody
+    # Otherwise an item that runs out of memory is repeated without limit. Read when this process connects.
+    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))
     import ray
 
     if ray.is_initialized():
@@ -182,7 +165,7 @@ def most_at_once(ray: ModuleType, workers: Workers) -> int:
 
 
 def result_of(ray: ModuleType, reference: Any) -> Any:
-    """The result of a item, or `Died`.
+    """The result of an item, or `Lost` if its processes died again and again.
 
     Raises:
         ClusterError: Ray cannot go on.
@@ -201,6 +184,7 @@ def result_of(ray: ModuleType, reference: Any) -> Any:
         gone.OutOfMemoryError,
         gone.ObjectLostError,
     ) as error:
-        return Died(str(error).strip().splitlines()[0])
+        reason = str(error).strip().splitlines()[0]
+        return Lost(f"its process or machine died in each of {RETRIES + 1} attempts: {reason}")
     except gone.RayError as error:
         raise ClusterError(f"ray: {str(error).strip().splitlines()[-1]}") from None

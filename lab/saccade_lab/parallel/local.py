@@ -10,7 +10,7 @@ from itertools import islice
 from typing import Any
 
 from saccade_lab.extras import LAB
-from saccade_lab.parallel.workers import RETRIES, Lost, Item, Result
+from saccade_lab.parallel.workers import RETRIES, Item, Lost, Result
 
 LOST = Lost(f"a worker process died in each of {RETRIES + 1} attempts, perhaps out of memory")
 IDLE = 300  # seconds after which a process that has nothing to do ends
@@ -65,7 +65,7 @@ def _spread(
                 result = done.result()
                 yield running.pop(done), result
     except BrokenProcessPool as error:
-        # loky also raises this for a item that a process cannot unpickle, or a result that it cannot pickle.
+        # loky also raises this for an item that a process cannot unpickle, or a result that it cannot pickle.
         if not isinstance(error, TerminatedWorkerError):
             raise
         for index in running.values():

@@ -8,7 +8,7 @@ from typing import TypeVar
 from saccade.errors import InputError
 
 BACKENDS = ("loky", "ray")
-RETRIES = 3  # of a item whose process died, before it is given up
+RETRIES = 3  # of an item whose process died, before it is given up
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -21,7 +21,7 @@ class Workers:
     Attributes:
         backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
         jobs: Number of items at the same time. -1: one for each core, of this machine or of the cluster.
-            With loky 1 stands for this process, which a item may then end; -1 never does, also on one core.
+            With loky 1 stands for this process, which an item may then end; -1 never does, also on one core.
         address: Address of the Ray cluster. Default: that of the environment variable `RAY_ADDRESS`, then a
             cluster that runs on this machine, then one that is started here for this run.
         num_threads: Threads of one item, which it reserves on a Ray cluster.
@@ -61,7 +61,7 @@ ALONE = Workers()
 
 @dataclass(frozen=True)
 class Lost:
-    """What takes the place of a result if the processes that computed a item died again and again.
+    """What takes the place of a result if the processes that computed an item died again and again.
 
     Attributes:
         reason: What is known about it.

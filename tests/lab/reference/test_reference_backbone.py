@@ -201,7 +201,7 @@ def test_the_size_of_the_published_backbone() -> None:
     sizes = BackboneSizes.from_config({"model_type": "gr00t_n1_5"})
     counts = {
         name: math.prod(shape) for name, shape in backbone_tensors.tensor_shapes(sizes)
-    }  # the counts of the specification
+    }  # the published numbers of parameters
     assert sum(count for name, count in counts.items() if ".vision_model." in name) == 412_442_352
     assert sum(count for name, count in counts.items() if ".mlp1." in name) == 2_361_344
     decoder = [count for name, count in counts.items() if ".layers." in name and ".language_model." in name]

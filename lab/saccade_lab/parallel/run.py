@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from saccade_lab.parallel.workers import Lost, Item, Result, Workers
+from saccade_lab.parallel.workers import Item, Lost, Result, Workers
 
 
 def each(
@@ -21,7 +21,7 @@ def each(
     others go on.
 
     Args:
-        work: function from a item to its result. In other processes it is pickled, and keeps nothing from
+        work: function from an item to its result. In other processes it is pickled, and keeps nothing from
             one call to the next but what its module keeps.
         items: arguments of `work`.
         workers: where they run.
