@@ -9,6 +9,7 @@ import hypothesis
 import pytest
 
 from saccade import _saccade
+from tests.helpers.progress import Progress
 from tests.helpers.released import NAMES, Released, load_released
 from tests.helpers.tiers import TIERS, tier_of
 
@@ -26,6 +27,13 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("saccade")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """With several processes, the one that hands out the tests says how far they are."""
+    several = config.getoption("numprocesses", None) and not hasattr(config, "workerinput")
+    if several and config.option.verbose <= 0:
+        config.pluginmanager.register(Progress(config))
 
 
 @pytest.fixture(params=NAMES)
