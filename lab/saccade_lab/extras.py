@@ -22,6 +22,7 @@ LAB = Extras(
             "jinja2": "jinja2",
             "scipy": "scipy",
             "joblib": "joblib",
+            "cpuinfo": "py-cpuinfo",
         },
         "study": {
             "torch": "torch",
@@ -41,13 +42,13 @@ _TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn", "threadpoolctl
 _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
 #: The optional packages of each command, checked together once its arguments have been parsed.
 NEEDS: dict[str, tuple[str, ...]] = {
-    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy"),
+    "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy", "cpuinfo"),
     "demos": ("rich", *_SIMULATOR),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
     "attention --frames": ("rich", *_PICTURES, "jinja2", "scipy"),
-    "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib"),
-    "study --features": ("rich", *_PICTURES, *_TABLES, "joblib"),
+    "study": ("rich", *_SIMULATOR, *_PICTURES, "torch", "safetensors", *_TABLES, "joblib", "cpuinfo"),
+    "study --features": ("rich", *_PICTURES, *_TABLES, "joblib", "cpuinfo"),
     "study report": (*_PICTURES, *_TABLES),
     "parity": ("torch", "safetensors"),
 }

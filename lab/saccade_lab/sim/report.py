@@ -13,9 +13,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 import saccade
 from saccade._internal.arrays import UInt8Array
-from saccade._internal.environment import cpu_name
 from saccade._internal.files import write_atomically
 from saccade_lab.intervals import wilson
+from saccade_lab.machine import cpu_name
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.rollout import PARTS, Episode
 
