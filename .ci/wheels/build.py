@@ -1,10 +1,11 @@
-"""Builds a wheel: one file for every CPython from 3.10 on, for x86-64 or ARM Linux with an old glibc.
+"""Builds the wheels of saccade (one file for every CPython from 3.10 on, for x86-64 or ARM Linux with an old
+glibc), of the lab and of the lerobot plugin.
 
     python .ci/wheels/build.py --out dist [--target aarch64-unknown-linux-gnu]
 
 The sources are those of the last commit, unpacked into an empty folder, so that no other file of the checkout
-gets into the wheel. Its timestamps are the commit's. The same commit, Rust and tools give the same bytes;
-`--twice` builds in two folders and compares. Needs an environment with `requirements.txt`.
+gets into a wheel. Timestamps are the commit's. The same commit, Rust and tools give the same bytes;
+`--twice` builds in two folders and compares. Needs an environment with `requirements/wheels.txt`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,11 @@ COMPATIBILITY = "manylinux_2_17"
 BUILD = (
     f"-m maturin build --release --locked --quiet --zig --compatibility {COMPATIBILITY} --auditwheel check"
 )
-
+#: Pure Python, the same for every target. The plugin needs lerobot to run, but not to be packed.
+PURE = ("./lab", "./plugins/lerobot")
+PACK = (
+    "-m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --ignore-requires-python"
+)
 
 #: What wheels are built for.
 TARGETS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu")
@@ -53,8 +58,8 @@ def has_standard_library(target: str) -> bool:
     return said.returncode == 0 and Path(said.stdout.strip()).is_dir()
 
 
-def build(commit: str, folder: Path, target: str) -> Path:
-    """Builds the wheel and returns it.
+def build(commit: str, folder: Path, target: str) -> list[Path]:
+    """Builds the wheels and returns them, that of saccade first.
 
     Args:
         commit: The commit to build.
@@ -80,7 +85,9 @@ def build(commit: str, folder: Path, target: str) -> Path:
     command = [sys.executable, *BUILD.split(), "--target", target, "--out", str(wheels)]
     subprocess.run(command, cwd=source, env=environment, check=True)
     (wheel,) = wheels.glob("*.whl")
-    return wheel
+    pack = [sys.executable, *PACK.split(), "--wheel-dir", str(wheels), *PURE]
+    subprocess.run(pack, cwd=source, env=environment, check=True)
+    return [wheel, *sorted(set(wheels.glob("*.whl")) - {wheel})]
 
 
 def digest(file: Path) -> str:
@@ -93,7 +100,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder of the wheel (default: dist)")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "dist", help="folder of the wheels (default: dist)"
+    )
     parser.add_argument(
         "--work", type=Path, default=ROOT / "target" / "wheel", help="folder that is kept between builds"
     )
@@ -115,16 +124,18 @@ def main() -> int:
     if args.twice:
         with tempfile.TemporaryDirectory() as folder:
             again = build(commit, Path(folder).resolve(), args.target)
-            if digest(again) != digest(built):
-                shutil.copy2(again, built.with_suffix(".again.whl"))
-                print(f"the two wheels differ: {built}, {built.with_suffix('.again.whl')}", file=sys.stderr)
-                return 1
+            for first, second in zip(built, again, strict=True):
+                if digest(first) != digest(second):
+                    kept = shutil.copy2(second, first.with_suffix(".again.whl"))
+                    print(f"the two wheels differ: {first}, {kept}", file=sys.stderr)
+                    return 1
         print("two builds in different folders are equal byte for byte")
     args.out.mkdir(parents=True, exist_ok=True)
-    wheel = args.out / built.name
-    partial = wheel.with_suffix(".partial")
-    shutil.copyfile(built, partial)
-    partial.replace(wheel)
+    for file in built:
+        partial = args.out / f"{file.name}.partial"
+        shutil.copyfile(file, partial)
+        partial.replace(args.out / file.name)
+    wheel = args.out / built[0].name
     wheel.with_suffix(".commit").write_text(commit[:7] + "\n")  # for the page of `test.py`
     subprocess.run([sys.executable, "-m", "auditwheel", "show", str(wheel)], check=True)
     print(f"{wheel}: {wheel.stat().st_size} bytes, commit {commit[:7]}")

@@ -1,11 +1,11 @@
-"""Tests the wheel as users install it, prints the results, and writes a page about them.
+"""Tests the wheels as users install them, prints the results, and writes a page about them.
 
     python .ci/wheels/test.py dist --page docs/wheels.md
 
 Runs: a fresh environment with the wheel and one NumPy, for each CPython and NumPy; one environment with each
-instruction set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with the extra
-`sim`. A failure is named in its row, and the exit status is then 1. Needs the environment that built the
-wheel, the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
+instruction set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with the wheel
+of the lab and its extra `sim`. A failure is named in its row, and the exit status is then 1. Needs the
+environment that built the wheels, the CPythons (on PATH or from pyenv), qemu-user and a C compiler.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import numpy.typing as npt
 from elftools.elf.elffile import ELFFile
 
 CHECK = Path(__file__).resolve().with_name("check.py")
+ROOT = CHECK.parents[2]
 PAGE = CHECK.with_name("page.md")  # a template
 #: CPython -> NumPy: the oldest that saccade accepts and that has a wheel for it, 1.26, 2.0, the newest.
 MATRIX = {
@@ -46,7 +47,7 @@ ARM_CPUS = {
     "max": "everything qemu has",
 }
 #: An ARM Python with NumPy, which `.ci/aarch64/run.sh setup` puts there.
-ARM_ROOT = CHECK.parent.parent.parent / "target" / "aarch64" / "root"
+ARM_ROOT = ROOT / "target" / "aarch64" / "root"
 #: Tolerance of actions against the portable path, by precision; int8 may round to a neighbour.
 TOLERANCE = {"float32": 1e-5, "bfloat16": 0.05, "int8": 0.1}
 #: Stops with an illegal instruction without AVX2: shows that the emulated CPU refuses what it lacks.
@@ -139,8 +140,8 @@ def contents(wheel: Path, folder: Path) -> dict[str, Any]:
     wanted = {
         "saccade/py.typed",
         "saccade/_saccade.pyi",
-        "saccade/sim/demo/config.json",
-        "saccade/sim/demo/model.safetensors",
+        "saccade/checkpoints/demo/config.json",
+        "saccade/checkpoints/demo/model.safetensors",
         f"{info}/licenses/LICENSE-MIT",
         f"{info}/licenses/LICENSE-APACHE",
         f"{info}/entry_points.txt",
@@ -161,10 +162,29 @@ def contents(wheel: Path, folder: Path) -> dict[str, Any]:
     glibc = max((tuple(map(int, n[6:].split("."))) for n in names if n.startswith("GLIBC_")), default=())
     return {
         "library": sizes["saccade/_saccade.abi3.so"],
-        "demo": sizes["saccade/sim/demo/model.safetensors"],
+        "demo": sizes["saccade/checkpoints/demo/model.safetensors"],
         "wheel": wheel.stat().st_size,
         "glibc": ".".join(map(str, glibc)),
     }
+
+
+def contents_of_lab(wheel: Path) -> None:
+    """Checks that the wheel of the lab has every file of its package and nothing else.
+
+    Raises:
+        Failed: something is missing, or does not belong there.
+    """
+    with zipfile.ZipFile(wheel) as archive:
+        names = {item.filename for item in archive.infolist() if not item.is_dir()}
+    listed = ["git", "ls-files", "saccade_lab"]
+    wanted = set(run(listed, ROOT / "lab").split())
+    if missing := wanted - names:
+        raise Failed(f"not in the wheel of the lab: {', '.join(sorted(missing))}")
+    if foreign := {name for name in names - wanted if ".dist-info/" not in name}:
+        raise Failed(f"should not be in the wheel of the lab: {', '.join(sorted(foreign))}")
+    licences = {Path(name).name for name in names if ".dist-info/licenses/" in name}
+    if licences != {"LICENSE-MIT", "LICENSE-APACHE"}:
+        raise Failed(f"expected two licences in the wheel of the lab, got {sorted(licences)}")
 
 
 def try_versions(wheel: Path, work: Path) -> list[list[str]]:
@@ -264,7 +284,7 @@ def refuses_avx2(qemu: str, work: Path) -> str:
     return "passed" if stopped in (-4, 132) else f"FAILED: exit status {stopped}"
 
 
-def try_rollouts(wheel: Path, work: Path) -> list[list[str]]:
+def try_rollouts(wheel: Path, lab: Path, work: Path) -> list[list[str]]:
     """A row for each CPython, with NumPy 1.26 where it exists and with the newest: one episode."""
     rows = []
     pairs = [(version, numpy) for version, numpys in MATRIX.items() for numpy in numpys]
@@ -274,7 +294,7 @@ def try_rollouts(wheel: Path, work: Path) -> list[list[str]]:
         row = [version, numpy]
         try:
             folder = work / f"rollout-{version}-{numpy}"
-            python = environment(version, folder, f"{wheel}[sim]", pin(numpy))
+            python = environment(version, folder, wheel, f"{lab}[sim]", pin(numpy))
             names = ("numpy", "mujoco", "metaworld", "gymnasium")
             code = f"import importlib.metadata as m; print(*map(m.version, {names}))"
             row = [version, *run([python, "-I", "-c", code], work).split()]
@@ -328,6 +348,8 @@ def main() -> int:
     parser.add_argument("--page", type=Path, help="where to write the page")
     args = parser.parse_args()
     wheel, arm_wheel = (of_architecture(args.folder.resolve(), name) for name in ("x86_64", "aarch64"))
+    (lab,) = args.folder.resolve().glob("saccade_vla_lab-*.whl")
+    contents_of_lab(lab)
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         inside = contents(wheel, work / "unpacked")
@@ -347,7 +369,7 @@ def main() -> int:
                 try_cpus(python, here["available_isas"], work),
             ),
             rollouts=table(
-                "CPython | NumPy | mujoco | metaworld | gymnasium | goal | ", try_rollouts(wheel, work)
+                "CPython | NumPy | mujoco | metaworld | gymnasium | goal | ", try_rollouts(wheel, lab, work)
             ),
             arm_glibc=inside_arm["glibc"],
             arm_wheel=f"{inside_arm['wheel'] / 1e6:.1f}",

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 #: What may be installed.
-EXPECTED = {"numpy", "pip", "saccade", "setuptools"}
+EXPECTED = {"numpy", "pip", "saccade-vla", "setuptools"}
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 

@@ -6,12 +6,15 @@ import importlib.metadata
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from saccade import SaccadeError
-from saccade._internal import extras as _extras
+from saccade._internal import extras
+from saccade._internal.extras import SACCADE, Extras
 from saccade.errors import MissingExtraError
+from saccade_lab.extras import LAB
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -19,12 +22,24 @@ else:
     from pip._vendor import tomli as tomllib
 
 ROOT = Path(__file__).parents[2]
+DISTRIBUTIONS = pytest.mark.parametrize("table", [SACCADE, LAB], ids=lambda table: str(table.distribution))
 
 
-@pytest.fixture
-def declared() -> dict[str, list[str]]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return dict(project["optional-dependencies"])
+def project(distribution: str) -> dict[str, Any]:
+    """The table `project` of a distribution's pyproject.toml."""
+    folder = {"saccade-vla": ROOT, "saccade-vla-lab": ROOT / "lab"}[distribution]
+    return dict(tomllib.loads((folder / "pyproject.toml").read_text())["project"])
+
+
+def required(distribution: str, extra: str) -> set[str]:
+    """The names of what an extra requires, those of saccade's extras included."""
+    found = set[str]()
+    for line in project(distribution)["optional-dependencies"][extra]:
+        name, extras_of = re.match(r"([\w.-]+)(?:\[(.*)\])?", line).groups()  # type: ignore[union-attr]
+        if name == distribution:
+            continue  # `includes` says so
+        found |= required(name, extras_of) if name == "saccade-vla" else {name}
+    return found
 
 
 @pytest.fixture
@@ -40,96 +55,87 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "crates").mkdir()
     (tmp_path / "pyproject.toml").touch()
     package = tmp_path / "python" / "saccade"
-    monkeypatch.setattr(_extras, "__file__", str(package / "_extras.py"))
+    monkeypatch.setattr(extras, "__file__", str(package / "_internal" / "extras.py"))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_the_table_is_that_of_pyproject(declared: dict[str, list[str]]) -> None:
-    names = {
-        extra: [re.split(r"[<>=\[ ]", requirement)[0] for requirement in requirements]
-        for extra, requirements in declared.items()
-    }
-    for extra, modules in _extras.EXTRAS.items():
-        assert set(modules.values()) == set(names[extra]) - {"saccade"}, extra
+@DISTRIBUTIONS
+def test_the_table_is_that_of_pyproject(table: Extras) -> None:
+    declared = project(table.distribution)
+    assert set(table.modules) == set(declared["optional-dependencies"])
+    # The lab itself requires saccade's extra cli; its table names those packages under the extra sim.
+    always = required("saccade-vla", "cli") if table is LAB else set[str]()
+    for extra, modules in table.modules.items():
+        expected = required(table.distribution, extra) | (always if extra == "sim" else set())
+        assert set(modules.values()) == expected, extra
 
 
-def test_included_extras_are_those_of_pyproject(declared: dict[str, list[str]]) -> None:
+@DISTRIBUTIONS
+def test_included_extras_are_those_of_pyproject(table: Extras) -> None:
+    declared = project(table.distribution)["optional-dependencies"]
+
     def included(extra: str) -> set[str]:
         direct = {
             name
             for requirement in declared[extra]
-            if (found := re.fullmatch(r"saccade\[(.*)\]", requirement))
+            if (found := re.fullmatch(rf"{table.distribution}\[(.*)\]", requirement))
             for name in found[1].split(",")
         }
         return direct.union(*map(included, direct)) if direct else set()
 
-    for extra in _extras.EXTRAS:
-        assert set(_extras.INCLUDES.get(extra, ())) == included(extra), extra
+    for extra in table.modules:
+        assert set(table.includes.get(extra, ())) == included(extra), extra
+
+
+def test_the_lab_requires_the_same_version() -> None:
+    version = project("saccade-vla-lab")["version"]
+    cargo = tomllib.loads((ROOT / "Cargo.toml").read_text())
+    assert version == cargo["workspace"]["package"]["version"]
+    assert project("saccade-vla-lab")["dependencies"] == [f"saccade-vla[cli]=={version}"]
 
 
 def test_nothing_is_raised_for_what_is_there() -> None:
-    _extras.require("rich", "torch")
+    SACCADE.require("rich", "torch")
 
 
 @pytest.mark.usefixtures("absent")
 def test_a_missing_module_is_an_import_error_with_its_name() -> None:
     with pytest.raises(MissingExtraError, match=r"^jinja2 is not installed") as caught:
-        _extras.require("pandas", "jinja2")
+        LAB.require("pandas", "jinja2")
     assert isinstance(caught.value, SaccadeError)
     assert isinstance(caught.value, ModuleNotFoundError)
     assert caught.value.name == "jinja2"
 
 
-@pytest.mark.usefixtures("absent")
-def test_all_extras_that_are_needed_are_named(checkout: Path) -> None:
-    with pytest.raises(MissingExtraError, match=re.escape("[cli,torch]'")):
-        _extras.require("rich", "torch")
-    with pytest.raises(MissingExtraError, match=re.escape("--editable '.[sim]'")):
-        _extras.require("rich", "mujoco")  # sim includes cli
-    with pytest.raises(MissingExtraError, match=re.escape("--editable '.[study]'")):
-        _extras.require("rich", "mujoco", "pandas")
+@pytest.mark.usefixtures("absent", "checkout")
+def test_all_extras_that_are_needed_are_named() -> None:
+    with pytest.raises(MissingExtraError, match=re.escape("--editable '.[cli,torch]'")):
+        SACCADE.require("rich", "torch")
+    with pytest.raises(MissingExtraError, match=re.escape("--editable './lab[sim]'")):
+        LAB.require("rich", "mujoco")
+    with pytest.raises(MissingExtraError, match=re.escape("--editable './lab[study]'")):
+        LAB.require("rich", "mujoco", "pandas")  # study includes sim
 
 
 def test_the_path_of_the_checkout_is_relative_to_the_working_directory(
     checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert _extras.install_command(["study"], ["jinja2"]).endswith("--editable '.[study]'")
+    assert LAB.install_command(["study"], ["jinja2"]).endswith("--editable './lab[study]'")
     monkeypatch.chdir(checkout.parent)
-    expected = f"--editable '{checkout.name}[study]'"
-    assert _extras.install_command(["study"], ["jinja2"]).endswith(expected)
+    assert SACCADE.install_command(["cli"], ["rich"]).endswith(f"--editable './{checkout.name}[cli]'")
+    assert LAB.install_command(["study"], ["jinja2"]).endswith(f"--editable './{checkout.name}/lab[study]'")
     monkeypatch.chdir("/")
-    command = _extras.install_command(["study"], ["jinja2"])
-    assert str(checkout).lstrip("/") in command
+    assert str(checkout).lstrip("/") in LAB.install_command(["study"], ["jinja2"])
 
 
-def test_an_environment_of_make_rollout_is_extended_by_make(
-    checkout: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_a_checkout_packages_and_versions_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    environment = checkout / ".venv"
-    environment.mkdir()
-    monkeypatch.setattr(sys, "prefix", str(environment))
-    (environment / ".rollout").touch()
-    assert _extras.install_command(["study"], ["jinja2"]) == "make setup-test"
-    assert "--editable" in _extras.install_command(["study", "ray"], ["ray"])  # make installs no ray
-    monkeypatch.chdir(checkout.parent)
-    assert _extras.install_command(["study"], ["jinja2"]) == f"make -C {checkout.name} setup-test"
-    (environment / ".test").touch()  # make has installed everything: it would not do so again
-    assert "--editable" in _extras.install_command(["study"], ["jinja2"])
-
-
-def test_the_targets_of_make_are_there() -> None:
-    makefile = (ROOT / "Makefile").read_text()
-    assert re.search(r"^setup-test:", makefile, re.MULTILINE)
-    assert "$(VENV)/.rollout" in makefile
-    assert "$(VENV)/.test" in makefile
-
-
-def test_a_wheel_names_packages_and_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_extras, "__file__", str(tmp_path / "lib" / "saccade" / "_extras.py"))
+    monkeypatch.setattr(extras, "__file__", str(tmp_path / "lib" / "saccade" / "_internal" / "extras.py"))
     requires = [
-        "numpy>=1.24",
-        "saccade[sim,torch] ; extra == 'study'",
+        "saccade-vla==0.1.0",
+        "saccade-vla-lab[sim] ; extra == 'study'",
         "jinja2>=3.1 ; extra == 'study'",
         "imageio>=2.31 ; extra == 'sim'",
         "imageio-ffmpeg>=0.5 ; extra == 'sim'",
@@ -138,7 +144,7 @@ def test_a_wheel_names_packages_and_versions(tmp_path: Path, monkeypatch: pytest
     ]
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: requires)
     modules = ["jinja2", "imageio", "imageio_ffmpeg", "packaging", "PIL"]
-    command = _extras.install_command(["study"], modules)
+    command = LAB.install_command(["study"], modules)
     expected = "'jinja2>=3.1' 'imageio>=2.31' 'imageio-ffmpeg>=0.5' packaging 'pillow>=10,<12'"
     assert command.endswith(f"pip install {expected}")
 
@@ -151,18 +157,18 @@ def test_packages_go_to_the_environment_that_runs(tmp_path: Path, monkeypatch: p
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "executable", str(folder / "python"))
     monkeypatch.setenv("PATH", "/nonexistent")
-    assert _extras.pip_install("rich") == "bin/python -m pip install rich"
+    assert extras.pip_install("rich") == "./bin/python -m pip install rich"
     monkeypatch.setenv("PATH", str(folder))
-    assert _extras.pip_install("rich>=13") == "pip install 'rich>=13'"
+    assert extras.pip_install("rich>=13") == "pip install 'rich>=13'"
     monkeypatch.setitem(sys.modules, "pip", None)
-    assert _extras.pip_install("rich") == "uv pip install --python bin/python rich"
+    assert extras.pip_install("rich") == "uv pip install --python ./bin/python rich"
 
 
 def test_an_import_that_failed_is_explained() -> None:
-    error = _extras.explain(ModuleNotFoundError("No module named 'jinja2.ext'", name="jinja2.ext"))
+    error = LAB.explain(ModuleNotFoundError("No module named 'jinja2.ext'", name="jinja2.ext"))
     assert error is not None
     assert error.name == "jinja2"
-    assert _extras.explain(ModuleNotFoundError("No module named 'x'", name="x")) is None
+    assert LAB.explain(ModuleNotFoundError("No module named 'x'", name="x")) is None
 
 
 @pytest.mark.usefixtures("absent")
@@ -170,4 +176,4 @@ def test_a_long_list_is_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("joblib", "pandas"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtraError, match=r"^jinja2, joblib, pandas and 2 more are not installed"):
-        _extras.require("jinja2", "joblib", "pandas", "torch", "rich")
+        LAB.require("jinja2", "joblib", "pandas", "torch", "rich")
