@@ -1,76 +1,108 @@
-"""Writes constraints.txt: one exact version of every Python package in the development environment.
+"""Writes requirements/NAME.txt: one exact version of every Python package of an environment.
 
-Each given interpreter resolves `.[all]` to the newest compatible versions. Where the versions differ, lines
-carry a marker. The last interpreter's versions also apply to every newer Python.
+    nox --session lock                  keeps the versions that are there
+    nox --session lock -- --upgrade     takes the newest ones
 
-    python .ci/lock.py python3.10 python3.11
+The versions hold for Python 3.10 and later on every system: lines carry markers where they differ. They are
+resolved by uv, from the index that pip is configured for. No file names an index.
 """
 
 from __future__ import annotations
 
-import json
+import os
 import re
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
+from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    from pip._vendor import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
-RELEASED_HEAD = "lerobot==0.4.4"  # installed without its requirements, so it is not in an extra of saccade
-# The numbers in the docs were measured with these versions. Change them deliberately, not in a refresh.
-HELD = ("torch==2.13.0", "gymnasium==1.4.0")
-HEADER = f"""\
-# One exact version of every Python package in the development environment; every pip call of the Makefile
-# uses it. Do not edit: `python .ci/lock.py python3.10 python3.11` writes it. Then run `make test`.
-{RELEASED_HEAD}
+OLDEST_PYTHON = "3.10"
+#: Distribution -> its pyproject.toml.
+PROJECTS = {"saccade-vla": ROOT / "pyproject.toml", "saccade-vla-lab": ROOT / "lab" / "pyproject.toml"}
+#: File -> the distributions with their extras, and the groups of pyproject.toml, that it serves. dev comes
+#: first: its versions hold for the others. That of wheels is apart, because what it has was tested together.
+FILES: dict[str, tuple[list[str], list[str]]] = {
+    "dev": (["saccade-vla[serve,torch,hub]", "saccade-vla-lab[study]"], ["dev"]),
+    "nox": ([], ["nox"]),
+    "core": (["saccade-vla"], ["build", "test"]),
+    "rollout": (["saccade-vla-lab[sim]"], ["build"]),
+    "ray": (["saccade-vla-lab[ray]"], ["build", "test", "measured"]),
+    "peers": ([], ["peers"]),
+    "lock": ([], ["lock"]),
+    "wheels": ([], ["wheels"]),
+}
+APART = ("dev", "wheels")
+#: Parity is tested against it. Its own requirements are not installed, so it is not resolved.
+RELEASED_HEAD = "lerobot==0.4.4"
+WITH_RELEASED_HEAD = ("dev", "peers")
+HEADER = """\
+# Every Python package of an environment of noxfile.py. `nox --session lock` writes this file; then run
+# `make test`. Install it with `pip install --no-deps --requirement`.
 """
+#: Settings of pip and the variables by which uv takes the same.
+SETTINGS = {
+    "index-url": "UV_DEFAULT_INDEX",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "cert": "SSL_CERT_FILE",
+}
 
 
-def resolve(python: str) -> dict[str, str]:
-    """Package name -> version, as that interpreter's pip would install them into an empty environment."""
-    with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([python, "-m", "venv", folder], check=True)
-        report = Path(folder, "report.json")
-        pip = [str(Path(folder, "bin", "python")), "-m", "pip", "install", "--quiet"]
-        subprocess.run(
-            [*pip, "--dry-run", "--ignore-installed", "--report", str(report), f"{ROOT}[all]", *HELD],
-            check=True,
-        )
-        packages = [item["metadata"] for item in json.loads(report.read_text())["install"]]
-    versions = {re.sub(r"[-_.]+", "-", package["name"]).lower(): package["version"] for package in packages}
-    del versions["saccade"]
-    return versions
+def load(path: Path) -> dict[str, Any]:
+    """A TOML file."""
+    return tomllib.loads(path.read_text())
 
 
-def python_version(python: str) -> str:
-    """`3.11` for an interpreter of that version."""
-    command = [python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+def requirements(distribution: str) -> set[str]:
+    """What one of `PROJECTS`, such as ``saccade-vla-lab[sim]``, requires of others."""
+    name, extras = re.fullmatch(r"([\w-]+)(?:\[(.*)\])?.*", distribution).groups()  # type: ignore[union-attr]
+    if name not in PROJECTS:
+        return {distribution}
+    project = load(PROJECTS[name])["project"]
+    lines = list(project["dependencies"])
+    for extra in filter(None, (extras or "").split(",")):
+        lines += project["optional-dependencies"][extra]
+    return set[str]().union(*map(requirements, lines))
 
 
-def marked_lines(resolved: dict[str, dict[str, str]]) -> list[str]:
-    """The lines of constraints.txt.
+def group(name: str) -> set[str]:
+    """The requirements of a group of pyproject.toml and of those that it includes."""
+    found = set[str]()
+    for item in load(PROJECTS["saccade-vla"])["dependency-groups"][name]:
+        found |= {item} if isinstance(item, str) else group(item["include-group"])
+    return found
 
-    Args:
-        resolved: Python version -> package name -> package version, in ascending order of Python versions.
-    """
-    pythons = list(resolved)
-    markers = {python: f'; python_version == "{python}"' for python in pythons}
-    markers[pythons[-1]] = f'; python_version >= "{pythons[-1]}"'
-    lines = []
-    for name in sorted({name for versions in resolved.values() for name in versions}):
-        found = {python: versions[name] for python, versions in resolved.items() if name in versions}
-        if len(found) == len(pythons) and len(set(found.values())) == 1:
-            lines.append(f"{name}=={found[pythons[0]]}")
-        else:
-            lines += [f"{name}=={version} {markers[python]}" for python, version in found.items()]
-    return lines
+
+def settings_of_pip() -> dict[str, str]:
+    """pip's index and certificates, as environment variables for uv."""
+    command = [sys.executable, "-m", "pip", "config", "list"]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    found = re.findall(r"^(?:global|install|:env:)\.([\w-]+)='(.*)'$", said, re.MULTILINE)
+    return {SETTINGS[key]: " ".join(value.split("\\n")).strip() for key, value in found if key in SETTINGS}
 
 
 def main() -> None:
-    """Resolves for each interpreter of the command line, in ascending order."""
-    resolved = {python_version(python): resolve(python) for python in sys.argv[1:]}
-    (ROOT / "constraints.txt").write_text(HEADER + "\n".join(marked_lines(resolved)) + "\n")
+    """Writes every file; options go to `uv pip compile`."""
+    environment = {"UV_PYTHON_DOWNLOADS": "never", **settings_of_pip(), **os.environ}
+    uv = str(Path(sys.executable).with_name("uv"))
+    command = [uv, "pip", "compile", "--quiet", "--universal", "--python-version", OLDEST_PYTHON, "-"]
+    command += ["--no-header", "--no-annotate", *sys.argv[1:]]
+    for name, (distributions, groups) in FILES.items():
+        wanted = set[str]().union(*map(requirements, distributions), *map(group, groups))
+        file = ROOT / "requirements" / f"{name}.txt"
+        constraints = [] if name in APART else ["--constraint", "requirements/dev.txt"]
+        lines = "\n".join(sorted(wanted))
+        options = ["--output-file", str(file), *constraints]
+        subprocess.run([*command, *options], input=lines, text=True, check=True, cwd=ROOT, env=environment)
+        released = f"{RELEASED_HEAD}\n" if name in WITH_RELEASED_HEAD else ""
+        file.write_text(HEADER + released + file.read_text())
+        print(f"{file.relative_to(ROOT)}: {len(file.read_text().splitlines())} lines", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
 #!/bin/sh
 # Builds ggml from the sources in llama-cpp-python's source package: build_ggml.sh ENVIRONMENT. The libraries
-# are written to ENVIRONMENT/ggml/build/bin. constraints.txt names the version.
+# are written to ENVIRONMENT/ggml/build/bin.
 set -eu
 environment=$(cd "$1" && pwd)
-constraints=$(cd "$(dirname "$0")" && pwd)/constraints.txt
-requirement=$(grep '^llama-cpp-python==' "$constraints")
+requirement=llama-cpp-python==0.3.36
 mkdir -p "$environment/ggml"
 cd "$environment/ggml"
 "$environment/bin/python" -m pip --disable-pip-version-check download --quiet --no-deps --no-binary llama-cpp-python "$requirement"

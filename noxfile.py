@@ -1,0 +1,446 @@
+"""The tasks of this repository: `make NAME`, or `.venv/bin/nox --session NAME -- OPTIONS`.
+
+`.venv` is the environment to work in: `make rollout` installs saccade and the simulation there, other tasks
+add what tests and linters need. Both packages are editable in it. Tasks that need other packages have
+environments in `.nox`. All are kept, and a step is repeated only when what it was made from has changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import nox
+
+ROOT = Path(__file__).resolve().parent
+MAKE = ROOT / ".venv"  # where the Makefile installs nox
+ENVIRONMENTS = ROOT / ".nox"
+PROGRAMS = "Scripts" if os.name == "nt" else "bin"
+
+nox.needs_version = ">=2025.2"
+nox.options.sessions = ["test"]
+nox.options.default_venv_backend = "none"  # `Environment` makes them, because several tasks share one
+# The summary of a test runner stays the last line of a run. uv is not needed.
+logging.getLogger("nox").addFilter(
+    lambda record: record.levelname != "SUCCESS" and not record.getMessage().startswith("uv binary")
+)
+
+
+def digest(files: Iterable[Path]) -> str:
+    """SHA-256 of the names and contents of files."""
+    found = hashlib.sha256()
+    for file in sorted(files):
+        found.update(f"{file.relative_to(ROOT)} {file.stat().st_size}\n".encode())
+        found.update(file.read_bytes())
+    return found.hexdigest()
+
+
+def rust_sources() -> list[Path]:
+    """What the extension is built from."""
+    files = [path for path in (ROOT / "crates").rglob("*") if path.is_file()]
+    return [*files, *(ROOT / name for name in ("Cargo.toml", "Cargo.lock", "pyproject.toml"))]
+
+
+class Environment:
+    """A virtual environment, with a note of what its steps were made from.
+
+    Args:
+        session: The task that needs it.
+        folder: Where it is, or is to be created.
+    """
+
+    def __init__(self, session: nox.Session, folder: Path) -> None:
+        self.session = session
+        self.folder = folder
+        self.python = folder / PROGRAMS / "python"
+        self.note = folder / "saccade-steps.json"
+        # An environment that was copied or moved points to its old place.
+        command = [str(self.python), "-c", "import sys; print(sys.prefix)"]
+        said = session.run(*command, silent=True, external=True, log=False) if self.python.exists() else ""
+        if str(said).strip() != str(folder):
+            session.run(sys.executable, "-m", "venv", "--clear", str(folder), external=True, log=False)
+        self.steps: dict[str, str] = json.loads(self.note.read_text()) if self.note.exists() else {}
+
+    def program(self, name: str) -> str:
+        """The path of a program that is installed in it."""
+        return str(self.folder / PROGRAMS / name)
+
+    def run(self, *command: str | Path, **variables: str) -> None:
+        """Runs its Python with these arguments and environment variables."""
+        self.session.run(str(self.python), *map(str, command), env=variables, external=True)
+
+    def is_done(self, step: str, made_from: str) -> bool:
+        """Whether a step was taken with these inputs."""
+        return self.steps.get(step) == made_from
+
+    def done(self, step: str, made_from: str) -> None:
+        """Notes that a step was taken."""
+        self.steps[step] = made_from
+        self.note.write_text(json.dumps(self.steps, indent=1))
+
+    def pip(self, *arguments: str | Path) -> None:
+        """Installs these, and nothing that they require."""
+        options = "--disable-pip-version-check --no-input install --quiet --no-deps --no-build-isolation"
+        self.run("-m", "pip", *options.split(), *arguments, MATURIN_PEP517_ARGS="--locked")
+
+    def install(self, name: str) -> Environment:
+        """Installs the packages of requirements/NAME.txt, which is complete."""
+        file = ROOT / "requirements" / f"{name}.txt"
+        made_from = digest([file])
+        if not self.is_done(name, made_from):
+            print(f"setup: requirements/{file.name} (takes minutes the first time)", flush=True)
+            self.pip("--requirement", file)
+            self.done(name, made_from)
+        return self
+
+    def install_saccade(self, *, editable: bool = True) -> Environment:
+        """Installs saccade, and builds its extension if what that is made from has changed."""
+        package = ROOT / "python" / "saccade"
+        files = rust_sources()
+        if not editable:
+            files += [path for path in package.rglob("*") if path.suffix in (".py", ".pyi", ".json")]
+
+        def made_from() -> str:
+            # Editable installations share the extension: another one may have built it from other sources.
+            built = [path.stat().st_mtime_ns for path in package.glob("_saccade*.so")] if editable else []
+            return f"{digest(files)} {built}"
+
+        if not self.is_done("saccade", made_from()):
+            print("setup: saccade (builds the Rust code; takes minutes the first time)", flush=True)
+            self.pip("--editable" if editable else "--force-reinstall", ROOT)
+            self.done("saccade", made_from())
+        return self
+
+    def install_lab(self) -> Environment:
+        """Installs saccade's laboratory as editable."""
+        made_from = digest([ROOT / "lab" / "pyproject.toml"])
+        if not self.is_done("lab", made_from):
+            self.pip("--editable", ROOT / "lab")
+            self.done("lab", made_from)
+        return self
+
+
+def needs(session: nox.Session, *names: str, required: bool = True) -> None:
+    """Says which packages have what this machine lacks, and stops if it is required."""
+    command = (sys.executable, str(ROOT / ".ci" / "needs.py"), *names)
+    session.run(*command, external=True, log=False, success_codes=[0] if required else [0, 1])
+
+
+def working(session: nox.Session, requirements: str = "dev") -> Environment:
+    """`.venv`, with everything that tests and linters need, or with the packages of another file."""
+    needs(session, "python", "rust", "opengl")
+    return Environment(session, MAKE).install(requirements).install_saccade().install_lab()
+
+
+def cargo(session: nox.Session, *arguments: str, **variables: str) -> None:
+    """Runs cargo."""
+    session.run("cargo", *arguments, env=variables, external=True)
+
+
+@nox.session
+def setup(session: nox.Session) -> None:
+    """Install everything that tests and linters need in .venv."""
+    working(session)
+
+
+@nox.session
+def rollout(session: nox.Session) -> None:
+    """Run the bundled policy in simulation; table and videos in out/rollout."""
+    environment = working(session, "rollout")
+    options = session.posargs or ["--episodes", "3", "--video", "--out", "out/rollout"]
+    session.run(environment.program("saccade"), "rollout", *options, external=True)
+
+
+@nox.session
+def test(session: nox.Session) -> None:
+    """Run all tests, Rust and Python."""
+    environment = working(session)
+    run_rust_tests(session)
+    run_python_tests(environment)
+
+
+@nox.session(name="test-rust")
+def test_rust(session: nox.Session) -> None:
+    """Run the Rust tests."""
+    needs(session, "rust")
+    run_rust_tests(session)
+
+
+@nox.session(name="test-python")
+def test_python(session: nox.Session) -> None:
+    """Run the Python tests."""
+    run_python_tests(working(session))
+
+
+def run_rust_tests(session: nox.Session) -> None:
+    """Those of the default members, and their examples, which a test run only builds.
+
+    Benches have no tests, and their dependencies are slow to build.
+    """
+    cargo(session, "test", "--locked", "--quiet")
+    for example in ("sample", "look_inside"):
+        command = ("run", "--locked", "--quiet", "--package", "saccade-groot", "--example", example)
+        session.run("cargo", *command, silent=True, external=True)
+
+
+def run_python_tests(environment: Environment) -> None:
+    """One worker per core, each with a contiguous part of the tests: few module fixtures are built twice.
+
+    The workers fill the cores; more OpenMP threads in torch and NumPy would only compete for them.
+    """
+    needs(environment.session, "browser", required=False)
+    options = ("--numprocesses", "auto", "--dist", "worksteal", *environment.session.posargs)
+    environment.run("-m", "pytest", *options, OMP_NUM_THREADS="1")
+
+
+@nox.session
+def core(session: nox.Session) -> None:
+    """Run the tests that need the wheel of saccade, NumPy and pytest only."""
+    needs(session, "python", "rust")
+    environment = Environment(session, ENVIRONMENTS / "core").install("core").install_saccade(editable=False)
+    options = ("--numprocesses", "auto", "--dist", "worksteal", *session.posargs)
+    environment.run("-m", "pytest", "-m", "core", *options, OMP_NUM_THREADS="1")
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Run the other checks of .ci/run: formatting, clippy, rustdoc, ruff, mypy, stubs."""
+    environment = working(session)
+    cargo(session, "fmt", "--all", "--check")
+    cargo(
+        session, "clippy", "--workspace", "--all-targets", "--locked", "--quiet", "--", "--deny", "warnings"
+    )
+    cargo(session, "doc", "--workspace", "--no-deps", "--locked", "--quiet", RUSTDOCFLAGS="--deny warnings")
+    for command in ("ruff check .", "ruff format --check .", "mypy", "stubtest saccade._saccade"):
+        program, *options = command.split()
+        session.run(environment.program(program), *options, external=True)
+
+
+@nox.session
+def format(session: nox.Session) -> None:
+    """Format all Rust and Python files."""
+    environment = working(session)
+    cargo(session, "fmt", "--all")
+    session.run(environment.program("ruff"), "check", "--fix", ".", external=True)
+    session.run(environment.program("ruff"), "format", ".", external=True)
+
+
+@nox.session
+def bench(session: nox.Session) -> None:
+    """Measure the kernels and the head beside other implementations, with cargo bench."""
+    needs(session, "rust")
+    cargo(session, "bench", "--locked", "--package", "saccade-benches", *session.posargs)
+
+
+@nox.session(name="bench-peers")
+def bench_peers(session: nox.Session) -> None:
+    """Compare with other engines that run the same head, or with `--only policy` the whole policy."""
+    needs(session, "python", "rust")
+    folder = ENVIRONMENTS / "peers"
+    environment = Environment(session, folder).install("peers").install_saccade().install_lab()
+    scripts = ROOT / "benches" / "peers"
+    made_from = digest([scripts / "build_ggml.sh"])
+    if not environment.is_done("ggml", made_from):
+        # It is optional: without it, the report has no rows of ggml and says so.
+        print("setup: ggml, as llama-cpp-python ships it (takes minutes)", flush=True)
+        session.run(
+            "sh", str(scripts / "build_ggml.sh"), str(folder), external=True, success_codes=range(256)
+        )
+        environment.done("ggml", made_from)
+    source = os.environ.get("VLA_SOURCE", "")
+    made_from = digest([scripts / "build_vla.sh"]) + source
+    if source and not environment.is_done("vla", made_from):
+        session.run("sh", str(scripts / "build_vla.sh"), str(folder), source, external=True)
+        environment.done("vla", made_from)
+    variables = {
+        "SACCADE_PEERS_GGML": str(folder / "ggml/build/bin"),
+        "SACCADE_PEERS_VLA": str(folder / "vla"),
+    }
+    environment.run("-m", "benches.peers", *session.posargs, **variables)
+
+
+@nox.session(name="test-compat")
+def test_compat(session: nox.Session) -> None:
+    """Test accelerate() and the plugin on lerobot releases; writes docs/compatibility.md.
+
+    lerobot 0.5 and later need Python 3.12. If python3.12 is not on PATH: `--python312 PATH`.
+    """
+    working(session).run("tests/compat/run.py", *session.posargs)
+
+
+@nox.session(name="test-clients")
+def test_clients(session: nox.Session) -> None:
+    """Test `saccade serve` with Isaac-GR00T's clients, from a clone of its repository: `--clone PATH`."""
+    working(session).run("tests/compat/groot.py", *session.posargs)
+
+
+@nox.session(name="test-ray")
+def test_ray(session: nox.Session) -> None:
+    """Test rollout, study and demos on a Ray cluster of two nodes on this machine, one of which dies.
+
+    Ray is in no other environment, since it does not support every Python.
+    """
+    needs(session, "python", "rust", "opengl")
+    environment = Environment(session, ENVIRONMENTS / "ray").install("ray").install_saccade().install_lab()
+    (file,) = (ROOT / "tests").rglob("test_ray.py")
+    environment.run("-m", "pytest", file, *session.posargs, SACCADE_RAY="1", OMP_NUM_THREADS="1")
+
+
+@nox.session(name="test-aarch64")
+def test_aarch64(session: nox.Session) -> None:
+    """Run the Rust tests and some of Python's on emulated 64-bit ARM CPUs, `max` or those given (Debian)."""
+    cpus = " ".join(session.posargs) or "max"
+    session.run(str(ROOT / ".ci/aarch64/run.sh"), "test", env={"CPUS": cpus}, external=True)
+
+
+@nox.session
+def fuzz(session: nox.Session) -> None:
+    """Fuzz headers, indexes, configs, resizing, tokenizers and processors, 1800 seconds each or those given.
+
+    Needs a nightly Rust and cargo-fuzz. fuzz/README.md describes the targets.
+    """
+    environment = working(session)
+    if not succeeds("cargo", "+nightly", "fuzz", "--version"):
+        session.error("needs a nightly Rust (rustup toolchain install nightly) and cargo install cargo-fuzz")
+    environment.run("fuzz/seeds.py")
+    seconds = session.posargs[0] if session.posargs else "1800"
+    limits = ("-dict=fuzz/words.dict", f"-max_total_time={seconds}", "-timeout=10", "-rss_limit_mb=2048")
+    for target in ("header", "index", "config", "resize", "tokenizer", "processor"):
+        cargo(session, "+nightly", "fuzz", "run", "--sanitizer", "none", target, "--", *limits)
+
+
+def succeeds(*command: str) -> bool:
+    """Whether a program is there and ends with status 0."""
+    found = shutil.which(command[0]) is not None
+    return found and subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+# Tests that take too long in valgrind's emulation are left out; `narrow` takes a minute and a half.
+VALGRIND_TESTS = "attention layer_norm linear masks narrow narrow_weights outliers rms_norm rope"
+# AddressSanitizer reports running out of memory as an error. Under it a test may run for more than a minute;
+# the test runner then prints a warning, which allocates, so the test that counts allocations is skipped too.
+ASAN_SKIPPED = "allocates_nothing without_memory cannot_be_had cannot_be_started"
+
+
+@nox.session
+def sanitize(session: nox.Session) -> None:
+    """Run the kernel tests under AddressSanitizer (nightly Rust) and valgrind.
+
+    They are of the only crate with unsafe code. AddressSanitizer runs on every instruction set of this CPU,
+    in a target folder of its own, because dependencies are instrumented too. Valgrind emulates a CPU without
+    AVX-512, so it covers the portable and AVX2 paths, and tiles in software where a test has them. It is
+    slow, so the tests that compare many sizes with float64 are skipped.
+    """
+    if not succeeds("cargo", "+nightly", "--version"):
+        session.error("needs a nightly Rust: rustup toolchain install nightly")
+    if shutil.which("valgrind") is None:
+        session.error("valgrind is not installed; install the package valgrind")
+    kernels = ("test", "--locked", "--quiet", "--package", "saccade-kernels")
+    skipped = [word for name in ASAN_SKIPPED.split() for word in ("--skip", name)]
+    target = ("--target", "x86_64-unknown-linux-gnu", "--target-dir", "target/sanitize")
+    cargo(
+        session,
+        "+nightly",
+        *kernels,
+        "--lib",
+        "--tests",
+        *target,
+        "--",
+        *skipped,
+        RUSTFLAGS="-Zsanitizer=address",
+    )
+    tests = [word for name in VALGRIND_TESTS.split() for word in ("--test", name)]
+    runner = {"CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER": "valgrind --quiet --error-exitcode=1"}
+    cargo(session, *kernels, *tests, "--", "--test-threads", "1", "--skip", "float64", **runner)
+
+
+@nox.session
+def wheel(session: nox.Session) -> None:
+    """Build the wheels of the last commit in dist: saccade for x86-64 and ARM, the lab, the lerobot plugin.
+
+    WHEEL_TARGETS names other targets of Rust; options go to .ci/wheels/build.py.
+    """
+    build_wheels(session, session.posargs)
+
+
+def build_wheels(session: nox.Session, options: Iterable[str]) -> Environment:
+    """Builds all wheels; returns the environment that did."""
+    needs(session, "python", "rust")
+    environment = Environment(session, ENVIRONMENTS / "wheels").install("wheels")
+    targets = os.environ.get("WHEEL_TARGETS", "x86_64-unknown-linux-gnu aarch64-unknown-linux-gnu").split()
+    if any(target.startswith("aarch64") for target in targets):
+        session.run(str(ROOT / ".ci/aarch64/run.sh"), "setup", external=True)
+    shutil.rmtree(ROOT / "dist", ignore_errors=True)
+    for target in targets:
+        environment.run(".ci/wheels/build.py", "--out", "dist", "--target", target, *options)
+    return environment
+
+
+@nox.session(name="test-wheel")
+def test_wheel(session: nox.Session) -> None:
+    """Build the wheels and test them on CPythons, NumPys and emulated CPUs; writes docs/wheels.md."""
+    needs(session, "opengl", "qemu")
+    build_wheels(session, []).run(".ci/wheels/test.py", "dist", "--page", "docs/wheels.md", *session.posargs)
+
+
+@nox.session(name="demo-policy")
+def demo_policy(session: nox.Session) -> None:
+    """Record demonstrations and train the bundled policy anew, in out/demo-policy or the given folder.
+
+    Takes an hour and a half of one core. Each part resumes where it was stopped. The second training has more
+    demonstrations of the tasks that the first one did worst.
+    """
+    environment = working(session)
+    out = Path(session.posargs[0] if session.posargs else "out/demo-policy")
+    demos, first, policy = (str(out / name) for name in ("demos", "first", "policy"))
+
+    def saccade(*command: str) -> None:
+        session.run(environment.program("saccade"), *command, external=True)
+
+    finished = (
+        out / "first.done"
+    )  # the demonstrations that follow would make the finished training look like another one
+    if not finished.exists():
+        saccade("demos", "--out", demos)
+        saccade("train", "--demos", demos, "--out", first)
+        finished.touch()
+    saccade("demos", "--out", demos, "--tasks", "push", "--episodes", "300")
+    saccade("demos", "--out", demos, "--tasks", "window-open", "--episodes", "200")
+    again = ("--start-from", first, "--training-steps", "4000", "--learning-rate", "3e-4", "--seed", "1")
+    saccade("train", "--demos", demos, *again, "--out", policy)
+    saccade(
+        "rollout", "--checkpoint", policy, "--episodes", "20", "--seed", "1000", "--out", str(out / "check")
+    )
+
+
+@nox.session
+def pictures(session: nox.Session) -> None:
+    """Draw the pictures of README and docs/attention.md anew, from the bundled policy."""
+    environment = working(session, "rollout")
+    out = Path(session.posargs[0] if session.posargs else "out/pictures")
+    saccade = environment.program("saccade")
+    shown = ("--episodes", "1", "--seed", "2", "--video", "--out", str(out / "gif"))
+    session.run(saccade, "rollout", *shown, external=True)
+    tasks = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
+    environment.run(
+        "docs/make_pictures.py", "gif", *(out / "gif" / "videos" / f"{task}-2.mp4" for task in tasks)
+    )
+    session.run(
+        saccade, "attention", "--task", "push", "--seed", "3", "--out", str(out / "look"), external=True
+    )
+    environment.run("docs/make_pictures.py", "map", out / "look" / "sheet.png")
+    shutil.copyfile(out / "look" / "sheet.png", ROOT / "docs" / "images" / "attention.png")
+
+
+@nox.session
+def lock(session: nox.Session) -> None:
+    """Write requirements/, one exact version of every Python package; `--upgrade` takes the newest ones."""
+    environment = Environment(session, ENVIRONMENTS / "lock").install("lock")
+    environment.run(".ci/lock.py", *session.posargs)
