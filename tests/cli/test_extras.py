@@ -92,6 +92,7 @@ def test_the_lab_requires_the_same_version() -> None:
     version = project("saccade-vla-lab")["version"]
     cargo = tomllib.loads((ROOT / "Cargo.toml").read_text())
     assert version == cargo["workspace"]["package"]["version"]
+    assert version == importlib.metadata.version("saccade-vla-lab")
     assert project("saccade-vla-lab")["dependencies"] == [f"saccade-vla[cli]=={version}"]
 
 

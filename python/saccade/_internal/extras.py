@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import os
 import re
 import shlex
-import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -112,6 +110,8 @@ class Extras:
 
     def _requirement(self, module: str) -> str:
         """The distribution of a module with the versions that are accepted, such as ``"jinja2>=3.1"``."""
+        import importlib.metadata  # not at the top: `import saccade` should stay cheap
+
         distribution = self.modules[self._extra_of(module)][module]
         try:
             required = importlib.metadata.requires(self.distribution) or []
@@ -144,6 +144,8 @@ def pip_install(*arguments: str) -> str:
     This is plain ``pip`` only if the first ``pip`` on ``PATH`` belongs to this Python. Otherwise packages
     would go to another environment.
     """
+    import shutil  # not at the top: `import saccade` should stay cheap
+
     folder = Path(sys.executable).parent
     found = shutil.which("pip")
     if importlib.util.find_spec("pip") is None:  # environments that uv creates have no pip
