@@ -23,14 +23,14 @@ from torch import nn
 
 from saccade.integrations import Accelerated, accelerate
 from saccade_lab.reference import lerobot_head
-from saccade_lab.reference.random_weights import n15_config, random_tensor, small_config
+from saccade_lab.reference.random_weights import random_tensor, sized_config, small_config
 
 PRECISIONS = ("float32", "bfloat16", "int8")
 
 
 def released_head(size: str) -> nn.Module:
     """lerobot's N1.5 head with random weights."""
-    config = n15_config(num_embodiments=2) if size == "n1.5" else small_config()
+    config = sized_config("n1.5", num_embodiments=2) if size == "n1.5" else small_config()
     head = lerobot_head.build(config, device="meta")
     generator = torch.Generator().manual_seed(0)
     shapes = {name: tensor.shape for name, tensor in head.state_dict().items()}

@@ -103,7 +103,11 @@ def main() -> None:
     if args.checkpoint is not None:
         head = ActionHead.from_pretrained(args.checkpoint)
     else:
-        config = random_weights.n15_config(num_embodiments=1) if args.full else random_weights.small_config()
+        config = (
+            random_weights.sized_config("n1.5", num_embodiments=1)
+            if args.full
+            else random_weights.small_config()
+        )
         head = random_weights.random_head(config, args.seed)
     if args.outliers:
         add_outliers(head)

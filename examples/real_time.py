@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import saccade
-from saccade.bench import heads
+from saccade.checkpoints.random_checkpoint.head import config_of_size, write_head
 
 Float32Array = NDArray[np.float32]
 EMBODIMENT_ID = 0
@@ -148,7 +148,7 @@ def load(args: argparse.Namespace) -> saccade.ActionHead:
         with importlib.resources.as_file(saccade.demo_checkpoint()) as folder:
             return saccade.ActionHead.from_pretrained(folder, num_threads=args.num_threads)
     with tempfile.TemporaryDirectory(prefix="saccade-real-time-") as name:
-        heads.write(Path(name), heads.sized("n1.5"))
+        write_head(Path(name), config_of_size("n1.5"))
         return saccade.ActionHead.from_pretrained(name, num_threads=args.num_threads)
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from benches.backbone import setup
 from benches.checkpoints import written
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints import head_configs, random_checkpoint
-from saccade.checkpoints.backbone_sizes import RELEASED
+from saccade.checkpoints import random_checkpoint
+from saccade.checkpoints.published import CONFIGS, RELEASED
 
 MODELS = {"plain": False, "outliers": True}
 
@@ -39,7 +39,7 @@ def checkpoint(work: Path, *, outliers: bool, layers: tuple[int, int] | None, sm
         vocabulary = config["text_config"]["vocab_size"]
         config["text_config"] = {**released["text_config"], "vocab_size": vocabulary}
         config |= {"vision_config": released["vision_config"], "select_layer": released["select_layer"]}
-        full = head_configs.CONFIGS["n1.5"]
+        full = CONFIGS["n1.5"]
         for key in ("backbone_embedding_dim", "vl_self_attention_cfg"):
             head[key] = full[key]
         head["vl_self_attention_cfg"] = {**head["vl_self_attention_cfg"], "num_layers": 1}

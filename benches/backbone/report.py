@@ -11,9 +11,8 @@ from benches.backbone import memory, reuse
 from benches.backbone.work import backbone_work, floor_seconds
 from benches.peers.results import TOLERANCE
 from benches.peers.text import plural, table
-from saccade.bench.cost import Machine
-from saccade.bench.timing import quartiles
 from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.cli.timing import Machine, quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "backbone.md"
 COMMITTED = Path(__file__).with_name("results.json")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from saccade.bench.cost import ELEMENT_BYTES, Machine
-from saccade.bench.work import Work, Works, add_linear
+from benches.cost import ELEMENT_BYTES
+from benches.work import Work, Works, add_linear
 from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.cli.timing import Machine
 
 #: Parts whose operands are keys, values and probabilities rather than weights.
 ATTENTION = ("vision_attention", "language_attention")

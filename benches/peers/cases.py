@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from benches.work import encode_work, sample_work, total
 from saccade import HeadConfig
-from saccade.bench.work import Call, encode_work, sample_work, total
+from saccade.cli.timing import Call
 
 NUM_BLOCKS = 4  # of the piece "blocks": cross, self, cross, self
 LINEAR_SHAPES = ((49, 1536, 6144), (49, 6144, 1536), (49, 1536, 1536), (296, 2048, 1536))

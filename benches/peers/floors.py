@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from benches.cost import floors
 from benches.peers.cases import Case, exact_macs
 from benches.peers.contenders import CONTENDERS
 from benches.peers.results import Results
 from benches.peers.text import arithmetic, calls, config
-from saccade.bench.cost import PRECISIONS, Machine, floors
-from saccade.bench.work import Call, Works, encode_work, sample_work
+from benches.work import Works, encode_work, sample_work
+from saccade._internal.arrays import PRECISIONS
+from saccade.cli.timing import Call, Machine
 
 
 def limits(results: Results, case: Case, name: str) -> tuple[float, float] | None:

@@ -32,7 +32,7 @@ def config_of(case: Case) -> dict[str, Any]:
     if case.size == "small":
         config = random_weights.small_config()
     else:
-        config = random_weights.n15_config(num_embodiments=NUM_EMBODIMENTS)
+        config = random_weights.sized_config("n1.5", num_embodiments=NUM_EMBODIMENTS)
     config["num_target_vision_tokens"] = case.num_future_tokens
     if case.piece == "blocks":
         config["diffusion_model_cfg"] |= {"num_layers": NUM_BLOCKS, "output_dim": 64}

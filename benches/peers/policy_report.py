@@ -12,7 +12,7 @@ from benches.peers.goals import Goal, reached
 from benches.peers.report import demoted, joined, said_of
 from benches.peers.results import Results, records
 from benches.peers.text import number, plural, table, usual
-from saccade.bench.timing import quartiles
+from saccade.cli.timing import quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "policy-speed.md"
 NOTES = Path(__file__).with_name("policy_notes.md")

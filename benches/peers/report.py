@@ -26,7 +26,7 @@ from benches.peers.text import (
     usual,
 )
 from benches.peers.throughput import throughput
-from saccade.bench.timing import quartiles
+from saccade.cli.timing import quartiles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE, IMAGES = DOCS / "performance.md", DOCS / "images"

@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 
+from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import (
-    PRECISIONS,
     Arguments,
     add_checkpoint,
     add_config,
     add_features,
     add_integer,
     add_list,
-    add_moments,
+    add_pictures,
     add_preprocessing,
     add_seed,
     check_known,
@@ -34,7 +34,7 @@ def add_episodes(parser: Arguments, default: int | None, help: str = "episodes p
 def add_frames(parser: argparse.ArgumentParser) -> None:
     """Declares pictures and words for a whole checkpoint; see `check_frames`."""
     seen = parser.add_argument_group("pictures and words for a whole checkpoint")
-    add_moments(seen, "--frames")
+    add_pictures(seen, "--frames")
     seen.add_argument(
         "--precision", choices=PRECISIONS, help="of the backbone (default: float32, as the head always)"
     )

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import saccade
+from benches.cost import predict
 from benches.peers import __main__ as command
 from benches.peers import figures, goals, inputs, processes, report, text
 from benches.peers.cases import COST, Case, exact_macs
@@ -26,13 +27,11 @@ from benches.peers.machine import describe, family_name
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
 from benches.peers.throughput import throughput
-from saccade.bench.cost import predict
-from saccade.bench.timing import quartiles
-from saccade.bench.work import Call
-from saccade_lab.reference.random_weights import n15_config
+from saccade.cli.timing import Call, quartiles
+from saccade_lab.reference.random_weights import sized_config
 
 ROOT = Path(__file__).resolve().parents[2]
-N15 = saccade.HeadConfig.from_dict(n15_config())
+N15 = saccade.HeadConfig.from_dict(sized_config("n1.5"))
 
 
 def test_exact_work_at_the_released_size() -> None:

@@ -269,7 +269,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "backbone": saccade.Backbone.from_pretrained,
     "policy": saccade.Policy.from_pretrained,
     "processor": saccade.Processor.from_pretrained,
-    "inspect": lambda source: inspect(source, time=False),
+    "inspect": lambda source: inspect(source),
     "convert": lambda source: convert(source, source.parent / "out"),
 }
 

@@ -134,7 +134,7 @@ def test_what_is_no_path() -> None:
 
 def test_commands_take_ids(cache: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cached(cache, checkpoint)
-    assert cli.main(["inspect", NAME, "--no-time", "--json"]) == 0
+    assert cli.main(["inspect", NAME, "--json"]) == 0
     assert '"version": "n1.5"' in capsys.readouterr().out
     for command in (
         ["bench", "--checkpoint", "nvidia/absent"],

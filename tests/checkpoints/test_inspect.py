@@ -17,15 +17,14 @@ from torch import Tensor, nn
 
 import saccade
 from saccade import _saccade, cli
-from saccade.bench.cost import Machine, measured_like
 from saccade.checkpoints import quantize
 from saccade.checkpoints.findings import Counts, Inspection, Part
 from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
 from saccade.checkpoints.inspection import inspect
-from saccade.checkpoints.parts import parameters
+from saccade.checkpoints.parts import in_order, part_of
 from saccade.checkpoints.survey import robust_z
 from saccade.checkpoints.tokens import token_statistics
-from saccade.errors import CheckpointError, InputError
+from saccade.errors import CheckpointError
 from saccade_lab.reference.random_weights import CONFIGS, whole_config
 from tests.helpers import layout_heads, layouts
 
@@ -47,7 +46,12 @@ N15_PARTS = {
 def published_parts(kind: str) -> dict[str, Part]:
     """Parameters by part of a head with the sizes of the published one."""
     shapes = _saccade.tensor_shapes(json.dumps(whole_config(CONFIGS[kind])))
-    return parameters({name: tuple(shape) for name, shape in shapes})
+    counted: dict[str, Part] = {}
+    for name, shape in shapes:
+        part = counted.setdefault(part_of(name), Part())
+        part.tensors += 1
+        part.parameters += math.prod(shape)
+    return in_order(counted)
 
 
 def test_parts_add_up_to_the_published_heads() -> None:
@@ -75,7 +79,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
 def test_memory_is_what_a_head_holds(tmp_path: Path, layout: str, precision: str) -> None:
     folder = layouts.write(tmp_path / layout, layout)
-    memory = inspect(folder, time=False).memory[precision]
+    memory = inspect(folder).memory[precision]
     assert memory.all == saccade.ActionHead.from_pretrained(folder, precision=precision).nbytes
     assert (
         memory.one
@@ -89,14 +93,14 @@ def test_memory_on_every_instruction_set_and_of_an_int8_checkpoint(
 ) -> None:
     quantize(base, tmp_path / "int8")
     monkeypatch.setenv("SACCADE_ISA", isa)
-    for precision, memory in inspect(tmp_path / "int8", time=False).memory.items():
+    for precision, memory in inspect(tmp_path / "int8").memory.items():
         assert memory.all == saccade.ActionHead.from_pretrained(tmp_path / "int8", precision=precision).nbytes
 
 
 def test_the_report_of_a_checkpoint(base: Path) -> None:
     tensors = layouts.read(base, "action_head.")
     reported: list[tuple[int, int]] = []
-    report = inspect(base, num_vl_tokens=9, progress=lambda done, total: reported.append((done, total)))
+    report = inspect(base, progress=lambda done, total: reported.append((done, total)))
     assert report.parameters == sum(tensor.numel() for tensor in tensors.values())
     assert sum(part.tensors for part in report.parts.values()) == len(tensors)
     assert sum(part.nbytes for part in report.parts.values()) == sum(t.nbytes for t in tensors.values())
@@ -105,25 +109,14 @@ def test_the_report_of_a_checkpoint(base: Path) -> None:
     assert reported[-1][0] == reported[-1][1] == sum(tensor.nbytes for tensor in tensors.values())
     assert len(reported) == len(tensors)
     assert report.odd == []
-    assert report.machine is not None
-    assert report.seconds is not None
-    assert report.machine.isa == _saccade.selected_isa()
-    here = Machine.measured(report.machine.isa, 1)
-    family = saccade.show_config("dicts")["family"]
-    assert family.startswith(here.family)
-    assert "(" not in here.family
-    assert report.machine.efficiency_of == measured_like(here).cpu
-    for seconds in report.seconds.values():
-        assert seconds["encode"] > 0.0
-        assert seconds["sample"] > 0.0
     json.dumps(dataclasses.asdict(report), allow_nan=False)  # nothing in it needs a converter
 
 
 def test_which_embodiments_look_trained(base: Path) -> None:
     tensors = layouts.read(base, "action_head.")
-    entries = inspect(base, time=False).embodiments
-    assert [entry.id for entry in entries if entry.looks == "trained"] == [17, 24, 26]
-    assert {entry.looks for entry in entries if entry.id not in (17, 24, 26)} == {"as initialised"}
+    entries = inspect(base).embodiments
+    assert [entry.id for entry in entries if entry.weights == "trained"] == [17, 24, 26]
+    assert {entry.weights for entry in entries if entry.id not in (17, 24, 26)} == {"as initialised"}
     assert entries[31].names == ["new_embodiment"]
     assert entries[26].names[0] == "agibot_genie1"
     squares = sum(t.double().square().sum((1, 2) if t.ndim == 3 else 1)
@@ -138,13 +131,13 @@ def test_which_embodiments_look_trained(base: Path) -> None:
 
 def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:
     folder = layouts.write(tmp_path / "n17", "n17")
-    names = [entry.names for entry in inspect(folder, time=False).embodiments]
+    names = [entry.names for entry in inspect(folder).embodiments]
     assert names[2] == ["libero_sim"]
     assert names[10] == ["new_embodiment"]
     assert names[31] == []
     for text in ("[]", '{"a": "b", "c": [1]}', "{", '{"x": 7}'):
         (folder / "embodiment_id.json").write_text(text)
-        names = [entry.names for entry in inspect(folder, time=False).embodiments]
+        names = [entry.names for entry in inspect(folder).embodiments]
     assert names[7] == ["x"]
 
 
@@ -239,7 +232,7 @@ def sides(report: Inspection) -> dict[str, str]:
 
 
 def test_evidence_on_a_checkpoint_as_the_constructors_left_it(tmp_path: Path) -> None:
-    report = inspect(layouts.write(tmp_path / "fork", "fork", fresh=True), time=False)
+    report = inspect(layouts.write(tmp_path / "fork", "fork", fresh=True))
     assert set(sides(report).values()) == {"for"}
     assert {"DiT blocks", "VL self-attention", "future tokens"} <= set(sides(report))
     assert report.future_tokens is not None
@@ -249,13 +242,13 @@ def test_evidence_on_a_checkpoint_as_the_constructors_left_it(tmp_path: Path) ->
 
 
 def test_evidence_on_a_trained_checkpoint(base: Path) -> None:
-    assert set(sides(inspect(base, time=False)).values()) == {"against"}
+    assert set(sides(inspect(base)).values()) == {"against"}
 
 
 def test_a_reference_of_another_version(base: Path, tmp_path: Path) -> None:
     other = layouts.write(tmp_path / "n17", "n17")
     with pytest.raises(saccade.InputError, match=r"n17 is of GR00T N1\.7, expected N1\.5"):
-        inspect(base, reference=other, time=False)
+        inspect(base, reference=other)
 
 
 def test_tokens_that_are_not_finite(tmp_path: Path) -> None:
@@ -263,9 +256,7 @@ def test_tokens_that_are_not_finite(tmp_path: Path) -> None:
     tensors = load_file(folder / "model.safetensors")
     tensors["action_head.future_tokens.weight"][0, 0] = torch.nan
     save_file(tensors, folder / "model.safetensors")
-    assert inspect(folder, time=False).odd == [
-        "future_tokens.weight contains 1 values that are NaN or infinite"
-    ]
+    assert inspect(folder).odd == ["future_tokens.weight contains 1 values that are NaN or infinite"]
 
 
 def fine_tuned(base: Path, folder: Path, tensors: dict[str, Tensor] | None = None) -> Path:
@@ -285,11 +276,11 @@ def fine_tuned(base: Path, folder: Path, tensors: dict[str, Tensor] | None = Non
 
 
 def test_beside_the_checkpoint_that_it_was_trained_from(base: Path, tmp_path: Path) -> None:
-    report = inspect(fine_tuned(base, tmp_path / "kept"), reference=base, time=False)
+    report = inspect(fine_tuned(base, tmp_path / "kept"), reference=base)
     found = report.reference
     assert found is not None
     state = found.parts["state encoder"]
-    assert state.identical == state.pieces - 2  # all but the weights of one embodiment
+    assert state.identical == state.compared - 2  # all but the weights of one embodiment
     cosine = found.parts["DiT blocks"].cosine
     assert cosine is not None
     assert cosine.min > 0.999
@@ -308,7 +299,7 @@ def test_beside_a_checkpoint_that_was_dropped(base: Path, tmp_path: Path) -> Non
     """64 tokens where the checkpoint had 32, everything dropped, then trained."""
     config = layout_heads.head_config("fork") | {"num_target_vision_tokens": 64}
     folder = layouts.write(tmp_path / "dropped", "fork", config=config, seed=9, trained=[31])
-    report = inspect(folder, reference=base, time=False)
+    report = inspect(folder, reference=base)
     assert sides(report)["DiT blocks compared with the reference"] == "for"
     assert sides(report)["embodiment 24 (gr1), which NVIDIA trained"] == "for"
     assert report.reference is not None
@@ -328,7 +319,7 @@ def test_what_is_odd(base: Path, tmp_path: Path) -> None:
         "model.transformer_blocks.1.attn1.to_q.weight": zeros,
         "model.transformer_blocks.2.ff.net.0.proj.weight": broken,
     }
-    report = inspect(fine_tuned(base, tmp_path / "odd", odd), time=False)
+    report = inspect(fine_tuned(base, tmp_path / "odd", odd))
     assert report.odd == [
         "every value of model.transformer_blocks.1.attn1.to_q.weight is 0",
         "model.transformer_blocks.2.ff.net.0.proj.weight contains 3 values that are NaN or infinite",
@@ -344,8 +335,8 @@ def test_embodiments_whose_layers_are_zero(base: Path, tmp_path: Path) -> None:
         if name.endswith((".W", ".b")):
             tensor[[2, 5]] = 0.0
     save_file(tensors, folder / "model.safetensors")
-    report = inspect(folder, time=False)
-    assert [entry.id for entry in report.embodiments if entry.looks == "zero"] == [2, 5]
+    report = inspect(folder)
+    assert [entry.id for entry in report.embodiments if entry.weights == "zero"] == [2, 5]
     assert report.odd == [
         "the layers of 2 embodiments are zero, as after saccade convert: 2, 5",
     ]
@@ -355,8 +346,6 @@ def test_a_checkpoint_that_does_not_load_is_not_inspected(base: Path, tmp_path: 
     folder = fine_tuned(base, tmp_path / "more", {"surprise": torch.zeros(3)})
     with pytest.raises(CheckpointError, match="surprise is unknown"):
         inspect(folder)
-    with pytest.raises(InputError, match="num_vl_tokens"):
-        inspect(base, num_vl_tokens=0)
 
 
 def run(*arguments: str | Path) -> int:
@@ -364,9 +353,9 @@ def run(*arguments: str | Path) -> int:
 
 
 def test_the_command_prints_json(base: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(base, "--json", "--no-time") == 0
+    assert run(base, "--json") == 0
     report = json.loads(capsys.readouterr().out)
-    assert (report["version"], report["layout"], report["seconds"]) == ("n1.5", "nvidia", None)
+    assert (report["version"], report["layout"]) == ("n1.5", "nvidia")
 
 
 def test_the_command_prints_tables(base: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -376,7 +365,6 @@ def test_the_command_prints_tables(base: Path, tmp_path: Path, capsys: pytest.Ca
         "GR00T N1.5",
         "action_arm_decoder 4, action_claw_decoder 2",
         "width of an action while denoised  8",
-        "by the cost model, efficiency as on a ",
         "27 to 30",
         "a random draw",
         "Evidence on",
@@ -394,7 +382,7 @@ def test_without_rich_the_columns_are_plain(base: Path) -> None:
     program = (
         "import sys; sys.modules['rich'] = None\n"
         "from saccade import cli\n"
-        f"sys.exit(cli.main(['inspect', {str(base)!r}, '--no-time']))"
+        f"sys.exit(cli.main(['inspect', {str(base)!r}]))"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert "Embodiments" in result.stdout
@@ -404,8 +392,7 @@ def test_without_rich_the_columns_are_plain(base: Path) -> None:
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path / "nothing") == 2
-    assert run("nvidia/no-such-model", "--no-time") == 2
-    assert run(tmp_path, "--num-vl-tokens", "0") == 2
+    assert run("nvidia/no-such-model") == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 3
+    assert len(lines) == 2
     assert "hf download nvidia/no-such-model" in lines[1]

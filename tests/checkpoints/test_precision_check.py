@@ -46,7 +46,7 @@ def test_the_numbers_are_those_of_the_policy(layout: str, frames: Path) -> None:
     source = whole(layout)
     found = check_precisions(source, frames, instruction="open it", embodiment=EMBODIMENT, seed=3)
     assert [one.name for one in found.precisions] == list(PRECISIONS)
-    assert (found.moments, found.samples, found.source) == (2, NUM_SAMPLES, str(source))
+    assert (found.observations, found.samples, found.source) == (2, NUM_SAMPLES, str(source))
     exact, *others = found.precisions
     assert exact.features == exact.actions.worst == 0.0
     assert found.other_noise.worst > others[0].actions.worst > 0.0
@@ -116,7 +116,7 @@ def test_the_command(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--instruction", "open it", "--embodiment", EMBODIMENT, "--num-threads", "1"]
     assert cli.main([*command, *options]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "2 moments, 4 chunks of each" in printed
+    assert "2 observations, 4 chunks of each" in printed
     assert "recommended: " in printed
     assert all(name in printed for name in (*PRECISIONS, "other noise"))
     assert cli.main([*command, *options, "--json"]) == 0

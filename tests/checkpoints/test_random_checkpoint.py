@@ -14,11 +14,13 @@ from torch import Tensor, nn
 
 import saccade
 from saccade import BackboneInputs, InputError
-from saccade.checkpoints import random_tensors
-from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes
-from saccade.checkpoints.prompt_tokenizer import tokenizer
-from saccade.checkpoints.random_checkpoint import main, small_backbone, small_head, write
-from saccade.checkpoints.random_tensors import Outliers, bfloat16, pieces
+from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.checkpoints.published import RELEASED
+from saccade.checkpoints.random_checkpoint import small_backbone, small_head, write
+from saccade.checkpoints.random_checkpoint import tensors as random_tensors
+from saccade.checkpoints.random_checkpoint.__main__ import main
+from saccade.checkpoints.random_checkpoint.tensors import Outliers, bfloat16, blocks
+from saccade.checkpoints.random_checkpoint.tokenizer import tokenizer
 from saccade_lab.reference import Backbone
 
 Tokenizer = pytest.importorskip("tokenizers").Tokenizer  # it has no types
@@ -64,7 +66,7 @@ def test_shards_have_an_index_and_the_content_does_not_depend_on_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, many = small(tmp_path / "one"), tmp_path / "many"
-    monkeypatch.setattr(random_tensors, "PIECE", 1000)
+    monkeypatch.setattr(random_tensors, "BLOCK", 1000)
     small(many, shard_bytes=500_000)
     assert len(list(many.glob("*.safetensors"))) > 3
     index = json.loads((many / "model.safetensors.index.json").read_text())
@@ -100,8 +102,8 @@ def test_rounding_to_bfloat16_is_torchs() -> None:
 
 def test_pieces_are_small_and_their_moments_right() -> None:
     tensor = random_tensors.Tensor("x.mlp.up_proj.weight", (3000, 2000), "F32")
-    found = list(pieces(tensor, seed=0))
-    assert all(len(piece) <= 4 * random_tensors.PIECE for piece in found)
+    found = list(blocks(tensor, seed=0))
+    assert all(len(piece) <= 4 * random_tensors.BLOCK for piece in found)
     values = np.frombuffer(b"".join(found), np.float32)
     assert values.size * 4 == tensor.nbytes
     assert abs(values.std() * 2000**0.5 - 1) < 1e-2

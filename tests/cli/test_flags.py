@@ -1,4 +1,4 @@
-"""The vocabulary of flags: one name, one meaning, one way to be read, over all commands and studies."""
+"""The flags that commands share: one name, one meaning, one way to be read."""
 
 from __future__ import annotations
 
@@ -10,67 +10,31 @@ import pytest
 from saccade import InputError, cli
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
-from saccade_lab.study.study import STUDIES
-
-#: Flags that say what another one says.
-OLD = ("--threads", "--vl-tokens", "--count", "--inputs", "--bf16", "--size", "--sizes", "--model")
-NEED_A_CHECKPOINT = ("inspect", "convert", "quantize", "resize")
-HAVE_A_DEFAULT = ("rollout", "attention", "bench", "parity")
 
 
-def parser_of(*words: str) -> argparse.ArgumentParser:
-    """The parser of a command, or of one study."""
-    parser = cli.build_parser(words[0])
-    for word in words:
-        found = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-        parser = found.choices[word]
-    if isinstance(parser, cli.Parser) and getattr(parser, "study", None) is not None:
-        with pytest.raises(SystemExit):
-            parser.parse_known_args(["--help"])  # declares its arguments
-    return parser
+@pytest.mark.parametrize("command", ["act", "inspect", "convert", "quantize", "resize", "serve"])
+def test_a_command_that_needs_a_checkpoint_takes_it_first(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([command])
+    assert "arguments are required: CHECKPOINT" in capsys.readouterr().err
 
 
-PARSERS = [*((name,) for name in cli.COMMANDS), *(("study", name) for name in (*STUDIES, "report"))]
+@pytest.mark.parametrize("command", ["bench", "rollout", "attention", "parity"])
+def test_a_command_with_a_default_takes_a_flag(command: str) -> None:
+    parser = cli.build_parser(command)
+    assert parser.parse_args([command]).checkpoint is None
+    assert parser.parse_args([command, "--checkpoint", "policy"]).checkpoint == Path("policy")
 
 
-def flags(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
-    return {flag: action for action in parser._actions for flag in action.option_strings}
-
-
-@pytest.mark.parametrize("words", PARSERS, ids=" ".join)
-def test_flags_of_a_command(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    parser = parser_of(*words)
-    known = flags(parser)
-    assert not known.keys() & set(OLD)
-    for flag, action in known.items():
-        assert action.help, flag
-        assert not action.help.rstrip(")").endswith("."), flag
-    if "--steps" in known:  # indices
-        assert isinstance(known["--steps"], arguments.StoreList)
-    for flag in {
-        "--num-steps",
-        "--num-threads",
-        "--num-vl-tokens",
-        "--training-steps",
-        "--episodes",
-    } & known.keys():
-        assert isinstance(known[flag], arguments.StoreNumber), flag
-        assert known[flag].type is int
-    assert parser.epilog is not None
-    assert "examples:" in parser.epilog
-    assert "  saccade " + " ".join(words) in parser.epilog
-
-
-def positionals(command: str) -> list[str]:
-    return [action.dest for action in parser_of(command)._actions if not action.option_strings]
-
-
-def test_a_checkpoint_is_an_argument_or_a_flag() -> None:
-    for name in NEED_A_CHECKPOINT:
-        assert positionals(name) == ["checkpoint"]
-    for name in HAVE_A_DEFAULT:
-        assert "--checkpoint" in flags(parser_of(name))
-        assert positionals(name) == []
+@pytest.mark.parametrize("command", [*cli.COMMANDS, *cli.LAB_COMMANDS])
+def test_the_help_has_examples(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([command, "--help"])
+    _, found, examples = capsys.readouterr().out.partition("\nexamples:\n")
+    assert found
+    assert f"  saccade {command}" in examples
 
 
 def parsed(*words: str) -> argparse.Namespace:

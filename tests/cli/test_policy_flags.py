@@ -81,7 +81,7 @@ def test_processor_options_are_json_or_a_file_of_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["act", "serve"])
 def test_commands_pass_them_on(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = loading(saccade.Policy, "load", monkeypatch)
+    given = loading(saccade.Policy, "from_pretrained", monkeypatch)
     words = [command, "checkpoint", *FLAGS, *(["--port", "0"] if command == "serve" else [])]
     with pytest.raises(Loaded):
         cli.main(words)
@@ -93,7 +93,7 @@ def test_inspect_passes_them_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     with pytest.raises(Loaded):
         cli.main(["inspect", "checkpoint", "--data-config", "so100"])
     assert given["data_config"] == "so100"
-    given = loading(saccade.Policy, "load", monkeypatch)
+    given = loading(saccade.Policy, "from_pretrained", monkeypatch)
     with pytest.raises(Loaded):
         cli.main(["inspect", "checkpoint", "--precision-check", ".", *FLAGS])
     assert OVERRIDES.items() <= given.items()
@@ -104,7 +104,7 @@ def test_inspect_passes_them_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 
 def test_rollout_passes_on_those_that_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = loading(saccade.Policy, "load", monkeypatch)
+    given = loading(saccade.Policy, "from_pretrained", monkeypatch)
     made = episodes.Episodes(
         str(policy.DEMO_CHECKPOINT),
         data_config="so100",

@@ -15,19 +15,19 @@ import pytest
 
 from saccade._internal import json as _json
 from saccade._internal.files import write_atomically, write_json
-from saccade.cli import _output, main
+from saccade.cli import main, output
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
 from tests.helpers.systems import IS_ROOT
 
-INSPECT = [sys.executable, "-m", "saccade", "inspect", str(DEMO_CHECKPOINT), "--no-time"]
+INSPECT = [sys.executable, "-m", "saccade", "inspect", str(DEMO_CHECKPOINT)]
 #: Prints what no ASCII stream can take, through rich and without.
 PRINTS = """
 import sys, types
 from saccade import cli
-from saccade.cli import _output
+from saccade.cli import output
 def run(args):
     print("18–32 × é “told” \\udcff")
-    _output.console().print("R² → 0.3")
+    output.console().print("R² → 0.3")
     return 0
 cli.load_command = lambda name: types.SimpleNamespace(add_arguments=lambda parser: None, run=run)
 sys.exit(cli.main(["parity"]))
@@ -160,11 +160,11 @@ def test_progress_in_a_log_is_at_most_a_line_a_minute(
 ) -> None:
     """Also without rich."""
     now = 0.0
-    monkeypatch.setattr("saccade.cli._output.time.monotonic", lambda: now)
+    monkeypatch.setattr("saccade.cli.output.time.monotonic", lambda: now)
 
     def work() -> str:
         nonlocal now
-        with _output.progress_bar("reading", 3_000_000, in_bytes=True) as update:
+        with output.progress_bar("reading", 3_000_000, in_bytes=True) as update:
             for later, total, description in (
                 (59, None, None),
                 (2, None, None),

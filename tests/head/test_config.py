@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import saccade
-from saccade.bench.heads import sized
+from saccade.checkpoints.random_checkpoint.head import config_of_size
 from saccade_lab.reference.random_weights import CONFIGS, small_config, whole_config
 
 Config = dict[str, Any]
@@ -73,7 +73,7 @@ def test_published_sizes(kind: str) -> None:
 
 @pytest.mark.parametrize("size", ["n1.5", "n1.6", "n1.7"])
 def test_the_sizes_to_time_are_the_published_ones(size: str) -> None:
-    assert read(sized(size)) == read({**CONFIGS[size], "max_num_embodiments": 1})
+    assert read(config_of_size(size)) == read({**CONFIGS[size], "max_num_embodiments": 1})
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 import saccade
 from saccade_lab.reference import ActionHead, lerobot_head
-from saccade_lab.reference.random_weights import n15_config, random_head, random_inputs, write_checkpoint
+from saccade_lab.reference.random_weights import random_head, random_inputs, sized_config, write_checkpoint
 from tests.helpers.reference_cases import relative_error, small_config
 from tests.helpers.released import Released
 
@@ -40,7 +40,7 @@ class Wide:
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory: pytest.TempPathFactory) -> Wide:
     checkpoint = tmp_path_factory.mktemp("wide")
-    config = n15_config(num_layers=2, vl_num_layers=1, num_embodiments=3)
+    config = sized_config("n1.5", num_layers=2, vl_num_layers=1, num_embodiments=3)
     write_checkpoint(checkpoint, config, seed=0)
     reference = ActionHead.from_pretrained(checkpoint)
     theirs = lerobot_head.build(config, device="meta")

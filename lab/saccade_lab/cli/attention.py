@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal import flags as arguments
 from saccade._internal.files import writable_directory, write_json
 from saccade._internal.flags import UsageError
-from saccade.cli import EXIT_OK, _output
+from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
-from saccade_lab.extras import require
+from saccade_lab.extras import LAB, require
 
 if TYPE_CHECKING:
     from saccade.head.config import HeadConfig
@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from saccade_lab.maps.view import View
 
 HELP = "show what the rows of the action head attend to"
+EXTRAS = LAB
 
 EPILOG = """\
 The observation comes from the simulator (--task, --seed, --after), from pictures (--frames) or from a file of
 backbone features (--features).
 
 Pictures need a whole checkpoint, with backbone and tokenizer. DIR holds a picture for each camera, named
-after it (front.png), and state.json; or a folder of these for each moment, of which --row chooses one.
+after it (front.png), and state.json; or a folder of these for each observation, of which --row chooses one.
 Without state.json and --state the state is in the middle of the robot's range. `saccade inspect` lists the
 cameras.
 
@@ -72,9 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "seed of the task's layout, words and noise; with pictures or a file without noise, of the noise",
     )
-    arguments.add_integer(
-        parser, "--row", minimum=0, help="which moment or observation, of several (default: 0)"
-    )
+    arguments.add_integer(parser, "--row", minimum=0, help="which observation, of several (default: 0)")
     simulator = parser.add_argument_group("an observation from the simulator")
     simulator.add_argument(
         "--task", metavar="NAME", help="task (default: push, or the policy's first task if it lacks push)"
@@ -131,13 +130,13 @@ def run(args: argparse.Namespace) -> int:
     maps = compute(args)
     writable_directory(args.out)
     # 21 s with 16 blocks, 32 heads, T_vl 825
-    with _output.console(stderr=True).status("numbers, sheet and page"):
+    with output.console(stderr=True).status("numbers, sheet and page"):
         record = maps.to_dict()
         write_sheet(maps, args.out / "sheet.png")
         write_page(maps, args.out / "page.html")
         write_json(args.out / "attention.json", record)
     if args.json:
-        _output.print_json(record, indent=2)
+        output.print_json(record, indent=2)
     else:
         show(maps, record, args.out)
     return EXIT_OK
@@ -255,7 +254,7 @@ def take_simulator(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHe
 
 
 def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:
-    """The head of a whole checkpoint, and the moment of a directory that the arguments ask for."""
+    """The head of a whole checkpoint, and the observation of a directory that the arguments ask for."""
     import numpy as np
 
     from saccade.observations.pictures import read_frames
@@ -263,7 +262,7 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     from saccade.policy.policy import Policy
     from saccade_lab.maps.view import from_policy
 
-    with _output.progress_bar("loading", transient=True):
+    with output.progress_bar("loading", transient=True):
         policy = Policy.from_pretrained(
             checkpoint,
             embodiment=args.embodiment,
@@ -273,21 +272,21 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
             num_threads=args.num_threads,
         )
     parts = parts_of(policy)
-    moments = read_frames(args.frames, policy, instruction=args.instruction, state=args.state)
+    recorded = read_frames(args.frames, policy, instruction=args.instruction, state=args.state)
     row = args.row or 0
-    if row >= len(moments):
-        raise UsageError(f"--row: given {row}, {args.frames} has moments 0 to {len(moments) - 1}")
-    moment = moments[row]
+    if row >= len(recorded):
+        raise UsageError(f"--row: given {row}, {args.frames} has observations 0 to {len(recorded) - 1}")
+    one = recorded[row]
     robot = policy.normalizer.embodiment or f"embodiment {policy.embodiment_id}"
     view = from_policy(
         policy,
-        moment.observation,
+        one.observation,
         rng=np.random.default_rng(args.seed),
-        title=f'{moment.name}: "{moment.instruction}", {robot}',
+        title=f'{one.name}: "{one.instruction}", {robot}',
         source={
             "kind": "frames",
-            "moment": moment.name,
-            "instruction": moment.instruction,
+            "moment": one.name,
+            "instruction": one.instruction,
             "embodiment_id": policy.embodiment_id,
             "precision": args.precision or "float32",
             "preprocessing": parts.processor.preprocessing,
@@ -311,7 +310,7 @@ def occlude(head: ActionHead, view: View, cell: int) -> Occlusion:
         return np.asarray(chunks)[0]
 
     total = len(places_of(view.layout, cell))
-    with _output.progress_bar("occlusion", total, transient=True) as update:
+    with output.progress_bar("occlusion", total, transient=True) as update:
         return measure(head, view.layout, view.occluder, whole, cell=cell, on_done=update)
 
 
@@ -323,7 +322,7 @@ def show(maps: Maps, record: dict[str, Any], out: Path) -> None:
 
     from saccade_lab.maps.notes import NO_FUTURE, NO_IMAGES
 
-    console = _output.console(width=WIDTH)
+    console = output.console(width=WIDTH)
     console.print(maps.view.title, style="bold", markup=False, soft_wrap=True)
     entries = [entry for entry in record["summaries"] if entry["head"] == "mean"]
     for reads, blocks in (("vl", maps.cross_blocks()), ("rows", maps.self_blocks())):

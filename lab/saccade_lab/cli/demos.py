@@ -6,13 +6,14 @@ import argparse
 
 from saccade._internal import flags as arguments
 from saccade._internal.files import writable_directory
-from saccade.cli import EXIT_OK, _output
+from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
-from saccade_lab.extras import require
+from saccade_lab.extras import LAB, require
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 
 HELP = "record demonstrations of the tasks with scripted experts"
+EXTRAS = LAB
 
 EPILOG = """\
 Tasks of the demo: reach, push, drawer-open, button-press-topdown, window-open. Harder tasks, for studies:
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     counts = {task: args.episodes or DEFAULT_COUNTS[task] for task in tasks}
     writable_directory(args.out)
     done = 0
-    with _output.progress_bar("demos", sum(counts.values())) as update:
+    with output.progress_bar("demos", sum(counts.values())) as update:
 
         def on_episode(task: str) -> None:
             nonlocal done

@@ -16,12 +16,13 @@ import numpy as np
 
 import saccade
 from saccade._internal import flags as arguments
+from saccade._internal.arrays import PRECISIONS
 from saccade._internal.environment import cpu_name
 from saccade._internal.flags import UsageError
 from saccade.checkpoints.hub import resolve
-from saccade.cli import _output
+from saccade.cli import output
 from saccade.observations.recorded import Observation, read
-from saccade_lab.extras import require
+from saccade_lab.extras import LAB, require
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     Outputs: TypeAlias = tuple[NDArray[Any], NDArray[Any]]  # vl_embs, actions
 
 HELP = "compare the Rust head with the torch reference"
+EXTRAS = LAB
 EPILOG = """\
 The reference runs in float64. Its float32 result is shown for comparison. The exit status is 1 if an action
 differs from the reference by more than --tolerance; at a precision below float32 there is no verdict.
@@ -110,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_num_steps(parser)
     parser.add_argument(
         "--precision",
-        choices=arguments.PRECISIONS,
+        choices=PRECISIONS,
         default="float32",
         help="precision of the Rust head (default: float32)",
     )
@@ -134,9 +136,9 @@ def run(args: argparse.Namespace) -> int:
         inputs = recorded_inputs(source, args) if args.features else random_inputs(source, args)
         outputs = {}
         for engine, run_engine in engines(source, inputs, args):
-            _output.note("parity", engine)
+            output.note("parity", engine)
             outputs[engine] = run_engine()
-        _output.note("parity", f"reference in float64: {describe(inputs)}")
+        output.note("parity", f"reference in float64: {describe(inputs)}")
         expected = run_reference(source, inputs, args.num_steps, "float64")
     results = [
         Result(engine, Deviation.between(vl_embs, expected[0]), Deviation.between(actions, expected[1]))
@@ -160,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
         "results": [dataclasses.asdict(result) for result in results],
     }
     if args.json:
-        _output.print_json(report, indent=1)
+        output.print_json(report, indent=1)
     else:
         print(table(report, results))
     return 0 if passed else EXIT_DIFFERENT
@@ -188,7 +190,7 @@ def write_random(folder: Path, args: argparse.Namespace) -> None:
     config = random_weights.small_config(version)
     if args.full:
         config = random_weights.sized_config(version, num_embodiments=2)
-    _output.note("parity", "writing random weights")
+    output.note("parity", "writing random weights")
     dtype = torch.bfloat16 if args.dtype == "bfloat16" else torch.float32
     random_weights.write_checkpoint(folder, config, args.seed, dtype=dtype)
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal import flags as arguments
 from saccade._internal.files import path_text, writable_directory, write_atomically, write_json
 from saccade._internal.policy_flags import add_data_config, add_overrides
-from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade.errors import SaccadeError
 from saccade_lab import flags as lab_flags
-from saccade_lab.extras import require
+from saccade_lab.extras import LAB, require
 from saccade_lab.parallel import Lost, Workers, each
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from saccade_lab.sim.report import Summary
 
 HELP = "run a policy on the simulated robot and report how often it succeeds"
+EXTRAS = LAB
 
 COLUMNS = 50  # of the contact sheet: with more seeds, only the first ones are shown
 
@@ -165,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
     if pictures:
         write_contact_sheet(pictures, session.out / "contact-sheet.png")
     if args.json:
-        _output.print_json(session.record(), indent=2)
+        output.print_json(session.record(), indent=2)
     else:
         show(session)
     if session.lost:
@@ -202,7 +203,7 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
 
 def roll_out(session: Session) -> None:
     """Runs the episodes with a progress bar."""
-    with _output.progress_bar("rollout", len(session.seeds) * len(session.tasks)) as update:
+    with output.progress_bar("rollout", len(session.seeds) * len(session.tasks)) as update:
 
         def on_episode(rolled: Rolled) -> None:
             done = len(session.done)
@@ -216,7 +217,7 @@ def show(session: Session) -> None:
     """Prints the table and where the files are."""
     from saccade_lab.sim.report import summarize, summarize_tasks
 
-    console = _output.console()
+    console = output.console()
     episodes = [rolled.episode for rolled in session.done]
     if not episodes:
         print("no episode was completed")

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
 from saccade._internal.files import writable_directory
-from saccade.cli import EXIT_OK, Parser, _output
-from saccade_lab.extras import require
+from saccade.cli import EXIT_OK, Parser, output
+from saccade_lab.extras import LAB, require
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.study.study import STUDIES, load_study
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 HELP = "measure what the parts of an action head contribute"
+EXTRAS = LAB
 
 EPILOG = """\
 DIR receives STUDY.csv (one row per measurement) and STUDY.json (settings, hashes, versions) after every cell
@@ -95,11 +96,11 @@ def measure(args: argparse.Namespace) -> int:
     from saccade_lab.study.run import run as run_study
 
     workers = workers_of(args)
-    with _output.progress_bar("loading", transient=True) as loading:
-        args.on_moment = lambda done, total: loading(done, total, "looking at the pictures")
+    with output.progress_bar("loading", transient=True) as loading:
+        args.on_moment = lambda done, total: loading(done, total, "reading the pictures")
         study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
-    with _output.progress_bar(args.study) as update:
+    with output.progress_bar(args.study) as update:
 
         def on_done(finished: Finished, done: int, total: int) -> None:
             update(done, total, finished.cell.name)
@@ -118,7 +119,7 @@ def show(name: str, out: Path, as_json: bool) -> None:
         rows: list[dict[str, Any]] = json.loads(
             tables.read_table(tables.table_path(out, name)).to_json(orient="records", double_precision=15)
         )
-        _output.print_json({"provenance": vars(provenance), "rows": rows}, indent=2)
+        output.print_json({"provenance": vars(provenance), "rows": rows}, indent=2)
         return
     section = load_study(name).summarise(tables.read_table(tables.table_path(out, name)), provenance)
     for line in (*section.answer, *section.concluded):
@@ -133,7 +134,7 @@ def run_report(args: argparse.Namespace) -> int:
 
     page, markdown = write_report(args.directory)
     if args.json:
-        _output.print_json({"html": str(page), "markdown": str(markdown)})
+        output.print_json({"html": str(page), "markdown": str(markdown)})
     else:
         print(f"page      {page}")
         print(f"markdown  {markdown}")

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
 from saccade._internal.files import writable_directory
-from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, _output
-from saccade_lab.extras import require
+from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
+from saccade_lab.extras import LAB, require
 
 if TYPE_CHECKING:
     from saccade_lab.training.settings import TrainingSettings
     from saccade_lab.training.train import Progress
 
 HELP = "train a policy on recorded demonstrations"
+EXTRAS = LAB
 
 EPILOG = """\
 Trains a small whole checkpoint of GR00T N1.5's kind, a SigLIP, a Qwen3 and an action head, and writes it in
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     writable_directory(args.out)
     torch.set_num_threads(args.num_threads)
     try:
-        with _output.progress_bar("reading", settings.steps) as update:
+        with output.progress_bar("reading", settings.steps) as update:
 
             def on_step(now: Progress) -> None:
                 held_out = "" if now.validation_loss is None else f", held out {now.validation_loss:.3f}"

@@ -10,20 +10,12 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from saccade.checkpoints.head_configs import (
-    CONFIGS,
-    n15_config,
-    sized_config,
-    small_config,
-    unused_parameters,
-    whole_config,
-)
+from saccade.checkpoints.published import CONFIGS, sized_config, small_config, whole_config
 from saccade.head.config import HeadConfig
 from saccade_lab.reference.head import ActionHead
 
 __all__ = [
     "CONFIGS",
-    "n15_config",
     "random_head",
     "random_inputs",
     "random_masks",
@@ -34,6 +26,17 @@ __all__ = [
     "whole_config",
     "write_checkpoint",
 ]
+
+
+def unused_parameters(config: Mapping[str, Any]) -> list[str]:
+    """Parameters that the released code creates from a config, but that inference does not use."""
+    names = []
+    if config.get("use_multi_action_heads") and config.get("use_learnable_loss_weights"):
+        arms = ["left_arm", "right_arm"] if config.get("split_arm_heads") else ["arm"]
+        names += [f"task_log_sigma.{part}" for part in [*arms, "claw"]]
+    if config.get("model_type") == "Gr00tN1d6" and config.get("state_dropout_prob", 0.0) > 0:
+        names.append("mask_token")
+    return names
 
 
 def random_head(config: Mapping[str, Any], seed: int, *, dtype: torch.dtype = torch.float32) -> ActionHead:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from saccade._internal.files import write_json
 from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config
-from saccade.checkpoints.prompt_tokenizer import token_id, tokenizer
-from saccade.checkpoints.robot_metadata import metadata
+from saccade.checkpoints.random_checkpoint.robot_metadata import metadata
+from saccade.checkpoints.random_checkpoint.tokenizer import token_id, tokenizer
 from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.processor import Processor
@@ -109,7 +109,7 @@ class PolicyConfig:
 
     Attributes:
         head: Config of the head, in the published keys.
-        backbone: Config of the backbone, in the keys of `saccade.checkpoints.backbone_sizes.RELEASED`.
+        backbone: Config of the backbone, in the keys of `saccade.checkpoints.published.RELEASED`.
         simulation: How it is run in the simulator.
         words: Words that are one token each.
         statistics: Statistics of `state` and `action`, by group, see `statistics_of`; empty before the

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 FLOAT32 = np.dtype(np.float32)
 INT64 = np.dtype(np.int64)
 
+#: The precisions that weights are loaded in.
+PRECISIONS = ("float32", "bfloat16", "int8")
+
 #: No head has as many tokens. A larger range is refused, since it would be slow to write out.
 LARGEST_RANGE = 1 << 20
 
@@ -184,8 +187,8 @@ def check_precision(precision: str) -> None:
     """
     if not isinstance(precision, str):
         raise InputError(
-            "precision: expected one of 'float32', 'bfloat16', 'int8', got "
-            f"{precision!r} ({type(precision).__name__})"
+            f"precision: expected one of {str(PRECISIONS)[1:-1]}, got {precision!r} "
+            f"({type(precision).__name__})"
         )
     text("precision", precision)
 

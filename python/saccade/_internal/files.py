@@ -41,7 +41,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def path_text(path: Path) -> str:
-    """A path as text that contains a separator, which tells it from a word.
+    """A path as text that contains a separator, so that it cannot be taken for a word.
 
     Example:
         >>> path_text(Path("reach")), path_text(Path("out/reach"))
@@ -67,12 +67,12 @@ def writable_directory(path: Path) -> Path:
 
 
 def sha256_of(*paths: Path) -> str:
-    """SHA-256 of files, one after the other, read in pieces."""
+    """SHA-256 of files, one after the other, read in blocks."""
     digest = hashlib.sha256()
     for path in paths:
         with path.open("rb") as file:
-            while piece := file.read(1 << 24):
-                digest.update(piece)
+            while block := file.read(1 << 24):
+                digest.update(block)
     return digest.hexdigest()
 
 

@@ -19,8 +19,6 @@ from saccade.errors import InputError
 #: A parser, or a group of its arguments.
 Arguments: TypeAlias = argparse._ActionsContainer
 
-PRECISIONS = ("float32", "bfloat16", "int8")
-
 
 class UsageError(Exception):
     """Arguments that a command cannot follow; printed as one line, without a traceback."""
@@ -251,7 +249,7 @@ WITH_FRAMES = (
 )
 
 
-def add_moments(parser: Arguments, flag: str) -> None:
+def add_pictures(parser: Arguments, flag: str) -> None:
     """Declares a directory of pictures, an instruction and a state, for `read_frames`.
 
     Args:
@@ -262,15 +260,15 @@ def add_moments(parser: Arguments, flag: str) -> None:
         flag,
         type=Path,
         metavar="DIR",
-        help="a picture for each camera, named after it (front.png), or a folder of them for each moment",
+        help="a picture for each camera, named after it (front.png), or folders of them, one per observation",
     )
-    parser.add_argument("--instruction", metavar="TEXT", help="what the robot is told")
+    parser.add_argument("--instruction", metavar="TEXT", help="instruction to the robot")
     parser.add_argument(
         "--state",
         type=Path,
         metavar="FILE",
-        help="JSON: the robot's state in its own units, for moments without a state.json (default: the "
-        "middle of its range)",
+        help="JSON: the robot's state in its own units, for observations without a state.json (default: "
+        "the middle of its range)",
     )
 
 

@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from saccade._internal.flags import PRECISIONS, Arguments, UsageError, add_integer, add_preprocessing
+from saccade._internal.arrays import PRECISIONS
+from saccade._internal.flags import Arguments, UsageError, add_integer, add_preprocessing
 
 
 def add_policy_options(parser: Arguments) -> None:

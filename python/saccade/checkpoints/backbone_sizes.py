@@ -8,82 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
+from saccade.checkpoints.published import RELEASED
 from saccade.errors import CheckpointError
 
 #: ``model_type`` of a checkpoint's config, and the version of its backbone.
-MODEL_TYPES: Mapping[str, str] = MappingProxyType(
-    {"gr00t_n1_5": "n1.5", "Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
-)
-
-_QWEN3 = {
-    "hidden_size": 2048,
-    "intermediate_size": 6144,
-    "num_hidden_layers": 28,
-    "num_attention_heads": 16,
-    "num_key_value_heads": 8,
-    "head_dim": 128,
-    "vocab_size": 151680,
-    "rms_norm_eps": 1e-6,
-    "rope_theta": 1e6,
-}
-_SIGLIP = {
-    "hidden_size": 1152,
-    "intermediate_size": 4304,
-    "num_hidden_layers": 27,
-    "num_attention_heads": 16,
-    "patch_size": 14,
-    "layer_norm_eps": 1e-6,
-}
-
-#: The configs of the published backbones, by version; the keys are those of the released code.
-RELEASED: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "n1.5": {
-            "select_layer": 12,
-            "project_to_dim": None,
-            "use_pixel_shuffle": False,
-            "downsample_ratio": 0.5,
-            "mlp_connector_layers": 1,
-            "image_token_index": 151669,
-            "text_config": _QWEN3,
-            "vision_config": {**_SIGLIP, "image_size": 224},
-        },
-        "n1.6": {
-            "select_layer": 16,
-            "use_pixel_shuffle": True,
-            "downsample_ratio": 0.5,
-            "mlp_connector_layers": 2,
-            "image_token_index": 151669,
-            "text_config": _QWEN3,
-            "vision_config": {**_SIGLIP, "num_patches": 256},
-        },
-        "n1.7": {
-            "select_layer": 16,
-            "image_token_index": 151655,
-            "text_config": {
-                **_QWEN3,
-                "vocab_size": 151936,
-                "rope_theta": 5e6,
-                "rope_scaling": {"mrope_section": [24, 20, 20]},
-            },
-            "vision_config": {
-                "hidden_size": 1024,
-                "intermediate_size": 4096,
-                "depth": 24,
-                "num_heads": 16,
-                "patch_size": 16,
-                "temporal_patch_size": 2,
-                "spatial_merge_size": 2,
-                "out_hidden_size": 2048,
-                "num_position_embeddings": 2304,
-                "deepstack_visual_indexes": [5, 11, 17],
-            },
-        },
-    }
-)
+MODEL_TYPES: Mapping[str, str] = {"gr00t_n1_5": "n1.5", "Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def odd_tokens(tokens: TokenStatistics | None, description: Description) -> list
 
 def odd_embodiments(embodiments: Sequence[Embodiment]) -> list[str]:
     """What is unusual about the layers of the embodiments."""
-    ids = [str(entry.id) for entry in embodiments if entry.looks == "zero"]
+    ids = [str(entry.id) for entry in embodiments if entry.weights == "zero"]
     if not ids:
         return []
     return [f"the layers of {len(ids)} embodiments are zero, as after saccade convert: {', '.join(ids)}"]
@@ -80,11 +80,11 @@ def from_noise(
     if version == "n1.5" and len(embodiments) == 32:
         for name in PRETRAINED:
             entry = embodiments[N15_IDS[name]]
-            if entry.looks == "zero":
+            if entry.weights == "zero":
                 continue
-            side = "for" if entry.looks == "as initialised" else "against"
+            side = "for" if entry.weights == "as initialised" else "against"
             found[side].append(
-                f"embodiment {entry.id} ({name}), which NVIDIA trained: its layers look {entry.looks}"
+                f"embodiment {entry.id} ({name}), which NVIDIA trained: its layers look {entry.weights}"
             )
     if reference is not None:
         for name, resemblance in reference.parts.items():
@@ -110,10 +110,10 @@ def _of_tokens(tokens: TokenStatistics) -> str:
 
 def _likeness(part: PartResemblance) -> tuple[str, str]:
     """The side that a part's resemblance to the reference is on, and the reason."""
-    same = f"{part.identical} of {part.pieces} tensors and slices are identical"
+    same = f"{part.identical} of {part.compared} tensors and slices are identical"
     if part.cosine is None:
         return ("against" if part.identical else "neither"), same
     others = f"cosines of the other weights are {part.cosine.min:.3f} to {part.cosine.max:.3f}"
-    if part.cosine.mean > RELATED or part.identical * 2 > part.pieces:
+    if part.cosine.mean > RELATED or part.identical * 2 > part.compared:
         return "against", f"{same}, {others}"
     return ("for" if part.cosine.max < RELATED else "neither"), f"{same}, {others}"

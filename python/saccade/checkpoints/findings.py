@@ -48,20 +48,6 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class MachineRates:
-    """What the CPU can do, measured during the inspection, and what the expected times assume of it."""
-
-    isa: str
-    num_threads: int
-    macs_per_second: dict[str, float]
-    """Multiply-adds per second by arithmetic."""
-    read_bytes_per_second: float
-    """Rate of reading from memory."""
-    efficiency_of: str
-    """The CPU on which the shares of these rates that saccade reaches were measured."""
-
-
-@dataclass(frozen=True)
 class Embodiment:
     """The category-specific layers of one embodiment."""
 
@@ -73,7 +59,7 @@ class Embodiment:
     robust_z: float | None
     """Distance of the norm from the median over all ids, in units of 1.4826 median absolute deviations. None
     if the deviation is 0."""
-    looks: str
+    weights: str
     """``"zero"``, ``"as initialised"`` (biases are zero, weights are distributed as before any training) or
     ``"trained"``."""
 
@@ -125,7 +111,7 @@ class TokenStatistics(TokenGeometry):
 class PartResemblance:
     """How similar one part is to the same part of the reference."""
 
-    pieces: int
+    compared: int
     """Number of tensors that were compared. Each embodiment's slice counts separately. Tensors that the
     reference has as initialised (biases, norms) are left out."""
     identical: int
@@ -164,12 +150,6 @@ class Inspection(Description):
     """The robots whose statistics are among the files."""
     memory: dict[str, Memory]
     """Size of a loaded head by precision."""
-    num_vl_tokens: int
-    """T_vl of the expected times."""
-    machine: MachineRates | None
-    """The machine of the expected times; None if they were not requested."""
-    seconds: dict[str, dict[str, float]] | None
-    """Expected time of ``encode`` and ``sample`` by precision, in seconds."""
     embodiments: list[Embodiment]
     """All ids in ascending order."""
     future_tokens: TokenStatistics | None

@@ -1,4 +1,4 @@
-"""Examines a checkpoint: sizes, parts, memory, expected time, embodiments, future tokens, anomalies."""
+"""Examines a checkpoint: sizes, parts, memory, embodiments, future tokens, anomalies."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import saccade._saccade as _saccade
-from saccade._internal.arrays import integer
-from saccade.bench.cost import PRECISIONS, Machine, measured_like, predict
-from saccade.bench.work import Call
+from saccade._internal.arrays import PRECISIONS
 from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
-from saccade.checkpoints.findings import Counts, Inspection, MachineRates, Memory
+from saccade.checkpoints.findings import Counts, Inspection, Memory
 from saccade.checkpoints.hub import resolve
 from saccade.checkpoints.resemblance import Reference
-from saccade.checkpoints.survey import Piece, Survey
+from saccade.checkpoints.survey import Slice, Survey
 from saccade.checkpoints.tokens import token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.errors import InputError, SaccadeError
-from saccade.head.config import HeadConfig, to_json
+from saccade.head.config import to_json
 from saccade.robots import DataConfigLike, read_json
 from saccade.robots.embodiments import IDS
 
@@ -29,8 +26,6 @@ def inspect(
     *,
     config: Config = None,
     reference: Source | None = None,
-    num_vl_tokens: int = 296,
-    time: bool = True,
     data_config: DataConfigLike | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Inspection:
@@ -42,10 +37,8 @@ def inspect(
         source, config: As for :meth:`saccade.ActionHead.from_pretrained`.
         reference: A checkpoint to compare with, tensor by tensor; for example the one that ``source`` was
             trained from.
-        num_vl_tokens: T_vl of the expected times. 296 is what one camera produces in N1.5.
         data_config: The data config of the robots of GR00T N1 and N1.5, as for
             :meth:`saccade.Normalizer.from_pretrained`.
-        time: Whether to estimate times. This measures the CPU, which takes about a second.
         progress: Called with the number of bytes that are done and the total number of bytes.
 
     Returns:
@@ -53,12 +46,10 @@ def inspect(
         them to JSON values.
 
     Raises:
-        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that
-        values need not be
-            finite.
-        InputError: ``num_vl_tokens`` is not an integer of at least 1, or ``reference`` is of another version.
+        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that values
+            need not be finite.
+        InputError: ``reference`` is of another version.
     """
-    num_vl_tokens = integer("num_vl_tokens", num_vl_tokens)
     published = open_published(source, config)
     published.check()
     description = description_of(published, source)
@@ -70,20 +61,19 @@ def inspect(
             f"{head.version.upper()}, the version of source"
         )
 
-    def look(piece: Piece) -> None:
+    def compare(one: Slice) -> None:
         if other is not None:
-            other.compare(piece)
+            other.compare(one)
 
     path = resolve(source)
     outside = _outside(description)
-    survey = Survey(published, head, look, progress)
+    survey = Survey(published, head, compare, progress)
     parts = survey.parts()
     embodiments = survey.embodiments(_embodiment_names(description))
     tokens = None
     if survey.tokens is not None and len(survey.tokens) > 0:
         tokens = token_statistics(survey.tokens, head.future_key_bias)
     resemblance = None if other is None else other.resemblance()
-    machine, seconds = expected_times(head, num_vl_tokens) if time else (None, None)
     return Inspection(
         **vars(description),
         parts=parts,
@@ -97,30 +87,12 @@ def inspect(
             )
             for precision in PRECISIONS
         },
-        num_vl_tokens=num_vl_tokens,
-        machine=machine,
-        seconds=seconds,
         embodiments=embodiments,
         future_tokens=tokens,
         reference=resemblance,
         odd=survey.odd + odd_tokens(tokens, description) + odd_embodiments(embodiments),
         from_noise=from_noise(head.version, parts, tokens, embodiments, resemblance),
     )
-
-
-def expected_times(head: HeadConfig, num_vl_tokens: int) -> tuple[MachineRates, dict[str, dict[str, float]]]:
-    """The rates of this CPU, measured now, and the seconds that `saccade.bench.cost` expects of a chunk."""
-    machine = Machine.measured(_saccade.selected_isa(), _saccade.default_num_threads())
-    call = Call.of(head, num_vl_tokens)
-    seconds = {precision: predict(head, call, precision, machine) for precision in PRECISIONS}
-    rates = MachineRates(
-        isa=machine.isa,
-        num_threads=machine.num_threads,
-        macs_per_second=dict(machine.macs_per_second),
-        read_bytes_per_second=machine.read_bytes_per_second,
-        efficiency_of=measured_like(machine).cpu,
-    )
-    return rates, seconds
 
 
 def _outside(description: Description) -> dict[str, Counts]:

@@ -36,7 +36,7 @@ PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(
 #: excluded a loss of 2 points (docs/fast.md). Nothing larger was tested in closed loop.
 TOLERANCE = 0.01
 
-#: Number of chunks that are compared for each moment, from different noise.
+#: Number of chunks that are compared for each observation, from different noise.
 NUM_SAMPLES = 4
 
 #: Standard deviations that stand for the range of an action, if the statistics are mean and deviation.
@@ -45,7 +45,7 @@ DEVIATIONS = 4.0
 
 @dataclass(frozen=True)
 class Difference:
-    """The largest difference of actions over all moments, samples, steps and numbers."""
+    """The largest difference of actions over all observations, samples, steps and numbers."""
 
     largest: dict[str, float]
     """By key of the action, in the robot's units."""
@@ -68,12 +68,12 @@ class PrecisionError:
     """Of ``backbone`` and ``head``."""
     features: float
     """Error of the backbone's features: the norm of the difference of a token, relative to the token's norm,
-    and of that the mean over tokens and moments."""
+    and of that the mean over tokens and observations."""
     actions: Difference
     nbytes: int
     """Size of the weights in memory, in bytes."""
     milliseconds: float
-    """Time of one chunk, from frames to actions: the median over moments."""
+    """Time of one chunk, from frames to actions: the median over observations."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,9 @@ class PrecisionCheck:
     """What :func:`check_precisions` found."""
 
     source: str
-    moments: int
+    observations: int
     samples: int
-    """Chunks for each moment."""
+    """Chunks for each observation."""
     precisions: tuple[PrecisionError, ...]
     other_noise: Difference
     """Of float32 with itself, from other noise: how much the policy leaves to chance."""
@@ -95,7 +95,7 @@ class PrecisionCheck:
 
 @dataclass(frozen=True)
 class _Results:
-    """What one precision computes on each moment."""
+    """What one precision computes on each observation."""
 
     features: list[Float32Array]
     actions: list[dict[str, Float32Array]]
@@ -143,7 +143,7 @@ def check_precisions(
         ...     return check_precisions(checkpoint, Path("frames"), instruction="open the drawer").recommended
     """
     seed = integer("seed", seed, least=0)
-    moments: list[Moment] = []
+    recorded: list[Moment] = []
     found: list[PrecisionError] = []
     exact: _Results | None = None
     other_noise = Difference({}, {})
@@ -163,12 +163,12 @@ def check_precisions(
         )
         groups = policy.normalizer.action_groups
         if exact is None:
-            moments = read_frames(directory, policy, instruction=instruction, state=state)
-            results = exact = run(policy, moments, seed)
-            others = run(policy, moments, seed + len(moments))
+            recorded = read_frames(directory, policy, instruction=instruction, state=state)
+            results = exact = run(policy, recorded, seed)
+            others = run(policy, recorded, seed + len(recorded))
             other_noise = difference(exact.actions, others.actions, groups)
         else:
-            results = run(policy, moments, seed)
+            results = run(policy, recorded, seed)
         parts = parts_of(policy)
         found.append(
             PrecisionError(
@@ -183,7 +183,7 @@ def check_precisions(
         del policy, parts  # before the next one is loaded
     return PrecisionCheck(
         source=os.fspath(source),
-        moments=len(moments),
+        observations=len(recorded),
         samples=NUM_SAMPLES,
         precisions=tuple(found),
         other_noise=other_noise,
@@ -198,17 +198,17 @@ def recommended(found: Sequence[PrecisionError]) -> str:
     return min(close, key=lambda one: one.nbytes).name
 
 
-def run(policy: Policy, moments: Sequence[Moment], seed: int) -> _Results:
+def run(policy: Policy, recorded: Sequence[Moment], seed: int) -> _Results:
     """Features, chunks from `NUM_SAMPLES` draws of noise, and the time of a chunk."""
     features, actions, seconds = [], [], []
-    policy.act(moments[0].observation, seed=seed)  # claims memory
-    for index, moment in enumerate(moments):
+    policy.act(recorded[0].observation, seed=seed)  # claims memory
+    for index, one in enumerate(recorded):
         started = time.perf_counter()
-        computed = policy.features(policy.inputs(moment.observation))
+        computed = policy.features(policy.inputs(one.observation))
         context = policy.context(computed)
-        policy.sample(context, moment.observation, seed=seed + index)
+        policy.sample(context, one.observation, seed=seed + index)
         seconds.append(time.perf_counter() - started)
-        chunks = policy.sample(context, moment.observation, seed=seed + index, num_samples=NUM_SAMPLES)
+        chunks = policy.sample(context, one.observation, seed=seed + index, num_samples=NUM_SAMPLES)
         features.append(np.asarray(computed[0].backbone_features[0]))
         actions.append({key: np.asarray(chunk[0]) for key, chunk in chunks.items()})
     return _Results(features, actions, 1e3 * float(np.median(seconds)))
@@ -229,7 +229,7 @@ def difference(
     given: Sequence[Mapping[str, Float32Array]],
     groups: Sequence[Group],
 ) -> Difference:
-    """The largest differences of chunks `(samples, T, size)` by key, over all moments."""
+    """The largest differences of chunks `(samples, T, size)` by key, over all observations."""
     largest = {group.key: 0.0 for group in groups}
     of_range = dict(largest)
     for expected, got in zip(exact, given, strict=True):

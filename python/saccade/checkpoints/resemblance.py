@@ -11,7 +11,7 @@ from saccade.checkpoints.description import Source, open_published
 from saccade.checkpoints.findings import PartResemblance, Resemblance
 from saccade.checkpoints.initialisation import is_norm
 from saccade.checkpoints.parts import PARTS, UNUSED, part_of
-from saccade.checkpoints.survey import Piece, dot
+from saccade.checkpoints.survey import Slice, dot
 from saccade.checkpoints.tokens import spread_of
 
 
@@ -19,14 +19,14 @@ from saccade.checkpoints.tokens import spread_of
 class _Compared:
     """What was counted of one part so far."""
 
-    pieces: int = 0
+    compared: int = 0
     identical: int = 0
     cosines: list[float] = field(default_factory=list)
     largest_change: float = 0.0
 
 
 class Reference:
-    """A reference checkpoint that pieces of another checkpoint are compared with.
+    """A reference checkpoint that slices of another checkpoint are compared with.
 
     Raises:
         FileNotFoundError, CheckpointError: As :func:`saccade.checkpoints.describe`.
@@ -41,33 +41,33 @@ class Reference:
         self._different_shapes: list[str] = []
         self._absent: list[str] = []
 
-    def compare(self, piece: Piece) -> None:
-        """Compares a piece with the same piece of the reference."""
-        name = self._published.prefix + piece.name
+    def compare(self, one: Slice) -> None:
+        """Compares a tensor or slice with the same one of the reference."""
+        name = self._published.prefix + one.name
         shape = self._shapes.get(name)
-        own = piece.values.shape
+        own = one.values.shape
         if shape is None:
-            self._absent += [piece.name] if not piece.embodiment else []
+            self._absent += [one.name] if not one.embodiment else []
             return
-        if piece.embodiment is not None and piece.embodiment >= shape[0]:
+        if one.embodiment is not None and one.embodiment >= shape[0]:
             return
-        if shape[0 if piece.embodiment is None else 1 :] != own:
-            if not piece.embodiment:
-                self._different_shapes.append(f"{piece.name}: {own}, in the reference {shape}")
+        if shape[0 if one.embodiment is None else 1 :] != own:
+            if not one.embodiment:
+                self._different_shapes.append(f"{one.name}: {own}, in the reference {shape}")
             return
-        theirs = self._published.read(name, piece.embodiment)
-        drawn = piece.drawn
+        theirs = self._published.read(name, one.embodiment)
+        drawn = one.drawn
         if drawn is not None and drawn.kind == "constant" and np.all(theirs == drawn.scale):
             return  # as in every checkpoint
-        part = self._parts.setdefault(part_of(piece.name), _Compared())
-        part.pieces += 1
-        if np.array_equal(piece.values, theirs):
+        part = self._parts.setdefault(part_of(one.name), _Compared())
+        part.compared += 1
+        if np.array_equal(one.values, theirs):
             part.identical += 1
-        elif piece.values.size > 1 and not piece.name.endswith((".b", ".bias")) and not is_norm(piece.name):
-            mine, norm = np.sqrt(dot(piece.values, piece.values)), np.sqrt(dot(theirs, theirs))
+        elif one.values.size > 1 and not one.name.endswith((".b", ".bias")) and not is_norm(one.name):
+            mine, norm = np.sqrt(dot(one.values, one.values)), np.sqrt(dot(theirs, theirs))
             if mine > 0.0 and norm > 0.0:
-                part.cosines.append(dot(piece.values, theirs) / float(mine * norm))
-                difference = piece.values - theirs
+                part.cosines.append(dot(one.values, theirs) / float(mine * norm))
+                difference = one.values - theirs
                 change = np.sqrt(dot(difference, difference)) / norm
                 part.largest_change = max(part.largest_change, float(change))
 
@@ -79,7 +79,7 @@ class Reference:
             not_in_reference=self._absent,
             parts={
                 name: PartResemblance(
-                    pieces=part.pieces,
+                    compared=part.compared,
                     identical=part.identical,
                     cosine=spread_of(np.array(part.cosines)),
                     largest_change=part.largest_change,

@@ -26,7 +26,7 @@ WIDENED = 1 << 17
 
 
 @dataclass(frozen=True)
-class Piece:
+class Slice:
     """A tensor, or one embodiment's slice of it, while it is in memory."""
 
     name: str
@@ -43,7 +43,7 @@ class Survey:
     Args:
         published: The open checkpoint.
         head: Its config.
-        look: Called with each piece.
+        examine: Called with each of them.
         progress: Called with the number of bytes that are done and the total number of bytes.
 
     Attributes:
@@ -55,7 +55,7 @@ class Survey:
         self,
         published: _saccade.Published,
         head: HeadConfig,
-        look: Callable[[Piece], object],
+        examine: Callable[[Slice], object],
         progress: Callable[[int, int], object] | None,
     ) -> None:
         self._published = published
@@ -78,9 +78,9 @@ class Survey:
             part.nbytes += nbytes
             part.dtypes[dtype] = part.dtypes.get(dtype, 0) + 1
             judged = []
-            for piece in self._pieces(name, dtype, tuple(shape)):
-                look(piece)
-                judged.append(self._judge(piece))
+            for one in self._slices(name, dtype, tuple(shape)):
+                examine(one)
+                judged.append(self._judge(one))
             if judged and None not in judged:
                 part.judged += 1
                 part.as_drawn += all(judged)
@@ -88,14 +88,14 @@ class Survey:
             if progress is not None:
                 progress(done, total)
 
-    def _pieces(self, name: str, dtype: str, shape: tuple[int, ...]) -> Iterator[Piece]:
+    def _slices(self, name: str, dtype: str, shape: tuple[int, ...]) -> Iterator[Slice]:
         drawn = None if dtype == "I8" or part_of(name) == UNUSED else draw(name, self._inputs(name, shape))
         if name.endswith("_scale"):
             drawn = None
         is_category = name.endswith((".W", ".b"))
         indices: list[int | None] = list(range(shape[0])) if is_category else [None]
         for index in indices:
-            yield Piece(name, index, self._published.read(self._prefix + name, index), drawn)
+            yield Slice(name, index, self._published.read(self._prefix + name, index), drawn)
 
     def _inputs(self, name: str, shape: tuple[int, ...]) -> int:
         """Number of inputs of the linear layer that a weight or bias belongs to."""
@@ -104,29 +104,29 @@ class Survey:
             return self._shapes[f"{module}.weight"][1]
         return shape[1] if len(shape) == 2 else 1
 
-    def _judge(self, piece: Piece) -> bool | None:
-        """Counts a piece. Whether it is distributed as at initialisation; None if that is not compared."""
-        values, name = piece.values, piece.name
-        where = name if piece.embodiment is None else f"{name}[{piece.embodiment}]"
+    def _judge(self, one: Slice) -> bool | None:
+        """Counts a tensor. Whether it is distributed as at initialisation; None if that is not compared."""
+        values, name = one.values, one.name
+        where = name if one.embodiment is None else f"{name}[{one.embodiment}]"
         squares = dot(values, values)
         if not math.isfinite(squares):
             count = int(np.sum(~np.isfinite(values)))
             self.odd.append(f"{where} contains {count} values that are NaN or infinite")
             return False
-        is_weight = not name.endswith((".b", ".bias")) and piece.drawn is not None
-        if piece.embodiment is None and is_weight and values.size > 1 and not is_norm(name):
+        is_weight = not name.endswith((".b", ".bias")) and one.drawn is not None
+        if one.embodiment is None and is_weight and values.size > 1 and not is_norm(name):
             low, high = float(values.min()), float(values.max())
             if low == high:
                 self.odd.append(f"every value of {where} is {low:g}")
         if name == "future_tokens.weight":
             self.tokens = values
-        as_drawn = None if piece.drawn is None else is_as_drawn(sample(values), piece.drawn)
-        if piece.embodiment is not None:
-            self._squares[piece.embodiment] += squares
+        as_drawn = None if one.drawn is None else is_as_drawn(sample(values), one.drawn)
+        if one.embodiment is not None:
+            self._squares[one.embodiment] += squares
             if name.endswith(".b"):
-                self._biases_zero[piece.embodiment] &= squares == 0.0
+                self._biases_zero[one.embodiment] &= squares == 0.0
             else:
-                self._weights_drawn[piece.embodiment] &= as_drawn is not False
+                self._weights_drawn[one.embodiment] &= as_drawn is not False
         return as_drawn
 
     def parts(self) -> dict[str, Part]:
@@ -143,12 +143,12 @@ class Survey:
                 names=names.get(index, []),
                 norm=float(norms[index]),
                 robust_z=None if scores is None else float(scores[index]),
-                looks=self._looks(index, norms[index] == 0.0),
+                weights=self._weights_of(index, norms[index] == 0.0),
             )
             for index in range(self._head.num_embodiments)
         ]
 
-    def _looks(self, index: int, is_zero: bool) -> str:
+    def _weights_of(self, index: int, is_zero: bool) -> str:
         if is_zero:
             return "zero"
         return "as initialised" if self._biases_zero[index] and self._weights_drawn[index] else "trained"
@@ -166,6 +166,6 @@ def dot(a: Float32Array, b: Float32Array) -> float:
     a, b = a.reshape(-1), b.reshape(-1)
     total = 0.0
     for first in range(0, a.size, WIDENED):
-        piece = slice(first, first + WIDENED)
-        total += float(np.einsum("i,i->", a[piece].astype(np.float64), b[piece].astype(np.float64)))
+        part = slice(first, first + WIDENED)
+        total += float(np.einsum("i,i->", a[part].astype(np.float64), b[part].astype(np.float64)))
     return total

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
+from saccade._internal.arrays import PRECISIONS
 from saccade.backbone.config import BackboneConfig
 from saccade.errors import CheckpointError, SaccadeError
 from saccade.observations import Requirements, observation_sources
 from saccade.processor import Processor
 from saccade.robots import DataConfigLike, Normalizer, read_json
 from saccade.robots.reading import OWN_DATA_CONFIG, processor_folder
-
-PRECISIONS = ("float32", "bfloat16", "int8")
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def _robot_of(
     source: Path, tag: str | None, state_history: int, data_config: DataConfigLike | None
 ) -> RobotFindings:
     """One robot: what can be used, or why not."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             normalizer = Normalizer.from_pretrained(source, tag, data_config=data_config)
@@ -117,7 +116,7 @@ def _robot_of(
         **vars(sources),
     )
     actions = tuple((group.key, group.size) for group in normalizer.action_groups)
-    warning = str(told[0].message) if told else None
+    warning = str(caught[0].message) if caught else None
     named = None if normalizer.data_config is None else str(data_config or OWN_DATA_CONFIG)
     return RobotFindings(tag, normalizer.embodiment_id, needs, actions, None, warning, named)
 

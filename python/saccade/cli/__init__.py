@@ -24,6 +24,9 @@ from typing import NoReturn, Protocol, runtime_checkable
 
 from saccade._internal import extras
 from saccade._internal.flags import UsageError
+from saccade._saccade import __version__
+from saccade.cli import output
+from saccade.errors import SaccadeError
 
 # A command is the module of its name in this package. Its line of help is repeated here, so that
 # `saccade --help` imports none of them; a test compares the two.
@@ -36,9 +39,8 @@ COMMANDS: dict[str, str] = {
     "convert": "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter",
     "quantize": "write a checkpoint with int8 weights",
 }
-# The commands of saccade-vla-lab, found by its entry points. They are listed here so that help and the
-# message
-# that says what to install need no other package.
+# The commands of saccade-vla-lab, found by its entry points. They are listed here, so that the help and the
+# message that says what to install need no other package.
 LAB_COMMANDS: dict[str, str] = {
     "rollout": "run a policy on the simulated robot and report how often it succeeds",
     "demos": "record demonstrations of the tasks with scripted experts",
@@ -83,7 +85,9 @@ examples:
 
 @runtime_checkable
 class Command(Protocol):
-    """The interface of a command's module in this package."""
+    """The interface of a command's module. A command of another distribution also has `EXTRAS`, its table of
+    optional packages (:class:`saccade._internal.extras.Extras`).
+    """
 
     HELP: str
 
@@ -115,12 +119,12 @@ def load_command(name: str) -> Command:
     """The module of a command.
 
     Args:
-        name: a key of `COMMANDS` or `LAB_COMMANDS`.
+        name: A key of `COMMANDS` or `LAB_COMMANDS`.
 
     Raises:
-        KeyError: there is no such command.
-        UsageError: it is a command of the lab, which is not installed.
-        TypeError: its module lacks a part of `Command`.
+        KeyError: There is no such command.
+        UsageError: It is a command of the lab, which is not installed.
+        TypeError: Its module lacks a part of `Command`.
     """
     if name in COMMANDS:
         module = importlib.import_module(f"saccade.cli.{name}")
@@ -137,7 +141,7 @@ def lab_command(name: str) -> ModuleType:
     """The module of a command of the lab.
 
     Raises:
-        UsageError: the lab is not installed.
+        UsageError: The lab is not installed.
     """
     # Entry points of other distributions are not asked: a name has one meaning.
     try:
@@ -153,14 +157,11 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """The parser of the command line. Only the arguments of the chosen command are declared.
 
     Args:
-        chosen: the command whose module is imported; None or an unknown name imports none.
+        chosen: The command whose module is imported; None or an unknown name imports none.
     """
-    from saccade import __version__
-
     parser = Parser(
         prog="saccade",
-        description="GR00T-style action heads on CPUs: run and train policies, inspect and convert "
-        "checkpoints.",
+        description="Run GR00T-style robot policies on CPUs.",
         epilog=EPILOG,
     )
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")
@@ -195,7 +196,7 @@ def require(command: str) -> None:
     """Checks that the optional packages of a command are installed, without importing them.
 
     Raises:
-        MissingExtraError: names those that are missing and a command that installs them.
+        MissingExtraError: Names those that are missing and a command that installs them.
     """
     extras.SACCADE.require(*NEEDS[command])
 
@@ -204,32 +205,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line.
 
     Args:
-        argv: the arguments after the program's name; None takes those of the process.
+        argv: The arguments after the program's name; None takes those of the process.
 
     Returns:
         The exit status, see the module.
 
     Raises:
-        SystemExit: from `--help`, `--version` and arguments that do not parse (status 2).
+        SystemExit: From `--help`, `--version` and arguments that do not parse (status 2).
     """
-    from saccade.cli import _output
-
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
-        _output.prepare_streams()
+        output.prepare_streams()
         try:
             with terminable(), plain_warnings():
                 return dispatch(argv)
         finally:
-            _output.flush()  # finds a closed pipe or a full disk here, not while the interpreter ends
+            output.flush()  # finds a closed pipe or a full disk here, not while the interpreter ends
     except KeyboardInterrupt:
         print("saccade: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        _output.discard_output()
+        output.discard_output()
         return EXIT_BROKEN_PIPE
-    except _output.OutputError as error:
-        _output.discard_output()
+    except output.OutputError as error:
+        output.discard_output()
         return refuse(str(error))
 
 
@@ -276,32 +275,32 @@ def plain_warnings() -> Iterator[None]:
 
 def dispatch(argv: list[str]) -> int:
     """Parses `argv`, runs the chosen command and turns bad input into one line and status 2."""
-    from saccade import SaccadeError
-    from saccade.cli import _output
-
     # The program's own options take no value, so the first word that is no option is the command.
     chosen = next((word for word in argv if not word.startswith("-")), None)
+    table = extras.SACCADE
     try:
         parser = build_parser(chosen)
         args = parser.parse_args(argv)
         if args.command is None:
             parser.print_help()
             return EXIT_OK
-        return load_command(args.command).run(args)
+        command = load_command(args.command)
+        table = getattr(command, "EXTRAS", table)
+        return command.run(args)
     except (UsageError, SaccadeError, *PATH_ERRORS) as error:
         return refuse(describe(error))
     except BrokenPipeError:
         raise
     except OSError as error:
         if error.filename is None:
-            _output.flush()  # raises if the error is that of standard output
+            output.flush()  # raises if the error is that of standard output
             if error.errno not in DISK_ERRORS:
                 raise
         return refuse(describe(error))
     except MemoryError as error:
         return refuse(f"too large for this machine's memory: {error}".removesuffix(": "))
     except ModuleNotFoundError as error:
-        missing = extras.SACCADE.explain(error)
+        missing = table.explain(error)
         if missing is None:
             raise
         return refuse(describe(missing))

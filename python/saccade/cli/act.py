@@ -13,12 +13,12 @@ import numpy as np
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
 from saccade._internal.policy_flags import add_policy_options, policy_options
-from saccade.cli import EXIT_OK, _output, require
-from saccade.cli._tables import Section, show
+from saccade.cli import EXIT_OK, output, require
+from saccade.cli.tables import Section, show
 
 if TYPE_CHECKING:
-    from saccade import Policy
     from saccade._internal.arrays import Float32Array
+    from saccade.policy.policy import Policy
 
 HELP = "run a whole checkpoint on pictures and an instruction"
 EPILOG = """\
@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
     arguments.add_checkpoint_argument(parser)
-    seen = parser.add_argument_group("what the robot sees, is told and feels")
+    seen = parser.add_argument_group("observation")
     seen.add_argument(
         "--image",
         nargs="+",
@@ -68,16 +68,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Loads, looks, acts and prints."""
+    """Loads the checkpoint, computes a chunk and prints it."""
     require("act")
-    import saccade
     from saccade.observations.pictures import instruction_of, observation, read_state
+    from saccade.policy.policy import Policy
 
     pictures = named_pictures(args.image)
     state = None if args.state is None else read_state(args.state)
     clock = Clock()
-    with _output.progress_bar("loading", transient=True):
-        policy = saccade.Policy.from_pretrained(args.checkpoint, **policy_options(args))
+    with output.progress_bar("loading", transient=True):
+        policy = Policy.from_pretrained(args.checkpoint, **policy_options(args))
     clock.done("load")
     given = observation(policy, pictures, args.instruction, state)
     clock.done("frames")
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     actions = policy.sample(context, given, seed=args.seed, num_steps=args.num_steps)
     clock.done("sample")
     if args.json:
-        _output.print_json(report(args, policy, inputs[0].input_ids.shape[1], actions, clock))
+        output.print_json(report(args, policy, inputs[0].input_ids.shape[1], actions, clock))
         return EXIT_OK
     assumed = [
         *(["random frames"] if not pictures else []),
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         *([f'the instruction "{instruction_of(given)}"'] if args.instruction is None else []),
     ]
     if assumed:
-        _output.note("act", f"for want of arguments: {', '.join(assumed)}")
+        output.note("act", f"using defaults: {', '.join(assumed)}")
     show([chunk(policy, actions), times(clock)])
     return EXIT_OK
 
@@ -150,8 +150,8 @@ def times(clock: Clock) -> Section:
     """How long each part took."""
     spent = clock.milliseconds
     rows = [[part, f"{spent[part]:,.1f}", what] for part, what in PARTS.items()]
-    looking = sum(spent.values()) - spent["load"]
-    rows.append(["all but load", f"{looking:,.1f}", "the first call; later ones need not allocate memory"])
+    rest = sum(spent.values()) - spent["load"]
+    rows.append(["all but load", f"{rest:,.1f}", "the first call; later ones need not allocate memory"])
     return Section("Time", ["", ">ms", ""], rows)
 
 

@@ -8,8 +8,8 @@ import re
 
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
-from saccade.cli import EXIT_OK, _output
-from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
+from saccade.cli import EXIT_OK, output
+from saccade.cli.copying import add_copy_arguments, copying, print_files_not_copied
 
 HELP = "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter"
 
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
             progress=progress,
         )
     if args.json:
-        _output.print_json(dataclasses.asdict(report), default=str)
+        output.print_json(dataclasses.asdict(report), default=str)
         return EXIT_OK
     files = f"{len(report.files)} file{'s' if len(report.files) > 1 else ''}"
     others = f"{len(report.carried)} other file{'' if len(report.carried) == 1 else 's'}"

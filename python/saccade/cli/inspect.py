@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
 from saccade._internal.policy_flags import add_data_config, add_overrides
-from saccade.cli import EXIT_OK, _output, _precisions
-from saccade.cli._tables import Section, show
+from saccade.cli import EXIT_OK, output, precisions
+from saccade.cli.tables import Section, show
 
 if TYPE_CHECKING:
     from saccade.checkpoints.findings import Embodiment, Inspection, Resemblance, Spread, TokenStatistics
@@ -50,15 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reference", type=Path, metavar="PATH", help="checkpoint to compare with, tensor by tensor"
     )
-    arguments.add_num_vl_tokens(
-        parser, 296, "vision-language tokens for the expected times; 296 is one camera"
-    )
-    parser.add_argument(
-        "--no-time", action="store_true", help="leave out the expected times and do not measure this CPU"
-    )
     arguments.add_json(parser, "print JSON instead of tables")
     seen = parser.add_argument_group("compare the precisions on pictures and words")
-    arguments.add_moments(seen, "--precision-check")
+    arguments.add_pictures(seen, "--precision-check")
     arguments.add_preprocessing(seen)
     add_overrides(seen)
     arguments.add_integer(seen, "--seed", minimum=0, help="seed of the noise (default: 0)")
@@ -68,25 +62,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Reads the checkpoint and prints what it contains, or compares its precisions."""
     if args.precision_check is not None:
-        return _precisions.run(args)
-    given = [name for name in _precisions.ARGUMENTS if getattr(args, name) is not None]
+        return precisions.run(args)
+    given = [name for name in precisions.ARGUMENTS if getattr(args, name) is not None]
     if given:
         flags = ", ".join("--" + name.replace("_", "-") for name in given)
         raise UsageError(f"{flags}: only with --precision-check")
     from saccade.checkpoints.inspection import inspect
 
-    with _output.progress_bar("reading", in_bytes=True, transient=True) as update:
+    with output.progress_bar("reading", in_bytes=True, transient=True) as update:
         report = inspect(
             args.checkpoint,
             config=args.config,
             reference=args.reference,
             data_config=args.data_config,
-            num_vl_tokens=args.num_vl_tokens,
-            time=not args.no_time,
             progress=lambda done, total: update(done, total),
         )
     if args.json:
-        _output.print_json(dataclasses.asdict(report), indent=1)
+        output.print_json(dataclasses.asdict(report), indent=1)
     else:
         show(sections(report))
     return EXIT_OK
@@ -162,24 +154,12 @@ def parts(report: Inspection) -> Section:
 
 
 def memory(report: Inspection) -> Section:
-    """Memory, and expected time, at each precision."""
-    rows, seconds = [], report.seconds
-    for precision, nbytes in report.memory.items():
-        row = [precision, megabytes(nbytes.all), megabytes(nbytes.one)]
-        if seconds is not None:
-            times = [seconds[precision][name] for name in ("encode", "sample")]
-            row += [f"{1000 * time:.1f}" for time in (*times, sum(times))]
-        rows.append(row)
-    columns = ["", ">MB, all embodiments", ">MB, one"]
-    machine = report.machine
-    if seconds is None or machine is None:
-        return Section("Memory", columns, rows)
-    title = (
-        f"Memory, and expected time of a chunk with {report.num_vl_tokens} VL tokens "
-        f"({machine.isa}, {machine.num_threads} threads),\n"
-        f"by the cost model, efficiency as on {machine.efficiency_of}"
-    )
-    return Section(title, [*columns, ">ms, encode", ">ms, sample", ">ms, chunk"], rows)
+    """Memory of the loaded head at each precision."""
+    rows = [
+        [precision, megabytes(nbytes.all), megabytes(nbytes.one)]
+        for precision, nbytes in report.memory.items()
+    ]
+    return Section("Memory", ["", ">MB, all embodiments", ">MB, one"], rows)
 
 
 def backbone(found: BackboneFindings) -> Section:
@@ -252,7 +232,7 @@ def line(text: str | None) -> str:
 
 
 def embodiments(report: Inspection) -> Section:
-    """Which embodiments look trained; consecutive ids without a name that look alike share a row."""
+    """Which embodiments look trained; consecutive ids without a name and with equal findings share a row."""
     rows: list[list[str]] = []
     run: list[Embodiment] = []
 
@@ -261,11 +241,11 @@ def embodiments(report: Inspection) -> Section:
             return
         ids = str(run[0].id) if len(run) == 1 else f"{run[0].id} to {run[-1].id}"
         norms, scores = [one.norm for one in run], [one.robust_z for one in run]
-        rows.append([ids, ", ".join(run[0].names), span(norms, ".2f"), span(scores, ".1f"), run[0].looks])
+        rows.append([ids, ", ".join(run[0].names), span(norms, ".2f"), span(scores, ".1f"), run[0].weights])
         run.clear()
 
     for entry in report.embodiments:
-        if run and (entry.names or run[-1].names or entry.looks != run[-1].looks):
+        if run and (entry.names or run[-1].names or entry.weights != run[-1].weights):
             close()
         run.append(entry)
     close()
@@ -273,7 +253,7 @@ def embodiments(report: Inspection) -> Section:
         "Embodiments: norms of their layers, and the robust z-scores of these; "
         '"trained" if not distributed as initialised'
     )
-    return Section(title, [">id", "name", ">norm", ">robust z", "looks"], rows)
+    return Section(title, [">id", "name", ">norm", ">robust z", "weights"], rows)
 
 
 def span(values: Sequence[float | None], form: str) -> str:
@@ -314,7 +294,7 @@ def reference(found: Resemblance) -> Section:
     rows = [
         [
             name,
-            f"{part.identical} of {part.pieces}",
+            f"{part.identical} of {part.compared}",
             spread(part.cosine),
             f"{part.largest_change:.3g}" if part.cosine else "-",
         ]

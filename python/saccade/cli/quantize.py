@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from saccade.cli import EXIT_OK, _output
-from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
+from saccade.cli import EXIT_OK, output
+from saccade.cli.copying import add_copy_arguments, copying, print_files_not_copied
 
 HELP = "write a checkpoint with int8 weights"
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
             progress=progress,
         )
     if args.json:
-        _output.print_json(dataclasses.asdict(report), default=str)
+        output.print_json(dataclasses.asdict(report), default=str)
         return EXIT_OK
     before, after = (size / 1e6 for size in (report.head_bytes_before, report.head_bytes_after))
     print(

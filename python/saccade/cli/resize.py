@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade.cli import EXIT_OK, _output
-from saccade.cli._copying import add_copy_arguments, copying, print_files_not_copied
+from saccade.cli import EXIT_OK, output
+from saccade.cli.copying import add_copy_arguments, copying, print_files_not_copied
 
 if TYPE_CHECKING:
     from saccade.checkpoints import ResizeReport
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.json:
         both = {**dataclasses.asdict(report), "actions": dataclasses.asdict(changes)}
-        _output.print_json(both, default=str)
+        output.print_json(both, default=str)
         return EXIT_OK
     print_report(args, report, changes)
     print_files_not_copied(report)

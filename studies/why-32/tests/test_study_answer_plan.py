@@ -24,8 +24,9 @@ from why_32.contrasts import CONFIRMATORY, EXPLORATORY
 from why_32.measured import MEASURED
 from why_32.study import Answer
 
-from saccade.bench.work import Call, encode_work, sample_work, total
+from benches.work import encode_work, sample_work, total
 from saccade.cli import main
+from saccade.cli.timing import Call
 from saccade.errors import InputError
 
 

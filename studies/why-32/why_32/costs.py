@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from saccade_lab.training.settings import TrainingSettings
 
-from saccade.bench.work import Call, encode_work, sample_work, total
+from benches.work import encode_work, sample_work, total
+from saccade.cli.timing import Call
 from why_32.plan import Recording
 
 
@@ -38,7 +39,7 @@ class Cost:
 def cost(training: TrainingSettings, recording: Recording) -> Cost:
     """Counts the multiply-adds of a policy.
 
-    Those of the head are the engine's own (`saccade.bench.work`). Those of backbone and training are counted
+    Those of the head are the engine's own (`benches.work`). Those of backbone and training are counted
     by torch while a policy of these sizes runs once. The prompt is the longest one of the recording's tasks.
 
     Args:

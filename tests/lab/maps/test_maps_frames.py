@@ -232,7 +232,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         (["--frames", "{frames}", "--features", "x.npz"], "--features: not with --frames"),
         (["--frames", "{frames}", "--task", "push"], "--task: not with --frames"),
         (["--frames", "{frames}", "--grid", "2x2"], "--grid: not with --frames"),
-        (["--frames", "{frames}", "--row", "1"], "--row: given 1, {frames} has moments 0 to 0"),
+        (["--frames", "{frames}", "--row", "1"], "--row: given 1, {frames} has observations 0 to 0"),
         (["--frames", "{frames}", "--embodiment", "walker"], "got 'walker'"),
         (["--frames", "{missing}"], "missing: no such directory"),
         (

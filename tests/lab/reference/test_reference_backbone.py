@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from saccade import BackboneInputs, CheckpointError, InputError, ShapeError
 from saccade.checkpoints import backbone_tensors
-from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes
+from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade.checkpoints.published import RELEASED
 from saccade_lab.reference import Backbone, BackboneFeatures
 from tests.helpers import upstream_backbones
 from tests.helpers.reference_backbone_cases import random_inputs, random_sizes, randomised

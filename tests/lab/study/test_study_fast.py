@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import saccade
-from saccade.bench import heads
+from saccade.checkpoints.random_checkpoint import head as random_head
 from saccade.cli import main
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference import random_weights
@@ -41,8 +41,8 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_one_episode_in_every_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sized = heads.sized
-    monkeypatch.setattr(heads, "sized", lambda size: sized("small"))
+    of_size = random_head.config_of_size
+    monkeypatch.setattr(random_head, "config_of_size", lambda size: of_size("small"))
     monkeypatch.setattr(fast_times, "FULL_TOKENS", 7)
     monkeypatch.setattr(fast_times, "MOST_ROUNDS", 3)
     monkeypatch.setattr(fast, "CALIBRATION_EPISODES", 1)

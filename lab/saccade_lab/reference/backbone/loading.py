@@ -14,8 +14,8 @@ from safetensors import safe_open
 from torch import Tensor
 
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.checkpoints.backbone_tensors import is_unread
 from saccade.checkpoints.hub import resolve
+from saccade.checkpoints.random_checkpoint.backbone_tensors import is_unread
 from saccade.errors import CheckpointError
 
 #: Prefixes of the names of a backbone's tensors, in checkpoints by NVIDIA and by lerobot.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from saccade.bench import heads
+from saccade.checkpoints.random_checkpoint import head as random_head
 from saccade.head.head import ActionHead
 from saccade.observations.recorded import Observation
 from saccade_lab.study.cell import Rows
@@ -27,7 +27,7 @@ def times_at_full_size(modes: Sequence[Mode], calibration: Calibration) -> Rows:
     Which tokens are dropped does not change the time, so they are chosen at random.
     """
     with tempfile.TemporaryDirectory() as name:
-        heads.write(Path(name), heads.sized(FULL))
+        random_head.write_head(Path(name), random_head.config_of_size(FULL))
         loaded = {
             precision: ActionHead.from_pretrained(name, precision=precision)
             for precision in dict.fromkeys(mode.precision for mode in modes)

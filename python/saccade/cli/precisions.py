@@ -7,8 +7,8 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from saccade._internal.flags import UsageError
-from saccade.cli import EXIT_OK, _output, require
-from saccade.cli._tables import Section, show
+from saccade.cli import EXIT_OK, output, require
+from saccade.cli.tables import Section, show
 
 if TYPE_CHECKING:
     from saccade.checkpoints.precisions import Difference, PrecisionCheck
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     require("inspect --precision-check")
     from saccade.checkpoints.precisions import check_precisions
 
-    with _output.progress_bar("comparing", transient=True) as update:
+    with output.progress_bar("comparing", transient=True) as update:
         found = check_precisions(
             args.checkpoint,
             args.precision_check,
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda done, total: update(done, total),
         )
     if args.json:
-        _output.print_json(dataclasses.asdict(found), indent=1)
+        output.print_json(dataclasses.asdict(found), indent=1)
         return EXIT_OK
     show([overview(found), by_key(found)])
     print(
@@ -68,9 +68,9 @@ def overview(found: PrecisionCheck) -> Section:
         for one in found.precisions
     ]
     rows.append(["float32, other noise", "-", of_range(found.other_noise), "-", "-"])
-    title = f"Difference from float32: {found.moments} moments, {found.samples} chunks of each, same noise"
+    count = f"{found.observations} observations, {found.samples} chunks of each, same noise"
     columns = ["", ">error of features", ">largest of an action, of its range", ">MB", ">ms"]
-    return Section(title, columns, rows)
+    return Section(f"Difference from float32: {count}", columns, rows)
 
 
 def by_key(found: PrecisionCheck) -> Section:

@@ -1,4 +1,6 @@
-"""The cost model: the least time that a call can take on this machine, and the time it is expected to take.
+"""The cost model: the time that a call of a head is expected to take on a machine.
+
+    python -m benches.cost --version n1.5     measured and expected times for other N, T_vl, steps, samples
 
 The floor of a part is the longer of two times: its multiply-adds at the CPU's peak rate in the arithmetic of
 the part, and reading its weights at the memory's bandwidth. The expected time divides the floor by the share
@@ -7,60 +9,32 @@ of it that the kernels reach, as measured on a Zen 4, a Zen 5, and on Xeons with
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import argparse
+import statistics
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
-import saccade._saccade as _saccade
-from saccade.bench.work import ATTENTION, Call, Work, Works, encode_work, sample_work
+from benches.work import ATTENTION, Work, Works, encode_work, sample_work
+from saccade.cli import bench
+from saccade.cli.timing import Call, Machine, arithmetic_of, by_turns, works_of
 from saccade.head.config import HeadConfig
-
-PRECISIONS = ("float32", "bfloat16", "int8")
+from saccade.head.head import ActionHead
 
 #: Bytes of a weight, or of a cached key or value, in memory. A float32 head keeps weights that are stored as
 #: bfloat16 in bfloat16. Floors that reading sets are then too high, which may happen where only action rows
 #: are computed.
 ELEMENT_BYTES = {"float32": 4, "bfloat16": 2, "int8": 1}
 
-#: The parts that an int8 head computes in bfloat16, a hundredth of the work.
-NOT_INT8 = (*ATTENTION, "embodiment", "output")
-
-
-@dataclass(frozen=True)
-class Machine:
-    """The measured peak rates of a CPU.
-
-    Attributes:
-        isa: The instruction set.
-        num_threads: Threads that the rates are for.
-        macs_per_second: Multiply-adds per second, by arithmetic.
-        read_bytes_per_second: Bandwidth of reading memory, as that number of streams which is fastest.
-        clock_hz: Clock rate, if it is known.
-        read_by_streams: Bandwidth by the number of streams that each thread reads.
-        family: Name of the CPU's family, such as ``Zen 5``; ``unknown family``, or the architecture where
-            there is no CPUID.
-    """
-
-    isa: str
-    num_threads: int
-    macs_per_second: Mapping[str, float]
-    read_bytes_per_second: float
-    clock_hz: float | None = None
-    read_by_streams: Mapping[int, float] = field(default_factory=dict)
-    family: str = ""
-
-    @classmethod
-    def measured(cls, isa: str, num_threads: int) -> Machine:
-        """Measures this machine; takes about a second."""
-        peaks = _saccade.measure_peaks(num_threads)
-        return cls(
-            isa,
-            num_threads,
-            peaks["macs_per_second"][isa],
-            peaks["read_bytes_per_second"],
-            peaks["clock_hz"],
-            peaks["read_bytes_per_second_by_streams"],
-            _saccade.cpu_report()[0].partition(" (")[0],
-        )
+#: What :func:`main` varies, one size at a time.
+VARIED: dict[str, tuple[int, ...]] = {
+    "num_future_tokens": (0, 32, 64),
+    "num_vl_tokens": (64, 296, 559, 822),
+    "num_steps": (1, 2, 4, 8),
+    "num_samples": (1, 4, 8),
+    "future_refresh": (1, 2, 4),
+}
 
 
 @dataclass(frozen=True)
@@ -158,33 +132,14 @@ def measured_like(machine: Machine) -> Measured:
     return WITHOUT_TILES.get(machine.family, ZEN_4)
 
 
-def arithmetic(part: str, precision: str) -> str:
-    """The arithmetic of a part in a head of this precision."""
-    return "bfloat16" if precision == "int8" and part in NOT_INT8 else precision
-
-
-def floor(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float) -> float:
-    """The least time of this work, in seconds."""
-    return max(
-        multiply_adds / machine.macs_per_second[runs_in],
-        num_bytes / machine.read_bytes_per_second,
-    )
-
-
-def limit(machine: Machine, runs_in: str, multiply_adds: float, num_bytes: float) -> str:
-    """What sets `floor`: ``"arithmetic"`` or ``"memory"``."""
-    in_registers = multiply_adds / machine.macs_per_second[runs_in]
-    return "arithmetic" if in_registers >= num_bytes / machine.read_bytes_per_second else "memory"
-
-
 def floor_of(machine: Machine, precision: str, part: str, work: Work) -> float:
-    """`floor` of one part of a call, in seconds."""
-    runs_in = arithmetic(part, precision)
-    return floor(machine, runs_in, work.multiply_adds, work.elements * ELEMENT_BYTES[runs_in])
+    """The least time of one part of a call, in seconds."""
+    arithmetic = arithmetic_of(part, precision)
+    return machine.floor(arithmetic, work.multiply_adds, work.elements * ELEMENT_BYTES[arithmetic])
 
 
 def floors(machine: Machine, precision: str, works: Works) -> dict[str, float]:
-    """`floor` of every part of a call, in seconds."""
+    """The least time of every part of a call, in seconds."""
     return {part: floor_of(machine, precision, part, work) for part, work in works.items()}
 
 
@@ -192,10 +147,10 @@ def predict(config: HeadConfig, call: Call, precision: str, machine: Machine) ->
     """Seconds that `encode` and `sample` are expected to take.
 
     Args:
-        config: config of the head.
-        call: its sizes.
-        precision: precision of the head.
-        machine: the machine that it runs on.
+        config: Config of the head.
+        call: Its sizes.
+        precision: Precision of the head.
+        machine: The machine that it runs on.
 
     Returns:
         `{"encode": seconds, "sample": seconds}`.
@@ -218,3 +173,63 @@ def share(reached: Efficiency, part: str, work: Work) -> float:
         return reached.attention
     rows = work.multiply_adds / work.elements  # the mean over its products, weighted by their weights
     return reached.few_rows if rows <= 96 else reached.many_rows
+
+
+def compared(
+    heads: Mapping[str, ActionHead], call: Call, machine: Machine, rounds: int
+) -> list[dict[str, Any]]:
+    """Median and expected times; one size is changed at a time."""
+    records = []
+    for varied, values in VARIED.items():
+        for value in values:
+            bench.note(f"{varied} {value}")
+            changed = replace(call, **{varied: value})
+            calls: dict[tuple[str, str], Callable[[], Any]] = {}
+            for precision, head in heads.items():
+                works = works_of(head, changed)
+                calls |= {(precision, name): works[name] for name in ("encode", "sample")}
+            for (precision, name), seconds in by_turns(calls, rounds).items():
+                expected = predict(heads[precision].config, changed, precision, machine)[name]
+                records.append(
+                    {
+                        "varied": varied,
+                        "value": value,
+                        "precision": precision,
+                        "call": name,
+                        "seconds": statistics.median(seconds),
+                        "expected_seconds": expected,
+                    }
+                )
+    return records
+
+
+def table(records: list[dict[str, Any]]) -> list[str]:
+    """Measured and expected times, as text."""
+    lines = [
+        "one size changed at a time, ms",
+        f"{'':<24}{'precision':<12}{'call':<8}{'measured':>10}{'expected':>10}{'ratio':>8}",
+    ]
+    for record in records:
+        name = f"{record['varied']} {record['value']}"
+        seconds, expected = 1e3 * record["seconds"], 1e3 * record["expected_seconds"]
+        lines.append(
+            f"{name:<24}{record['precision']:<12}{record['call']:<8}"
+            f"{seconds:>10.2f}{expected:>10.2f}{seconds / expected:>8.2f}"
+        )
+    return lines
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measures and prints; the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m benches.cost", description="Tests the cost model.")
+    bench.add_head_arguments(parser)
+    args = parser.parse_args(arguments)
+    heads, name, call = bench.prepared(args)
+    machine = bench.measured(heads)
+    print(f"{name}; efficiency as on {measured_like(machine).cpu}")
+    print("\n".join(table(compared(heads, call, machine, args.rounds))))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

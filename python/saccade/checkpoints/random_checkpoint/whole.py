@@ -1,21 +1,9 @@
-"""Writes a random whole checkpoint in NVIDIA's layout: backbone, head, statistics, tokenizer. NumPy only.
-
-    python -m saccade.checkpoints.random_checkpoint OUT                    N1.5 at its published size, 4.8 GB
-    python -m saccade.checkpoints.random_checkpoint OUT --small            a few MB
-    python -m saccade.checkpoints.random_checkpoint OUT --version n1.7
-
-Everything that loads the published checkpoint loads this one, so installation, memory and speed can be tried
-before it is downloaded. Its actions mean nothing. Weights are scaled so that activations stay of order one;
-`--outliers` plants channels as large as trained models have. A tensor is drawn and written in pieces, so
-memory stays below 0.2 GB.
-"""
+"""Writes a random whole checkpoint in NVIDIA's layout: backbone, head, statistics, tokenizer. NumPy only."""
 
 from __future__ import annotations
 
-import argparse
 import copy
 import json
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,12 +12,12 @@ import numpy as np
 
 import saccade._saccade as _saccade
 from saccade._internal.files import write_json
-from saccade.checkpoints import head_configs
-from saccade.checkpoints.backbone_sizes import RELEASED, BackboneSizes, eagle_config, merged
-from saccade.checkpoints.backbone_tensors import tensor_shapes, unread_tensor_shapes
-from saccade.checkpoints.prompt_tokenizer import FIRST_ADDED, token_id, tokenizer
-from saccade.checkpoints.random_tensors import Outliers, Tensor, pieces
-from saccade.checkpoints.robot_metadata import metadata
+from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config, merged
+from saccade.checkpoints.published import CONFIGS, RELEASED, small_config, whole_config
+from saccade.checkpoints.random_checkpoint.backbone_tensors import tensor_shapes, unread_tensor_shapes
+from saccade.checkpoints.random_checkpoint.robot_metadata import metadata
+from saccade.checkpoints.random_checkpoint.tensors import Outliers, Tensor, write_file
+from saccade.checkpoints.random_checkpoint.tokenizer import FIRST_ADDED, token_id, tokenizer
 from saccade.errors import InputError
 
 #: The robot of the checkpoint: its tag and published id, the width of each group of joints, its cameras.
@@ -86,7 +74,7 @@ def small_backbone(version: str) -> dict[str, Any]:
 
 def small_head(version: str) -> dict[str, Any]:
     """The config of a small head for the features of `small_backbone`, with the published embodiments."""
-    return head_configs.small_config(version) | {"max_num_embodiments": 32}
+    return small_config(version) | {"max_num_embodiments": 32}
 
 
 def write(
@@ -105,13 +93,13 @@ def write(
     Args:
         folder: Where; made if it does not exist, and otherwise empty.
         version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
-        backbone: Config with the keys of :data:`saccade.checkpoints.backbone_sizes.RELEASED`, or those of it
+        backbone: Config with the keys of :data:`saccade.checkpoints.published.RELEASED`, or those of it
             that differ. Default: the published sizes.
         head: Config of the head in the released keys, for features as wide as the backbone's. Default: the
             published sizes.
         seed: Of all tensors and statistics.
         head_dtype: ``"BF16"`` or ``"F32"``, as published. The backbone is bfloat16.
-        outliers: Plants outliers; see :class:`saccade.checkpoints.random_tensors.Outliers`.
+        outliers: Plants outliers; see :class:`saccade.checkpoints.random_checkpoint.tensors.Outliers`.
         shard_bytes: A shard is complete when it reaches this size.
 
     Returns:
@@ -136,7 +124,7 @@ def write(
         raise InputError(f"{folder}: expected an empty directory")
     config = merged(version, backbone or {})
     sizes = BackboneSizes.from_config({**config, "kind": f"{version} backbone"})
-    head_config = dict(head_configs.CONFIGS[version] if head is None else head)
+    head_config = dict(CONFIGS[version] if head is None else head)
     width = head_config["backbone_embedding_dim"]
     if width != sizes.features_width:
         raise InputError(f"head: expected features of width {sizes.features_width}, got {width}")
@@ -147,7 +135,7 @@ def write(
         )
     tensors = [Tensor(f"backbone.{name}", shape, "BF16") for name, shape in tensor_shapes(sizes)]
     tensors += [Tensor(f"backbone.{name}", shape, "BF16") for name, shape in unread_tensor_shapes(sizes)]
-    whole_head = json.dumps(head_configs.whole_config(head_config))
+    whole_head = json.dumps(whole_config(head_config))
     tensors += [
         Tensor(f"action_head.{name}", tuple(shape), head_dtype)
         for name, shape in _saccade.tensor_shapes(whole_head)
@@ -171,23 +159,7 @@ def _write_tensors(
     for number, shard in enumerate(shards, start=1):
         name = f"model-{number:05}-of-{len(shards):05}.safetensors"
         weight_map |= {tensor.name: name for tensor in shard}
-        header: dict[str, Any] = {"__metadata__": {"format": "pt"}}
-        end = 0
-        for tensor in shard:
-            start, end = end, end + tensor.nbytes
-            header[tensor.name] = {
-                "dtype": tensor.dtype,
-                "shape": list(tensor.shape),
-                "data_offsets": [start, end],
-            }
-        encoded = json.dumps(header, separators=(",", ":")).encode()
-        encoded += b" " * (-len(encoded) % 8)
-        with (folder / name).open("wb") as file:
-            file.write(len(encoded).to_bytes(8, "little"))
-            file.write(encoded)
-            for tensor in shard:
-                for piece in pieces(tensor, seed, None if outliers is None else outliers.plant):
-                    file.write(piece)
+        write_file(folder / name, shard, seed, None if outliers is None else outliers.plant)
     total = sum(tensor.nbytes for tensor in tensors)
     index = {"metadata": {"total_size": total}, "weight_map": weight_map}
     write_json(folder / "model.safetensors.index.json", index)
@@ -219,7 +191,7 @@ def _config(
         own["eagle_config"] = eagle_config(version, backbone)
     if version == "n1.5":
         return {
-            **head_configs.whole_config(head),
+            **whole_config(head),
             "action_dim": head["max_action_dim"],
             "action_horizon": head["action_horizon"],
             "architectures": ["GR00T_N1_5"],
@@ -302,40 +274,3 @@ def _group(rng: np.random.Generator, width: int) -> dict[str, list[float]]:
     return {key: (centre + share * half).tolist() for key, share in shares.items()} | {
         "std": (half / 2).tolist()
     }
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m saccade.checkpoints.random_checkpoint",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("folder", type=Path, help="where to write; must not exist or be empty")
-    parser.add_argument("--version", choices=RELEASED, default="n1.5", help="default: n1.5")
-    parser.add_argument("--small", action="store_true", help="a few MB instead of the published size")
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything (default 0)")
-    parser.add_argument("--head-dtype", choices=("BF16", "F32"), default="BF16", help="default: BF16")
-    parser.add_argument("--outliers", action="store_true", help="plant outlier channels in the backbone")
-    args = parser.parse_args(arguments)
-    try:
-        write(
-            args.folder,
-            args.version,
-            backbone=small_backbone(args.version) if args.small else None,
-            head=small_head(args.version) if args.small else None,
-            seed=args.seed,
-            head_dtype=args.head_dtype,
-            outliers=args.outliers,
-        )
-    except (InputError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    files = sorted(path for path in args.folder.rglob("*") if path.is_file())
-    for path in files:
-        print(f"{path.stat().st_size:>13,} {path.relative_to(args.folder)}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

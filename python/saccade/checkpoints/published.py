@@ -1,4 +1,4 @@
-"""The configs of the published heads, and of smaller ones, for random checkpoints of any size."""
+"""The configs of the published heads and backbones, and of smaller heads: the one place of their sizes."""
 
 from __future__ import annotations
 
@@ -149,6 +149,72 @@ CONFIGS: Mapping[str, Mapping[str, Any]] = {
 """All heads with their published sizes."""
 
 
+_QWEN3 = {
+    "hidden_size": 2048,
+    "intermediate_size": 6144,
+    "num_hidden_layers": 28,
+    "num_attention_heads": 16,
+    "num_key_value_heads": 8,
+    "head_dim": 128,
+    "vocab_size": 151680,
+    "rms_norm_eps": 1e-6,
+    "rope_theta": 1e6,
+}
+_SIGLIP = {
+    "hidden_size": 1152,
+    "intermediate_size": 4304,
+    "num_hidden_layers": 27,
+    "num_attention_heads": 16,
+    "patch_size": 14,
+    "layer_norm_eps": 1e-6,
+}
+
+#: The configs of the published backbones, by version; the keys are those of the released code.
+RELEASED: Mapping[str, Mapping[str, Any]] = {
+    "n1.5": {
+        "select_layer": 12,
+        "project_to_dim": None,
+        "use_pixel_shuffle": False,
+        "downsample_ratio": 0.5,
+        "mlp_connector_layers": 1,
+        "image_token_index": 151669,
+        "text_config": _QWEN3,
+        "vision_config": {**_SIGLIP, "image_size": 224},
+    },
+    "n1.6": {
+        "select_layer": 16,
+        "use_pixel_shuffle": True,
+        "downsample_ratio": 0.5,
+        "mlp_connector_layers": 2,
+        "image_token_index": 151669,
+        "text_config": _QWEN3,
+        "vision_config": {**_SIGLIP, "num_patches": 256},
+    },
+    "n1.7": {
+        "select_layer": 16,
+        "image_token_index": 151655,
+        "text_config": {
+            **_QWEN3,
+            "vocab_size": 151936,
+            "rope_theta": 5e6,
+            "rope_scaling": {"mrope_section": [24, 20, 20]},
+        },
+        "vision_config": {
+            "hidden_size": 1024,
+            "intermediate_size": 4096,
+            "depth": 24,
+            "num_heads": 16,
+            "patch_size": 16,
+            "temporal_patch_size": 2,
+            "spatial_merge_size": 2,
+            "out_hidden_size": 2048,
+            "num_position_embeddings": 2304,
+            "deepstack_visual_indexes": [5, 11, 17],
+        },
+    },
+}
+
+
 def sized_config(
     kind: str,
     *,
@@ -165,13 +231,6 @@ def sized_config(
     if num_embodiments is not None:
         config["max_num_embodiments"] = num_embodiments
     return config
-
-
-def n15_config(*, num_layers: int = 16, vl_num_layers: int = 4, num_embodiments: int = 32) -> dict[str, Any]:
-    """`sized_config("n1.5")`."""
-    return sized_config(
-        "n1.5", num_layers=num_layers, vl_num_layers=vl_num_layers, num_embodiments=num_embodiments
-    )
 
 
 def small_config(kind: str = "n1.5") -> dict[str, Any]:
@@ -199,14 +258,3 @@ def whole_config(config: Mapping[str, Any]) -> dict[str, Any]:
         return dict(config)
     model_type = "gr00t_n1_5" if "num_target_vision_tokens" in config else "gr00t_n1"
     return {"model_type": model_type, "action_head_cfg": dict(config)}
-
-
-def unused_parameters(config: Mapping[str, Any]) -> list[str]:
-    """Parameters that the released code creates from a config, but that inference does not use."""
-    names = []
-    if config.get("use_multi_action_heads") and config.get("use_learnable_loss_weights"):
-        arms = ["left_arm", "right_arm"] if config.get("split_arm_heads") else ["arm"]
-        names += [f"task_log_sigma.{part}" for part in [*arms, "claw"]]
-    if config.get("model_type") == "Gr00tN1d6" and config.get("state_dropout_prob", 0.0) > 0:
-        names.append("mask_token")
-    return names

@@ -111,8 +111,8 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
     """A console of rich.
 
     Args:
-        stderr: write to standard error.
-        width: characters in a line where the output is not a terminal; None for rich's 80.
+        stderr: Whether to write to standard error.
+        width: Characters in a line where the output is not a terminal; None for rich's 80.
     """
     made = _console_class()(stderr=stderr)
     if width is not None and not made.is_terminal and "COLUMNS" not in os.environ:
@@ -132,8 +132,8 @@ class Lines:
 
     Args:
         description: Description of the work.
-        total: Number of pieces of work; None if it is not known yet.
-        in_bytes: Whether the pieces are bytes.
+        total: Number of items; None if it is not known yet.
+        in_bytes: Whether the items are bytes.
     """
 
     def __init__(self, description: str, total: int | None, *, in_bytes: bool) -> None:
@@ -153,8 +153,8 @@ class Lines:
         of = "" if self._total is None else f" of {self._amount(self._total)}"
         print(f"{self._description}: {self._amount(completed)}{of}", file=sys.stderr, flush=True)
 
-    def _amount(self, pieces: int) -> str:
-        return f"{pieces / 1e6:,.0f} MB" if self._in_bytes else str(pieces)
+    def _amount(self, items: int) -> str:
+        return f"{items / 1e6:,.0f} MB" if self._in_bytes else str(items)
 
 
 @contextlib.contextmanager
@@ -164,10 +164,10 @@ def progress_bar(
     """A progress bar on standard error; without a terminal or rich, at most one line a minute.
 
     Args:
-        description: description of the work.
-        total: number of pieces of work; None if it is not known yet.
-        in_bytes: show megabytes instead of a count.
-        transient: remove the bar at the end.
+        description: Description of the work.
+        total: Number of items; None if it is not known yet.
+        in_bytes: Whether to show megabytes instead of a count.
+        transient: Whether to remove the bar at the end.
     """
     try:
         from rich.progress import (

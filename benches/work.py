@@ -8,41 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from saccade.cli.timing import Call
 from saccade.head.config import HeadConfig
 
 #: Parts whose operands are keys, values and probabilities rather than weights.
 ATTENTION = ("attention",)
-
-
-@dataclass(frozen=True)
-class Call:
-    """The sizes of one call of a head: encode an observation, then sample from it.
-
-    Attributes:
-        num_vl_tokens: T_vl.
-        num_steps: Euler steps.
-        batch: Observations.
-        num_samples: Chunks of each observation.
-        future_refresh: As in `ActionHead.sample`; 1 for None.
-        num_future_tokens: N, which an intervention may change.
-        num_image_tokens: How many of the T_vl tokens are image tokens, for heads whose blocks attend to
-            either text or images; None for half of them. The number does not change the work if as many
-            blocks attend to text as to images.
-    """
-
-    num_vl_tokens: int
-    num_steps: int
-    batch: int = 1
-    num_samples: int = 1
-    future_refresh: int = 1
-    num_future_tokens: int = 32
-    num_image_tokens: int | None = None
-
-    @classmethod
-    def of(cls, config: HeadConfig, num_vl_tokens: int, num_steps: int | None = None, **sizes: int) -> Call:
-        """A call; steps and future tokens default to those of the config."""
-        sizes = {"num_future_tokens": config.num_future_tokens} | sizes
-        return cls(num_vl_tokens, config.num_steps if num_steps is None else num_steps, **sizes)
 
 
 @dataclass
@@ -125,7 +95,6 @@ def total(works: Works) -> Work:
 
 def cross_keys(config: HeadConfig, call: Call) -> Iterator[int | None]:
     """For each block the number of vision-language tokens that it attends to; None for self-attention."""
-    images = call.num_vl_tokens // 2 if call.num_image_tokens is None else call.num_image_tokens
     every = config.attend_text_every_n_blocks
     for block in range(config.num_layers):
         if config.interleave_self_attention and block % 2 == 1:
@@ -133,7 +102,7 @@ def cross_keys(config: HeadConfig, call: Call) -> Iterator[int | None]:
         elif config.mask_mode == "none":
             yield call.num_vl_tokens
         else:
-            yield images if block % (2 * every) else call.num_vl_tokens - images
+            yield call.image_tokens if block % (2 * every) else call.num_vl_tokens - call.image_tokens
 
 
 def add_feed_forward(works: Works, rows: int, width: int) -> None:

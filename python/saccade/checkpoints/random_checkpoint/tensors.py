@@ -1,11 +1,14 @@
-"""Seeded random tensors of a whole checkpoint, in pieces of bounded size. NumPy only."""
+"""Files of seeded random tensors, drawn and written in blocks of bounded size. NumPy only."""
 
 from __future__ import annotations
 
+import json
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +17,10 @@ from saccade._internal.arrays import Float32Array
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 
 #: Numbers that are drawn at a time.
-PIECE = 1 << 22
+BLOCK = 1 << 22
+
+#: Changes rows of a tensor in place: its name, the rows, and their values ``(rows, ...)``.
+Plant: TypeAlias = Callable[[str, slice, Float32Array], None]
 
 #: What `Outliers` multiplies rows, columns or values with; see there.
 RESIDUAL = 40.0
@@ -68,23 +74,49 @@ class Outliers:
             values[:, self.channels(text)] /= GATE**2 / 2
 
 
-def pieces(
-    tensor: Tensor, seed: int, plant: Callable[[str, slice, Float32Array], None] | None = None
-) -> Iterator[bytes]:
+def write_file(path: Path, tensors: Sequence[Tensor], seed: int, plant: Plant | None = None) -> None:
+    """Writes tensors to a safetensors file.
+
+    Args:
+        path: The file.
+        tensors: What to draw, in this order.
+        seed: Seed of all tensors.
+        plant: As :meth:`Outliers.plant`.
+    """
+    header: dict[str, Any] = {"__metadata__": {"format": "pt"}}
+    end = 0
+    for tensor in tensors:
+        start, end = end, end + tensor.nbytes
+        header[tensor.name] = {
+            "dtype": tensor.dtype,
+            "shape": list(tensor.shape),
+            "data_offsets": [start, end],
+        }
+    encoded = json.dumps(header, separators=(",", ":")).encode()
+    encoded += b" " * (-len(encoded) % 8)
+    with path.open("wb") as file:
+        file.write(len(encoded).to_bytes(8, "little"))
+        file.write(encoded)
+        for tensor in tensors:
+            for block in blocks(tensor, seed, plant):
+                file.write(block)
+
+
+def blocks(tensor: Tensor, seed: int, plant: Plant | None = None) -> Iterator[bytes]:
     """The content of a tensor in row-major order, as it is stored.
 
     The numbers depend on the seed and the name only.
 
     Args:
-        tensor: what to draw.
-        seed: of all tensors.
-        plant: as `Outliers.plant`.
+        tensor: What to draw.
+        seed: Seed of all tensors.
+        plant: As :meth:`Outliers.plant`.
     """
     rng = np.random.Generator(np.random.SFC64([seed, zlib.crc32(tensor.name.encode())]))
     shape = tensor.shape or (1,)
     width = math.prod(shape[1:])
-    offset, scale = moments(tensor.name, tensor.shape)
-    rows = max(PIECE // max(width, 1), 1)
+    offset, scale = mean_and_std(tensor.name, tensor.shape)
+    rows = max(BLOCK // max(width, 1), 1)
     for start in range(0, shape[0], rows):
         part = slice(start, min(start + rows, shape[0]))
         values = rng.standard_normal((part.stop - part.start, width), np.float32)
@@ -95,12 +127,12 @@ def pieces(
         yield bfloat16(values).tobytes() if tensor.dtype == "BF16" else values.tobytes()
 
 
-def moments(name: str, shape: tuple[int, ...]) -> tuple[float, float]:
+def mean_and_std(name: str, shape: tuple[int, ...]) -> tuple[float, float]:
     """Mean and standard deviation of a tensor, such that activations stay of order one.
 
     Args:
-        name: name in the checkpoint, which distinguishes weights, biases, norms and tables.
-        shape: shape of the tensor.
+        name: Name in the checkpoint, which distinguishes weights, biases, norms and tables.
+        shape: Shape of the tensor.
     """
     if name.endswith((".bias", ".b", "in_proj_bias")) or not shape:
         return 0.0, 0.1

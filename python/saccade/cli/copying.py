@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade.cli import _output
+from saccade.cli import output
 
 if TYPE_CHECKING:
     from saccade.checkpoints import Written
@@ -26,7 +26,7 @@ def add_copy_arguments(parser: argparse.ArgumentParser) -> None:
 @contextlib.contextmanager
 def copying(description: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar in bytes; yields a function that takes the bytes done and the bytes in all."""
-    with _output.progress_bar(description, in_bytes=True, transient=True) as update:
+    with output.progress_bar(description, in_bytes=True, transient=True) as update:
         yield lambda done, total: update(done, total)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from saccade.cli import _output
+from saccade.cli import output
 
 WIDTH = 110  # characters in a line where the output is not a terminal
 
@@ -27,7 +27,7 @@ def show(tables: Sequence[Section]) -> None:
     except ModuleNotFoundError:
         print("\n\n".join(map(plain, tables)))
         return
-    console = _output.console(width=WIDTH)
+    console = output.console(width=WIDTH)
     for section in tables:
         console.print(Text(section.title, style="bold"))
         table = Table(box=None, show_header=any(column.lstrip(">") for column in section.columns))

@@ -1,18 +1,23 @@
 """The roofline: what each part of a call reaches, and what multiply-adds and memory allow.
 
+    python -m benches.roofline --version n1.5 --precisions bfloat16 --figure roofline.png
+
 A part that does `x` multiply-adds for each byte that it reads can do `x` times the memory's bandwidth at
 most, and never more than the peak of its arithmetic. Both axes are logarithmic.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saccade.bench.cost import Machine, arithmetic, floor, limit
+from saccade.cli import bench
+from saccade.cli.timing import Machine, arithmetic_of
 
 #: Columns and rows of the picture in text.
 WIDTH, HEIGHT = 64, 16
@@ -43,17 +48,17 @@ def points(machine: Machine, precision: str, parts: Iterable[Mapping[str, Any]])
     """The points of a profile, slowest part first.
 
     Args:
-        machine: the machine, measured in the same run.
-        precision: precision of the head.
-        parts: records with `part`, `seconds`, `multiply_adds` and `bytes`; those without multiply-adds or
+        machine: The machine, measured in the same run.
+        precision: Precision of the head.
+        parts: Records with `part`, `seconds`, `multiply_adds` and `bytes`; those without multiply-adds or
             bytes have no place in the picture.
     """
     made = []
     for record in sorted(parts, key=lambda record: -record["seconds"]):
         work, read, seconds = record["multiply_adds"], record["bytes"], record["seconds"]
         if work and read and seconds:
-            runs_in = arithmetic(record["part"], precision)
-            least = floor(machine, runs_in, work, read)
+            runs_in = arithmetic_of(record["part"], precision)
+            least = machine.floor(runs_in, work, read)
             made.append(
                 Point(
                     record["part"],
@@ -61,7 +66,7 @@ def points(machine: Machine, precision: str, parts: Iterable[Mapping[str, Any]])
                     work / read,
                     work / seconds,
                     least / seconds,
-                    limit(machine, runs_in, work, read),
+                    machine.limit(runs_in, work, read),
                 )
             )
     return made
@@ -144,7 +149,7 @@ def text(machine: Machine, shown: Sequence[Point]) -> list[str]:
 
 
 def write_figure(machine: Machine, shown: Mapping[str, Sequence[Point]], path: Path) -> None:
-    """Writes the picture as an image, a panel for each piece of work, in the format that the name says."""
+    """Writes the picture as an image, a panel for each call, in the format that the name says."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.5 * len(shown), 4.2), layout="tight")
@@ -187,3 +192,26 @@ def _place(value: float, least: float, most: float, count: int) -> int:
 def _letter(index: int) -> str:
     """`a` to `z`, then `*`: no head has more parts."""
     return chr(ord("a") + index) if index < 26 else "*"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measures and prints; the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m benches.roofline", description="Draws the roofline.")
+    bench.add_head_arguments(parser)
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="an image too (needs matplotlib)")
+    args = parser.parse_args(arguments)
+    heads, _, call = bench.prepared(args)
+    machine = bench.measured(heads)
+    shown = {
+        f"{one['precision']} {one['call']}": points(machine, one["precision"], one["parts"])
+        for one in bench.profiles(heads, call, machine, args.rounds)
+    }
+    for title, parts in shown.items():
+        print("\n".join([f"{title}, roofline", "", *text(machine, parts), ""]))
+    if args.figure is not None:
+        write_figure(machine, shown, args.figure)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
