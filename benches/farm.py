@@ -4,7 +4,7 @@
     python -m benches.farm --minutes 60 --seconds 20   longer
     python -m benches.farm --policies demo             without the full-size policy
     python -m benches.farm report                      print the tables of existing measurements
-    python -m benches.farm report --write              write them to docs/farms.md and keep the measurements
+    python -m benches.farm report --write              write docs/results/farm.md, keep the measurements
     python -m benches.farm --small --seconds 0.1       a quick trial of the program itself
 
 Each setting is written to the results when it is done. The next run on the same machine measures what is
@@ -36,8 +36,9 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from benches import checkpoints, farm_report, pages
+from benches import checkpoints, farm_report
 from benches.farm_processes import Setting, measure
+from benches.pages.report import report
 from benches.peers import machine
 from benches.peers.results import rounded
 from saccade._internal.files import write_json
@@ -57,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     path: Path = args.work / ("results-small.json" if args.small else "results.json")
     if args.command == "report":
-        return pages.report(
+        return report(
             path,
             farm_report.COMMITTED,
             farm_report.PAGE,
@@ -223,7 +224,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("command", nargs="?", choices=("measure", "report"), default="measure")
-    add("--write", action="store_true", help="report: write docs/farms.md and benches/farm.json")
+    add("--write", action="store_true", help="report: write docs/results/farm.md and benches/farm.json")
     add("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
     add("--policies", nargs="+", choices=POLICIES, default=POLICIES)
     add("--engines", nargs="+", choices=ENGINES, default=ENGINES, help="saccade is always measured")

@@ -1,4 +1,4 @@
-"""The tables of docs/farms.md, from the JSON of the measurements."""
+"""docs/results/farm.md, from the JSON of the measurements."""
 
 from __future__ import annotations
 
@@ -8,8 +8,14 @@ from typing import Any
 
 from benches.peers.text import table
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "farms.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "results" / "farm.md"
 COMMITTED = Path(__file__).with_name("farm.json")
+
+NOTES = """Chunks a second: processes that act on random images without pause. Episodes an hour: processes
+that run the five tasks of the bundled policy in the simulator, rendering included. All contenders get the
+same observations; torch is `saccade_lab.reference`, the same policy in plain torch. Memory is the sum of
+the proportional set sizes (PSS) of all processes: a page that three processes share counts
+a third in each."""
 
 POLICIES = ("demo", "full")
 SECTIONS = {"chunks": "chunks a second", "episodes": "episodes an hour"}
@@ -19,10 +25,12 @@ Row = dict[str, Any]
 
 
 def document(results: Results) -> str:
-    """The measured part of the page."""
+    """The page."""
     parts = [
+        "# Many processes",
         "Written by `python -m benches.farm report --write` from `benches/farm.json`, which "
-        "`python -m benches.farm` measured on this machine: " + machine(results["machine"])
+        "`python -m benches.farm` measured on this machine: " + machine(results["machine"]),
+        NOTES,
     ]
     parts += choices(results)
     for policy in POLICIES:
@@ -30,7 +38,7 @@ def document(results: Results) -> str:
             rows = rows_of(results, policy, section)
             if rows:
                 name = results["names"][policy]
-                parts += [f"### {name[0].upper()}{name[1:]}: {title}", *speeds(results, rows)]
+                parts += [f"## {name[0].upper()}{name[1:]}: {title}", *speeds(results, rows)]
     parts += memory(results)
     parts += left_out(results)
     return "\n\n".join(parts) + "\n"
@@ -124,7 +132,7 @@ def choices(results: Results) -> Iterator[str]:
                     ]
                 )
     if lines:
-        yield "### What to choose here"
+        yield "## What to choose here"
         yield (
             "The fastest settings of saccade, with one copy of the weights for all processes, and the memory "
             "of all of them. Times torch's best: the rate over that of torch's fastest setting, of any "
@@ -182,7 +190,7 @@ def memory(results: Results) -> Iterator[str]:
                 ]
             )
     if lines:
-        yield "### Memory"
+        yield "## Memory"
         yield (
             "The same processes with the policy loaded once, by a process that then forks them, and loaded "
             "by each (spawn). In all: the PSS of all processes, with fork also of the one that only loaded. "

@@ -6,7 +6,7 @@
     python -m benches.serve --random DIR --precision int8 --clients 1 4 16 --requests 48 --rounds 3
                                                                    N1.5 at its published size, random weights,
                                                                    written to DIR first (4.8 GB)
-    python -m benches.serve report [--write]                       the tables; --write: into docs/serve.md
+    python -m benches.serve report [--write]                       the tables; --write: docs/results/serve.md
 
 One server in a process of its own answers all. In each round every number of clients sends its part of the
 requests, so that a disturbance of the machine meets them all. The clients share one process, which sends
@@ -40,7 +40,8 @@ import numpy as np
 import zmq
 
 import saccade
-from benches import checkpoints, pages, serve_report
+from benches import checkpoints, serve_report
+from benches.pages.report import report
 from benches.peers import machine
 from saccade._internal.files import write_json
 from saccade.serve.packing import pack
@@ -91,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     path: Path = args.out / "results.json"
     if args.command == "report":
-        return pages.report(
+        return report(
             path,
             serve_report.COMMITTED,
             serve_report.PAGE,
@@ -149,7 +150,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("command", nargs="?", choices=("run", "report"), default="run")
-    parser.add_argument("--write", action="store_true", help="report: into docs/serve.md")
+    parser.add_argument("--write", action="store_true", help="report: into docs/results/serve.md")
     parser.add_argument(
         "--random", type=Path, metavar="DIR", help="a random checkpoint of full size, written if missing"
     )

@@ -1,4 +1,4 @@
-"""The tables of docs/serve.md, from the JSON of the measurements."""
+"""docs/results/serve.md, from the JSON of the measurements."""
 
 from __future__ import annotations
 
@@ -10,9 +10,21 @@ from benches.peers.text import table
 from saccade.cli.timing import quartiles
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "serve.md"
+PAGE = ROOT / "docs" / "results" / "serve.md"
 #: The committed measurements, by policy.
 COMMITTED = Path(__file__).with_name("serve_results.json")
+
+NOTES = """Clients on the server's own machine send their next request when they have the response to the
+last one.
+
+- **a second**: responses to all clients together. **x one**: relative to one client, of the same round.
+- **p50, p99**: from sending a request to its response, as a client sees it.
+- **batch**: observations that were computed together, mean over requests.
+- **in process**: observations a second of `policy.act` in a loop, with batches of the same sizes.
+- **ms of processor**: CPU time per request, of the server and of the clients.
+
+One server handled all rounds. Medians and quartiles are over rounds. On two cores, many clients cannot be
+served faster than two threads compute, and a single client's request already uses both."""
 
 POLICIES = {"demo": "The bundled policy", "full": "N1.5 at its published size, random weights"}
 
@@ -21,14 +33,16 @@ Row = dict[str, Any]
 
 
 def document(results: dict[str, Results]) -> str:
-    """The measured part of the page."""
+    """The page."""
     parts = [
+        "# The server under load",
         "Written by `python -m benches.serve report --write` from `benches/serve_results.json`, which "
-        "`python -m benches.serve` measured."
+        "`python -m benches.serve` measured.",
+        NOTES,
     ]
     for name, title in POLICIES.items():
         if name in results:
-            parts += [f"### {title}, {results[name]['precision']}", *section(results[name])]
+            parts += [f"## {title}, {results[name]['precision']}", *section(results[name])]
     return "\n\n".join(parts) + "\n"
 
 

@@ -1,6 +1,6 @@
 """Tests the wheels as users install them, prints the results, and writes a page about them.
 
-    python .ci/wheels/test.py dist --page docs/wheels.md
+    python .ci/wheels/test.py dist --page docs/results/wheels.md
 
 Runs: a fresh environment with the wheel and one NumPy, for each CPython and NumPy; one environment with each
 instruction set and on emulated CPUs, the oldest of which lacks AVX; a rollout on each CPython, with the wheel

@@ -1,9 +1,11 @@
-"""The vision-language backbone: speed against transformers, reuse, memory, errors. Writes docs/backbone.md.
+"""The vision-language backbone: speed against transformers, reuse, memory, errors.
+
+Writes docs/results/backbone.md.
 
     python -m benches.backbone                        all sections; about half an hour on two cores
     python -m benches.backbone speed --rounds 9       some sections: speed, reuse, memory, accuracy
     python -m benches.backbone report                 print the report of existing measurements
-    python -m benches.backbone report --write         write docs/backbone.md and keep the measurements
+    python -m benches.backbone report --write         write docs/results/backbone.md and keep the measurements
     python -m benches.backbone --small --rounds 2     a quick trial of the program itself
 
 The checkpoint is random, at N1.5's published size; it is written once, 4.8 GB. In `speed` every contender has
@@ -21,9 +23,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benches import checkpoints, pages
+from benches import checkpoints
 from benches.backbone import accuracy, memory, report, reuse, setup
 from benches.backbone.contenders import GROUPS, Task, contenders, note, round_of
+from benches.pages.report import report as write_report
 from benches.peers import machine
 
 SECTIONS = ("speed", "reuse", "memory", "accuracy")
@@ -37,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     path = args.work / ("results-small.json" if args.small else "results.json")
     if args.sections == ["report"]:
-        return pages.report(
+        return write_report(
             path, report.COMMITTED, report.PAGE, report.document, program="benches.backbone", write=args.write
         )
     results: Results = json.loads(path.read_text()) if path.exists() else {}
@@ -145,7 +148,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--work", type=Path, default=Path("out/backbone"), help="default: out/backbone")
     parser.add_argument("--small", action="store_true", help="small sizes, for a quick trial")
-    parser.add_argument("--write", action="store_true", help="report: write docs/backbone.md")
+    parser.add_argument("--write", action="store_true", help="report: write docs/results/backbone.md")
     args = parser.parse_args(arguments)
     args.sections = args.sections or list(SECTIONS)
     if not set(args.sections) <= set(SECTIONS) and args.sections != ["report"]:

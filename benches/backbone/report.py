@@ -1,4 +1,4 @@
-"""The report: docs/backbone.md, written from the JSON of the measurements."""
+"""The report: docs/results/backbone.md, written from the JSON of the measurements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benches.peers.text import plural, table
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.cli.timing import Machine, quartiles
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "backbone.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "backbone.md"
 COMMITTED = Path(__file__).with_name("results.json")
 
 #: Contender, the peer that it is compared with, the ratio to reach, and the ratio beyond.

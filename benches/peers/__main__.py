@@ -8,8 +8,8 @@
                        chunks per second of 1, 8 and 32 observations at once, on 1 thread to all cores
     make bench-peers PEERS_ARGS="--only policy"            the whole policy, frames and words to a chunk
     python -m benches.peers report                         write the report of existing measurements
-    python -m benches.peers report --write                 write docs/performance.md and its figures
-    python -m benches.peers report --only policy --write   write docs/policy-speed.md
+    python -m benches.peers report --write                 write docs/results/performance.md and its figures
+    python -m benches.peers report --only policy --write   write docs/results/policy-speed.md
 
 Every contender runs in a separate process with the requested number of threads and waits while another one
 works. In a round, each does every piece of work once, in an order that rotates. Before anything is timed, its
@@ -36,6 +36,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benches.pages.report import require_commit
 from benches.peers import machine, policy_report, processes, report
 from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
 from benches.peers.contenders import CONTENDERS, GROUPS, POLICY_GROUPS, PROCESSES, able
@@ -105,9 +106,10 @@ def measure_cases(
 
 def keep(results: Results, folder: Path) -> None:
     """Copies the measurements to the record of this CPU's family, if the whole head or policy is among
-    them.
+    them. Those of a tree with uncommitted changes are refused.
     """
     if usual(results, "head") or usual(results, "policy"):
+        require_commit(results.data, results.path)
         path = folder / f"{results.slug}.json"
         results.save(path)
         print(path)

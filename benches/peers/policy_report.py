@@ -1,4 +1,4 @@
-"""The report of the whole policy: Markdown of one machine, and docs/policy-speed.md of all."""
+"""The report of the whole policy: Markdown of one machine, and docs/results/policy-speed.md of all."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
+from benches.pages.report import require_commit
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.goals import Goal, reached
@@ -14,7 +15,7 @@ from benches.peers.results import Results, records
 from benches.peers.text import number, plural, table, usual
 from saccade.cli.timing import quartiles
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "policy-speed.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "policy-speed.md"
 NOTES = Path(__file__).with_name("policy_notes.md")
 
 LEROBOT_BF16 = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
@@ -32,7 +33,10 @@ GOALS = tuple(
 def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report --only policy`."""
     if args.write:
-        PAGE.write_text(page(records(args.record)))
+        measured = records(args.record)
+        for each in measured:
+            require_commit(each.data, each.path)
+        PAGE.write_text(page(measured))
         print(PAGE)
         return 0
     if not results.data["machine"]:
@@ -52,7 +56,7 @@ def write(results: Results, folder: Path) -> None:
 
 
 def page(measured: list[Results]) -> str:
-    """docs/policy-speed.md: all machines, one after the other."""
+    """docs/results/policy-speed.md: all machines, one after the other."""
     parts = [
         "# The whole policy, measured",
         "From frames and words to a chunk of actions: N1.5 at its published size with seeded random weights. "

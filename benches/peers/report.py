@@ -1,4 +1,4 @@
-"""The report of `make bench-peers`: Markdown and figures of one machine, and docs/performance.md of all."""
+"""The report of `make bench-peers`: Markdown and figures of one machine; the page of all machines."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import re
 from pathlib import Path
 
+from benches.pages.report import require_commit
 from benches.peers.cases import LINEAR_SHAPES, Case, exact_macs
 from benches.peers.contenders import CONTENDERS
 from benches.peers.figures import cost_lines, straight, write_figures
@@ -28,8 +29,8 @@ from benches.peers.text import (
 from benches.peers.throughput import throughput
 from saccade.cli.timing import quartiles
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE, IMAGES = DOCS / "performance.md", DOCS / "images"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "performance.md"
+IMAGES = PAGE.parent
 NOTES = Path(__file__).with_name("notes.md")
 OVERVIEW_ROWS = (
     "saccade-float32",
@@ -55,6 +56,8 @@ def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report`."""
     if args.write:
         measured = records(args.record)
+        for each in measured:
+            require_commit(each.data, each.path)
         PAGE.write_text(page(measured))
         for each in measured:
             write_figures(each, IMAGES)
@@ -78,7 +81,7 @@ def document(results: Results) -> str:
 
 
 def page(measured: list[Results]) -> str:
-    """docs/performance.md: all machines, one after the other."""
+    """docs/results/performance.md: all machines, one after the other."""
     names = "; ".join(results.cpu for results in measured)  # names have commas
     parts = [
         "# Performance",
@@ -88,7 +91,7 @@ def page(measured: list[Results]) -> str:
         across(measured),
     ]
     for results in measured:
-        parts += [f"## {results.cpu}", *(demoted(part) for part in of_machine(results, "images"))]
+        parts += [f"## {results.cpu}", *(demoted(part) for part in of_machine(results, "."))]
     return joined([*parts, NOTES.read_text().strip()])
 
 

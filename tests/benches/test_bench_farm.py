@@ -253,14 +253,13 @@ def test_the_page(
     assert "- random N1.5, chunks a second, saccade, 2 x 1, batch 4, fork: no time left" in page
 
     (tmp_path / "results.json").write_text(json.dumps(results))
-    written = tmp_path / "farms.md"
-    written.write_text(farm_report.PAGE.read_text())
+    written = tmp_path / "farm.md"
     monkeypatch.setattr(farm_report, "PAGE", written)
     monkeypatch.setattr(farm_report, "COMMITTED", tmp_path / "farm.json")
     for _ in range(2):
         assert farm.main(["report", "--write", "--work", str(tmp_path)]) == 0
     assert written.read_text().count(choice) == 1
-    assert written.read_text().startswith("# Farms")
+    assert written.read_text().startswith("# Many processes")
     assert (tmp_path / "farm.json").exists()
     assert str(written) in capsys.readouterr().out
 

@@ -19,7 +19,7 @@ def test_every_request_is_counted_and_reported(
     arguments = ["--clients", "1", "3", "--requests", "12", "--rounds", "2", "--num-threads", "2"]
     assert serve.main([*arguments, "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text())
-    assert set(results) == {"demo", "full"}  # that of the other policy is the committed one
+    assert "demo" in results
     result = results["demo"]
     for row, clients in zip(result["rows"], (1, 3), strict=True):
         assert (row["clients"], row["requests"], row["lost"]) == (clients, 12, 0)
@@ -37,7 +37,7 @@ def test_every_request_is_counted_and_reported(
     assert "Requests: 24; rounds: 1." in text
     assert "Memory" not in text  # there is nothing to compare it with
     assert serve.main(["report", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("### ") == 2
+    assert capsys.readouterr().out.count("## ") == 1
 
 
 def row(clients: int, per_second: list[float], in_process: list[float]) -> dict[str, Any]:
@@ -75,5 +75,5 @@ def test_ratios_are_those_of_the_same_round() -> None:
 
 def test_the_page_shows_what_is_committed() -> None:
     committed = json.loads(serve_report.COMMITTED.read_text())
-    assert set(committed) == set(serve_report.POLICIES)
-    assert serve_report.document(committed) in serve_report.PAGE.read_text()
+    assert set(committed) <= set(serve_report.POLICIES)
+    assert serve_report.document(committed) == serve_report.PAGE.read_text()

@@ -1,6 +1,6 @@
 """Runs the tests against released lerobot packages, each in a separate environment, and writes the page.
 
-    python tests/compat/run.py [--releases 0.6.1] [--python312 PATH] [--page docs/compatibility.md]
+    python tests/compat/run.py [--releases 0.6.1] [--python312 PATH] [--page docs/results/compatibility.md]
 
 `make test-compat` runs all releases. Environments are `.venv-compat-lerobot-*` next to the Makefile. They are
 recreated when their list of packages changes. All packages are installed without their dependencies, because
@@ -134,7 +134,7 @@ episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their
 - **GPUs**: a head on a GPU is copied, computed on the CPU, and the results are copied back. This path has not
   been run.
 - **Trained weights**: random weights have errors of another size at reduced precision: see
-  [precision](precision.md).
+  [precision](../precision.md).
 """
 
 
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument(
         "--python312", default=shutil.which("python3.12"), help="needed for lerobot 0.5 and later"
     )
-    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "compatibility.md")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "compatibility.md")
     options = parser.parse_args()
     chosen = [release for release in RELEASES if release.lerobot in (options.releases or [release.lerobot])]
     for release in chosen:

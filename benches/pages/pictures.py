@@ -1,16 +1,13 @@
-"""Makes the pictures of the README from what the commands write, and the diagram of docs/future-tokens.md.
+r"""Makes the GIF of the README from videos of rollouts, and the diagram of docs/future-tokens.md.
 
-    saccade rollout --episodes 1 --video --out out/gif python docs/make_pictures.py gif
-    out/gif/videos/{reach,push,drawer-open,button-press-topdown,window-open}-0.mp4
+    saccade rollout --episodes 1 --video --out out/gif
+    python -m benches.pages.pictures gif \
+        out/gif/videos/{reach,push,drawer-open,button-press-topdown,window-open}-0.mp4
 
-    saccade attention --task push --seed 3 --out out/look
-    python docs/make_pictures.py map out/look/sheet.png
-
-    python docs/make_pictures.py step
+    python -m benches.pages.pictures step
 
 `gif` joins videos into one looping GIF; frames are scaled down, thinned out and reduced to one palette, so
-that the file stays small. `map` cuts out the upper part of a sheet: images, occlusion and the first attention
-maps. `step` draws one denoising step of N1.5's action head. Needs the extra `sim`.
+that the file stays small. `step` draws one denoising step of N1.5's action head. Needs the lab's extra `sim`.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-IMAGES = Path(__file__).resolve().parent / "images"
+IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 
 
 def frames(video: Path, every: int, width: int) -> Iterator[Image.Image]:
@@ -56,13 +53,6 @@ def make_gif(args: argparse.Namespace) -> None:
     first, *rest = reduced
     first.save(args.out, save_all=True, append_images=rest, duration=args.frame_ms, loop=0, optimize=True)
     print(f"{args.out}: {len(reduced)} frames, {args.out.stat().st_size / 1e6:.2f} MB")
-
-
-def make_map(args: argparse.Namespace) -> None:
-    """Writes the upper part of the sheet."""
-    with Image.open(args.sheet) as sheet:
-        sheet.convert("RGB").crop((0, args.top, sheet.width, args.bottom)).save(args.out, optimize=True)
-    print(f"{args.out}: {args.out.stat().st_size / 1e6:.2f} MB")
 
 
 def make_step(args: argparse.Namespace) -> None:
@@ -104,12 +94,12 @@ def make_step(args: argparse.Namespace) -> None:
         rows(left, 30, count, 1.75, **style)
         axes.text(left, 34, text, fontsize=9, va="bottom")
         rows(left, 8, count, 1.75, **style)
-    box(6, 17, 94, 4.5, "odd blocks: the 49 rows read each other")
+    box(6, 17, 94, 4.5, "odd blocks: the 49 rows attend to each other")
     box(6, 22, 94, 4.5, "")
     axes.text(
         53,
         24.2,
-        "even blocks: each of the 49 rows reads the vision-language tokens",
+        "even blocks: each of the 49 rows attends to the vision-language tokens",
         ha="center",
         va="center",
         fontsize=9,
@@ -126,7 +116,7 @@ def make_step(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Runs one of the three."""
+    """Runs one of the two."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -139,12 +129,6 @@ def main() -> None:
     gif.add_argument("--colours", type=int, default=128, help="size of the palette (default: 128)")
     gif.add_argument("--frame-ms", type=int, default=80, help="duration of a frame (default: 80)")
     gif.set_defaults(make=make_gif)
-    one = kinds.add_parser("map", help="the upper part of a sheet of attention maps")
-    one.add_argument("sheet", type=Path, help="sheet.png of `saccade attention`")
-    one.add_argument("--out", type=Path, default=IMAGES / "map.png")
-    one.add_argument("--top", type=int, default=105, help="first row of pixels (default: 105)")
-    one.add_argument("--bottom", type=int, default=670, help="last row of pixels (default: 670)")
-    one.set_defaults(make=make_map)
     step = kinds.add_parser("step", help="one denoising step")
     step.add_argument("--out", type=Path, default=IMAGES / "step.png")
     step.set_defaults(make=make_step)

@@ -3,15 +3,45 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from benches.peers.results import rounded
 
-#: The part of a page that is measured; without these marks, all of it.
-MEASURED = re.compile(r"(?<=<!-- measured -->\n).*(?=<!-- end of measured -->)", re.DOTALL)
+
+class UncommittedError(SystemExit):
+    """A record was measured with uncommitted changes, so that nobody else can measure it again."""
+
+
+def require_commit(measured: Any, record: Path) -> None:
+    """Refuses measurements of a tree with uncommitted changes.
+
+    Args:
+        measured: JSON value with a `commit` in each description of a machine, as `git describe --dirty`
+            prints it.
+        record: Its file, for the message.
+
+    Raises:
+        UncommittedError: A commit ends with `-dirty`.
+    """
+    for commit in _commits(measured):
+        if commit.endswith("-dirty"):
+            raise UncommittedError(
+                f"{record}: measured at {commit}, with uncommitted changes; commit them and measure again"
+            )
+
+
+def _commits(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, each in value.items():
+            if key == "commit":
+                yield str(each)
+            else:
+                yield from _commits(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from _commits(each)
 
 
 def report(
@@ -32,6 +62,7 @@ def report(
 
     Raises:
         SystemExit: Nothing is measured yet.
+        UncommittedError: `write`, and the measurements are of a tree with uncommitted changes.
     """
     measured = measured if measured.exists() else kept
     if not measured.exists():
@@ -41,8 +72,7 @@ def report(
     if not write:
         print(text)
         return 0
-    if page.exists() and MEASURED.search(before := page.read_text()):
-        text = MEASURED.sub(lambda found: f"\n{text}\n", before)
+    require_commit(results, measured)
     kept.write_text(json.dumps(rounded(results), indent=1) + "\n")
     page.write_text(text)
     print(page)

@@ -1,6 +1,6 @@
 """Writes the tables of docs/robots.md: data configs, tags, and what is computed or refused for each release.
 
-    python docs/make_robots.py
+    python -m benches.pages.robots
 
 Every cell of the last table is tried: a small checkpoint folder of the release, from `tests/data/robots`, is
 changed and its robot is loaded and used. `--check` only says whether the page is up to date.
@@ -26,7 +26,7 @@ import saccade
 from saccade.robots import RELEASED, DataConfig
 from saccade.robots.embodiments import N15_IDS, N16_IDS, N17_IDS, N17_NAMES
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "robots.md"
 DATA = ROOT / "tests" / "data" / "robots"
 
@@ -386,7 +386,8 @@ def page() -> str:
     """The page with its tables written anew."""
     text = PAGE.read_text(encoding="utf-8")
     for name, make in TABLES.items():
-        begin, end = f"<!-- {name}: written by docs/make_robots.py -->\n", f"<!-- end of {name} -->"
+        begin = f"<!-- {name}: written by python -m benches.pages.robots -->\n"
+        end = f"<!-- end of {name} -->"
         before, _, rest = text.partition(begin)
         _, found, after = rest.partition(end)
         if not found:
@@ -403,7 +404,7 @@ def main() -> int:
     text = page()
     if args.check:
         is_new = text == PAGE.read_text(encoding="utf-8")
-        print(f"{PAGE.name}: {'up to date' if is_new else 'stale: run python docs/make_robots.py'}")
+        print(f"{PAGE.name}: {'up to date' if is_new else 'stale: run python -m benches.pages.robots'}")
         return int(not is_new)
     PAGE.write_text(text, encoding="utf-8")
     return 0

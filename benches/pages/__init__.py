@@ -1,0 +1,1 @@
+"""Programs that write pages of docs: tables from measurements, pictures, what is known of robots."""

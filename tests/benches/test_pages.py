@@ -1,0 +1,49 @@
+"""Pages are written from measurements of committed trees only."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benches.pages.report import UncommittedError, report, require_commit
+from benches.peers import __main__ as peers
+from benches.peers.results import RECORDS, Results
+
+ROOT = Path(__file__).resolve().parents[2]
+DIRTY = {"demo": {"machine": {"commit": "0123abc"}}, "full": [{"machine": {"commit": "4567def-dirty"}}]}
+
+
+def test_a_record_of_a_tree_with_uncommitted_changes_is_refused(tmp_path: Path) -> None:
+    measured, kept, page = tmp_path / "measured.json", tmp_path / "kept.json", tmp_path / "page.md"
+
+    def written(results: Any, write: bool) -> int:
+        measured.write_text(json.dumps(results))
+        return report(measured, kept, page, str, program="benches.x", write=write)
+
+    assert written(DIRTY, False) == 0  # may be printed
+    with pytest.raises(UncommittedError, match="4567def-dirty, with uncommitted changes"):
+        written(DIRTY, True)
+    assert not page.exists()
+    assert not kept.exists()
+    assert written({"demo": DIRTY["demo"]}, True) == 0
+    assert page.exists()
+
+
+def test_peers_write_no_page_of_such_a_record(tmp_path: Path) -> None:
+    data = json.loads((RECORDS / "zen-5.json").read_text())
+    data["machine"]["commit"] += "-dirty"
+    (tmp_path / "zen-5.json").write_text(json.dumps(data))
+    for more in ([], ["--only", "policy"]):
+        with pytest.raises(UncommittedError):
+            peers.main(["report", "--write", "--record", str(tmp_path), *more])
+    with pytest.raises(UncommittedError):
+        peers.keep(Results(tmp_path / "zen-5.json"), tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benches").rglob("*.json")), ids=lambda path: path.name)
+def test_committed_records_are_of_committed_trees(path: Path) -> None:
+    require_commit(json.loads(path.read_text()), path)
