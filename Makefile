@@ -35,7 +35,7 @@ export VLA_SOURCE WHEEL_TARGETS
 $(SESSIONS): $(VENV)/.nox
 	@$(VENV)/bin/python -m nox --session $@ -- $(ARGS)
 
-# On CPUs that differ in what they have. docs/aarch64.md says more.
+# On CPUs that differ in what they have. docs/cpus.md says more.
 test-aarch64-all: $(VENV)/.nox
 	@$(VENV)/bin/python -m nox --session test-aarch64 -- max,sve=off neoverse-n1 cortex-a72 max
 

@@ -268,7 +268,7 @@ def bench_peers(session: nox.Session) -> None:
 
 @nox.session(name="test-compat")
 def test_compat(session: nox.Session) -> None:
-    """Test accelerate() and the plugin on lerobot releases; writes docs/compatibility.md.
+    """Test accelerate() and the plugin on lerobot releases; writes docs/results/compatibility.md.
 
     lerobot 0.5 and later need Python 3.12. If python3.12 is not on PATH: `--python312 PATH`.
     """
@@ -385,9 +385,9 @@ def build_wheels(session: nox.Session, options: Iterable[str]) -> Environment:
 
 @nox.session(name="test-wheel")
 def test_wheel(session: nox.Session) -> None:
-    """Build the wheels and test them on CPythons, NumPys and emulated CPUs; writes docs/wheels.md."""
+    """Build the wheels and test them on CPythons, NumPys and emulated CPUs; writes docs/results/wheels.md."""
     needs(session, "opengl", "qemu")
-    build_wheels(session, []).run(".ci/wheels/test.py", "dist", "--page", "docs/wheels.md", *session.posargs)
+    build_wheels(session, []).run(".ci/wheels/test.py", "dist", "--page", "docs/results/wheels.md", *session.posargs)
 
 
 @nox.session(name="demo-policy")
@@ -422,20 +422,19 @@ def demo_policy(session: nox.Session) -> None:
 
 @nox.session
 def pictures(session: nox.Session) -> None:
-    """Draw the pictures of README and docs/attention.md anew, from the bundled policy."""
+    """Draw the pictures of README and docs anew, from the bundled policy."""
     environment = working(session, "rollout")
     out = Path(session.posargs[0] if session.posargs else "out/pictures")
     saccade = environment.program("saccade")
     shown = ("--episodes", "1", "--seed", "2", "--video", "--out", str(out / "gif"))
     session.run(saccade, "rollout", *shown, external=True)
     tasks = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
-    environment.run(
-        "docs/make_pictures.py", "gif", *(out / "gif" / "videos" / f"{task}-2.mp4" for task in tasks)
-    )
+    videos = (out / "gif" / "videos" / f"{task}-2.mp4" for task in tasks)
+    environment.run("-m", "benches.pages.pictures", "gif", *videos)
     session.run(
         saccade, "attention", "--task", "push", "--seed", "3", "--out", str(out / "look"), external=True
     )
-    environment.run("docs/make_pictures.py", "map", out / "look" / "sheet.png")
+    environment.run("-m", "benches.pages.pictures", "step")
     shutil.copyfile(out / "look" / "sheet.png", ROOT / "docs" / "images" / "attention.png")
 
 

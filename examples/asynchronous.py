@@ -1,7 +1,7 @@
 """Asynchronous inference: the effect of delay in closed loop, with and without real-time chunking.
 
     python examples/asynchronous.py                     2 episodes of each task in each arm, a minute
-    python examples/asynchronous.py --episodes 30       the run of docs/asynchronous.md; resumes after a stop
+    python examples/asynchronous.py --episodes 30       the run of docs/real-time.md; resumes after a stop
     python examples/asynchronous.py report              print the tables and draw the figure again
 
 The bundled policy drives the simulated robot. A chunk of actions arrives `delay` control ticks after its

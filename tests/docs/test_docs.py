@@ -22,6 +22,7 @@ import saccade
 from saccade import cli
 from saccade._internal.extras import SACCADE
 from saccade_lab.extras import LAB
+from tests.docs.test_docs_checkpoints import PAGES as WITH_CHECKPOINTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
@@ -29,13 +30,12 @@ PAGES = [
     ROOT / "ARCHITECTURE.md",
     ROOT / "CHANGELOG.md",
     ROOT / "studies" / "README.md",
+    ROOT / "lab" / "README.md",
+    ROOT / "plugins" / "lerobot" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-#: These pages need checkpoints: tests/test_docs_checkpoints.py runs them.
-NEED_CHECKPOINTS = (
-    *("lerobot.md", "nvidia.md", "fork.md", "resize.md", "processor.md", "policy.md", "robots.md"),
-    *("frames.md", "protocol.md"),
-)
+#: These pages need checkpoints: `test_docs_checkpoints` runs them.
+NEED_CHECKPOINTS = tuple(f"{name}.md" for name in WITH_CHECKPOINTS)
 MODULES = sorted(
     info.name
     for info in pkgutil.walk_packages(saccade.__path__, "saccade.")
@@ -97,11 +97,10 @@ def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/usage.md"])
-def test_the_first_pages_need_numpy_only(page: str, tmp_path: Path) -> None:
+def test_the_readme_needs_numpy_only(tmp_path: Path) -> None:
     modules = sorted(set().union(*SACCADE.modules.values(), *LAB.modules.values()))
     hidden = f"import sys; sys.modules.update(dict.fromkeys({modules}))\n"
-    code = hidden + "\n".join(code_blocks(ROOT / page, "python"))
+    code = hidden + "\n".join(code_blocks(ROOT / "README.md", "python"))
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
@@ -111,7 +110,7 @@ def test_the_first_pages_need_numpy_only(page: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_commands_on_pages_exist(page: Path) -> None:
     targets = set(re.findall(r"^([\w-]+):(?!=)", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    for block in code_blocks(page, "bash"):
+    for block in code_blocks(page, "bash") + code_blocks(page, "sh"):  # those in bash also run, if they can
         for arguments in command_lines(block, "make"):
             assert {word for word in arguments if "=" not in word} <= targets  # variables aside
         for arguments in command_lines(block, "saccade"):
@@ -162,51 +161,52 @@ def tree_of_architecture() -> set[Path]:
     return found
 
 
-def test_architecture_names_every_folder_and_nothing_that_is_not_there() -> None:
+def test_architecture_names_every_package_and_nothing_that_is_not_there() -> None:
     named = tree_of_architecture()
     assert [str(path) for path in sorted(named) if not (ROOT / path).exists()] == []
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
-    files = [Path(name) for name in listed.stdout.split("\0") if name]
-    # The folders of a study hold what its commands wrote, and each case of a robot has one of its own.
-    cases = (Path("tests/data/robots"), Path("tests/data/images"))
-    folders = {
-        file.parent
-        for file in files
-        if file.parts[0] != "studies" and not any(file.is_relative_to(one) for one in cases)
-    } - {Path()}
-    assert [str(folder) for folder in sorted(folders - named)] == []
+    packages = {
+        Path(base) / folder.name
+        for base in ("crates", "lab/saccade_lab", "python/saccade")
+        for folder in (ROOT / base).iterdir()
+        if folder.is_dir() and folder.name != "__pycache__"
+    }
+    assert [str(folder) for folder in sorted(packages - named)] == []
 
 
-def test_pictures_of_the_readme_are_made_from_what_commands_write(tmp_path: Path) -> None:
+def test_pictures_are_made_from_what_commands_write(tmp_path: Path) -> None:
     shades = np.linspace(0, 255, 9).astype(np.uint8)
     frames = [np.full((64, 96, 3), shade, np.uint8) for shade in shades]
     imageio.mimwrite(tmp_path / "one.mp4", frames, fps=20, macro_block_size=16)  # type: ignore[arg-type]
-    Image.new("RGB", (40, 30), "red").save(tmp_path / "sheet.png")
-    script = [sys.executable, str(ROOT / "docs" / "make_pictures.py")]
     gif = ["gif", str(tmp_path / "one.mp4"), "--out", str(tmp_path / "one.gif"), "--width", "48"]
-    crop = [
-        "map",
-        str(tmp_path / "sheet.png"),
-        "--out",
-        str(tmp_path / "map.png"),
-        "--top",
-        "5",
-        "--bottom",
-        "25",
-    ]
-    for arguments in (gif, crop, ["step", "--out", str(tmp_path / "step.png")]):
-        subprocess.run([*script, *arguments], check=True, capture_output=True)
+    for arguments in (gif, ["step", "--out", str(tmp_path / "step.png")]):
+        subprocess.run(
+            [sys.executable, "-m", "benches.pages.pictures", *arguments],
+            cwd=ROOT,
+            check=True,
+            capture_output=True,
+        )
     with Image.open(tmp_path / "one.gif") as made:
         assert made.size == (48, 32)
         assert len(list(ImageSequence.Iterator(made))) == 5  # every second of eight, and the last
         assert made.info["loop"] == 0
-    with Image.open(tmp_path / "map.png") as made:
-        assert made.size == (40, 20)
     with (
         Image.open(tmp_path / "step.png") as made,
         Image.open(ROOT / "docs" / "images" / "step.png") as shown,
     ):
         assert made.size == shown.size
+
+
+def test_every_image_of_the_docs_is_shown() -> None:
+    text = "".join(page.read_text() for page in PAGES)
+    images = [path for path in (ROOT / "docs").rglob("*") if path.suffix in (".png", ".gif")]
+    assert [path.name for path in images if path.name not in text] == []
+
+
+def test_every_page_that_names_a_published_checkpoint_says_that_none_was_run() -> None:
+    caveat = "yet been run"
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    named = [page for page in pages if re.search(r"nvidia/|GR00T-N1", page.read_text())]
+    assert [page_id(page) for page in named if caveat not in " ".join(page.read_text().split())] == []
 
 
 def test_nothing_names_a_package_registry_or_a_path_of_one_machine() -> None:

@@ -15,7 +15,10 @@ from tests.helpers.published import published
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TOKENIZER = Path(__file__).resolve().parents[1] / "data" / "backbone" / "tiny_tokenizer.json"
-PAGES = ("lerobot", "nvidia", "fork", "resize", "processor", "policy", "frames", "protocol", "robots")
+PAGES = (
+    *("quickstart", "checkpoints", "checkpoint-tools", "lerobot", "robots"),
+    *("interpretability", "protocol"),
+)
 #: Names on the pages, and the layouts of these checkpoints.
 CHECKPOINTS = {
     "GR00T-N1.5-3B": "nvidia",

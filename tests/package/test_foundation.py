@@ -147,7 +147,7 @@ def test_the_declared_rust_is_what_builds(
 ) -> None:
     """`.ci/oldest_rust.sh` with a cargo whose named and default toolchains are of these versions."""
     oldest = re.search(r'^rust-version = "(.+)"', (ROOT / "Cargo.toml").read_text(), re.MULTILINE)[1]  # type: ignore[index]
-    assert f"Rust {oldest} or newer" in (ROOT / "docs/usage.md").read_text()
+    assert f"Rust {oldest} or newer" in (ROOT / "docs/quickstart.md").read_text()
     named, default = installed.format(oldest=oldest), default.format(oldest=oldest)
     (tmp_path / "cargo").write_text(
         f"#!/bin/sh\nversion={default}\n"

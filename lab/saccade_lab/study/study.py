@@ -54,7 +54,6 @@ STUDIES: dict[str, tuple[str, str]] = {
         "saccade_lab.study.questions.sweeps:VlSelfAttention",
         "policies with different depths of VL self-attention",
     ),
-    "answer": ("how many future tokens a policy needs: many policies, trained and judged",),
     "fast": (
         "saccade_lab.study.questions.fast:Fast",
         "what faster modes cost in actions and in success, and what they save",

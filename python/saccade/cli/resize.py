@@ -21,7 +21,7 @@ EPILOG = """\
 To add tokens, tokens are copied. A key of saccade in config.json subtracts ln of the number of copies from
 the logits of their keys, so that actions in saccade are unchanged except for rounding. Other programs ignore
 that key and give the copies more weight; the report says how far their actions move. To remove tokens,
-similar tokens are merged. Everything else is copied bit for bit. docs/resize.md says what is exact and what
+similar tokens are merged. Everything else is copied bit for bit. docs/checkpoint-tools.md says what is exact and what
 is not.
 
 examples:

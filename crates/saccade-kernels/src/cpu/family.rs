@@ -28,7 +28,7 @@ pub(crate) struct Rates {
     pub streams: bool,
 }
 
-/// Measured by a prototype, before saccade had tiles: `docs/instruction-sets.md`. The others were measured by `make bench-peers`, but for
+/// Measured by a prototype, before saccade had tiles: `docs/cpus.md`. The others were measured by `make bench-peers`, but for
 /// VDPBF16PS on Intel, where `avx512` does not use it.
 const SAPPHIRE_RAPIDS: Rates = Rates {
     float32: 145.0,

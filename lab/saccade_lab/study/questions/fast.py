@@ -50,7 +50,7 @@ SCREENED = (
     *(f"{precision}-euler-4-refresh-{every}" for precision in ("float32", "int8") for every in (2, 4)),
     *(f"float32-euler-4-drop-{percent}" for percent in (25, 50, 75)),
 )
-# What runs in closed loop by default; docs/fast.md says how these were selected by the screening.
+# What runs in closed loop by default; docs/precision.md says how these were selected by the screening.
 JUDGED = (
     ONE_STEP,
     *(f"float32-{rest}" for rest in ("euler-2", "euler-3", "adams-2", "adams-3", "times-2", "midpoint-1")),
