@@ -387,7 +387,9 @@ def build_wheels(session: nox.Session, options: Iterable[str]) -> Environment:
 def test_wheel(session: nox.Session) -> None:
     """Build the wheels and test them on CPythons, NumPys and emulated CPUs; writes docs/results/wheels.md."""
     needs(session, "opengl", "qemu")
-    build_wheels(session, []).run(".ci/wheels/test.py", "dist", "--page", "docs/results/wheels.md", *session.posargs)
+    build_wheels(session, []).run(
+        ".ci/wheels/test.py", "dist", "--page", "docs/results/wheels.md", *session.posargs
+    )
 
 
 @nox.session(name="demo-policy")

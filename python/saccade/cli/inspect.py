@@ -25,8 +25,8 @@ Reads every tensor of the head once, one at a time: about ten seconds for a publ
 
 A tensor counts "as initialised" if it is distributed as the released constructors draw it: uniform with
 1 / sqrt(inputs) for linear layers; normal with 0.02 for the embodiments' layers, tokens and positions. The
-last table lists the evidence for and against "this checkpoint was trained from a random start"; docs/checkpoint-tools.md
-explains when that happens.
+last table lists the evidence for and against "this checkpoint was trained from a random start";
+docs/checkpoint-tools.md explains when that happens.
 
 With --precision-check it runs the whole checkpoint instead, at every precision on the same pictures from the
 same noise, compares features and actions with float32, and recommends the smallest precision whose actions

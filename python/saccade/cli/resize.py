@@ -21,8 +21,8 @@ EPILOG = """\
 To add tokens, tokens are copied. A key of saccade in config.json subtracts ln of the number of copies from
 the logits of their keys, so that actions in saccade are unchanged except for rounding. Other programs ignore
 that key and give the copies more weight; the report says how far their actions move. To remove tokens,
-similar tokens are merged. Everything else is copied bit for bit. docs/checkpoint-tools.md says what is exact and what
-is not.
+similar tokens are merged. Everything else is copied bit for bit. docs/checkpoint-tools.md
+says what is exact and what is not.
 
 examples:
   saccade resize GR00T-N1.5-3B/ --num-future-tokens 64 --out GR00T-N1.5-3B-64
