@@ -88,8 +88,9 @@ class Processor:
     @classmethod
     def from_pretrained(
         cls,
-        source: str | os.PathLike[str],
+        id_or_path: str | os.PathLike[str],
         *,
+        revision: str | None = None,
         preprocessing: Preprocessing | None = None,
         tokenizer: str | os.PathLike[str] | None = None,
         options: Mapping[str, Any] | None = None,
@@ -101,7 +102,8 @@ class Processor:
         ``policy_preprocessor.json``. A checkpoint that holds only a backbone will do.
 
         Args:
-            source: A path, or the id of a published checkpoint in the local Hugging Face cache.
+            id_or_path: A path, or the id of a published checkpoint in the local Hugging Face cache.
+            revision: A branch, tag or commit of the id. Default: ``main``.
             preprocessing: Whose frames and words. Default: lerobot's for a checkpoint that lerobot wrote, and
                 else Isaac-GR00T's.
             tokenizer: A ``tokenizer.json``, a directory, or a published id in the local cache. Default: the
@@ -122,7 +124,7 @@ class Processor:
             >>> saccade.Processor.from_pretrained("n1.5-backbone.safetensors", tokenizer="tokenizer.json")
             <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
         """
-        held = _saccade.ProcessorSource(os.fspath(resolve(source)))
+        held = _saccade.ProcessorSource(os.fspath(resolve(id_or_path, revision)))
         chosen = None if preprocessing is None else text("preprocessing", preprocessing)
         processor = cls.__new__(cls)
         replaced = None if options is None else _to_json(options)

@@ -128,7 +128,7 @@ def test_other_paths_stay_as_they_are(path: str) -> None:
 
 def test_what_is_no_path() -> None:
     for source in (3, None, b"bytes", "null\0character"):
-        with pytest.raises(InputError, match="source: expected a path"):
+        with pytest.raises(InputError, match="id_or_path: expected a path"):
             resolve(source)  # type: ignore[arg-type]
 
 

@@ -164,12 +164,12 @@ def test_velocity(error: type[Exception], message: str, options: dict[str, Any])
         ("embodiment_ids: .*got -1", {"embodiment_ids": [-1]}),
         ("embodiment_ids: expected at least one", {"embodiment_ids": np.zeros(0, int)}),
         ("embodiment_ids: expected an integer", {"embodiment_ids": ["gr1"]}),
-        ("source: expected a path, got int", {"source": 3}),
-        ("source: .*null characters", {"source": "a\0b"}),
+        ("id_or_path: expected a path, got int", {"id_or_path": 3}),
+        ("id_or_path: .*null characters", {"id_or_path": "a\0b"}),
     ],
 )
 def test_load_options(message: str, options: dict[str, Any]) -> None:
-    arguments: dict[str, Any] = {"source": TINY.path, "config": TINY.config} | options
+    arguments: dict[str, Any] = {"id_or_path": TINY.path, "config": TINY.config} | options
     with pytest.raises(Input, match=message):
         saccade.ActionHead.from_pretrained(**arguments)
 

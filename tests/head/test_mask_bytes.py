@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import saccade
 import saccade.torch
 from saccade._internal.arrays import boolean, mask_bytes
-from saccade.observations.recorded import as_mask
+from saccade.head.input_files import as_mask
 from tests.head.test_head import cross_tensors, load
 from tests.helpers.released import load_released
 from tests.helpers.released_backbones import released_backbone

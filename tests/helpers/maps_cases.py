@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import saccade
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.maps.layout import parse_layout
 from saccade_lab.maps.occlusion import DroppedPositions, Occlusion
 from saccade_lab.maps.record import Maps, Selection
@@ -67,7 +67,7 @@ def one_hot_maps(
         np.zeros((1, config.state_dim), np.float32),
     )
     noise = np.zeros((1, ACTIONS, config.encoder_action_dim), np.float32)
-    observation = Observation(features, state, np.array([0]), noise)
+    observation = HeadInputs(features, state, np.array([0]), noise)
     gradient = np.arange(16 * 16 * 3, dtype=np.uint32).reshape(16, 16, 3) % 251
     pictures = {"left": gradient.astype(np.uint8), "top": np.full((8, 24, 3), 200, np.uint8)}
     change = {"left": np.array([[0, 1], [0, 0]], np.float32), "top": np.array([[0, 0, 0.25]], np.float32)}

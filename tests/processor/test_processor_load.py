@@ -464,7 +464,7 @@ def test_sources_that_are_none(tmp_path: Path) -> None:
         load(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match="source"):
         load(tmp_path)
-    with pytest.raises(InputError, match="source: expected a path"):
+    with pytest.raises(InputError, match="id_or_path: expected a path"):
         saccade.Processor.from_pretrained(7)  # type: ignore[arg-type]
 
 

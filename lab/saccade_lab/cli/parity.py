@@ -21,7 +21,7 @@ from saccade._internal.environment import cpu_name
 from saccade._internal.flags import UsageError
 from saccade.checkpoints.hub import resolve
 from saccade.cli import output
-from saccade.observations.recorded import Observation, read
+from saccade.head.inputs import HeadInputs
 from saccade_lab.extras import LAB, require
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def write_random(folder: Path, args: argparse.Namespace) -> None:
     random_weights.write_checkpoint(folder, config, args.seed, dtype=dtype)
 
 
-def random_inputs(source: Path, args: argparse.Namespace) -> Observation:
+def random_inputs(source: Path, args: argparse.Namespace) -> HeadInputs:
     """Standard normal inputs that fit the checkpoint."""
     from saccade_lab.reference import random_weights
 
@@ -207,16 +207,16 @@ def random_inputs(source: Path, args: argparse.Namespace) -> Observation:
     drawn = random_weights.random_inputs(
         config, args.seed + 1, batch=args.batch, num_vl_tokens=args.num_vl_tokens
     )
-    inputs = Observation(**{name: tensor.numpy() for name, tensor in drawn.items()})
+    inputs = HeadInputs(**{name: tensor.numpy() for name, tensor in drawn.items()})
     if args.embodiment_id is not None:
         inputs = dataclasses.replace(inputs, embodiment_id=np.full(args.batch, args.embodiment_id))
     return inputs
 
 
-def recorded_inputs(source: Path, args: argparse.Namespace) -> Observation:
+def recorded_inputs(source: Path, args: argparse.Namespace) -> HeadInputs:
     """The inputs of a file; noise is drawn if there is none."""
     config = head_config(source)
-    inputs = read(args.features, config).with_noise(np.random.default_rng(args.seed), config)
+    inputs = HeadInputs.from_file(args.features, config).with_noise(np.random.default_rng(args.seed), config)
     assert inputs.noise is not None
     return dataclasses.replace(
         inputs,
@@ -234,7 +234,7 @@ def head_config(source: Path) -> saccade.HeadConfig:
 
 
 def engines(
-    source: Path, inputs: Observation, args: argparse.Namespace
+    source: Path, inputs: HeadInputs, args: argparse.Namespace
 ) -> Iterator[tuple[str, Callable[[], Outputs]]]:
     """The Rust head on each instruction set, then torch in float32 for comparison.
 
@@ -246,7 +246,7 @@ def engines(
     yield "torch float32", partial(run_reference, source, inputs, args.num_steps, "float32")
 
 
-def run_reference(source: Path, inputs: Observation, num_steps: int | None, dtype: str) -> Outputs:
+def run_reference(source: Path, inputs: HeadInputs, num_steps: int | None, dtype: str) -> Outputs:
     """`vl_embs` and actions of the reference. Its weights are freed when this returns."""
     import torch
 
@@ -270,7 +270,7 @@ def run_reference(source: Path, inputs: Observation, num_steps: int | None, dtyp
     return vl_embs.numpy(), actions.numpy()
 
 
-def run_rust(source: Path, inputs: Observation, args: argparse.Namespace, isa: str) -> Outputs:
+def run_rust(source: Path, inputs: HeadInputs, args: argparse.Namespace, isa: str) -> Outputs:
     """`vl_embs` and actions of the Rust head on one instruction set."""
     from saccade_lab.reference import loading
 
@@ -300,7 +300,7 @@ def forced_isa(isa: str) -> Iterator[None]:
             os.environ["SACCADE_ISA"] = before
 
 
-def describe(inputs: Observation) -> str:
+def describe(inputs: HeadInputs) -> str:
     """The sizes of the inputs, in words."""
     assert inputs.noise is not None
     return (

@@ -15,8 +15,8 @@ import numpy as np
 from saccade._internal.arrays import Float32Array, UInt8Array
 from saccade.errors import InputError
 from saccade.head.head import ActionHead
+from saccade.head.inputs import HeadInputs
 from saccade.observations import view_places
-from saccade.observations.recorded import Observation
 from saccade.policy.context import PolicyContext
 from saccade.policy.policy import Policy
 from saccade_lab.maps.layout import Camera, Layout
@@ -80,7 +80,7 @@ class BlankedFrames:
     batch = 4  # keys and values of N1.5's language model take 50 MB for each
 
     def __init__(
-        self, policy: Policy, seen: Mapping[str, Any], encoded: PolicyContext, observation: Observation
+        self, policy: Policy, seen: Mapping[str, Any], encoded: PolicyContext, observation: HeadInputs
     ) -> None:
         self._policy = policy
         self._seen = seen
@@ -137,7 +137,7 @@ class DroppedPositions:
     )
     batch = 16  # one observation of N1.5 holds 32 MB of keys and values
 
-    def __init__(self, observation: Observation) -> None:
+    def __init__(self, observation: HeadInputs) -> None:
         self._observation = observation
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:

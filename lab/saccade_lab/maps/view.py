@@ -14,8 +14,9 @@ import numpy.typing as npt
 from saccade._internal.arrays import UInt8Array
 from saccade.errors import InputError, ShapeError
 from saccade.head.config import HeadConfig
+from saccade.head.input_files import as_mask, read_arrays
+from saccade.head.inputs import HeadInputs
 from saccade.observations import read
-from saccade.observations.recorded import Observation, as_mask, from_arrays, read_arrays
 from saccade.policy.parts import as_head_takes_it
 from saccade.policy.policy import Policy
 from saccade_lab.maps import layout as layouts
@@ -42,7 +43,7 @@ class View:
 
     title: str
     source: dict[str, Any]
-    observation: Observation
+    observation: HeadInputs
     layout: Layout
     images: dict[str, UInt8Array]
     occluder: Occluder
@@ -144,7 +145,7 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
     """One observation of a file of backbone features.
 
     Args:
-        path: `.npz` or `.safetensors`, see `saccade.observations.recorded.read_arrays`.
+        path: `.npz` or `.safetensors`, see `saccade.head.input_files.read_arrays`.
         config: config of the head that will take them.
         row: which of the observations of the file.
         options: where its image tokens are.
@@ -158,7 +159,7 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
     arrays = read_arrays(path)
     # Heads that ignore padding show it: there these masks say what the positions are, and nothing else.
     shown = () if config.mask_mode == "alternate" else ("attention_mask", "image_mask")
-    given = from_arrays(
+    given = HeadInputs.from_arrays(
         {name: array for name, array in arrays.items() if name not in shown}, config, str(path)
     )
     batch, num_tokens = len(given), given.num_vl_tokens

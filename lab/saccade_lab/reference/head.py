@@ -23,8 +23,8 @@ from saccade._internal.arrays import integer
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig
-from saccade.head.integrator import INTEGRATORS, check_integrator
 from saccade.head.intervention import Intervention, Tokens
+from saccade.head.options import INTEGRATORS, check_integrator
 from saccade.head.trace import Trace
 from saccade_lab.reference import loading
 from saccade_lab.reference.checks import as_embodiment, check_shape

@@ -18,9 +18,9 @@ from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
+from saccade.head.inputs import HeadInputs
 from saccade.observations import read
 from saccade.observations.pictures import Moment, read_frames
-from saccade.observations.recorded import Observation
 from saccade.policy.context import longer
 from saccade.policy.parts import as_head_takes_it, parts_of
 from saccade.policy.policy import Policy
@@ -109,12 +109,12 @@ class Moments(Recorded):
         return encode(self).action_width
 
     @property
-    def all(self) -> Observation:
+    def all(self) -> HeadInputs:
         """See `Recorded`; raises as `read_frames` and `saccade.Policy.from_pretrained`."""
         return encode(self).observation
 
     @property
-    def others(self) -> Observation | None:
+    def others(self) -> HeadInputs | None:
         """For each moment the one in the same place of the other directory, or with the other instruction."""
         return encode(self).other_observation
 
@@ -145,8 +145,8 @@ class Encoded:
     action_width: int
     moments: Sequence[Moment]
     others: Sequence[Moment]
-    observation: Observation
-    other_observation: Observation | None
+    observation: HeadInputs
+    other_observation: HeadInputs | None
     inputs: Sequence[BackboneInputs]
     layouts: Sequence[Layout]
     backbone_config: BackboneConfig
@@ -211,7 +211,7 @@ def moments_of(source: Moments, policy: Policy, directory: str, instruction: str
     return read_frames(Path(directory), policy, instruction=instruction, state=state)
 
 
-def joined(observations: Sequence[Observation], moments: Sequence[Moment]) -> Observation:
+def joined(observations: Sequence[HeadInputs], moments: Sequence[Moment]) -> HeadInputs:
     """Observations of one row each as one, the shorter ones padded and their padding dropped.
 
     The head drops padding exactly: each has the bits that it has alone.
@@ -221,7 +221,7 @@ def joined(observations: Sequence[Observation], moments: Sequence[Moment]) -> Ob
     masks = [longer(one.image_mask, longest) for one in observations if one.image_mask is not None]
     dropped = np.arange(longest) >= lengths[:, None]
     episodes = [moment.episode for moment in moments]
-    return Observation(
+    return HeadInputs(
         np.concatenate([longer(one.backbone_features, longest) for one in observations]),
         np.concatenate([one.state for one in observations]),
         np.concatenate([one.embodiment_id for one in observations]),

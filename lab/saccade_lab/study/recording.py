@@ -14,9 +14,8 @@ from saccade._internal.arrays import Float32Array
 from saccade._internal.files import checkpoint_identity, sha256_of
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
+from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
-from saccade.observations import recorded as observation
-from saccade.observations.recorded import Observation
 from saccade_lab.study.source import Source, episode_rng
 
 NOISES = 4  # drawn for each observation that has none
@@ -36,11 +35,11 @@ class Recorded(Source):
 
     @property
     @abstractmethod
-    def all(self) -> Observation:
+    def all(self) -> HeadInputs:
         """All observations, checked."""
 
     @property
-    def others(self) -> Observation | None:
+    def others(self) -> HeadInputs | None:
         """For each of `all` an observation to compare it with, or None if there are none."""
         return None
 
@@ -54,7 +53,7 @@ class Recorded(Source):
         """See `Source`."""
         return self.head().config
 
-    def observed(self, task: str, seed: int) -> Observation:
+    def observed(self, task: str, seed: int) -> HeadInputs:
         """See `Source`."""
         rng = np.random.default_rng([self.seed, seed])
         return self.all.row(seed).with_noise(rng, self.config, NOISES)
@@ -67,12 +66,12 @@ class Recorded(Source):
         """See `Source`; the same for all observations of an episode."""
         return episode_rng(f"{task} {self.seed}", self.episode_of(seed))
 
-    def encode(self, observation: Observation) -> Any:
+    def encode(self, observation: HeadInputs) -> Any:
         """See `Source`."""
         return observation.encode(self.head())
 
     def actions(
-        self, observation: Observation, intervention: Intervention | None, context: Any = None
+        self, observation: HeadInputs, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
         """The head's own, normalised actions, those that count; see `Source`."""
         found = observation.sample(self.head(), context, intervention=intervention)
@@ -106,7 +105,7 @@ class Recorded(Source):
         }
 
 
-def num_episodes(observation: Observation) -> int | None:
+def num_episodes(observation: HeadInputs) -> int | None:
     """The number of episodes, or None if unknown."""
     return None if observation.episode is None else int(observation.episode.max()) + 1
 
@@ -117,7 +116,7 @@ class Recording(Recorded):
 
     Attributes:
         checkpoint: A checkpoint that `ActionHead.from_pretrained` reads.
-        file: File of features, see `saccade.observations.recorded.read_arrays`.
+        file: File of features, see `saccade.head.input_files.read_arrays`.
         config_file: Path of the head's config. Default: that of the checkpoint.
         seed: Seed of random tokens, and of the noise if the file contains none.
         num_threads: Number of threads of the head. Default: that of the engine.
@@ -158,8 +157,8 @@ class Recording(Recorded):
         return head_of(self.checkpoint, self.config_file, precision, self.num_threads)
 
     @property
-    def all(self) -> Observation:
-        """All observations of the file, checked; raises as `saccade.observations.recorded.read`."""
+    def all(self) -> HeadInputs:
+        """All observations of the file, checked; raises as `saccade.head.inputs.HeadInputs.from_file`."""
         return read(self.file, self.config)
 
 
@@ -170,6 +169,6 @@ def head_of(checkpoint: str, config: str | None, precision: str, num_threads: in
 
 
 @functools.lru_cache(maxsize=1)
-def read(file: str, config: HeadConfig) -> Observation:
+def read(file: str, config: HeadConfig) -> HeadInputs:
     """The observations of a file, cached for the next cell."""
-    return observation.read(Path(file), config)
+    return HeadInputs.from_file(Path(file), config)

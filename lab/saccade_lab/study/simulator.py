@@ -16,8 +16,9 @@ from saccade._internal.files import path_text
 from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
+from saccade.head.input_files import BoolArray
+from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
-from saccade.observations.recorded import BoolArray, Observation
 from saccade.policy.head import Head
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
@@ -86,7 +87,7 @@ class Simulator(Source):
         """An episode of the unchanged policy."""
         return recorded(self.checkpoint, self.engine, task, seed)
 
-    def observed(self, task: str, seed: int) -> Observation:
+    def observed(self, task: str, seed: int) -> HeadInputs:
         """See `Source`."""
         return self.recorded(task, seed).observation
 
@@ -94,21 +95,21 @@ class Simulator(Source):
         """See `Source`."""
         return episode_rng(task, seed)
 
-    def first(self, task: str, seed: int, instruction: str) -> Observation:
+    def first(self, task: str, seed: int, instruction: str) -> HeadInputs:
         """The first observation of an episode with another instruction, without noise."""
         environment = environment_of(self.checkpoint, task)
         environment.restart(seed)
         environment.instruction = instruction
         seen = environment.observe()
         ids = np.array([EMBODIMENT_ID])
-        return Observation(self.policy.features(seen), self.policy.state(seen), ids)
+        return HeadInputs(self.policy.features(seen), self.policy.state(seen), ids)
 
-    def encode(self, observation: Observation) -> Any:
+    def encode(self, observation: HeadInputs) -> Any:
         """See `Source`."""
         return self.policy.head.encode(observation.backbone_features)
 
     def actions(
-        self, observation: Observation, intervention: Intervention | None, context: Any = None
+        self, observation: HeadInputs, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
         """Actions of the robot, in [-1, 1]; see `Source`."""
         assert observation.noise is not None
@@ -197,7 +198,7 @@ class Recorded:
     """
 
     episode: Episode
-    observation: Observation
+    observation: HeadInputs
     privileged: PrivilegedState
 
 
@@ -233,7 +234,7 @@ class Recorder(WrappedHead):
         """The recording, when the episode is over."""
         features, images, state, noise, *known = map(np.concatenate, zip(*self._given, strict=True))
         ids = np.full(len(features), EMBODIMENT_ID)
-        observation = Observation(features, state, ids, noise, image_mask=images)
+        observation = HeadInputs(features, state, ids, noise, image_mask=images)
         return Recorded(episode, observation, PrivilegedState(*known))
 
 

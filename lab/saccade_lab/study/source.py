@@ -13,8 +13,8 @@ import numpy as np
 from saccade._internal.arrays import Float32Array
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
+from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
-from saccade.observations.recorded import Observation
 
 
 class Source(ABC):
@@ -80,7 +80,7 @@ class Source(ABC):
         return self.head().future_tokens
 
     @abstractmethod
-    def observed(self, task: str, seed: int) -> Observation:
+    def observed(self, task: str, seed: int) -> HeadInputs:
         """The input of the unchanged head: all observations of an episode, or one row of the file.
 
         Returns:
@@ -93,7 +93,7 @@ class Source(ABC):
 
     @abstractmethod
     def actions(
-        self, observation: Observation, intervention: Intervention | None, context: Any = None
+        self, observation: HeadInputs, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
         """Chunks as they are compared, `(batch, draws, horizon, action_dim)`.
 
@@ -104,7 +104,7 @@ class Source(ABC):
         """
 
     @abstractmethod
-    def encode(self, observation: Observation) -> Any:
+    def encode(self, observation: HeadInputs) -> Any:
         """The `context` of an observation for `actions`."""
 
     @abstractmethod
@@ -137,7 +137,7 @@ class Unchanged:
         actions: `(observations, draws, horizon, action_dim)`, as they are compared.
     """
 
-    observations: Sequence[Observation]
+    observations: Sequence[HeadInputs]
     contexts: Sequence[Any]
     actions: Float32Array
 

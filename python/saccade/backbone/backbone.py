@@ -20,7 +20,7 @@ from saccade.head.options import optional_integer
 
 
 class Backbone:
-    """A loaded backbone. Create one with :meth:`load` or :meth:`from_tensors`.
+    """A loaded backbone. Create one with :meth:`from_pretrained` or :meth:`from_tensors`.
 
     A backbone is immutable: any number of threads may call it at the same time. The features of an
     observation have the same bits whatever else is in the batch, as long as it has the same padding, and with
@@ -48,8 +48,9 @@ class Backbone:
     @classmethod
     def from_pretrained(
         cls,
-        source: str | os.PathLike[str],
+        id_or_path: str | os.PathLike[str],
         *,
+        revision: str | None = None,
         config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
         precision: str = "float32",
         num_threads: int | None = None,
@@ -62,9 +63,10 @@ class Backbone:
         ``embed_tokens`` is there too, and layers of the language model from ``select_layer`` on.
 
         Args:
-            source: A directory (``config.json`` and one or more ``.safetensors`` files, with or without an
-                index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache of
-                ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``. Nothing is downloaded.
+            id_or_path: A directory (``config.json`` and one or more ``.safetensors`` files, with or without
+                an index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache
+                of ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``.
+            revision: A branch, tag or commit of the id. Default: ``main``.
             config: A dict or the path of a JSON file: the config of a whole checkpoint, whose
                 ``backbone_cfg.eagle_config`` may hold sizes, or that of a backbone alone (``vision_config``,
                 ``text_config``, ``eagle``, ``select_layer``, ``project_to_dim``). Sizes that it does not hold
@@ -86,13 +88,13 @@ class Backbone:
                 ``SACCADE_NUM_THREADS``, else the number of physical cores that the process may use.
 
         Raises:
-            FileNotFoundError: ``source`` or the config does not exist.
+            FileNotFoundError: ``id_or_path`` or the config does not exist.
             CheckpointError: The config or the weights are damaged or do not fit each other, or there is no
                 backbone. The message lists every problem.
             InputError: An option is out of range.
         """
         check_precision(precision)
-        path = os.fspath(resolve(source))
+        path = os.fspath(resolve(id_or_path, revision))
         config_text = None if config is None else to_json(config)
         threads = optional_integer("num_threads", num_threads)
         backbone = _saccade.Backbone.load(path, config_text, precision, threads)
@@ -110,15 +112,15 @@ class Backbone:
     ) -> Backbone:
         """Creates a backbone from tensors in memory.
 
-        The result is bit for bit the backbone that :meth:`load` reads from a file with these tensors. The
+        The result has the bits of :meth:`from_pretrained` for a file with these tensors. The
         backbone keeps no reference to the tensors. A tensor that is not C-contiguous is copied first. Such a
         backbone cannot be pickled, because it has no file to be loaded from.
 
         Args:
             tensors: The tensors by their names in a checkpoint, with or without the prefix, as NumPy arrays
                 or torch CPU tensors of float32, bfloat16 or float16.
-            config: As for :meth:`load`. Default: that of the published model.
-            precision, num_threads: As for :meth:`load`.
+            config: As for :meth:`from_pretrained`. Default: that of the published model.
+            precision, num_threads: As for :meth:`from_pretrained`.
 
         Raises:
             DtypeError: A tensor has another dtype, or is not on the CPU.

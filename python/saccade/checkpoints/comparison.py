@@ -13,9 +13,10 @@ import numpy as np
 from saccade._internal.arrays import Float32Array, integer
 from saccade.checkpoints.description import Config, Source, open_published
 from saccade.head.head import ActionHead
+from saccade.head.input_files import read_arrays
+from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
 from saccade.head.options import LoadOptions
-from saccade.observations.recorded import Observation, from_arrays, read_arrays
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def action_changes(
         resized: The copy.
         config: Config of the source, as in ``resize``.
         features: A file of recorded observations, ``.npz`` or ``.safetensors``, see
-            :func:`saccade.observations.recorded.read_arrays`. Default: random observations of the first
+            :func:`saccade.head.input_files.read_arrays`. Default: random observations of the first
             embodiment,
             which are less informative, because no robot produces them.
         seed: Seed of random observations, and of noise that the file does not contain.
@@ -90,11 +91,11 @@ def action_changes(
     head = ActionHead.from_pretrained(source, config=config, **loading)
     if arrays is None:
         observations = [
-            Observation.random(head.config, num_vl_tokens, rng, head.embodiment_ids[0])
+            HeadInputs.random(head.config, num_vl_tokens, rng, head.embodiment_ids[0])
             for _ in range(num_observations)
         ]
     else:
-        recorded = from_arrays(arrays, head.config, str(features))
+        recorded = HeadInputs.from_arrays(arrays, head.config, str(features))
         observations = list(recorded.with_noise(rng, head.config).rows())
     before = _actions(head, observations)
     others = [dataclasses.replace(one, noise=None).with_noise(rng, head.config) for one in observations]
@@ -116,6 +117,6 @@ def action_changes(
 
 
 def _actions(
-    head: ActionHead, observations: Sequence[Observation], intervention: Intervention | None = None
+    head: ActionHead, observations: Sequence[HeadInputs], intervention: Intervention | None = None
 ) -> Float32Array:
     return np.concatenate([one.sample(head, intervention=intervention) for one in observations])

@@ -17,42 +17,45 @@ from saccade.errors import InputError
 PUBLISHED = re.compile(r"(?P<id>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(?P<revision>[\w./-]+))?")
 
 
-def resolve(source: str | os.PathLike[str]) -> Path:
+def resolve(id_or_path: str | os.PathLike[str], revision: str | None = None) -> Path:
     """The path of a checkpoint.
 
     Args:
-        source: A path, or the id of a published checkpoint, such as ``nvidia/GR00T-N1.5-3B`` or
+        id_or_path: A path, or the id of a published checkpoint, such as ``nvidia/GR00T-N1.5-3B`` or
             ``nvidia/GR00T-N1.5-3B@main``. An existing path takes precedence. The files of an id are looked up
             in the local cache of ``huggingface_hub`` (environment variables ``HF_HOME`` and
             ``HF_HUB_CACHE``). Nothing is downloaded.
+        revision: A branch, tag or commit of the id. Default: ``main``.
 
     Returns:
         The directory of an id. A path is returned unchanged, whether it exists or not.
 
     Raises:
-        InputError: ``source`` is not a path.
-        FileNotFoundError: ``source`` has the form of an id, but neither the path exists nor are the files of
-            the id in the cache. The message contains a command that downloads them.
+        InputError: ``id_or_path`` is not a path, or ``revision`` is given with a path.
+        FileNotFoundError: ``id_or_path`` is an id, but neither the path exists nor are the files of the id
+            in the cache. The message contains a command that downloads them.
 
     Example:
         >>> resolve("policy.safetensors").name
         'policy.safetensors'
     """
     try:
-        text = os.fspath(source)
+        text = os.fspath(id_or_path)
     except TypeError:
         text = None
     if not isinstance(text, str):
-        raise InputError(f"source: expected a path, got {type(source).__name__}")
+        raise InputError(f"id_or_path: expected a path, got {type(id_or_path).__name__}")
     if "\0" in text:
-        raise InputError(f"source: expected a path without null characters, got {text!r}")
+        raise InputError(f"id_or_path: expected a path without null characters, got {text!r}")
     path = Path(text)
     published = PUBLISHED.fullmatch(text)
-    if published is None or text.endswith((".safetensors", ".json")):
+    is_file = text.endswith((".safetensors", ".json"))
+    # Of a name that is too long Path.exists raises OSError.
+    if published is None or is_file or os.path.exists(path):  # noqa: PTH110
+        if revision is not None:
+            raise InputError(f"revision: expected None with a path, got {revision!r} with {text}")
         return path
-    if os.path.exists(path):  # noqa: PTH110 (of a name that is too long Path.exists raises OSError)
-        return path
-    return _snapshot(published["id"], published["revision"])
+    return _snapshot(published["id"], revision or published["revision"])
 
 
 def cached(name: str, revision: str | None = None) -> Path | None:
@@ -92,7 +95,7 @@ def cache() -> Path:
 def _snapshot(name: str, revision: str | None) -> Path:
     """The directory of a revision in the cache."""
     download = f"hf download {name}" + ("" if revision is None else f" --revision {revision}")
-    start = f"source: {name}{'' if revision is None else '@' + revision}: no such path, and "
+    start = f"id_or_path: {name}{'' if revision is None else '@' + revision}: no such path, and "
     try:
         from huggingface_hub import snapshot_download
     except ImportError:

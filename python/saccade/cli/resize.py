@@ -62,10 +62,10 @@ def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains and how far actions move."""
     from saccade.checkpoints import describe, resize
     from saccade.checkpoints.comparison import action_changes
-    from saccade.observations.recorded import read
+    from saccade.head.inputs import HeadInputs
 
     if args.features is not None:  # refused before anything is written
-        read(Path(args.features), describe(args.checkpoint, args.config).config)
+        HeadInputs.from_file(Path(args.features), describe(args.checkpoint, args.config).config)
     with copying("resizing") as progress:
         report = resize(
             args.checkpoint,

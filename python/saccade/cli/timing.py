@@ -15,7 +15,7 @@ from saccade.head.config import HeadConfig
 from saccade.head.context import Context
 from saccade.head.head import ActionHead
 from saccade.head.intervention import Intervention
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 
 #: The timed calls: encoding an observation, sampling a chunk from its context, and both.
 WORKS = ("encode", "sample", "both")
@@ -139,7 +139,7 @@ def works_of(head: ActionHead, call: Call) -> dict[str, Callable[[], Any]]:
     """The calls of :data:`WORKS` on random observations; each has been made once."""
     config = head.config
     rng = np.random.default_rng(0)
-    drawn = Observation.random(config, call.num_vl_tokens, rng, head.embodiment_ids[0])
+    drawn = HeadInputs.random(config, call.num_vl_tokens, rng, head.embodiment_ids[0])
     images = np.arange(call.num_vl_tokens)[None] < call.image_tokens
     observation = replace(drawn, noise=None, image_mask=images).repeated(call.batch)
     observation = observation.with_noise(rng, config, call.num_samples)

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import (
@@ -31,10 +31,9 @@ from saccade.errors import DtypeError, InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig, to_json
 from saccade.head.context import Context
-from saccade.head.integrator import check_integrator
 from saccade.head.intervention import Intervention
 from saccade.head.options import (
-    SampleOptions,
+    check_integrator,
     noise_or_draw,
     optional_integer,
     plain_chunking,
@@ -42,12 +41,9 @@ from saccade.head.options import (
 )
 from saccade.head.trace import Record, Trace, check_record
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
 
 class ActionHead:
-    """A loaded action head. Create one with :meth:`load` or :meth:`from_tensors`.
+    """A loaded action head. Create one with :meth:`from_pretrained` or :meth:`from_tensors`.
 
     A head is immutable: any number of threads may call it at the same time. The result of an observation has
     the same bits in any batch, with any ``num_samples`` and with any number of threads.
@@ -90,8 +86,9 @@ class ActionHead:
     @classmethod
     def from_pretrained(
         cls,
-        source: str | os.PathLike[str],
+        id_or_path: str | os.PathLike[str],
         *,
+        revision: str | None = None,
         config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
         embodiment_ids: Sequence[int] | None = None,
         action_horizon: int | None = None,
@@ -106,9 +103,10 @@ class ActionHead:
         shape. Tensors that ``saccade quantize`` stored as int8 can be loaded at every precision.
 
         Args:
-            source: A directory (``config.json`` and one or more ``.safetensors`` files, with or without an
-                index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache of
-                ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``. Nothing is downloaded.
+            id_or_path: A directory (``config.json`` and one or more ``.safetensors`` files, with or without
+                an index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache
+                of ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``.
+            revision: A branch, tag or commit of the id. Default: ``main``.
             config: A dict or the path of a JSON file: the config of a whole checkpoint (with
                 ``action_head_cfg``, or flat as those of N1.6 and N1.7) or of the head alone.
                 Default: the ``config.json`` in the directory of the weights. A config that lerobot wrote does
@@ -141,13 +139,13 @@ class ActionHead:
                 affinity and container quota included).
 
         Raises:
-            FileNotFoundError: ``source`` or the config does not exist.
+            FileNotFoundError: ``id_or_path`` or the config does not exist.
             CheckpointError: The config or the weights are damaged or do not fit each other. The message lists
                 every problem.
             InputError: An option is out of range.
         """
         check_precision(precision)
-        path = os.fspath(resolve(source))
+        path = os.fspath(resolve(id_or_path, revision))
         config_text = None if config is None else to_json(config)
         ids = optional_integers("embodiment_ids", embodiment_ids)
         horizon = optional_integer("action_horizon", action_horizon)
@@ -177,7 +175,7 @@ class ActionHead:
     ) -> ActionHead:
         """Creates a head from tensors in memory.
 
-        The result is bit for bit the head that :meth:`load` reads from a file with these tensors. The head
+        The result has the bits of :meth:`from_pretrained` for a file with these tensors. The head
         keeps no reference to the tensors, so later changes to them have no effect. Tensors are packed one at
         a time, and of the layers of the embodiments only the requested ones are read. A tensor that is not
         C-contiguous is copied first. Such a head cannot be pickled, because it has no file to be loaded from.
@@ -188,8 +186,8 @@ class ActionHead:
                 is widened to float32, which is exact. All tensors that the config asks for must be present.
                 Others are refused, except those that only training uses (``task_log_sigma.*``,
                 ``mask_token``) and ``dropout_prob_by_embodiment`` (see the class).
-            config: The config of the head or of a whole checkpoint, as for :meth:`load`.
-            embodiment_ids, num_states, precision, num_threads: As for :meth:`load`.
+            config: The config of the head or of a whole checkpoint, as for :meth:`from_pretrained`.
+            embodiment_ids, num_states, precision, num_threads: As for :meth:`from_pretrained`.
 
         Raises:
             DtypeError: A tensor has another dtype, or is not on the CPU.
@@ -419,19 +417,36 @@ class ActionHead:
         attention_mask: ArrayLike | None = None,
         image_mask: ArrayLike | None = None,
         drop_vl: ArrayLike | None = None,
-        **options: Unpack[SampleOptions],
+        noise: ArrayLike | None = None,
+        seed: Any = None,
+        num_steps: int | None = None,
+        integrator: str | None = None,
+        num_samples: int | None = None,
+        future_refresh: int | None = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        previous_chunk: ArrayLike | None = None,
+        chunking: Chunking | None = None,
+        out: ArrayLike | None = None,
     ) -> Array:
-        """:meth:`encode` followed by :meth:`sample`.
-
-        Args:
-            backbone_features, attention_mask, image_mask, drop_vl: As in :meth:`encode`.
-            state, embodiment_id: As in :meth:`sample`.
-            **options: Keyword arguments of :meth:`sample`.
-        """
+        """:meth:`encode` followed by :meth:`sample`, which document the arguments, result and errors."""
         context = self.encode(
             backbone_features, attention_mask=attention_mask, image_mask=image_mask, drop_vl=drop_vl
         )
-        return self.sample(context, state, embodiment_id, **options)
+        return self.sample(
+            context,
+            state,
+            embodiment_id,
+            noise=noise,
+            seed=seed,
+            num_steps=num_steps,
+            integrator=integrator,
+            num_samples=num_samples,
+            future_refresh=future_refresh,
+            intervention=intervention,
+            previous_chunk=previous_chunk,
+            chunking=chunking,
+            out=out,
+        )
 
     def velocity(
         self,

@@ -15,6 +15,9 @@ from saccade.head.intervention import Intervention, as_interventions
 #: The parts of a policy that have a precision.
 PARTS = ("backbone", "head")
 
+#: Velocity evaluations in one step of each integrator.
+INTEGRATORS = {"euler": 1, "midpoint": 2}
+
 
 class _Sampling(TypedDict, total=False):
     noise: ArrayLike | None
@@ -43,19 +46,6 @@ class PolicyOptions(_Sampling, total=False):
     previous_chunk: Any  # an array, or actions by name
 
 
-class TraceOptions(TypedDict, total=False):
-    """The keyword arguments of :meth:`saccade.ActionHead.trace`, which documents them."""
-
-    noise: ArrayLike | None
-    seed: Any
-    num_steps: int | None
-    intervention: Intervention | Sequence[Intervention] | None
-    record: Sequence[str]
-    blocks: int | Sequence[int] | None
-    steps: int | Sequence[int] | None
-    max_bytes: int
-
-
 class LoadOptions(TypedDict, total=False):
     """How a head is loaded: keyword arguments of ``ActionHead.from_pretrained`` and ``from_tensors``."""
 
@@ -63,6 +53,19 @@ class LoadOptions(TypedDict, total=False):
     num_states: int | None
     precision: str
     num_threads: int | None
+
+
+def check_integrator(integrator: object) -> str:
+    """The name of the integrator. None means ``"euler"``.
+
+    Raises:
+        InputError: There is no integrator of that name.
+    """
+    if integrator is None:
+        return "euler"
+    if not isinstance(integrator, str) or integrator not in INTEGRATORS:
+        raise InputError(f"integrator: expected {' or '.join(INTEGRATORS)}, got {integrator!r}")
+    return integrator
 
 
 def optional_integer(name: str, value: int | None) -> int | None:

@@ -12,8 +12,8 @@ from saccade.backbone.backbone import Backbone
 from saccade.backbone.features import BackboneFeatures
 from saccade.errors import InputError
 from saccade.head.head import ActionHead
+from saccade.head.inputs import HeadInputs
 from saccade.observations import read
-from saccade.observations.recorded import Observation
 from saccade.policy.policy import Policy
 from saccade.processor import Processor
 
@@ -39,7 +39,7 @@ def parts_of(policy: Policy) -> Parts:
     return Parts(head, backbone, processor)
 
 
-def as_head_takes_it(policy: Policy, seen: Mapping[str, Any], features: BackboneFeatures) -> Observation:
+def as_head_takes_it(policy: Policy, seen: Mapping[str, Any], features: BackboneFeatures) -> HeadInputs:
     """One observation of a whole policy as its head takes it, without noise.
 
     Args:
@@ -49,7 +49,7 @@ def as_head_takes_it(policy: Policy, seen: Mapping[str, Any], features: Backbone
     """
     state = read(seen, policy.requirements).state
     reads_mask = policy.head.config.mask_mode == "alternate"
-    return Observation(
+    return HeadInputs(
         np.asarray(features.backbone_features),
         np.asarray(policy.normalizer.state(state)),
         np.array([policy.embodiment_id]),

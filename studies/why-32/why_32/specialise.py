@@ -29,7 +29,7 @@ from saccade.head.intervention import Intervention
 if TYPE_CHECKING:
     from saccade.head.context import Context
     from saccade.head.head import ActionHead
-    from saccade.observations.recorded import Observation
+    from saccade.head.inputs import HeadInputs
 
 Float64Array = npt.NDArray[np.float64]
 Tokens: TypeAlias = npt.NDArray[np.int64]
@@ -94,7 +94,7 @@ def measure(checkpoint: str, tasks: Sequence[str], seeds: range) -> Rows:
     ]
 
 
-def overlap(head: ActionHead, observation: Observation, context: Context, tokens: Float32Array) -> float:
+def overlap(head: ActionHead, observation: HeadInputs, context: Context, tokens: Float32Array) -> float:
     """How much the future rows attend to the same vision-language tokens: 1 for equal maps, 0 for disjoint.
 
     `shared_mass` of the rows' maps, each a mean over heads, averaged over cross-attention blocks and Euler
@@ -131,7 +131,7 @@ def shared_mass(maps: npt.ArrayLike) -> float:
     return float((behind @ ordered).sum() / behind.sum())
 
 
-def change_of(head: ActionHead, observation: Observation, context: Context, tokens: Float32Array) -> Change:
+def change_of(head: ActionHead, observation: HeadInputs, context: Context, tokens: Float32Array) -> Change:
     """The change of an observation's chunk, `(horizon, action_dim)`, when some tokens are removed.
 
     Args:

@@ -12,7 +12,7 @@ import torch
 import saccade
 from saccade import Intervention
 from saccade.errors import InputError
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.maps import occlusion
 from saccade_lab.maps.layout import parse_layout
 from saccade_lab.maps.occlusion import BlankedFrames, DroppedPositions, cell_for, measure, places_of
@@ -52,7 +52,7 @@ TINY_LAYOUT = parse_layout("text:2,image:2x3=left,image:1x2=top,text:1", 11)
 def tiny_occluder() -> DroppedPositions:
     given = load_released("n15_tiny")
     return DroppedPositions(
-        Observation(given.backbone_features[:1], given.state[:1], given.embodiment_id[:1], given.noise[:1])
+        HeadInputs(given.backbone_features[:1], given.state[:1], given.embodiment_id[:1], given.noise[:1])
     )
 
 

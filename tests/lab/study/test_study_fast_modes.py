@@ -14,7 +14,7 @@ import torch
 
 import saccade
 from saccade import InputError
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference import random_weights
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
@@ -45,11 +45,11 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def observation(head: saccade.ActionHead, seed: int = 0) -> Observation:
+def observation(head: saccade.ActionHead, seed: int = 0) -> HeadInputs:
     """A single one with six vision-language tokens."""
     inputs = random_weights.random_inputs(head.config, seed, batch=1, num_vl_tokens=6)
     names = ("backbone_features", "state", "embodiment_id", "noise")
-    return Observation(*(inputs[name].numpy() for name in names))
+    return HeadInputs(*(inputs[name].numpy() for name in names))
 
 
 @pytest.mark.parametrize("name", [*fast.SCREENED, *fast.JUDGED, "bfloat16-euler-8-refresh-3-drop-10"])
@@ -228,7 +228,7 @@ def test_many_steps_come_closer_than_any_mode() -> None:
     """On the shipped policy: a random head's velocity jumps between buckets of time."""
     head = saccade.ActionHead.from_pretrained(DEMO_CHECKPOINT)
     one = replace(
-        Observation.random(head.config, 57, np.random.default_rng(0)), state=np.zeros((1, 4), np.float32)
+        HeadInputs.random(head.config, 57, np.random.default_rng(0)), state=np.zeros((1, 4), np.float32)
     )
     context = one.encode(head)
     limit = one.sample(head, context, num_steps=1000)

@@ -14,7 +14,7 @@ import pandas as pd
 from saccade._internal.arrays import Float32Array
 from saccade._internal.flags import add_list, check_known
 from saccade.errors import InputError
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.flags import add_rollout_arguments
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.cell import Cell, Rows
@@ -310,7 +310,7 @@ def calibration_settings(source: Source) -> Mapping[str, Any]:
 
 
 @functools.lru_cache(maxsize=1)
-def calibration_observations(source: Source) -> list[Observation]:
+def calibration_observations(source: Source) -> list[HeadInputs]:
     """Single observations with one noise; cached, because every cell of the calibration needs them."""
     return [one.with_draw(0) for unit in calibration_units(source) for one in source.observed(*unit).rows()]
 
@@ -326,7 +326,7 @@ class Reference:
         other: Chunk of the baseline from other noise; None if the recording has only one noise.
     """
 
-    observation: Observation
+    observation: HeadInputs
     chunk: Float32Array
     exact: Float32Array
     other: Float32Array | None
@@ -345,7 +345,7 @@ def references(source: Source, task: str, seed: int) -> list[Reference]:
             source.comparable(actions)
             for actions in (sample(head, mode, Calibration(), context, one), many_steps(head, context, one))
         )
-        other: Observation | None = row.with_draw(1) if row.draws > 1 else None
+        other: HeadInputs | None = row.with_draw(1) if row.draws > 1 else None
         if source.closed_loop:
             other = replace(one, noise=rng.standard_normal(one.noise.shape, dtype=np.float32))
         repeated = None

@@ -10,7 +10,7 @@ import numpy as np
 from saccade._internal.arrays import ArrayLike, Float32Array
 from saccade.errors import InputError
 from saccade.head.context import Context
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.settings import EMBODIMENT_ID
 from saccade_lab.study.questions.fast_modes import Calibration, Mode, encode, sample
@@ -50,9 +50,9 @@ class ModeHead(WrappedHead):
         return sample(self._head, self._mode, self._calibration, context, observation)
 
 
-def given(features: Float32Array, state: Float32Array, noise: Float32Array | None = None) -> Observation:
+def given(features: Float32Array, state: Float32Array, noise: Float32Array | None = None) -> HeadInputs:
     """An observation of the simulated robot."""
-    return Observation(features, state, np.array([EMBODIMENT_ID]), noise)
+    return HeadInputs(features, state, np.array([EMBODIMENT_ID]), noise)
 
 
 @functools.lru_cache(maxsize=64)

@@ -15,7 +15,7 @@ from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.head.context import Context
 from saccade.head.head import ActionHead
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.study.cell import digest
 
 BoolArray = npt.NDArray[np.bool_]
@@ -148,7 +148,7 @@ class Calibration:
         return digest([times, self.mass if mode.drop else ()])
 
 
-def encode(head: ActionHead, mode: Mode, calibration: Calibration, observation: Observation) -> Context:
+def encode(head: ActionHead, mode: Mode, calibration: Calibration, observation: HeadInputs) -> Context:
     """A single observation as the mode encodes it."""
     if mode.drop:
         there = observation.drop_vl
@@ -158,7 +158,7 @@ def encode(head: ActionHead, mode: Mode, calibration: Calibration, observation: 
 
 
 def sample(
-    head: ActionHead, mode: Mode, calibration: Calibration, context: Context, observation: Observation
+    head: ActionHead, mode: Mode, calibration: Calibration, context: Context, observation: HeadInputs
 ) -> Float32Array:
     """A chunk `(1, horizon, action_dim)` as the mode computes it, from the observation's noise."""
     if mode.integrator in OF_THE_HEAD:
@@ -175,12 +175,12 @@ def sample(
     return chunk[..., : head.config.action_dim]
 
 
-def many_steps(head: ActionHead, context: Context, observation: Observation) -> Float32Array:
+def many_steps(head: ActionHead, context: Context, observation: HeadInputs) -> Float32Array:
     """The chunk for many small steps, `(1, horizon, action_dim)`."""
     return observation.sample(head, context, num_steps=EXACT_STEPS, integrator="midpoint")
 
 
-def velocity_of(head: ActionHead, context: Context, observation: Observation) -> Velocity:
+def velocity_of(head: ActionHead, context: Context, observation: HeadInputs) -> Velocity:
     """The head's velocity as a function of time in 0..1, which the head rounds down to a bucket."""
     buckets = head.config.num_timestep_buckets
 
@@ -266,7 +266,7 @@ def best_times(error: Callable[[tuple[float, ...]], float], num_steps: int) -> t
     return best
 
 
-def cross_mass(head: ActionHead, context: Context, observation: Observation) -> Float32Array:
+def cross_mass(head: ActionHead, context: Context, observation: HeadInputs) -> Float32Array:
     """The share of the cross-attention of each vision-language position, `(T_vl,)`.
 
     The mean over rows, heads, blocks and four Euler steps.

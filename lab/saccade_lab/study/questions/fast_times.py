@@ -11,7 +11,7 @@ import numpy as np
 
 from saccade.checkpoints.random_checkpoint import head as random_head
 from saccade.head.head import ActionHead
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.questions.fast_modes import Calibration, Mode, encode, sample
 
@@ -34,7 +34,7 @@ def times_at_full_size(modes: Sequence[Mode], calibration: Calibration) -> Rows:
         }
     config = next(iter(loaded.values())).config
     rng = np.random.default_rng(0)
-    one = Observation.random(config, FULL_TOKENS, rng)
+    one = HeadInputs.random(config, FULL_TOKENS, rng)
     mass = Calibration(calibration.times, tuple(rng.random(FULL_TOKENS)))
     return times_of(modes, loaded, mass, one)
 
@@ -43,7 +43,7 @@ def times_of(
     modes: Sequence[Mode],
     loaded: Mapping[str, ActionHead],
     calibration: Calibration,
-    observation: Observation,
+    observation: HeadInputs,
 ) -> Rows:
     """Milliseconds of `encode` and `sample` in each mode, in rounds with a random order of modes.
 

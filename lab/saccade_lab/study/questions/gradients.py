@@ -22,8 +22,9 @@ import pandas as pd
 from saccade._internal.files import path_text
 from saccade._internal.flags import add_integer
 from saccade.errors import InputError
+from saccade.head.input_files import MASKS
+from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import ROW_GROUPS
-from saccade.observations.recorded import MASKS, Observation
 from saccade_lab.flags import add_frames, add_rollout_arguments
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS
@@ -197,7 +198,7 @@ class Gradients(Study):
         return derivatives.part_rows(found, layout, by_view)
 
     def of_observation(
-        self, head: ActionHead, observation: Observation, generator: torch.Generator
+        self, head: ActionHead, observation: HeadInputs, generator: torch.Generator
     ) -> tuple[Sensitivity, Mapping[str, torch.Tensor] | None, torch.Tensor | None]:
         """Sensitivities; derivatives along paths, None without future tokens; and those along all paths,
         None where nothing needs them.

@@ -14,8 +14,8 @@ import pandas as pd
 
 from saccade._internal.flags import add_list, check_known, indices
 from saccade.head.head import ActionHead
+from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import ROW_GROUPS, Intervention, Tokens
-from saccade.observations.recorded import Observation
 from saccade_lab.flags import add_frames, add_rollout_arguments
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS
@@ -159,8 +159,8 @@ class Pair:
         labels: Columns that name the donor.
     """
 
-    donor: Observation
-    receiver: Observation
+    donor: HeadInputs
+    receiver: HeadInputs
     labels: Mapping[str, Any]
 
 

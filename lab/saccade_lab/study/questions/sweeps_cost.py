@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from saccade.head.head import ActionHead
-from saccade.observations.recorded import Observation
+from saccade.head.inputs import HeadInputs
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.runs import Run, describe_run
 from saccade_lab.study.statistics import bootstrap
@@ -38,7 +38,7 @@ def cost(runs: Sequence[Run]) -> Rows:
         tokens = num_vl_tokens(Processor.from_pretrained(run.directory), config)
         head.warmup(tokens)
         heads.append(head)
-        inputs.append(Observation.random(head.config, tokens, rng))
+        inputs.append(HeadInputs.random(head.config, tokens, rng))
     spent = np.zeros((2, ROUNDS, len(runs)))  # encode and sample, milliseconds
     for turn, (place, head) in itertools.product(range(ROUNDS), list(enumerate(heads))):
         start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Observations: read from the released files, batches and draws, and files that do not fit."""
+"""Inputs of heads: read from the released files, batches and draws, and files that do not fit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import saccade
 from saccade.cli import main
 from saccade.errors import InputError, ShapeError
-from saccade.observations.recorded import Observation, from_arrays, read
+from saccade.head.inputs import HeadInputs
 from saccade_lab.study.table import read_table
 from tests.helpers.released import Released, load_released
 
@@ -28,7 +28,7 @@ def loaded(given: Released) -> saccade.ActionHead:
 def test_a_released_file_gives_the_released_actions(name: str) -> None:
     given = load_released(name)
     head = loaded(given)
-    found = read(given.path, head.config)
+    found = HeadInputs.from_file(given.path, head.config)
     assert len(found) == len(given.backbone_features)
     assert found.num_vl_tokens == given.backbone_features.shape[1]
     difference = np.abs(found.sample(head) - given.actions_f64)
@@ -37,19 +37,9 @@ def test_a_released_file_gives_the_released_actions(name: str) -> None:
     np.testing.assert_array_equal(by_row, found.sample(head))
 
 
-def test_sampling_starts_from_the_noise_of_the_observation() -> None:
-    given = load_released("n15_tiny")
-    head = loaded(given)
-    found = read(given.path, head.config)
-    assert found.noise is not None
-    for run in (found.sample, found.trace):
-        with pytest.raises(InputError, match="noise: expected none"):
-            run(head, noise=np.zeros_like(found.noise))
-
-
 def test_masks_of_n17_are_kept_row_by_row() -> None:
     given = load_released("n17_tiny")
-    found = read(given.path, loaded(given).config)
+    found = HeadInputs.from_file(given.path, loaded(given).config)
     assert found.attention_mask is not None
     assert not found.attention_mask.all()
     assert found.image_mask is not None
@@ -68,7 +58,7 @@ def test_a_head_with_masks_is_studied_on_a_file(tmp_path: Path) -> None:
     table = read_table(tmp_path / "out" / "cuts.csv").set_index(["arm", "seed"])
     head = loaded(given)
     blind = saccade.Intervention(cut=[(row, "vl") for row in ("state", "action")])
-    for row, one in enumerate(read(given.path, head.config).rows()):
+    for row, one in enumerate(HeadInputs.from_file(given.path, head.config).rows()):
         change = np.abs(one.sample(head, intervention=blind) - one.sample(head))
         assert table.loc[("all-blind", row), "chunk_change"] == pytest.approx(change.mean(), rel=1e-6)
 
@@ -76,7 +66,7 @@ def test_a_head_with_masks_is_studied_on_a_file(tmp_path: Path) -> None:
 def test_draws_of_noise() -> None:
     given = load_released("n15_tiny")
     head = loaded(given)
-    whole = dataclasses.replace(read(given.path, head.config), noise=None)
+    whole = dataclasses.replace(HeadInputs.from_file(given.path, head.config), noise=None)
     assert whole.draws == 0
     drawn = whole.with_noise(np.random.default_rng(3), head.config, draws=3)
     assert drawn.draws == 3
@@ -92,7 +82,7 @@ def test_draws_of_noise() -> None:
 
 def test_random_observations_are_drawn_in_a_fixed_order() -> None:
     config = saccade.HeadConfig.from_dict(load_released("n15_tiny").config)
-    found = Observation.random(config, 7, np.random.default_rng(2), embodiment_id=1)
+    found = HeadInputs.random(config, 7, np.random.default_rng(2), embodiment_id=1)
     rng = np.random.default_rng(2)
     np.testing.assert_array_equal(
         found.backbone_features, rng.standard_normal((1, 7, config.context_dim), dtype=np.float32)
@@ -115,8 +105,8 @@ def arrays(**changes: Any) -> dict[str, Any]:
 
 def test_clusters_are_episodes_or_rows() -> None:
     config = saccade.HeadConfig.from_dict(load_released("n15_tiny").config)
-    assert from_arrays(arrays(), config, "file").clusters.tolist() == [0, 1]
-    found = from_arrays(arrays(episode=np.array([9, 9])), config, "file")
+    assert HeadInputs.from_arrays(arrays(), config, "file").clusters.tolist() == [0, 1]
+    found = HeadInputs.from_arrays(arrays(episode=np.array([9, 9])), config, "file")
     assert found.clusters.tolist() == [0, 0]
     assert found.row(1).clusters.tolist() == [0]
 
@@ -135,4 +125,4 @@ def test_clusters_are_episodes_or_rows() -> None:
 def test_what_no_head_takes_is_refused(changes: dict[str, Any], error: Any, message: str) -> None:
     config = saccade.HeadConfig.from_dict(load_released("n15_tiny").config)
     with pytest.raises(error, match=f"^file: .*{message}"):
-        from_arrays(arrays(**changes), config, "file")
+        HeadInputs.from_arrays(arrays(**changes), config, "file")
