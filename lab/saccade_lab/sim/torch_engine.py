@@ -77,10 +77,11 @@ class TorchHead:
             return TorchContext(self._head.encode(np.asarray(backbone_features), drop_vl=removed), removed)
 
     def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
-        """See `saccade.ActionHead.sample`; `noise` is required."""
+        """See `saccade.ActionHead.sample`; `noise` is required, and options that are None are left out."""
+        given = {name: value for name, value in options.items() if value is not None}
         with torch.no_grad():
             found = self._head.sample(
-                context.vl_embs, np.asarray(state), embodiment_id, drop_vl=context.drop_vl, **options
+                context.vl_embs, np.asarray(state), embodiment_id, drop_vl=context.drop_vl, **given
             )
         return np.asarray(found.numpy())
 

@@ -67,7 +67,7 @@ class Blind:
         return self.head.encode(*args, **options)
 
     def sample(self, *args: Any, **options: Any) -> Any:
-        return self.head.sample(*args, **options, intervention=self.cut)
+        return self.head.sample(*args, **{**options, "intervention": self.cut})
 
 
 def no_noise(count: int) -> Any:
