@@ -206,7 +206,7 @@ def core(session: nox.Session) -> None:
     needs(session, "python", "rust")
     environment = Environment(session, ENVIRONMENTS / "core").install("core").install_saccade(editable=False)
     options = ("--numprocesses", "auto", "--dist", "worksteal", *session.posargs)
-    environment.run("-m", "pytest", "-m", "core", *options, OMP_NUM_THREADS="1")
+    environment.run("-m", "pytest", "tests", "-m", "core", *options, OMP_NUM_THREADS="1")
 
 
 @nox.session

@@ -79,7 +79,7 @@ def main() -> None:
     for release in options.releases:
         read(release, options.clone)
     set_up()
-    paths = os.pathsep.join([str(ROOT / "python"), str(ROOT / "tests")])
+    paths = os.pathsep.join(map(str, (ROOT / "python", ROOT / "lab", ROOT, HERE)))
     command = [str(FOLDER / "bin" / "python"), "-m", "pytest", "--noconftest", "--quiet"]
     chosen = {"SACCADE_GROOT_SOURCES": str(SOURCES), "SACCADE_GROOT_RELEASES": " ".join(options.releases)}
     done = subprocess.run(

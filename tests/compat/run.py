@@ -189,7 +189,7 @@ def run_tests(release: Release) -> None:
     """Runs the release's tests with the saccade of this checkout."""
     print(f"testing: lerobot {release.lerobot}", flush=True)
     release.result.parent.mkdir(parents=True, exist_ok=True)
-    paths = os.pathsep.join([str(ROOT / "python"), str(ROOT / "tests")])
+    paths = os.pathsep.join(map(str, (ROOT / "python", ROOT / "lab", ROOT, HERE)))
     environment = os.environ | {"PYTHONPATH": paths, "SACCADE_COMPAT_OUT": str(release.result)}
     # The settings of the main suite need packages that this environment lacks.
     command = [str(release.folder / "bin" / "python"), "-m", "pytest", "--noconftest", "--quiet"]

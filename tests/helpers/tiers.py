@@ -1,9 +1,9 @@
 """The tier of a test module, from what it imports: `core`, `torch` or `lab`.
 
 `core` needs the wheel, NumPy, pytest and Hypothesis. `torch` also needs torch, the reference implementation
-of the model, or programs that saccade is compared with. `lab` needs the rest of saccade_lab, or the programs
-of `benches`. A module belongs to the highest tier of what it and its helpers import, also inside functions,
-and of its folder: some tests run programs that import more.
+of the model, the server's packages, or programs that saccade is compared with. `lab` needs the rest of
+saccade_lab, or the programs of `benches`. A module belongs to the highest tier of what it and its helpers
+import, also inside functions, and of its folder: some tests run programs that import more.
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ PACKAGES = {
         ("diffusers", "lerobot", "lerobot_policy_saccade", "safetensors", "scipy", "torch", "transformers"),
         "torch",
     ),
+    **dict.fromkeys(("msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
     **dict.fromkeys(("saccade.integrations", "saccade.torch", "saccade_lab.reference"), "torch"),
     **dict.fromkeys(("benches", "studies", "why_32", "saccade_lab"), "lab"),
     **dict.fromkeys(("gymnasium", "imageio", "joblib", "jinja2", "matplotlib", "mujoco", "pandas"), "lab"),
     **dict.fromkeys(("metaworld", "ray", "selenium", "sklearn"), "lab"),
 }
-#: The least tier of the modules of a folder.
-FOLDERS = {"docs/": "lab", "lab/": "torch", "lab/sim/": "lab", "lab/parallel/": "lab"}
+#: The least tier of the modules of a folder, and of modules that start programs which import more.
+FOLDERS = {
+    **dict.fromkeys(("docs/", "lab/sim/", "lab/parallel/", "package/test_imports.py"), "lab"),
+    **dict.fromkeys(("backbone/test_backbone_calls.py", "head/test_memory.py", "lab/"), "torch"),
+}
 
 
 @functools.cache
