@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benches.backbone.setup import INSTRUCTION_TEXT
 from benches.checkpoints import n15
 from benches.peers.cases import WORKS, Case
-from saccade.observations import ObservationSources
+from saccade.observations import Requirements
 
 if TYPE_CHECKING:
     import saccade
@@ -63,7 +63,11 @@ def with_views(policy: saccade.Policy, views: int) -> saccade.Policy:
         policy.normalizer,
         backbone=policy.backbone,
         processor=policy.processor,
-        sources=ObservationSources(needs.cameras[:views], needs.video_horizon, needs.language_keys),
+        requirements=Requirements(
+            cameras=needs.cameras[:views],
+            video_horizon=needs.video_horizon,
+            language_keys=needs.language_keys,
+        ),
     )
 
 
@@ -93,7 +97,8 @@ def expected_of(case: Case, folder: Path) -> Arrays:
 def inputs_of(source: Path) -> Arrays:
     """The inputs as saccade's processor prepares them, and noise."""
     import saccade
-    from saccade.observations import read_state
+    from saccade.observations import read, read_state
+    from saccade.policy.preparing import prepare_inputs
 
     policy = saccade.Policy.from_pretrained(source, precision="int8")
     config = policy.head.config
@@ -105,7 +110,8 @@ def inputs_of(source: Path) -> Arrays:
     for views in VIEWS:
         seeing = with_views(policy, views)
         observation = observation_of(seeing)
-        (inputs,) = seeing.inputs(observation)
+        assert seeing.processor is not None
+        (inputs,) = prepare_inputs([read(observation, seeing.requirements)], seeing.processor)
         assert inputs.attention_mask.all()
         arrays |= {f"pixels{views}": np.asarray(inputs.pixel_values), f"ids{views}": inputs.input_ids}
         arrays["state"] = np.asarray(

@@ -33,7 +33,7 @@ from saccade.head.cross_attention import CrossAttention, KeyValues
 from saccade.head.head import ActionHead
 from saccade.head.intervention import Intervention
 from saccade.head.trace import Record, Trace
-from saccade.policy.context import PolicyContext
+from saccade.policy.encoding import PolicyContext
 from saccade.policy.policy import Policy
 from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer

@@ -176,9 +176,9 @@ def test_prompts_of_different_length_share_a_pass(names: tuple[str, ...], precis
     backbone = first.load(precision)
     inputs = [released_backbone(name).inputs() for name in names]
     alone = [backbone(given) for given in inputs]
-    for given, expected in zip(backbone._ragged(inputs), alone, strict=True):
+    for given, expected in zip(backbone.encode_many(inputs), alone, strict=True):
         assert_same(given, expected)
-    for given, expected in zip(backbone._ragged(inputs, previous=alone[1:]), alone, strict=True):
+    for given, expected in zip(backbone.encode_many(inputs, previous=alone[1:]), alone, strict=True):
         assert_same(given, expected)
 
 

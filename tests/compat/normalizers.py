@@ -62,7 +62,7 @@ def test_n15(tmp_path: Path) -> None:
     )
     theirs = packed(pack, state, action)
     assert_same(normalizer.state(state), theirs[0])
-    assert_same(normalizer.unactions(action), theirs[1])
+    assert_same(normalizer.normalize_actions(action), theirs[1])
     robot = unpack({"action": chunk.reshape(-1, 8)})["action"].reshape(BATCH, STEPS, 6)
     assert_same(normalizer.actions(chunk), robot)
 
@@ -76,7 +76,7 @@ def test_n17_flat(tmp_path: Path) -> None:
     state, action, chunk = draw(BATCH, 7, seed=0), draw(BATCH, 40, 6, seed=1), draw(BATCH, 40, 10, seed=2)
     theirs = packed(pack, state, action)
     assert_same(normalizer.state(state), theirs[0])
-    assert_same(normalizer.unactions(action), theirs[1])
+    assert_same(normalizer.normalize_actions(action), theirs[1])
     assert_same(normalizer.actions(chunk), unpack({"action": chunk})["action"])
 
 
@@ -123,7 +123,7 @@ def test_n17_groups(relative: str, use_percentiles: bool, tmp_path: Path) -> Non
     theirs = packed(pack, state, action)
     # lerobot computes in float32, Isaac-GR00T and saccade with the statistics' float64.
     assert_same(normalizer.state(state), theirs[0], rounding=2e-6)
-    assert_same(normalizer.unactions(action, state), theirs[1][:, :16], rounding=2e-6)
+    assert_same(normalizer.normalize_actions(action, state), theirs[1][:, :16], rounding=2e-6)
     robot = decode({"action": chunk})["action"]
     assert tuple(robot.shape) == (BATCH, 16, 6)
     assert_same(normalizer.actions(chunk, state), robot, rounding=2e-6)

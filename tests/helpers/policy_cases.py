@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import saccade
-from saccade import BackboneInputs, Policy
-from saccade.observations import ObservationSources, observation_sources
+from saccade import BackboneInputs, Normalizer, Policy
+from saccade.observations import Requirements, read_requirements
+from saccade.policy.preparing import prepare_inputs
+from saccade.policy.reading import read_observations
 from tests.helpers import whole_checkpoints
 
 #: The id that stands for an image token, and how many there are of a view.
@@ -48,7 +50,7 @@ class StandInBackbone:
         self.table = np.random.default_rng(0).standard_normal((IMAGE + 1, width), np.float32)
         self.previous: list[Any] = []
 
-    def _ragged(
+    def encode_many(
         self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()
     ) -> list[StandInFeatures]:
         self.previous.append(previous)
@@ -67,10 +69,12 @@ def head(layout: str) -> saccade.ActionHead:
     return saccade.ActionHead.from_pretrained(whole_checkpoints.whole(layout))
 
 
-def policy(layout: str, sources: ObservationSources | None = None) -> Policy:
+def policy(layout: str, requirements: Requirements | None = None) -> Policy:
     """A policy with the head, the statistics and the cameras of a whole checkpoint, and stand-ins."""
     folder = whole_checkpoints.whole(layout)
-    found = observation_sources(folder, whole_checkpoints.EMBODIMENT) if sources is None else sources
+    if requirements is None:
+        normalizer = Normalizer.from_pretrained(folder, whole_checkpoints.EMBODIMENT)
+        requirements = read_requirements(folder, normalizer)
     backbone: Any = StandInBackbone(head(layout).config.context_dim)
     processor: Any = StandInProcessor()
     return Policy(
@@ -78,5 +82,11 @@ def policy(layout: str, sources: ObservationSources | None = None) -> Policy:
         embodiment=whole_checkpoints.EMBODIMENT,
         backbone=backbone,
         processor=processor,
-        sources=found,
+        requirements=requirements,
     )
+
+
+def inputs_of(policy: Policy, observation: Any) -> list[BackboneInputs]:
+    """The backbone's inputs for each row of observations."""
+    assert policy.processor is not None
+    return prepare_inputs(read_observations(observation, policy.requirements), policy.processor)

@@ -20,12 +20,26 @@ import msgpack
 import numpy as np
 import zmq
 
-from saccade.observations import Camera, Reading, Requirements
+from saccade.observations import Camera, ParsedObservation, Requirements
+from saccade.policy.encoding import PolicyContext
 from saccade.serve import Limits, Server
 from saccade.serve.connections import bind
 
 HORIZON, WIDTH, BUCKETS = 8, 3, 1000
 GROUPS = (SimpleNamespace(key="arm", size=2), SimpleNamespace(key="gripper", size=1))
+
+
+def process(frames: Sequence[Any], instruction: str | None, *, plain_text: bool) -> SimpleNamespace:
+    """Stands in for the processor: the brightness of the first frame, `(1, 1, 1)`."""
+    if "explode" in str(instruction):
+        raise RuntimeError("exploded")
+    mean = frames[0].mean(dtype=np.float64)
+    return SimpleNamespace(brightness=np.full((1, 1, 1), mean), crashes="crash" in str(instruction))
+
+
+def brightness(features: Any, **masks: Any) -> Any:
+    """Stands in for `encode` of the head."""
+    return features[:, 0, 0]
 
 
 @dataclass
@@ -55,35 +69,31 @@ class MemoryPolicy:
             version=self.version,
             num_timestep_buckets=BUCKETS,
         )
-        self.head = SimpleNamespace(config=config, source=None, num_threads=2)
-        self.backbone = SimpleNamespace(nbytes=self.nbytes)
+        self.head = SimpleNamespace(config=config, source=None, num_threads=2, encode=brightness)
+        self.backbone = SimpleNamespace(nbytes=self.nbytes, encode_many=self.encode_many)
+        self.processor = process
         self.normalizer = SimpleNamespace(state_groups=GROUPS, action_groups=GROUPS, action_horizon=HORIZON)
         self.requirements = Requirements(
             "robot", (Camera("front"),), (("arm", 2), ("gripper", 1)), language_keys=("annotation.task",)
         )
 
-    def inputs(self, reading: Reading) -> list[Any]:
-        if "explode" in str(reading.instructions[0]):
-            raise RuntimeError("exploded")
-        return [
-            (frames["front"].mean(dtype=np.float64), "crash" in str(text))
-            for frames, text in zip(reading.frames, reading.instructions, strict=True)
-        ]
-
-    def features(self, inputs: Sequence[Any]) -> list[Any]:
+    def encode_many(self, inputs: Sequence[Any], *, previous: Sequence[Any] = ()) -> list[Any]:
         self.gate.wait(30)
         self.batches.append(len(inputs))
-        if any(crashes for _, crashes in inputs):
+        if any(one.crashes for one in inputs):
             raise MemoryError("crashed")
-        return [brightness for brightness, _ in inputs]
+        return [
+            SimpleNamespace(backbone_features=one.brightness, image_mask=np.ones((1, 1), bool))
+            for one in inputs
+        ]
 
-    def context(self, features: Sequence[Any]) -> Any:
-        return np.array(features)
-
-    def sample(self, context: Any, readings: Sequence[Reading], **options: Any) -> list[Any]:
+    def sample(
+        self, encoded: PolicyContext, observations: Sequence[ParsedObservation], **options: Any
+    ) -> list[Any]:
+        context: Any = encoded.context
         self.chunkings.append(options.get("chunking"))
         self.steps.append(options.get("num_steps"))
-        state = np.concatenate([reading.state[:, -1] for reading in readings])
+        state = np.concatenate([parsed.state[:, -1] for parsed in observations])
         actions = options["noise"] + state[:, None] + context[:, None, None].astype(np.float32)
         if options.get("chunking") is not None:
             chunking = options["chunking"]
@@ -92,11 +102,11 @@ class MemoryPolicy:
             kept = previous[:, start : start + chunking.frozen]
             actions[:, : chunking.frozen, :2] = kept
         answers, start = [], 0
-        for reading in readings:
-            chunk = actions[start : start + len(reading)]
+        for parsed in observations:
+            chunk = actions[start : start + len(parsed)]
             parts = {"arm": chunk[..., :2], "gripper": chunk[..., 2:]}
-            answers.append(reading.dialect.answer(parts, reading))
-            start += len(reading)
+            answers.append(parsed.format.write_actions(parts, parsed))
+            start += len(parsed)
         return answers
 
 

@@ -11,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from saccade import CheckpointError
-from saccade.observations import ObservationSources, observation_sources
-from saccade.observations.sources import FILES
+from saccade.observations import Requirements, read_requirements
+from saccade.observations.checkpoint import FILES
+from saccade.robots import Robot
 
 KEYS = st.sampled_from(
     ["steps", "config", "language_key", "video_modality_keys", "input_features", "type", "VISUAL", "shape",
@@ -38,10 +39,10 @@ def test_any_json_is_cameras_or_an_error(
     (tmp_path / "config.json").write_text(json.dumps(config))
     for embodiment in ("robot", None):
         try:
-            found = observation_sources(tmp_path, embodiment)
+            found = read_requirements(tmp_path, Robot(embodiment, None, (), (), 1, 1))
         except CheckpointError:
             continue
-        assert isinstance(found, ObservationSources)
+        assert isinstance(found, Requirements)
         for camera in found.cameras or ():
             assert isinstance(camera.name, str)
             assert camera.height is None or camera.height > 0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from saccade import InputError, Policy, SaccadeError
-from saccade.observations import ObservationSources
+from saccade.observations import Requirements
 from saccade.observations.pictures import read_frames
 from tests.helpers.frames_cases import write_moment
 from tests.helpers.policy_cases import policy
@@ -81,14 +81,14 @@ def test_folders_of_folders_are_episodes(isaac: Policy, tmp_path: Path) -> None:
 
 
 def test_without_known_cameras_every_picture_is_a_view(tmp_path: Path) -> None:
-    any_camera = policy("nvidia", ObservationSources())
+    any_camera = policy("nvidia", Requirements())
     folder = write_moment(tmp_path, names=("left.jpg", "above.png"))
     (moment,) = read_frames(folder, any_camera)
     assert list(moment.observation["video"]) == ["above", "left"]
 
 
 def test_a_picture_stands_for_all_frames_of_its_camera(tmp_path: Path) -> None:
-    both = policy("n16", ObservationSources(video_horizon=2))
+    both = policy("n16", Requirements(video_horizon=2))
     (moment,) = read_frames(write_moment(tmp_path, names=["front.png"]), both)
     frames = moment.observation["video"]["front"]
     assert frames.shape == (1, 2, HEIGHT, WIDTH, 3)

@@ -52,9 +52,9 @@ def test_n15_ignores_what_it_does_not_need_and_takes_any_one_annotation() -> Non
         "my_annotations": ["a", "b"],
         "task": 5,
     }
-    reading = read(given, N15)
-    assert (reading.is_batched, reading.instructions, reading.is_plain) == (True, ("a", "b"), True)
-    assert tuple(reading.frames[0]) == ("front", "wrist")
+    parsed = read(given, N15)
+    assert (parsed.is_batched, parsed.instructions, parsed.is_plain) == (True, ("a", "b"), True)
+    assert tuple(parsed.frames[0]) == ("front", "wrist")
     with pytest.raises(InputError, match=r"one instruction, got my_annotations, annotation\.b"):
         read(given | {"annotation.b": ["a", "b"]}, N15)
     for wrong in ("a", ["a"], np.array("a"), [["a", "b"], ["c", "d"]]):
@@ -72,8 +72,8 @@ def test_n15_ignores_what_it_does_not_need_and_takes_any_one_annotation() -> Non
     [(["a"], False), (np.array(["a"]), False), (("a",), True), (np.array("a"), True), ("a", False)],
 )
 def test_n15s_prompt_of_one_observation_shows_lists_as_lists(text: Any, is_plain: bool) -> None:
-    reading = read(n15(None) | {"annotation.a": text}, N15)
-    assert (reading.instructions, reading.is_plain) == (("a",), is_plain)
+    parsed = read(n15(None) | {"annotation.a": text}, N15)
+    assert (parsed.instructions, parsed.is_plain) == (("a",), is_plain)
 
 
 def lerobots(batch: int = 2) -> Observation:
@@ -100,8 +100,8 @@ def test_lerobots_cameras_are_those_of_the_checkpoint_or_all() -> None:
     }
     assert list(read(nested_too, every).frames[0]) == ["front", "top"]
     given["observation.images.image2"] = given.pop("observation.images.wrist_image")
-    reading = read(given, one)
-    assert np.array_equal(reading.frames[1]["wrist_image"][..., 0], given["observation.images.image2"][1, 0])
+    parsed = read(given, one)
+    assert np.array_equal(parsed.frames[1]["wrist_image"][..., 0], given["observation.images.image2"][1, 0])
     del given["observation.images.image2"]
     with pytest.raises(InputError, match=r"observation\.images\.wrist_image: .*wrist_image or image2, front"):
         read(given, one)
@@ -141,9 +141,9 @@ def test_lerobots_keys_are_renamed_first() -> None:
     renamed["observation.images.top"] = renamed.pop("observation.images.front")
     renamed["observation.pose"] = renamed.pop("observation.state")
     for one in (given, renamed):
-        reading = read(one, needs)
-        assert np.array_equal(reading.state, expected.state)
-        for found, other in zip(reading.frames, expected.frames, strict=True):
+        parsed = read(one, needs)
+        assert np.array_equal(parsed.state, expected.state)
+        for found, other in zip(parsed.frames, expected.frames, strict=True):
             assert list(found) == list(other)
             assert all(np.array_equal(found[name], other[name]) for name in found)
     both = r"after renaming, got observation\.images\.front and observation\.images\.top"

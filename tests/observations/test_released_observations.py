@@ -189,15 +189,15 @@ def test_what_the_releases_take_is_taken_and_what_they_refuse_is_refused(
         with pytest.raises(SaccadeError, match="; embodiment 'robot' needs cameras front, wrist"):
             read(given, needs)
         return
-    reading = read(given, needs)
+    parsed = read(given, needs)
     expected = observation()
     states = np.concatenate([expected["state"]["arm"], expected["state"]["grip"]], axis=-1)
-    np.testing.assert_array_equal(reading.state, states[: len(reading)])
-    assert all(tuple(frames) == ("front", "wrist") for frames in reading.frames)
-    for row, frames in enumerate(reading.frames):
+    np.testing.assert_array_equal(parsed.state, states[: len(parsed)])
+    assert all(tuple(frames) == ("front", "wrist") for frames in parsed.frames)
+    for row, frames in enumerate(parsed.frames):
         np.testing.assert_array_equal(frames["wrist"], expected["video"]["wrist"][row, 0])
     texts = {"language ints after a text": ("x", "5"), "language empty text": ("", "y")}
-    assert reading.instructions == texts.get(name, ("x", "y"))[: len(reading)]
+    assert parsed.instructions == texts.get(name, ("x", "y"))[: len(parsed)]
 
 
 def test_the_coarse_action_counts_where_task_is_configured_and_both_are_given() -> None:

@@ -14,9 +14,9 @@ import torch
 
 import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
-from saccade.observations import ObservationSources, read
+from saccade.observations import Requirements, read
 from tests.helpers import whole_checkpoints
-from tests.helpers.policy_cases import policy
+from tests.helpers.policy_cases import inputs_of, policy
 
 Observation = dict[str, Any]
 
@@ -142,54 +142,54 @@ def test_several_observations_are_answered_as_if_alone(layout: str) -> None:
 def test_what_was_read_stands_for_the_observation() -> None:
     made = policy("nvidia")
     given = [nested(made), flat(nested(made, batch=2)), lerobot(nested(made))]
-    readings = [read(one, made.requirements) for one in given]
+    parsed = [read(one, made.requirements) for one in given]
     expected = made.act(given, seed=3)
-    context = made.encode(readings)
+    context = made.encode(parsed)
     for found in (
-        made.act(readings, seed=3),
-        made.act([given[0], readings[1], given[2]], seed=3),
-        made.sample(context, readings, seed=3),
+        made.act(parsed, seed=3),
+        made.act([given[0], parsed[1], given[2]], seed=3),
+        made.sample(context, parsed, seed=3),
     ):
         for one, other in zip(found, expected, strict=True):
             assert len(one) == len(other)
             for key in one if isinstance(one, dict) else (0,):
                 np.testing.assert_array_equal(one[key], other[key])
-    np.testing.assert_equal(made.act(readings[0], seed=4), made.act(given[0], seed=4))
+    np.testing.assert_equal(made.act(parsed[0], seed=4), made.act(given[0], seed=4))
     read(given[1], made.requirements, 2)
     with pytest.raises(InputError, match="expected at most 1 rows, got 2"):
         read({"state": nested(made, batch=2)["state"]}, made.requirements, 1)  # before frames are looked at
 
 
 def test_what_was_read_for_another_policy_is_refused() -> None:
-    made, other = policy("nvidia"), policy("nvidia", ObservationSources())
+    made, other = policy("nvidia"), policy("nvidia", Requirements())
     given = nested(made)
-    reading = read(given, made.requirements)
+    parsed = read(given, made.requirements)
     context = made.encode(given)
-    assert made.sample(context, reading, seed=0).keys() == made.sample(context, given, seed=0).keys()
-    for call in (other.inputs, other.act, lambda one: other.sample(context, one)):
+    assert made.sample(context, parsed, seed=0).keys() == made.sample(context, given, seed=0).keys()
+    for call in (other.encode, other.act, lambda one: other.sample(context, one)):
         with pytest.raises(
             InputError, match=r"expected what was read for this policy, got what was read for another"
         ):
-            call(reading)
+            call(parsed)
         with pytest.raises(
             InputError, match=r"expected what was read for this policy, got what was read for another"
         ):
-            call([reading])
+            call([parsed])
 
 
 def test_one_string_a_row_of_a_batch_is_plain() -> None:
     made = policy("isaac")
     given = nested(made, batch=2)
-    reading = read(flat(given) | {"annotation.human.action.task_description": ["a", "b"]}, made.requirements)
-    assert (reading.instructions, reading.is_plain) == (("a", "b"), True)
+    parsed = read(flat(given) | {"annotation.human.action.task_description": ["a", "b"]}, made.requirements)
+    assert (parsed.instructions, parsed.is_plain) == (("a", "b"), True)
     for texts in ([["a"], ["b"]], np.array([["a"], ["b"]]), (["a"], ("b",))):
-        reading = read(flat(given) | {"annotation.human.action.task_description": texts}, made.requirements)
-        assert (reading.instructions, reading.is_plain) == (("a", "b"), False)
+        parsed = read(flat(given) | {"annotation.human.action.task_description": texts}, made.requirements)
+        assert (parsed.instructions, parsed.is_plain) == (("a", "b"), False)
     for text in ("a", ["a"], np.array(["a"])):
-        reading = read(
+        parsed = read(
             row(flat(given), 0) | {"annotation.human.action.task_description": text}, made.requirements
         )
-        assert (reading.instructions, reading.is_plain) == (("a",), False)
+        assert (parsed.instructions, parsed.is_plain) == (("a",), False)
 
 
 def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() -> None:
@@ -209,7 +209,7 @@ def test_every_row_keeps_its_own_instruction_and_none_is_the_released_default() 
             made.act(given | {"task": task}, seed=0)
         assert processor.seen == [(text, False) for text in expected]
     # Sorted by name, whatever the order of the observation.
-    assert made.inputs(given)[0].view_names == ("front", "wrist")
+    assert inputs_of(made, given)[0].view_names == ("front", "wrist")
     isaac = policy("isaac")
     observation = flat(nested(isaac))
     del observation["annotation.human.action.task_description"]
@@ -228,8 +228,8 @@ def test_float_frames_become_uint8_as_in_lerobot() -> None:
     frames[:, :, 20, :3] = [-0.2, 1.2, 0.5]
     given = lerobot(nested(made))
     for kind in (frames, torch.from_numpy(frames), torch.from_numpy(frames).double()):
-        reading = read(given | {"observation.images.front": kind}, made.requirements)
-        found = reading.frames[0]["front"]
+        parsed = read(given | {"observation.images.front": kind}, made.requirements)
+        found = parsed.frames[0]["front"]
         assert np.array_equal(found[:16, :16], values[0])
         assert found[20, :3, 0].tolist() == [0, 255, 127]
     for scale in (255.0, np.nan, -255.0):
@@ -238,7 +238,7 @@ def test_float_frames_become_uint8_as_in_lerobot() -> None:
 
 
 def test_frames_along_time_come_before_cameras() -> None:
-    made = policy("n17", ObservationSources(None, 2))
+    made = policy("n17", Requirements(video_horizon=2))
     video = np.random.default_rng(0).integers(0, 256, (2, 2, 8, 8, 3), np.uint8)
     given = nested(policy("n17"))
     given["video"] = {"a": video[:1], "b": video[1:]}
@@ -251,7 +251,7 @@ def test_frames_along_time_come_before_cameras() -> None:
 
 
 def test_unnamed_cameras_keep_their_order_or_are_sorted() -> None:
-    made = policy("isaac", ObservationSources())
+    made = policy("isaac", Requirements())
     given = nested(policy("isaac"))
     given["video"] = dict.fromkeys(("z", "a"), given["video"]["wrist"])
     assert list(read(given, made.requirements).frames[0]) == ["z", "a"]
@@ -404,8 +404,8 @@ def test_a_head_alone_samples_for_observations_and_does_not_look() -> None:
     alone = saccade.Policy(whole.head, embodiment="new_embodiment")  # type: ignore[attr-defined]
     assert (alone.backbone, alone.processor) == (None, None)
     given = nested(whole)
-    for call in (alone.act, alone.encode, alone.inputs):
-        with pytest.raises(InputError, match=r"saccade\.Policy\.load"):
+    for call in (alone.act, alone.encode):
+        with pytest.raises(InputError, match=r"saccade\.Policy\.from_pretrained"):
             call(given)
     context = whole.encode(given)
     expected = whole.sample(context, given, seed=2)

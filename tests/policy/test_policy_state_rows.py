@@ -21,6 +21,7 @@ from saccade.checkpoints import describe, random_checkpoint
 from saccade.checkpoints.whole import robots_of
 from saccade_lab.reference import ActionHead as Reference
 from tests.helpers import released
+from tests.helpers.policy_cases import inputs_of
 from tests.helpers.reference_cases import relative_error
 from tests.helpers.tensor_files import read_tensor_file
 
@@ -96,7 +97,7 @@ def check(policy: saccade.Policy, folder: Path, case: Path) -> None:
     actions = policy.act(given, noise=noise)
     reference = Reference.from_pretrained(folder, config=edited(folder, head), num_states=head.num_states)
     raw = np.concatenate([given["state"][group.key] for group in policy.normalizer.state_groups], axis=-1)
-    for row, features in enumerate(policy.features(policy.inputs(given))):
+    for row, features in enumerate(policy.encode(given).features):
         chosen = slice(row, row + 1)
         masks = {"image_mask": features.image_mask} if head.mask_mode == "alternate" else {}
         with torch.no_grad():
@@ -140,7 +141,7 @@ def test_frames_are_ordered_by_time_before_camera(n15: Path) -> None:
     policy = saccade.Policy.from_pretrained(n15, data_config=data_config("wrist", "front"))
     given = observation(policy, N15)
     assert policy.processor is not None
-    for row, inputs in enumerate(policy.inputs(given)):
+    for row, inputs in enumerate(inputs_of(policy, given)):
         assert inputs.view_names == ("wrist[0]", "front[0]", "wrist[1]", "front[1]")
         frames = [given["video"][name][row, time] for time in (0, 1) for name in ("wrist", "front")]
         expected = policy.processor(frames, "push the red block")

@@ -18,6 +18,7 @@ from safetensors.torch import load_file, save_file
 import saccade
 from saccade import CheckpointError, InputError, Policy, PolicyContext
 from tests.helpers import layouts, whole_checkpoints
+from tests.helpers.policy_cases import inputs_of
 from tests.helpers.whole_checkpoints import EMBODIMENT, whole
 
 Observation = dict[str, Any]
@@ -81,7 +82,7 @@ def test_prompts_of_different_length_keep_the_bits_that_they_have_alone(layout: 
     observations = [told(policy, text, seed) for seed, text in enumerate(texts)]
     start = noise(policy, len(texts))
     together = policy.act(observations, noise=start)
-    lengths = {inputs.input_ids.shape[1] for inputs in policy.inputs(observations)}
+    lengths = {inputs.input_ids.shape[1] for inputs in inputs_of(policy, observations)}
     assert len(lengths) > 2
     for index, observation in enumerate(observations):
         assert same(policy.act(observation, noise=start[index]), together[index])
@@ -127,9 +128,9 @@ def test_one_string_a_row_of_a_batch_is_rendered_plainly() -> None:
         **{f"video.{name}": frames for name, frames in nested["video"].items()},
         **{f"state.{name}": values for name, values in nested["state"].items()},
     }
-    plain = policy.inputs(flat | {"annotation.human.task_description": ["push"]})[0]
-    listed = policy.inputs(flat | {"annotation.human.task_description": [["push"]]})[0]
-    assert np.array_equal(listed.input_ids, policy.inputs(told(policy, "push"))[0].input_ids)
+    plain = inputs_of(policy, flat | {"annotation.human.task_description": ["push"]})[0]
+    listed = inputs_of(policy, flat | {"annotation.human.task_description": [["push"]]})[0]
+    assert np.array_equal(listed.input_ids, inputs_of(policy, told(policy, "push"))[0].input_ids)
     words = [policy.processor.tokens(text) for text in ("push", "['push']")]
     assert plain.input_ids.shape[1] - listed.input_ids.shape[1] == len(words[0]) - len(words[1])
     text = policy.act(flat | {"annotation.human.task_description": ["push"]}, seed=0)
@@ -212,9 +213,7 @@ def test_half_a_checkpoint_is_named(layout: str, tmp_path: Path) -> None:
             Policy.from_pretrained(folder, embodiment=EMBODIMENT)
     alone = tmp_path / "alone"
     layouts.write(alone, "saccade")
-    with pytest.raises(
-        CheckpointError, match=r"saccade\.ActionHead\.from_pretrained\(checkpoint\)\.policy\(\)"
-    ):
+    with pytest.raises(CheckpointError, match=r"saccade\.Policy\(saccade\.ActionHead\.from_pretrained"):
         Policy.from_pretrained(alone)
 
 

@@ -80,7 +80,10 @@ def test_there_and_back(groups: list[tuple[int, str]], seed: int, padding: int) 
         np.concatenate([np.array(statistics[name][bound]) for name in names]) for bound in ("q01", "q99")
     )
     robot = (low + rng.random((2, 3, total)) * (high - low)).astype(np.float32)
-    for there, back in ((normalizer.state, normalizer.unstate), (normalizer.unactions, normalizer.actions)):
+    for there, back in (
+        (normalizer.state, normalizer.denormalize_state),
+        (normalizer.normalize_actions, normalizer.actions),
+    ):
         normalised = as_array(there(robot))
         assert normalised.shape == (2, 3, total + padding)
         assert not normalised[..., total:].any()

@@ -101,7 +101,7 @@ def test_a_lerobot_checkpoint_gives_the_bits_of_lerobots_own_steps(
         }
     )
     assert np.array_equal(as_array(normalizer.state(state)), packed["observation"]["state"][:, 0].numpy())
-    assert np.array_equal(as_array(normalizer.unactions(robot)), packed["action"].numpy())
+    assert np.array_equal(as_array(normalizer.normalize_actions(robot)), packed["action"].numpy())
     assert packed["complementary_data"]["embodiment_id"].tolist() == [normalizer.embodiment_id] * 4
     # Their step takes one action at a time; the constant dimension comes back as the constant.
     theirs = unpack({"action": torch.from_numpy(chunk).reshape(20, 8)})["action"].reshape(4, 5, 6)

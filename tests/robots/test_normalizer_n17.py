@@ -63,7 +63,7 @@ def test_n17_mean_and_deviation_and_sine_and_cosine_by_key(tmp_path: Path) -> No
     expected[..., 1] = chunk[..., 1]  # no deviation: as it is
     assert np.allclose(as_array(normalizer.actions(chunk))[..., :3], expected, atol=1e-6)
     with pytest.raises(saccade.InputError, match="got 'sin_cos'"):
-        normalizer.unstate(found)
+        normalizer.denormalize_state(found)
 
 
 RELATIVE = {"rep": "RELATIVE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
@@ -98,7 +98,7 @@ def test_relative_actions_are_added_to_the_state(by_step: bool, tmp_path: Path) 
     samples = as_array(normalizer.actions(np.repeat(chunk[:, None], 3, axis=1), state))
     assert np.array_equal(samples, np.repeat(robot[:, None], 3, axis=1))
     assert np.array_equal(as_array(normalizer.actions(chunk[1], state[1])), robot[1])
-    back = as_array(normalizer.unactions(robot, state))
+    back = as_array(normalizer.normalize_actions(robot, state))
     assert np.allclose(back[..., [0, 1, 2]], chunk[..., [0, 1, 2]], atol=1e-5)
     with pytest.raises(saccade.InputError, match="the actions of arm are relative to it"):
         normalizer.actions(chunk)
@@ -109,7 +109,7 @@ def test_relative_actions_are_added_to_the_state(by_step: bool, tmp_path: Path) 
 def test_statistics_of_each_step_need_their_steps(tmp_path: Path) -> None:
     normalizer, _ = relative(tmp_path, by_step=True)
     with pytest.raises(saccade.ShapeError, match="arm has statistics of 4 steps"):
-        normalizer.unactions(draw(1, 5, 4), draw(1, 4))
+        normalizer.normalize_actions(draw(1, 5, 4), draw(1, 4))
 
 
 def pose_robot(folder: Path, pose: str, size: int) -> Normalizer:
@@ -231,7 +231,7 @@ def test_a_head_trained_without_a_state_gets_zeros(tmp_path: Path) -> None:
     normalizer = load_processor(tmp_path, *processor(exclude_state=True))
     assert not as_array(normalizer.state(draw(2, 4))).any()
     with pytest.raises(saccade.InputError, match="gets zeros"):
-        normalizer.unstate(np.zeros((2, 9)))
+        normalizer.denormalize_state(np.zeros((2, 9)))
 
 
 @pytest.mark.parametrize("layout", ["n16", "n17"])

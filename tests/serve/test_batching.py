@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from saccade.errors import InputError
-from saccade.observations import DIALECTS, Reading, Requirements, StateReading
+from saccade.observations import FORMATS, ParsedObservation, ParsedState, Requirements
 from saccade.serve import Client, Server, ServerError
 from saccade.serve.batching import Job, Queue
 from saccade.serve.connections import bind
@@ -37,11 +37,11 @@ from tests.helpers.serve_cases import (
 
 
 def job(client: Any = None, rows: int = 1, session: str | None = None) -> Job:
-    nothing = StateReading(
-        DIALECTS[0], Requirements(None, None, ()), True, False, np.zeros((rows, 1, 1), np.float32)
+    nothing = ParsedState(
+        FORMATS[0], Requirements(None, None, ()), True, False, np.zeros((rows, 1, 1), np.float32)
     )
-    reading = Reading(**vars(nothing), frames=(), instructions=(), is_plain=False)
-    return Job(Call("get_action", options=Options(session=session)), reading, client or object())
+    parsed = ParsedObservation(**vars(nothing), frames=(), instructions=(), is_plain=False)
+    return Job(Call("get_action", options=Options(session=session)), parsed, client or object())
 
 
 def rows(jobs: list[Job] | None) -> list[int]:

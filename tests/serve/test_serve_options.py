@@ -16,7 +16,7 @@ import pytest
 
 import saccade
 from saccade.errors import InputError
-from saccade.observations import Camera, Reading
+from saccade.observations import Camera, ParsedObservation
 from saccade.serve import Client, Server, ServerError, engine, modalities
 from saccade.serve.connections import bind
 from tests.helpers import whole_checkpoints
@@ -205,10 +205,10 @@ class ReleasedPolicy(MemoryPolicy):
         super().__post_init__()
         self.released = load_released("n17_rtc")
         head = saccade.ActionHead.from_pretrained(self.released.path, config=self.released.config)
-        self.head = SimpleNamespace(config=head.config, source=None, num_threads=1)
+        self.head = SimpleNamespace(config=head.config, source=None, num_threads=1, encode=self.head.encode)
         self.call = head
 
-    def sample(self, context: Any, readings: Sequence[Reading], **options: Any) -> list[Any]:
+    def sample(self, encoded: Any, observations: Sequence[ParsedObservation], **options: Any) -> list[Any]:
         self.chunkings.append(options.get("chunking"))
         actions = self.released.options["previous_chunk"]
         if options.get("chunking") is not None:
@@ -221,7 +221,7 @@ class ReleasedPolicy(MemoryPolicy):
             }
             actions = self.call(**self.released.arguments | changed)
         parts = {"arm": actions[..., :2], "gripper": actions[..., 2:]}
-        return [reading.dialect.answer(parts, reading) for reading in readings]
+        return [parsed.format.write_actions(parts, parsed) for parsed in observations]
 
 
 def test_released_chunking_gives_the_released_actions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -219,8 +219,8 @@ def test_a_thread_computes_alone_while_others_do_and_no_longer(monkeypatch: pyte
         return time_of_pool() != before
 
     def jobs() -> list[Job]:
-        reading = read(seen, whole.requirements)
-        return [Job(Call("get_action", options=Options(seed=seed)), reading, None) for seed in range(2)]
+        parsed = read(seen, whole.requirements)
+        return [Job(Call("get_action", options=Options(seed=seed)), parsed, None) for seed in range(2)]
 
     made = engine.Engine(whole, Sessions(1, 1.0))
     assert made.num_workers == 2

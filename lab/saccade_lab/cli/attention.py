@@ -237,7 +237,7 @@ def take_features(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHea
 def take_simulator(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead, View]:
     """The head of a policy of the simulator, and what it sees in the episode that the arguments ask for."""
     from saccade.errors import CheckpointError
-    from saccade.policy.parts import parts_of
+    from saccade_lab.inside import parts_of
     from saccade_lab.maps.view import from_simulator
     from saccade_lab.sim import graphics
     from saccade_lab.sim.policy import Policy, check_trained_on
@@ -258,8 +258,8 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     import numpy as np
 
     from saccade.observations.pictures import read_frames
-    from saccade.policy.parts import parts_of
     from saccade.policy.policy import Policy
+    from saccade_lab.inside import parts_of
     from saccade_lab.maps.view import from_policy
 
     with output.progress_bar("loading", transient=True):

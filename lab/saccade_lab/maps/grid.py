@@ -12,9 +12,9 @@ from saccade._internal.arrays import Float32Array, UInt8Array
 from saccade.backbone.config import BackboneConfig
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import ShapeError
-from saccade.policy.parts import parts_of
 from saccade.policy.policy import Policy
 from saccade.processor import Processor
+from saccade_lab.inside import parts_of
 from saccade_lab.maps.layout import WHOLE, Camera, Layout, Region, kind_of
 
 #: Axes of N1.7's patches: a patch holds the same picture twice, as if it were two moments of a video.

@@ -17,7 +17,7 @@ from saccade.errors import InputError
 from saccade.head.head import ActionHead
 from saccade.head.inputs import HeadInputs
 from saccade.observations import view_places
-from saccade.policy.context import PolicyContext
+from saccade.policy.encoding import PolicyContext
 from saccade.policy.policy import Policy
 from saccade_lab.maps.layout import Camera, Layout
 

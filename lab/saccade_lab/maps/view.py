@@ -17,8 +17,8 @@ from saccade.head.config import HeadConfig
 from saccade.head.input_files import as_mask, read_arrays
 from saccade.head.inputs import HeadInputs
 from saccade.observations import read
-from saccade.policy.parts import as_head_takes_it
 from saccade.policy.policy import Policy
+from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of
 from saccade_lab.maps import layout as layouts
 from saccade_lab.maps.grid import layout_of
 from saccade_lab.maps.layout import Layout
@@ -126,10 +126,10 @@ def from_policy(
     Raises:
         InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.encode`.
     """
-    (inputs,) = policy.inputs(seen)
-    features = policy.features([inputs])
-    encoded = policy.context(features)
-    given = as_head_takes_it(policy, seen, features[0]).with_noise(rng, policy.head.config)
+    (inputs,) = inputs_of(policy, seen)
+    features = features_of(policy, [inputs])
+    encoded = context_of(policy, features)
+    given = head_inputs(policy, seen, features[0]).with_noise(rng, policy.head.config)
     frames = read(seen, policy.requirements).frames[0]
     return View(
         title=title,

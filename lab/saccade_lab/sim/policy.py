@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -17,9 +16,11 @@ from saccade._internal.arrays import Float32Array
 from saccade._internal.files import checkpoint_identity
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.head.intervention import Intervention
-from saccade.policy.head import Head
+from saccade.policy.interfaces import Head
 from saccade.processor import Processor
-from saccade_lab.sim.settings import CONFIG_FILE, FILES, GROUPS, LANGUAGE_KEY, SimulationConfig
+from saccade.robots import LANGUAGE_KEY
+from saccade_lab.inside import context_of, features_of, inputs_of
+from saccade_lab.sim.settings import CONFIG_FILE, FILES, GROUPS, SimulationConfig
 from saccade_lab.sim.tasks import find_task
 
 #: One intervention, several that act together, or none.
@@ -148,8 +149,14 @@ class Policy:
 
     def with_head(self, head: Head) -> Policy:
         """The same policy with another head."""
-        whole = copy.copy(self.whole)
-        whole.head = head
+        whole = saccade.Policy(
+            head,
+            self.whole.normalizer,
+            self.whole.embodiment_id,
+            backbone=self.whole.backbone,
+            processor=self.whole.processor,
+            requirements=self.whole.requirements,
+        )
         return Policy(whole, self.config, self.checkpoint, self.engine)
 
     def num_vl_tokens(self, instruction: str | None = None) -> int:
@@ -190,7 +197,7 @@ class Policy:
 
     def features(self, seen: Mapping[str, Any]) -> Float32Array:
         """Backbone features of what the simulator shows, `(1, T_vl, width)`."""
-        (found,) = self.whole.features(self.whole.inputs(self.observation(seen)))
+        (found,) = features_of(self.whole, inputs_of(self.whole, self.observation(seen)))
         return np.asarray(found.backbone_features)
 
     def state(self, seen: Mapping[str, Any]) -> Float32Array:
@@ -215,9 +222,9 @@ class Policy:
         """
         observation = self.observation(seen)
         times = [time.perf_counter()]
-        features = self.whole.features(self.whole.inputs(observation))
+        features = features_of(self.whole, inputs_of(self.whole, observation))
         times.append(time.perf_counter())
-        context = self.whole.context(features)
+        context = context_of(self.whole, features)
         times.append(time.perf_counter())
         answer = self.whole.sample(context, observation, noise=noise, intervention=intervention)
         times.append(time.perf_counter())
@@ -231,7 +238,9 @@ class Policy:
     def blank(self, instruction: str) -> dict[str, Any]:
         """What a black room would show, with the hand in the middle of its range."""
         size = self.config.image_size
-        middle = self.whole.normalizer.unstate(np.zeros((1, self.head.config.state_dim), np.float32))
+        middle = self.whole.normalizer.denormalize_state(
+            np.zeros((1, self.head.config.state_dim), np.float32)
+        )
         return {
             "images": {camera.name: np.zeros((size, size, 3), np.uint8) for camera in self.config.cameras},
             "proprio": np.asarray(middle)[0],

@@ -17,15 +17,13 @@ from saccade.checkpoints.random_checkpoint.tokenizer import token_id, tokenizer
 from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.processor import Processor
-from saccade.robots import Normalizer
+from saccade.robots import LANGUAGE_KEY, Normalizer
 from saccade_lab.sim.cameras import Camera
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
 TOKENIZER_FILE, METADATA_FILE = "tokenizer.json", "experiment_cfg/metadata.json"
 DATA_CONFIG_FILE = "experiment_cfg/data_config.json"
 
-#: The key of the instruction: Isaac-GR00T's usual one.
-LANGUAGE_KEY = "annotation.human.action.task_description"
 #: Every file of a policy.
 FILES = (CONFIG_FILE, TENSOR_FILE, TOKENIZER_FILE, METADATA_FILE)
 

@@ -17,7 +17,7 @@ import saccade
 from saccade._internal.arrays import ArrayLike, Float32Array
 from saccade.backbone.inputs import BackboneInputs
 from saccade.head.config import HeadConfig
-from saccade.observations import observation_sources
+from saccade.observations import read_requirements
 from saccade.processor import Processor
 from saccade.robots import Normalizer
 from saccade_lab.reference import ActionHead, Backbone
@@ -42,7 +42,7 @@ class TorchContext:
 
 
 class TorchHead:
-    """`saccade_lab.reference.ActionHead` as a `saccade.policy.head.Head`."""
+    """`saccade_lab.reference.ActionHead` as a `saccade.policy.interfaces.Head`."""
 
     def __init__(self, checkpoint: Path) -> None:
         self._head = ActionHead.from_pretrained(checkpoint)
@@ -62,6 +62,11 @@ class TorchHead:
     def num_threads(self) -> int:
         """Number of threads of torch."""
         return torch.get_num_threads()
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the weights, in bytes."""
+        return nbytes_of(self._head)
 
     def encode(
         self,
@@ -100,13 +105,21 @@ class TorchBackbone:
     def __init__(self, checkpoint: Path) -> None:
         self._backbone = Backbone.from_pretrained(checkpoint)
 
-    def _ragged(
-        self, inputs: Sequence[BackboneInputs], *, previous: Sequence[TorchFeatures] = ()
-    ) -> list[TorchFeatures]:
-        """See `saccade.Backbone._ragged`. Nothing is taken from `previous`."""
+    @property
+    def nbytes(self) -> int:
+        """Size of the weights, in bytes."""
+        return nbytes_of(self._backbone)
+
+    def encode_many(self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()) -> list[Any]:
+        """See `saccade.Backbone.encode_many`. Nothing is taken from `previous`."""
         with torch.no_grad():
             found = [self._backbone(given) for given in inputs]
         return [TorchFeatures(one.backbone_features.numpy(), one.image_mask.numpy()) for one in found]
+
+
+def nbytes_of(module: torch.nn.Module) -> int:
+    """Size of the parameters and buffers of a module, in bytes."""
+    return sum(one.nbytes for one in (*module.parameters(), *module.buffers()))
 
 
 def load_policy(checkpoint: Path, num_threads: int | None = None) -> saccade.Policy:
@@ -125,9 +138,9 @@ def load_policy(checkpoint: Path, num_threads: int | None = None) -> saccade.Pol
     return saccade.Policy(
         head,
         normalizer,
-        backbone=TorchBackbone(checkpoint),  # type: ignore[arg-type]
+        backbone=TorchBackbone(checkpoint),
         processor=Processor.from_pretrained(checkpoint),
-        sources=observation_sources(checkpoint, normalizer.embodiment, normalizer.data_config),
+        requirements=read_requirements(checkpoint, normalizer),
     )
 
 

@@ -20,10 +20,10 @@ from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.head.inputs import HeadInputs
 from saccade.observations import read
-from saccade.observations.pictures import Moment, read_frames
-from saccade.policy.context import longer
-from saccade.policy.parts import as_head_takes_it, parts_of
+from saccade.observations.pictures import PictureObservation, read_frames
+from saccade.policy.encoding import pad_tokens
 from saccade.policy.policy import Policy
+from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of, parts_of
 from saccade_lab.maps.grid import layout_of
 from saccade_lab.maps.layout import Layout
 from saccade_lab.study.recording import NOISES, Recorded, num_episodes
@@ -143,8 +143,8 @@ class Encoded:
     identity: dict[str, str]
     preprocessing: str
     action_width: int
-    moments: Sequence[Moment]
-    others: Sequence[Moment]
+    moments: Sequence[PictureObservation]
+    others: Sequence[PictureObservation]
     observation: HeadInputs
     other_observation: HeadInputs | None
     inputs: Sequence[BackboneInputs]
@@ -165,23 +165,23 @@ def encode(source: Moments) -> Encoded:
     )
     parts = parts_of(policy)
     moments = moments_of(source, policy, source.frames, source.instruction)
-    others: list[Moment] = []
+    others: list[PictureObservation] = []
     if (source.other_frames, source.other_instruction) != (None, None):
         told = source.instruction if source.other_instruction is None else source.other_instruction
         found = moments_of(source, policy, source.other_frames or source.frames, told)
         others = [found[place % len(found)] for place in range(len(moments))]
     seen, compared, given, layouts = [], [], [], []
     for place, moment in enumerate(moments):
-        (inputs,) = policy.inputs(moment.observation)
-        context = policy.context(policy.features([inputs]))
-        seen.append(as_head_takes_it(policy, moment.observation, context.features[0]))
+        (inputs,) = inputs_of(policy, moment.observation)
+        context = context_of(policy, features_of(policy, [inputs]))
+        seen.append(head_inputs(policy, moment.observation, context.features[0]))
         given.append(inputs)
         frames = read(moment.observation, policy.requirements).frames[0]
         layouts.append(layout_of(policy, frames, inputs, context.features[0].views))
         if others:  # views with the same frames are not computed again
             other = others[place].observation
-            (features,) = policy.features(policy.inputs(other), previous=context)
-            compared.append(as_head_takes_it(policy, other, features))
+            (features,) = features_of(policy, inputs_of(policy, other), previous=context)
+            compared.append(head_inputs(policy, other, features))
         if source.on_moment is not None:
             source.on_moment(place + 1, len(moments))
     return Encoded(
@@ -205,24 +205,26 @@ def head_of(checkpoint: str, embodiment_id: int, num_threads: int | None) -> Act
     return ActionHead.from_pretrained(checkpoint, embodiment_ids=[embodiment_id], num_threads=num_threads)
 
 
-def moments_of(source: Moments, policy: Policy, directory: str, instruction: str | None) -> list[Moment]:
+def moments_of(
+    source: Moments, policy: Policy, directory: str, instruction: str | None
+) -> list[PictureObservation]:
     """The moments of a directory, with the state of the source."""
     state = None if source.state is None else Path(source.state)
     return read_frames(Path(directory), policy, instruction=instruction, state=state)
 
 
-def joined(observations: Sequence[HeadInputs], moments: Sequence[Moment]) -> HeadInputs:
+def joined(observations: Sequence[HeadInputs], moments: Sequence[PictureObservation]) -> HeadInputs:
     """Observations of one row each as one, the shorter ones padded and their padding dropped.
 
     The head drops padding exactly: each has the bits that it has alone.
     """
     lengths = np.array([one.num_vl_tokens for one in observations])
     longest = int(lengths.max())
-    masks = [longer(one.image_mask, longest) for one in observations if one.image_mask is not None]
+    masks = [pad_tokens(one.image_mask, longest) for one in observations if one.image_mask is not None]
     dropped = np.arange(longest) >= lengths[:, None]
     episodes = [moment.episode for moment in moments]
     return HeadInputs(
-        np.concatenate([longer(one.backbone_features, longest) for one in observations]),
+        np.concatenate([pad_tokens(one.backbone_features, longest) for one in observations]),
         np.concatenate([one.state for one in observations]),
         np.concatenate([one.embodiment_id for one in observations]),
         image_mask=np.concatenate(masks) if masks else None,
@@ -231,7 +233,7 @@ def joined(observations: Sequence[HeadInputs], moments: Sequence[Moment]) -> Hea
     )
 
 
-def described(directory: str, moments: Sequence[Moment]) -> dict[str, Any]:
+def described(directory: str, moments: Sequence[PictureObservation]) -> dict[str, Any]:
     """What identifies moments, as JSON values; the hash covers names, pixels, states and instruction."""
     digest = hashlib.sha256()
     for moment in moments:

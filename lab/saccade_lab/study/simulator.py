@@ -19,7 +19,7 @@ from saccade.head.head import ActionHead
 from saccade.head.input_files import BoolArray
 from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
-from saccade.policy.head import Head
+from saccade.policy.interfaces import Head
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
 from saccade_lab.sim.rollout import Episode, environment_for, run_episode
@@ -203,7 +203,7 @@ class Recorded:
 
 
 class Recorder(WrappedHead):
-    """A head that records its inputs and passes them on; a `saccade.policy.head.Head`.
+    """A head that records its inputs and passes them on; a `saccade.policy.interfaces.Head`.
 
     Args:
         head: head that computes.

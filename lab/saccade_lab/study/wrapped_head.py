@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from saccade.head.config import HeadConfig
-from saccade.policy.head import Head
+from saccade.policy.interfaces import Head
 
 
 class WrappedHead:
-    """What a `saccade.policy.head.Head` says of itself, taken from another head. Subclasses compute.
+    """What a `saccade.policy.interfaces.Head` says of itself, taken from another head. Subclasses compute.
 
     Args:
         head: the head behind it.
@@ -35,3 +35,8 @@ class WrappedHead:
     def num_threads(self) -> int:
         """See `Head`."""
         return self._wrapped.num_threads
+
+    @property
+    def nbytes(self) -> int:
+        """See `Head`."""
+        return self._wrapped.nbytes

@@ -197,17 +197,20 @@ class Backbone:
         """
         return self._encode([inputs], [] if previous is None else [previous], record)[0]
 
-    def _ragged(
+    def encode_many(
         self, inputs: Sequence[BackboneInputs], *, previous: Sequence[BackboneFeatures] = ()
     ) -> list[BackboneFeatures]:
         """Computes the features of several inputs, whose prompts may differ in length, in one pass.
 
-        For internal use: :class:`saccade.Policy` never pads. All rows share the linear layers, and all views
-        the vision tower. The features of each have the bits that it has alone.
+        Nothing is padded. All rows share the linear layers, and all views the vision tower. The features of
+        each have the bits that it has alone.
 
         Args:
             inputs: Pixels and token ids.
             previous: Features that any of the inputs may take from, as in :meth:`__call__`.
+
+        Returns:
+            The features of each of ``inputs``, in their order.
 
         Raises:
             ShapeError, DtypeError, InputError, MemoryError: As :meth:`__call__`.

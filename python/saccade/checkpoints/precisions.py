@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array, integer
-from saccade.observations.pictures import Moment, read_frames
-from saccade.policy.parts import parts_of
+from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.policy import Policy
 from saccade.processor import Preprocessing
 from saccade.robots import Group
@@ -143,7 +142,7 @@ def check_precisions(
         ...     return check_precisions(checkpoint, Path("frames"), instruction="open the drawer").recommended
     """
     seed = integer("seed", seed, least=0)
-    recorded: list[Moment] = []
+    recorded: list[PictureObservation] = []
     found: list[PrecisionError] = []
     exact: _Results | None = None
     other_noise = Difference({}, {})
@@ -169,18 +168,17 @@ def check_precisions(
             other_noise = difference(exact.actions, others.actions, groups)
         else:
             results = run(policy, recorded, seed)
-        parts = parts_of(policy)
         found.append(
             PrecisionError(
                 name=name,
                 precision=dict(precision),
                 features=features_error(exact.features, results.features),
                 actions=difference(exact.actions, results.actions, groups),
-                nbytes=parts.backbone.nbytes + parts.head.nbytes,
+                nbytes=policy.nbytes,
                 milliseconds=results.milliseconds,
             )
         )
-        del policy, parts  # before the next one is loaded
+        del policy  # before the next one is loaded
     return PrecisionCheck(
         source=os.fspath(source),
         observations=len(recorded),
@@ -198,18 +196,17 @@ def recommended(found: Sequence[PrecisionError]) -> str:
     return min(close, key=lambda one: one.nbytes).name
 
 
-def run(policy: Policy, recorded: Sequence[Moment], seed: int) -> _Results:
+def run(policy: Policy, recorded: Sequence[PictureObservation], seed: int) -> _Results:
     """Features, chunks from `NUM_SAMPLES` draws of noise, and the time of a chunk."""
     features, actions, seconds = [], [], []
     policy.act(recorded[0].observation, seed=seed)  # claims memory
     for index, one in enumerate(recorded):
         started = time.perf_counter()
-        computed = policy.features(policy.inputs(one.observation))
-        context = policy.context(computed)
+        context = policy.encode(one.observation)
         policy.sample(context, one.observation, seed=seed + index)
         seconds.append(time.perf_counter() - started)
         chunks = policy.sample(context, one.observation, seed=seed + index, num_samples=NUM_SAMPLES)
-        features.append(np.asarray(computed[0].backbone_features[0]))
+        features.append(np.asarray(context.features[0].backbone_features[0]))
         actions.append({key: np.asarray(chunk[0]) for key, chunk in chunks.items()})
     return _Results(features, actions, 1e3 * float(np.median(seconds)))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import saccade._saccade as _saccade
 from saccade._internal.arrays import PRECISIONS
 from saccade.backbone.config import BackboneConfig
 from saccade.errors import CheckpointError, SaccadeError
-from saccade.observations import Requirements, observation_sources
+from saccade.observations import Requirements, read_requirements
 from saccade.processor import Processor
 from saccade.robots import DataConfigLike, Normalizer, read_json
 from saccade.robots.reading import OWN_DATA_CONFIG, processor_folder
@@ -106,15 +106,10 @@ def _robot_of(
         warnings.simplefilter("always")
         try:
             normalizer = Normalizer.from_pretrained(source, tag, data_config=data_config)
-            sources = observation_sources(source, normalizer.embodiment, normalizer.data_config)
+            needs = read_requirements(source, normalizer)
         except (SaccadeError, FileNotFoundError) as error:
             return RobotFindings(tag, None, None, (), str(error), None, None)
-    needs = Requirements(
-        embodiment=normalizer.embodiment,
-        state=tuple((group.key, group.size) for group in normalizer.state_groups),
-        state_history=normalizer.state_history or state_history,
-        **vars(sources),
-    )
+    needs = replace(needs, state_history=normalizer.state_history or state_history)
     actions = tuple((group.key, group.size) for group in normalizer.action_groups)
     warning = str(caught[0].message) if caught else None
     named = None if normalizer.data_config is None else str(data_config or OWN_DATA_CONFIG)

@@ -71,7 +71,10 @@ def run(args: argparse.Namespace) -> int:
     """Loads the checkpoint, computes a chunk and prints it."""
     require("act")
     from saccade.observations.pictures import instruction_of, observation, read_state
+    from saccade.policy.encoding import compute_features, encode_features
     from saccade.policy.policy import Policy
+    from saccade.policy.preparing import prepare_inputs
+    from saccade.policy.reading import read_observations
 
     pictures = named_pictures(args.image)
     state = None if args.state is None else read_state(args.state)
@@ -81,11 +84,14 @@ def run(args: argparse.Namespace) -> int:
     clock.done("load")
     given = observation(policy, pictures, args.instruction, state)
     clock.done("frames")
-    inputs = policy.inputs(given)
+    processor, backbone = policy.processor, policy.backbone
+    assert processor is not None
+    assert backbone is not None
+    inputs = prepare_inputs(read_observations(given, policy.requirements), processor)
     clock.done("processor")
-    features = policy.features(inputs)
+    features = compute_features(inputs, backbone)
     clock.done("backbone")
-    context = policy.context(features)
+    context = encode_features(features, policy.head)
     clock.done("encode")
     actions = policy.sample(context, given, seed=args.seed, num_steps=args.num_steps)
     clock.done("sample")

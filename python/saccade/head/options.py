@@ -1,4 +1,4 @@
-"""The options of heads' and policies' methods: their types, and the form that the engine takes."""
+"""Options of heads and policies: checks, and the form that the engine takes."""
 
 from __future__ import annotations
 
@@ -17,33 +17,6 @@ PARTS = ("backbone", "head")
 
 #: Velocity evaluations in one step of each integrator.
 INTEGRATORS = {"euler": 1, "midpoint": 2}
-
-
-class _Sampling(TypedDict, total=False):
-    noise: ArrayLike | None
-    seed: Any
-    num_steps: int | None
-    integrator: str | None
-    num_samples: int | None
-    future_refresh: int | None
-    intervention: Intervention | Sequence[Intervention] | None
-    chunking: Chunking | None
-    out: ArrayLike | None
-
-
-class SampleOptions(_Sampling, total=False):
-    """The keyword arguments of :meth:`saccade.ActionHead.sample`, which documents them.
-
-    Functions that pass them on are annotated ``**options: Unpack[SampleOptions]``.
-    """
-
-    previous_chunk: ArrayLike | None
-
-
-class PolicyOptions(_Sampling, total=False):
-    """The keyword arguments of :meth:`saccade.Policy.sample`, which documents them."""
-
-    previous_chunk: Any  # an array, or actions by name
 
 
 class LoadOptions(TypedDict, total=False):

@@ -1,26 +1,28 @@
-"""The forms of observations and answers: Isaac-GR00T's two, and lerobot's.
+"""Observation formats: Isaac-GR00T's two, and lerobot's.
 
-`dialects.read` tells the form of an observation by its keys, checks it against what the robot needs
-(`requirements`, read from the checkpoint by `sources`), and returns a `Reading`, which is the same for all
-forms. `isaac_nested`, `isaac_flat` and `lerobot` have one form each; `checks` has what they share.
+:func:`read` detects the format of an observation by its keys, checks the observation against what the robot
+needs, and returns a :class:`ParsedObservation`, which is the same for all formats.
+
+- ``requirements``: what a robot's observation must contain; ``checkpoint`` reads it from a checkpoint.
+- ``formats``: the table of formats; ``isaac`` and ``lerobot`` have them, ``checks`` what they share.
+- ``pictures``: observations from image files.
 """
 
+from saccade.observations.checkpoint import read_requirements
 from saccade.observations.checks import view_places
-from saccade.observations.formats import DIALECTS, read, read_state
-from saccade.observations.parsed import Dialect, Reading, StateReading
+from saccade.observations.formats import FORMATS, read, read_state
+from saccade.observations.parsed import ObservationFormat, ParsedObservation, ParsedState
 from saccade.observations.requirements import Camera, Requirements
-from saccade.observations.sources import ObservationSources, observation_sources
 
 __all__ = [
-    "DIALECTS",
+    "FORMATS",
     "Camera",
-    "Dialect",
-    "ObservationSources",
-    "Reading",
+    "ObservationFormat",
+    "ParsedObservation",
+    "ParsedState",
     "Requirements",
-    "StateReading",
-    "observation_sources",
     "read",
+    "read_requirements",
     "read_state",
     "view_places",
 ]

@@ -1,4 +1,4 @@
-"""Checks that the forms of observations share: frames, states, instructions, batch axes."""
+"""Checks that the observation formats share: frames, states, instructions, batch axes."""
 
 from __future__ import annotations
 

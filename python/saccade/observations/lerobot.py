@@ -1,4 +1,4 @@
-"""lerobot's form: ``observation.images.*``, ``observation.state``, ``task``."""
+"""lerobot's format: ``observation.images.*``, ``observation.state``, ``task``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._internal.arrays import Float32Array, UInt8Array, is_torch, like_features
+from saccade._internal.arrays import Array, Float32Array, UInt8Array, is_torch, like_features
 from saccade.observations.checks import (
     as_text,
     check_batch,
@@ -20,7 +20,7 @@ from saccade.observations.checks import (
     shape_of,
     views,
 )
-from saccade.observations.parsed import Reading, StateReading
+from saccade.observations.parsed import ParsedObservation, ParsedState
 from saccade.observations.requirements import Requirements
 
 IMAGES, IMAGE, STATE, TASK = "observation.images.", "observation.image", "observation.state", "task"
@@ -33,7 +33,7 @@ class Lerobot:
     """Frames ``(B, 3, H, W)``, uint8 or float from 0 to 1; the state ``(B, D)``; a string for each row.
 
     Frames may also be ``(B, T, 3, H, W)``, and have the colours last, as lerobot's robots and environments
-    give them. Keys are renamed first, as the checkpoint says. The answer is one array, ``(B, T, D)``: a torch
+    give them. Keys are renamed first, as the checkpoint says. Actions are one array, ``(B, T, D)``: a torch
     tensor if the observation contains one. Unlike lerobot, which gives the first instruction to the whole
     batch in N1.5, every row keeps its own.
     """
@@ -44,17 +44,17 @@ class Lerobot:
         """Whether a key begins with ``observation.``."""
         return any(key.startswith("observation.") for key in observation)
 
-    def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
-        """See :class:`saccade.observations.Dialect`."""
+    def read(
+        self, observation: Mapping[str, Any], state: ParsedState, needs: Requirements
+    ) -> ParsedObservation:
+        """See :class:`saccade.observations.ObservationFormat`."""
         frames = _frames(_renamed(observation, needs), needs)
         texts = _texts(observation.get(TASK), len(state), needs)
         check_batch({STATE: len(state), f"{IMAGES}*": len(frames), TASK: len(texts)}, needs)
-        return Reading(
-            self, needs, state.is_batched, state.use_torch, state.state, frames, texts, is_plain=False
-        )
+        return ParsedObservation(**vars(state), frames=frames, instructions=texts, is_plain=False)
 
-    def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> StateReading:
-        """See :class:`saccade.observations.Dialect`."""
+    def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> ParsedState:
+        """See :class:`saccade.observations.ObservationFormat`."""
         given = _renamed(observation, needs).get(STATE)
         if given is None:
             raise needs.input_error(STATE, f"the state, {needs.state_width} numbers", "none")
@@ -65,16 +65,16 @@ class Lerobot:
         if shaped.shape[1] != needs.state_history:
             raise needs.shape_error(STATE, f"{needs.state_history} states a row", f"shape {state.shape}")
         use_torch = any(is_torch(value) for key, value in observation.items() if "observation." in key)
-        return StateReading(self, needs, axes > 1, use_torch, shaped)
+        return ParsedState(self, needs, axes > 1, use_torch, shaped)
 
-    def answer(self, parts: Mapping[str, Float32Array], reading: StateReading) -> Any:
-        """See :class:`saccade.observations.Dialect`."""
-        actions = np.concatenate(list(parts.values()), axis=-1)
-        return like_features(actions if reading.is_batched else actions[0], reading.use_torch)
+    def write_actions(self, actions: Mapping[str, Float32Array], parsed: ParsedState) -> Array:
+        """See :class:`saccade.observations.ObservationFormat`."""
+        joined = np.concatenate(list(actions.values()), axis=-1)
+        return like_features(joined if parsed.is_batched else joined[0], parsed.use_torch)
 
-    def previous_chunk(self, answer: Any, keys: tuple[str, ...]) -> Any:
-        """See :class:`saccade.observations.Dialect`."""
-        return answer
+    def read_actions(self, actions: Any, keys: tuple[str, ...]) -> Any:
+        """See :class:`saccade.observations.ObservationFormat`."""
+        return actions
 
 
 def _renamed(observation: Mapping[str, Any], needs: Requirements) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""An observation after it was read: the same for every form in which it can be given."""
+"""Interface of an observation format, and an observation after parsing: the same for every format."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from saccade.observations.requirements import Requirements
 
 
 @dataclass(frozen=True, eq=False)
-class StateReading:
-    """The state of one or several observations, and the form of the answer.
+class ParsedState:
+    """The state of one or several observations, and how to return actions for them.
 
     Attributes:
-        dialect: The form.
-        needs: What the observation was checked against.
+        format: The format of the observation.
+        needs: The requirements that the observation was checked against.
         is_batched: Whether the observation had a batch axis.
-        use_torch: Whether the answer consists of torch tensors.
+        use_torch: Whether actions are returned as torch tensors.
         state: ``(batch, state_history, state_width)`` float32 in the robot's units.
     """
 
-    dialect: Dialect
+    format: ObservationFormat
     needs: Requirements
     is_batched: bool
     use_torch: bool
@@ -33,7 +33,7 @@ class StateReading:
 
 
 @dataclass(frozen=True, eq=False)
-class Reading(StateReading):
+class ParsedObservation(ParsedState):
     """One or several observations, checked. It shares the memory of the caller's arrays where it can.
 
     Attributes:
@@ -50,20 +50,22 @@ class Reading(StateReading):
     is_plain: bool
 
 
-class Dialect(Protocol):
-    """A form of observations and answers."""
+class ObservationFormat(Protocol):
+    """A layout of observations and of the actions that answer them."""
 
     name: str
 
     def matches(self, observation: Mapping[str, Any]) -> bool:
-        """Whether the keys are those of this form."""
+        """Whether the keys are those of this format."""
 
-    def read(self, observation: Mapping[str, Any], state: StateReading, needs: Requirements) -> Reading:
-        """Reads and checks frames and instructions.
+    def read(
+        self, observation: Mapping[str, Any], state: ParsedState, needs: Requirements
+    ) -> ParsedObservation:
+        """Parses and checks frames and instructions.
 
         Args:
             observation: The observation.
-            state: What `read_state` read of it.
+            state: The result of :meth:`read_state`.
             needs: What the robot needs.
 
         Raises:
@@ -71,19 +73,20 @@ class Dialect(Protocol):
                 the robot needs.
         """
 
-    def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> StateReading:
-        """Reads and checks the state; frames and instruction may be missing. Raises as `read`."""
+    def read_state(self, observation: Mapping[str, Any], needs: Requirements) -> ParsedState:
+        """Parses and checks the state; frames and instruction may be missing. Raises as :meth:`read`."""
 
-    def answer(self, parts: Mapping[str, Float32Array], reading: StateReading) -> Any:
-        """The actions in this form.
+    def write_actions(self, actions: Mapping[str, Float32Array], parsed: ParsedState) -> Any:
+        """Actions in this format.
 
         Args:
-            parts: The actions by key, in the order of the robot's action, ``(batch, ..., horizon, width)``.
-            reading: What the actions are for.
+            actions: The actions by key, in the order of the robot's action, ``(batch, ..., horizon, width)``
+                float32 in the robot's units.
+            parsed: The state that the actions are for.
         """
 
-    def previous_chunk(self, answer: Any, keys: tuple[str, ...]) -> Any:
-        """The inverse of `answer`: one array ``(..., horizon, action_width)``.
+    def read_actions(self, actions: Any, keys: tuple[str, ...]) -> Any:
+        """The inverse of :meth:`write_actions`: one array ``(..., horizon, action_width)``.
 
         Raises:
             InputError: An action is missing.

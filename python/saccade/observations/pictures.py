@@ -1,4 +1,4 @@
-"""Pictures, words and states from files, as observations of a whole policy. Needs Pillow."""
+"""Observations from image files, instructions and states in a directory. Needs Pillow."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """What the robot sees, feels and is told at one moment.
+class PictureObservation:
+    """One observation from a folder with a picture for each camera.
 
     Attributes:
         name: The folder of its pictures, relative to the directory: ``"0001"`` or ``"pour/0001"``; for a
-            directory that is itself one moment, the directory's own name.
-        episode: The folder that holds the moment's folder, ``"pour"``, or None. Moments of one episode are
+            directory that is itself such a folder, the directory's own name.
+        episode: The folder that contains this folder, ``"pour"``, or None. Observations of one episode are
             alike.
-        observation: In Isaac-GR00T's nested form, with a batch of one; see
+        observation: In Isaac-GR00T's nested format, with a batch of one; see
             :meth:`saccade.Policy.example_observation`.
     """
 
@@ -48,35 +48,35 @@ class Moment:
 
     @property
     def instruction(self) -> str:
-        """What the robot is told."""
+        """The instruction."""
         return instruction_of(self.observation)
 
 
 def read_frames(
     directory: Path, policy: Policy, *, instruction: str | None = None, state: Path | None = None
-) -> list[Moment]:
+) -> list[PictureObservation]:
     """The observations of a directory, in the order of their names (2 before 10).
 
-    A folder with one picture for each camera, named after it, is a moment: ``front.png``, ``wrist.jpg``. It
-    may also hold ``state.json``, see :func:`read_state`. The directory is
+    A folder with one picture for each camera, named after it, is an observation: ``front.png``,
+    ``wrist.jpg``. It may also contain ``state.json``, see :func:`read_state`. The directory is
 
-    - one moment: ``DIR/front.png``;
-    - or a folder for each moment: ``DIR/0001/front.png``, ``DIR/0002/front.png``;
-    - or one for each episode, with a folder for each moment: ``DIR/pour/0001/front.png``.
+    - one observation: ``DIR/front.png``;
+    - or a folder for each observation: ``DIR/0001/front.png``, ``DIR/0002/front.png``;
+    - or one for each episode, with a folder for each observation: ``DIR/pour/0001/front.png``.
 
     Hidden files and files that are no pictures are ignored. If the checkpoint does not name its cameras, all
-    pictures of a folder are views, in the order of their names. Where a robot sees several frames of a camera
-    at a time, the picture stands for all of them.
+    pictures of a folder are views, in the order of their names. If an observation contains several frames of
+    a camera, each of them is the picture.
 
     Args:
         directory: The directory.
         policy: The policy that is to accept the observations.
-        instruction: What the robot is told. Default: that of :meth:`saccade.Policy.example_observation`.
-        state: File with the state of moments that have no ``state.json``. Default: the middle of the robot's
+        instruction: The instruction. Default: that of :meth:`saccade.Policy.example_observation`.
+        state: File with the state of folders that have no ``state.json``. Default: the middle of the robot's
             range.
 
     Returns:
-        At least one moment.
+        At least one observation.
 
     Raises:
         FileNotFoundError, NotADirectoryError: There is no such directory or file.
@@ -88,15 +88,15 @@ def read_frames(
         >>> from saccade.observations.pictures import read_frames
         >>> def chunks(checkpoint: str, directory: Path) -> dict:
         ...     policy = saccade.Policy.from_pretrained(checkpoint)
-        ...     moments = read_frames(directory, policy, instruction="open the drawer")
-        ...     return {moment.name: policy.act(moment.observation, seed=0) for moment in moments}
+        ...     found = read_frames(directory, policy, instruction="open the drawer")
+        ...     return {one.name: policy.act(one.observation, seed=0) for one in found}
     """
     if not directory.is_dir():
         kind = NotADirectoryError if directory.exists() else FileNotFoundError
         raise kind(f"{directory}: no such directory; expected one with a picture for each camera")
     otherwise = None if state is None else read_state(state)
     found = []
-    for folder in moment_folders(directory, policy):
+    for folder in observation_folders(directory, policy):
         own = folder / STATE
         try:
             given = observation(
@@ -112,7 +112,7 @@ def read_frames(
             raise type(error)(f"{folder}: {error}") from None
         parts = folder.relative_to(directory).parts
         found.append(
-            Moment(
+            PictureObservation(
                 name="/".join(parts) or folder.resolve().name,
                 episode=parts[0] if len(parts) == 2 else None,
                 observation=given,
@@ -121,8 +121,8 @@ def read_frames(
     return found
 
 
-def moment_folders(directory: Path, policy: Policy) -> list[Path]:
-    """The folders of a directory that are moments, see `read_frames`.
+def observation_folders(directory: Path, policy: Policy) -> list[Path]:
+    """The folders of a directory that are observations, see :func:`read_frames`.
 
     Raises:
         InputError: There is none, or a folder has both pictures and folders.
@@ -141,9 +141,9 @@ def moment_folders(directory: Path, policy: Policy) -> list[Path]:
         if not inside or not levels:
             raise InputError(
                 f"{folder}: expected pictures named after the cameras ({example_names(policy)}), or a folder "
-                "of them for each moment, got no pictures"
+                "of them for each observation, got no pictures"
             )
-        return [moment for one in inside for moment in below(one, levels - 1)]
+        return [found for one in inside for found in below(one, levels - 1)]
 
     return below(directory, 2)
 
@@ -174,7 +174,7 @@ def pictures_in(folder: Path, policy: Policy) -> dict[str, Path]:
 
 
 def example_names(policy: Policy) -> str:
-    """What the pictures of a moment may be called."""
+    """Possible names of the pictures of an observation, for messages."""
     cameras = policy.requirements.cameras
     names = ["front"] if cameras is None else [camera.name for camera in cameras]
     return ", ".join(f"{name}.png" for name in names)
@@ -212,12 +212,12 @@ def by_number(path: Path) -> list[tuple[int, str]]:
 def observation(
     policy: Policy, pictures: Mapping[str, Path], instruction: str | None, state: Any
 ) -> dict[str, Any]:
-    """An observation in Isaac-GR00T's nested form, with a batch of one.
+    """An observation in Isaac-GR00T's nested format, with a batch of one.
 
     Args:
         policy: The policy that is to accept it.
-        pictures: Files by camera. The name may be empty if there is one camera. Empty: random frames.
-        instruction: What the robot is told, or None.
+        pictures: Files by camera. The name may be empty if there is one camera. Without any: random frames.
+        instruction: The instruction, or None.
         state: What :func:`read_state` returned, or None. What is None is that of
             :meth:`saccade.Policy.example_observation`.
 
@@ -250,7 +250,7 @@ def observation(
 
 
 def instruction_of(given: Mapping[str, Any]) -> str:
-    """The instruction of an observation of `observation`."""
+    """The instruction of an observation that :func:`observation` returned."""
     return str(next(iter(given["language"].values()))[0][0])
 
 

@@ -1,4 +1,4 @@
-"""What a robot's observation must contain: cameras, state and language, for checks and for messages."""
+"""Required cameras, state and language of a robot's observation, for checks and for messages."""
 
 from __future__ import annotations
 
@@ -38,21 +38,22 @@ class Requirements:
         state: Key and width of each part of the state, in order.
         state_history: Number of states in an observation.
         video_horizon: Number of frames of each camera in an observation; None if the checkpoint does not say.
-        language_keys: The keys of words that the checkpoint configures. The first is the instruction's. All
-            must be in an observation of Isaac-GR00T's forms.
+        language_keys: The language keys that the checkpoint configures. The first is the instruction's. All
+            must be in an observation of Isaac-GR00T's formats.
         requires_language: Whether a missing instruction is an error, as in Isaac-GR00T N1.6 and N1.7.
             Otherwise it is the released default.
         any_annotation: Whether the only key that contains "annotation" is the instruction, whatever it is
             called, as in Isaac-GR00T N1 and N1.5.
         takes_extra_cameras: Whether cameras beyond `cameras` are views too. All are then sorted by name, as
             in lerobot. Otherwise they are ignored.
-        rename_map: Keys of lerobot's form and the names that they get before anything else is read.
-        observation_indices, action_indices: The steps of observations and actions, to be told to clients.
+        rename_map: Keys of lerobot's format and the names that they get before anything else is read.
+        observation_indices, action_indices: The steps of observations and actions, which a server reports to
+            its clients.
     """
 
-    embodiment: str | None
-    cameras: tuple[Camera, ...] | None
-    state: tuple[tuple[str, int], ...]
+    embodiment: str | None = None
+    cameras: tuple[Camera, ...] | None = None
+    state: tuple[tuple[str, int], ...] = ()
     state_history: int = 1
     video_horizon: int | None = None
     language_keys: tuple[str, ...] = ()

@@ -1,1 +1,13 @@
-"""Policies in the robot's units: observation, prepare, encode, sample, units."""
+"""A whole policy: camera images, state and instruction in; actions in the robot's units out.
+
+:meth:`saccade.Policy.act` has five steps, each in a file of its own:
+
+1. ``reading``: parse and check the observation (:mod:`saccade.observations`).
+2. ``preparing``: resize frames and tokenize the prompt (:class:`saccade.Processor`).
+3. ``encoding``: compute features (:class:`saccade.Backbone`) and the context of the action head.
+4. ``sampling``: sample normalised actions (:class:`saccade.ActionHead`).
+5. ``units``: convert them to the robot's units (:class:`saccade.Normalizer`) and the observation's format.
+
+``loading`` loads the parts from a checkpoint, ``interfaces`` has what a policy requires of head and backbone,
+``compatibility`` checks that head and statistics fit each other, ``example`` makes an observation to try.
+"""

@@ -8,7 +8,7 @@ import numpy as np
 
 from saccade._internal.arrays import Float32Array
 from saccade.observations import Camera, Requirements
-from saccade.robots import Group, Normalizer
+from saccade.robots import LANGUAGE_KEY, Group, Normalizer
 from saccade.robots.rotations import POSES, from_matrix
 
 #: Size of the frames of a camera whose size is not known.
@@ -16,8 +16,8 @@ SIDE = 256
 
 INSTRUCTION = "pick up the red block"
 
-#: Isaac-GR00T's usual key of the instruction, and a camera, where a checkpoint names none.
-LANGUAGE_KEY, CAMERA = "annotation.human.action.task_description", "front"
+#: The camera of a checkpoint that names none.
+CAMERA = "front"
 
 
 def example_observation(needs: Requirements, normalizer: Normalizer, seed: int) -> dict[str, Any]:

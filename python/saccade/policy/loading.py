@@ -15,8 +15,8 @@ from saccade.errors import CheckpointError, InputError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.head.options import optional_integer, precisions_of_parts
-from saccade.observations import Camera, ObservationSources, observation_sources
-from saccade.policy.head import requested_id
+from saccade.observations import Camera, Requirements, read_requirements
+from saccade.policy.compatibility import requested_id
 from saccade.processor import Preprocessing, Processor
 from saccade.robots import DataConfigLike, Normalizer
 
@@ -34,10 +34,10 @@ class Parts:
     embodiment: int | None
     backbone: Backbone
     processor: Processor
-    sources: ObservationSources
+    requirements: Requirements
 
 
-def load(
+def load_parts(
     source: str | os.PathLike[str],
     *,
     embodiment: str | int | None,
@@ -71,7 +71,7 @@ def load(
             action_dim=config.encoder_action_dim,
         )
     horizon = _horizon(normalizer, action_horizon)
-    found = observation_sources(path, normalizer.embodiment, normalizer.data_config)
+    found = read_requirements(path, normalizer)
     if cameras is not None:
         found = replace(found, cameras=_chosen(cameras, found), takes_extra_cameras=False)
     processor = Processor.from_pretrained(
@@ -132,7 +132,7 @@ def check_whole(path: Path) -> None:
     )
 
 
-def _chosen(names: Sequence[str], found: ObservationSources) -> tuple[Camera, ...]:
+def _chosen(names: Sequence[str], found: Requirements) -> tuple[Camera, ...]:
     """Cameras by name, with the sizes that the checkpoint says.
 
     Raises:

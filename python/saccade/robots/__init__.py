@@ -6,13 +6,14 @@ N1.7), `lerobot` (with `lerobot_pipeline`) and `flat` (a mapping). `embodiments`
 release. `groups` has the arithmetic, `rotations` that of rotations and poses.
 """
 
-from saccade.robots.data_configs import RELEASED, DataConfig, DataConfigLike, data_config
+from saccade.robots.data_configs import LANGUAGE_KEY, RELEASED, DataConfig, DataConfigLike, data_config
 from saccade.robots.embodiments import N15_IDS, N16_IDS, N17_IDS
 from saccade.robots.files import read_json
 from saccade.robots.groups import Group, Robot
 from saccade.robots.normalizer import Normalizer, padded
 
 __all__ = [
+    "LANGUAGE_KEY",
     "N15_IDS",
     "N16_IDS",
     "N17_IDS",

@@ -24,6 +24,9 @@ DataConfigLike: TypeAlias = "str | os.PathLike[str] | Mapping[str, Any] | DataCo
 #: What may be done with a key. Keys without a mode are passed on unchanged.
 MODES = ("min_max", "q99", "mean_std", "scale", "binary", "sin_cos")
 
+#: Isaac-GR00T's usual key of the instruction.
+LANGUAGE_KEY = "annotation.human.action.task_description"
+
 #: Keys have one dot: the modality, and a name.
 KEY = re.compile(r"[^.]+\.[^.]+")
 
@@ -205,7 +208,8 @@ def _config(
     )
 
 
-_TASK, _SHORT, _COARSE = "human.action.task_description", "human.task_description", "human.coarse_action"
+_TASK = LANGUAGE_KEY.removeprefix("annotation.")
+_SHORT, _COARSE = "human.task_description", "human.coarse_action"
 
 _GR1_ARMS = "left_arm right_arm left_hand right_hand"
 _G1_BODY = "left_leg right_leg waist left_arm right_arm left_hand right_hand"

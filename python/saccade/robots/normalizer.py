@@ -138,7 +138,7 @@ class Normalizer(Robot):
             normalised = padded(_mapped(values, self.state_groups, Group.to_head), self.state_dim)
         return like_features(normalised, is_torch(state))
 
-    def unstate(self, state: ArrayLike) -> Array:
+    def denormalize_state(self, state: ArrayLike) -> Array:
         """The inverse of :meth:`state`: ``(..., state_dim)`` to ``(..., state_width)``.
 
         Constant dimensions are returned as the constant, and clipped values stay clipped.
@@ -183,7 +183,7 @@ class Normalizer(Robot):
         robot = _mapped(values, self.action_groups, Group.to_robot)
         return like_features(self._absolute(robot, state), is_torch(actions))
 
-    def unactions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
+    def normalize_actions(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
         """The inverse of :meth:`actions`, for training.
 
         The result is zero-padded on the right, and clipped as in the code that trained the head.
@@ -204,7 +204,7 @@ class Normalizer(Robot):
     def previous_chunk(self, actions: ArrayLike, state: ArrayLike | None = None) -> Array:
         """Converts a chunk to the ``previous_chunk`` of :meth:`saccade.ActionHead.sample`.
 
-        This is :meth:`unactions` without clipping, so that frozen actions keep their values.
+        This is :meth:`normalize_actions` without clipping, so that frozen actions keep their values.
         """
         groups = tuple(replace(group, clips=False) for group in self.action_groups)
         return self._to_head("previous_chunk", actions, state, groups)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from saccade.observations import Reading
+from saccade.observations import ParsedObservation
 from saccade.serve.requests import Call
 
 #: A client that asked within these seconds is expected to ask again.
@@ -22,7 +22,7 @@ class Job:
 
     Attributes:
         call: What it asks for.
-        reading: Its observations.
+        parsed: Its observations.
         client: Who asks.
         is_msgpack_numpy: In which form its arrays came, and those of the answer go.
         inputs: What the backbone takes, or why there is none, once it is prepared.
@@ -33,7 +33,7 @@ class Job:
     """
 
     call: Call
-    reading: Reading
+    parsed: ParsedObservation
     client: Hashable
     is_msgpack_numpy: bool = False
     inputs: Sequence[Any] | BaseException | None = None
@@ -45,7 +45,7 @@ class Job:
     @property
     def rows(self) -> int:
         """Number of its observations."""
-        return len(self.reading)
+        return len(self.parsed)
 
 
 class Queue:

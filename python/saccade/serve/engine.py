@@ -13,8 +13,11 @@ import numpy as np
 
 from saccade import _saccade
 from saccade._internal.arrays import Float32Array
+from saccade.errors import InputError
 from saccade.head.chunking import Chunking
-from saccade.head.options import PolicyOptions, noise_or_draw
+from saccade.head.options import noise_or_draw
+from saccade.policy.encoding import compute_features, encode_features
+from saccade.policy.preparing import prepare_inputs
 from saccade.serve.batching import Job
 from saccade.serve.requests import CHUNKING, RELEASED_CHUNKING
 from saccade.serve.sessions import Chunk, Session, Sessions
@@ -89,7 +92,10 @@ class Engine:
         self._num_steps = num_steps
         self._running = 0
         self._lock = threading.Lock()
-        is_small = policy.backbone is not None and policy.backbone.nbytes <= SMALL_BACKBONE
+        if policy.backbone is None or policy.processor is None:
+            raise InputError(f"policy: expected a whole policy, got one without a backbone: {policy!r}")
+        self._backbone, self._processor = policy.backbone, policy.processor
+        is_small = policy.backbone.nbytes <= SMALL_BACKBONE
         self.num_workers = policy.head.num_threads if is_small else 1
 
     def prepare(self, job: Job) -> None:
@@ -97,7 +103,7 @@ class Engine:
         if job.inputs is None:
             with _timed([job], "inputs"):
                 try:
-                    job.inputs = self._policy.inputs(job.reading)
+                    job.inputs = prepare_inputs([job.parsed], self._processor)
                 except BaseException as error:
                     job.inputs = error
 
@@ -171,7 +177,7 @@ class Engine:
             return []
         every = [one for work in works for one in work.inputs]
         with _timed([work.job for work in works], "backbone"):
-            features = self._policy.features(every)
+            features = compute_features(every, self._backbone)
         start = 0
         for work in works:
             work.features = features[start : start + len(work.inputs)]
@@ -186,17 +192,16 @@ class Engine:
         return outcomes
 
     def _sampled(self, works: Sequence[_Work], batch: int) -> list[Outcome]:
-        options: PolicyOptions = {
-            "noise": np.concatenate([work.noise for work in works]),
-            "num_steps": works[0].num_steps,
-        }
-        if works[0].continued is not None:
-            options["chunking"] = works[0].continued[1]
-            options["previous_chunk"] = [
-                work.continued[0].actions for work in works if work.continued is not None
-            ]
-        context = self._policy.context([one for work in works for one in work.features])
-        found = self._policy.sample(context, [work.job.reading for work in works], **options)
+        first = works[0].continued
+        previous = [work.continued[0].actions for work in works if work.continued is not None]
+        found = self._policy.sample(
+            encode_features([one for work in works for one in work.features], self._policy.head),
+            [work.job.parsed for work in works],
+            noise=np.concatenate([work.noise for work in works]),
+            num_steps=works[0].num_steps,
+            previous_chunk=None if first is None else previous,
+            chunking=None if first is None else first[1],
+        )
         outcomes = []
         for work, actions in zip(works, found, strict=True):
             if work.session is not None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal.json import dumps
 from saccade.checkpoints import hub
 from saccade.errors import CheckpointError
-from saccade.robots import read_json
+from saccade.robots import LANGUAGE_KEY, read_json
 from saccade.robots.reading import processor_folder
 
 if TYPE_CHECKING:
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 #: The forms of the answer: that of N1.5, and that of N1.6 and later.
 FORMS = ("text", "map")
 MODALITIES = ("video", "state", "action", "language")
-#: Isaac-GR00T's usual key of the instruction, where a checkpoint names none.
-LANGUAGE_KEY = "annotation.human.action.task_description"
 
 Configs = dict[str, dict[str, Any]]
 

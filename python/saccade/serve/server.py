@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from saccade import observations as dialects
+from saccade import observations
 from saccade.checkpoints import hub
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import engine, modalities, pickles
@@ -192,10 +192,10 @@ class Server:
             call = parse(message.value, self._most_steps, self._seed)
             endpoint = call.endpoint
             if endpoint == "get_action":
-                reading = self._read(call)
+                parsed = self._read(call)
                 reply = (connection, replace(request, payload=bytearray()))  # the payload was unpacked
                 self._enqueue(
-                    Job(call, reading, connection, message.is_msgpack_numpy, received=received, reply=reply)
+                    Job(call, parsed, connection, message.is_msgpack_numpy, received=received, reply=reply)
                 )
                 return
             self._connections.send(connection, request, pack(self._answer(connection, call)))
@@ -227,13 +227,13 @@ class Server:
         self.stop("kill")
         return {"status": "ok", "message": "Server is stopping"}
 
-    def _read(self, call: Call) -> dialects.Reading:
+    def _read(self, call: Call) -> observations.ParsedObservation:
         """The observations of a request, if it can be taken."""
         if self._stopping is not None:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
-        return dialects.read(call.observation, self._policy.requirements, self._limits.rows)
+        return observations.read(call.observation, self._policy.requirements, self._limits.rows)
 
     def _enqueue(self, job: Job) -> None:
         connection, _ = job.reply

@@ -13,7 +13,7 @@ from saccade_lab.study.questions.sweeps import equal_mass
 from saccade_lab.study.questions.sweeps_results import PLAIN
 from saccade_lab.study.source import episode_rng
 
-from saccade.policy.head import Head
+from saccade.policy.interfaces import Head
 
 if TYPE_CHECKING:
     from saccade_lab.sim.rollout import Episode
@@ -86,7 +86,7 @@ def find_arm(name: str) -> PolicyArm | None:
 
 
 class SteppedHead:
-    """A head that takes another number of Euler steps; a `saccade.policy.head.Head`.
+    """A head that takes another number of Euler steps; a `saccade.policy.interfaces.Head`.
 
     Args:
         head: The head that computes.

@@ -17,7 +17,7 @@ import saccade
 from saccade import Policy, Processor
 from saccade.cli import main
 from saccade.observations import view_places
-from saccade.policy.parts import parts_of
+from saccade_lab.inside import features_of, inputs_of, parts_of
 from saccade_lab.maps.drawing import HEAT, show
 from saccade_lab.maps.grid import by_token, region_of, view_pictures
 from saccade_lab.maps.layout import Camera
@@ -75,8 +75,8 @@ def test_bars_of_a_processor_lie_beside_the_frame() -> None:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_layout_is_that_of_the_features(layout: str) -> None:
     policy, view = loaded(layout), view_of(layout)
-    (inputs,) = policy.inputs(policy.example_observation())
-    (features,) = policy.features([inputs])
+    (inputs,) = inputs_of(policy, policy.example_observation())
+    (features,) = features_of(policy, [inputs])
     found = view.layout
     parts = found.parts()
     for name, positions in features.views.items():
@@ -119,7 +119,7 @@ def test_the_frame_behind_a_token_is_what_the_token_sees(layout: str) -> None:
     video = seen["video"]
     changed = grey(video[camera.name], *behind(place, *video[camera.name].shape[2:4]))
     (before,), (after,) = (
-        policy.inputs({**seen, "video": {**video, camera.name: frames}})
+        inputs_of(policy, {**seen, "video": {**video, camera.name: frames}})
         for frames in (video[camera.name], changed)
     )
     difference = [

@@ -143,7 +143,7 @@ def test_blanking_a_picture_of_one_colour_changes_nothing(
     grey = np.full_like(pushed.images["top"], 90)
     observation = {
         "images": {**pushed.images, "top": grey},
-        "proprio": np.asarray(policy.whole.normalizer.unstate(pushed.observation.state)).ravel(),
+        "proprio": np.asarray(policy.whole.normalizer.denormalize_state(pushed.observation.state)).ravel(),
         "instruction": pushed.source["instruction"],
     }
     nested = policy.observation(observation)

@@ -15,7 +15,7 @@ import torch
 from saccade import BackboneInputs, Policy
 from saccade.cli import main
 from saccade.observations.pictures import read_frames
-from saccade.policy.parts import as_head_takes_it, parts_of
+from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of, parts_of
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.study import derivatives as head_derivatives
 from saccade_lab.study import input_derivatives as derivatives
@@ -73,7 +73,7 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     rows = []
     for moment in read_frames(frames, policy, instruction=TOLD):
         (features,) = policy.encode(moment.observation).features
-        rows.append(as_head_takes_it(policy, moment.observation, features))
+        rows.append(head_inputs(policy, moment.observation, features))
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(row, name) for row in rows])
         for name in ("backbone_features", "state", "embodiment_id", "image_mask")
@@ -269,13 +269,15 @@ def test_a_derivative_is_what_a_small_change_does_in_rust() -> None:
     policy = loaded("isaac")
     parts = parts_of(policy)
     seen = policy.example_observation()
-    (inputs,) = policy.inputs(seen)
-    (features,) = policy.features([inputs])
-    given = as_head_takes_it(policy, seen, features).with_noise(np.random.default_rng(0), parts.head.config)
+    (inputs,) = inputs_of(policy, seen)
+    (features,) = features_of(policy, [inputs])
+    given = head_inputs(policy, seen, features).with_noise(np.random.default_rng(0), parts.head.config)
     assert given.noise is not None
 
     def chunk(changed: BackboneInputs) -> np.ndarray:
-        return np.asarray(given.sample(parts.head, policy.context(policy.features([changed])).context))
+        return np.asarray(
+            given.sample(parts.head, context_of(policy, features_of(policy, [changed])).context)
+        )
 
     direction = np.random.default_rng(1).standard_normal(chunk(inputs).shape).astype(np.float32)
     head, backbone = ActionHead.from_pretrained(whole("isaac")), Backbone.from_pretrained(whole("isaac"))

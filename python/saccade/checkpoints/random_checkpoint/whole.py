@@ -19,6 +19,7 @@ from saccade.checkpoints.random_checkpoint.robot_metadata import metadata
 from saccade.checkpoints.random_checkpoint.tensors import Outliers, Tensor, write_file
 from saccade.checkpoints.random_checkpoint.tokenizer import FIRST_ADDED, token_id, tokenizer
 from saccade.errors import InputError
+from saccade.robots.data_configs import LANGUAGE_KEY
 
 #: The robot of the checkpoint: its tag and published id, the width of each group of joints, its cameras.
 EMBODIMENT = "new_embodiment"
@@ -241,7 +242,7 @@ def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed:
         "video": (CAMERAS, [0]),
         "state": (list(GROUPS), [0]),
         "action": (list(GROUPS), list(range(16))),
-        "language": (["annotation.human.action.task_description"], [0]),
+        "language": ([LANGUAGE_KEY], [0]),
     }
     modality_config = {
         kind: {"delta_indices": indices, "modality_keys": list(names)}

@@ -1,16 +1,16 @@
-"""Reads from a checkpoint's files what the observations of a robot contain: cameras, words, steps, names."""
+"""Reads from a checkpoint's files which cameras and language keys the observations of a robot have."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from saccade.errors import CheckpointError
 from saccade.observations.lerobot import IMAGE, IMAGES
-from saccade.observations.requirements import Camera
-from saccade.robots import DataConfig, read_json
+from saccade.observations.requirements import Camera, Requirements
+from saccade.robots import Robot, read_json
 from saccade.robots.building import size_of
 from saccade.robots.lerobot_pipeline import read_pipeline
 from saccade.robots.reading import processor_folder, processor_version
@@ -19,57 +19,41 @@ from saccade.robots.reading import processor_folder, processor_version
 ALIASES = {"wrist_image": "image2"}
 
 
-@dataclass(frozen=True)
-class ObservationSources:
-    """What a checkpoint says about the observations of one robot: fields of `Requirements`.
-
-    Attributes:
-        cameras, video_horizon, language_keys, requires_language, any_annotation, takes_extra_cameras,
-            rename_map, observation_indices, action_indices: As in :class:`saccade.observations.Requirements`.
-    """
-
-    cameras: tuple[Camera, ...] | None = None
-    video_horizon: int | None = None
-    language_keys: tuple[str, ...] = ()
-    requires_language: bool = False
-    any_annotation: bool = False
-    takes_extra_cameras: bool = False
-    rename_map: tuple[tuple[str, str], ...] = ()
-    observation_indices: tuple[int, ...] | None = None
-    action_indices: tuple[int, ...] | None = None
-
-
-def observation_sources(
-    folder: Path, embodiment: str | None, data_config: DataConfig | None = None
-) -> ObservationSources:
-    """What the files of a checkpoint say about a robot's observations.
+def read_requirements(folder: Path, robot: Robot) -> Requirements:
+    """The requirements of a robot's observations: its state, and what a checkpoint says about the rest.
 
     Args:
         folder: The checkpoint's directory. A single file says nothing.
-        embodiment: Tag of the robot.
-        data_config: The data config of a robot of N1 or N1.5, or None.
+        robot: The robot, such as a :class:`saccade.Normalizer`.
 
     Raises:
         CheckpointError: A file is damaged.
     """
+    return replace(
+        _from_files(folder, robot),
+        embodiment=robot.embodiment,
+        state=tuple((group.key, group.size) for group in robot.state_groups),
+        state_history=robot.state_history or 1,
+    )
+
+
+def _from_files(folder: Path, robot: Robot) -> Requirements:
     for name, reader in FILES.items():
         where = processor_folder(folder) if reader is _processor else folder
         if not (where / name).is_file():
             continue
         try:
-            found = reader(folder, read_json(where / name), embodiment, data_config)
+            found = reader(folder, read_json(where / name), robot)
         except (AttributeError, KeyError, TypeError, IndexError, ValueError) as error:
             if isinstance(error, CheckpointError):
                 raise
             raise CheckpointError(f"{where / name}: cameras of an unknown form ({error!r})") from error
         if found is not None:
             return found
-    return ObservationSources()
+    return Requirements()
 
 
-def _lerobot(
-    folder: Path, values: Mapping[str, Any], embodiment: str | None, data_config: DataConfig | None
-) -> ObservationSources | None:
+def _lerobot(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirements | None:
     """lerobot: the policy's features, sorted by name; or N1.7's keys that are among them, in their order."""
     pipeline = read_pipeline(folder, values)
     if pipeline is None:
@@ -83,7 +67,7 @@ def _lerobot(
     ]
     ordered = _ordered(_names(pack.get("video_modality_keys") or []), names)
     cameras = ordered or tuple(Camera(name) for name in names)
-    return ObservationSources(
+    return Requirements(
         cameras=cameras or None,
         # N1.7 without a horizon takes every frame that there is.
         video_horizon=size_of(pack.get("video_horizon")) or (None if pipeline.is_n17 else 1),
@@ -107,26 +91,24 @@ def _ordered(keys: list[str], names: list[str]) -> tuple[Camera, ...]:
     return tuple(found)
 
 
-def _processor(
-    folder: Path, values: Mapping[str, Any], embodiment: str | None, data_config: DataConfig | None
-) -> ObservationSources | None:
+def _processor(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirements | None:
     """Isaac-GR00T N1.6 and N1.7: modality configs by robot."""
     if "processor_kwargs" not in values:
         return None
     robots = values["processor_kwargs"].get("modality_configs") or {}
-    robot = robots.get(str(embodiment))
-    if robot is None:
-        return ObservationSources(requires_language=True)
-    video, language = robot.get("video") or {}, robot.get("language") or {}
+    about = robots.get(str(robot.embodiment))
+    if about is None:
+        return Requirements(requires_language=True)
+    video, language = about.get("video") or {}, about.get("language") or {}
     cameras = _names(video.get("modality_keys") or [])
     keys = _names(language.get("modality_keys") or [])
     if len(keys) > 1 and processor_version(folder, values) == "n1.6":
         raise CheckpointError(
-            f"{folder}: {embodiment}: expected one language key, as the released N1.6 does, got "
+            f"{folder}: {robot.embodiment}: expected one language key, as the released N1.6 does, got "
             f"{', '.join(keys)}"
         )
     steps = video.get("delta_indices") or []
-    return ObservationSources(
+    return Requirements(
         cameras=tuple(Camera(name) for name in cameras) or None,
         video_horizon=len(steps) or None,
         language_keys=tuple(keys),
@@ -134,21 +116,19 @@ def _processor(
     )
 
 
-def _metadata(
-    folder: Path, values: Mapping[str, Any], embodiment: str | None, data_config: DataConfig | None
-) -> ObservationSources:
+def _metadata(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirements:
     """Isaac-GR00T N1 and N1.5: cameras of the data config, or all, of the size that the data set has."""
-    robot = values.get(str(embodiment))
-    if robot is None:
-        return ObservationSources(any_annotation=True)
-    known = robot["modalities"].get("video") or {}
+    about, data_config = values.get(str(robot.embodiment)), robot.data_config
+    if about is None:
+        return Requirements(any_annotation=True)
+    known = about["modalities"].get("video") or {}
     cameras = []
     for name in known if data_config is None else data_config.keys("video"):
         width, height = (size_of(size) for size in (known[name].get("resolution") or (None, None)))
         cameras.append(Camera(name, height, width) if height and width else Camera(name))
     if data_config is None:
-        return ObservationSources(tuple(cameras) or None, any_annotation=True)
-    return ObservationSources(
+        return Requirements(cameras=tuple(cameras) or None, any_annotation=True)
+    return Requirements(
         cameras=tuple(cameras),
         video_horizon=len(data_config.observation_indices),
         language_keys=data_config.language_keys,
@@ -165,10 +145,7 @@ def _names(given: Any) -> list[str]:
 
 
 #: Files of a checkpoint that name cameras, in the order in which they are tried: that of the statistics.
-FILES: dict[
-    str,
-    Callable[[Path, Mapping[str, Any], str | None, DataConfig | None], ObservationSources | None],
-] = {
+FILES: dict[str, Callable[[Path, Mapping[str, Any], Robot], Requirements | None]] = {
     "policy_preprocessor.json": _lerobot,
     "processor_config.json": _processor,
     "experiment_cfg/metadata.json": _metadata,

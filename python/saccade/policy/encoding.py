@@ -1,0 +1,110 @@
+"""Step 3 of :meth:`saccade.Policy.act`: the backbone's features, and the context of the action head."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from saccade.backbone.features import BackboneFeatures
+from saccade.backbone.inputs import BackboneInputs
+from saccade.errors import InputError
+from saccade.head.context import Context
+from saccade.policy.interfaces import Head, VisionLanguageBackbone
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyContext:
+    """Encoded observations of a whole policy. Returned by :meth:`saccade.Policy.encode`.
+
+    The context is immutable and is not stored by the policy. Pass it to :meth:`saccade.Policy.sample` for
+    actions, and as ``previous`` with the next observation, so that what did not change is not computed again.
+
+    Attributes:
+        context: The head's context: the keys and values of its cross-attention. ``batch`` observations, those
+            with fewer tokens than the longest padded, and the padding dropped.
+        features: The backbone's features of each observation, a batch of one each.
+
+    Example:
+        >>> import saccade
+        >>> def act_twice(policy: saccade.Policy, first: dict, second: dict) -> list:
+        ...     context = policy.encode(first)
+        ...     actions = [policy.sample(context, first, seed=0)]
+        ...     context = policy.encode(second, previous=context)
+        ...     return [*actions, policy.sample(context, second, seed=0)]
+    """
+
+    context: Context
+    features: tuple[BackboneFeatures, ...]
+
+    @property
+    def batch(self) -> int:
+        """Number of observations."""
+        return len(self.features)
+
+    @property
+    def num_vl_tokens(self) -> int:
+        """Number of vision-language tokens of the longest observation."""
+        return self.context.num_vl_tokens
+
+    def __repr__(self) -> str:
+        return f"<saccade.PolicyContext batch={self.batch} num_vl_tokens={self.num_vl_tokens}>"
+
+
+def encode_inputs(
+    inputs: Sequence[BackboneInputs],
+    backbone: VisionLanguageBackbone,
+    head: Head,
+    previous: PolicyContext | None = None,
+) -> PolicyContext:
+    """The context of inputs: :func:`compute_features` followed by :func:`encode_features`.
+
+    Args:
+        inputs: As :func:`saccade.policy.preparing.prepare_inputs` returns them.
+        backbone, head: The parts of the policy.
+        previous: The context of earlier observations, from which unchanged views and prompts are taken.
+
+    Raises:
+        InputError: ``previous`` is no context of this policy.
+    """
+    return encode_features(compute_features(inputs, backbone, previous), head)
+
+
+def compute_features(
+    inputs: Sequence[BackboneInputs],
+    backbone: VisionLanguageBackbone,
+    previous: PolicyContext | None = None,
+) -> tuple[BackboneFeatures, ...]:
+    """The backbone's features of each of its inputs. Arguments and errors as in :func:`encode_inputs`."""
+    if previous is not None and not isinstance(previous, PolicyContext):
+        raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
+    return tuple(backbone.encode_many(inputs, previous=() if previous is None else previous.features))
+
+
+def encode_features(features: Sequence[BackboneFeatures], head: Head) -> PolicyContext:
+    """The context of features, each a batch of one of any length."""
+    # Shorter ones are padded, and their padding is dropped, which gives the bits without padding.
+    lengths = [one.backbone_features.shape[1] for one in features]
+    longest = max(lengths)
+    dropped = np.arange(longest) >= np.array(lengths)[:, None]
+    context = head.encode(
+        _joined([pad_tokens(one.backbone_features, longest) for one in features]),
+        image_mask=_joined([pad_tokens(one.image_mask, longest) for one in features]),
+        drop_vl=dropped if dropped.any() else None,
+    )
+    return PolicyContext(context, tuple(features))
+
+
+def pad_tokens(array: Any, length: int) -> Any:
+    """``(1, T, ...)`` zero-padded to ``(1, length, ...)``."""
+    missing = length - array.shape[1]
+    if missing == 0:
+        return array
+    return np.concatenate([array, np.zeros((1, missing, *array.shape[2:]), array.dtype)], axis=1)
+
+
+def _joined(arrays: list[Any]) -> Any:
+    """Batches of one as one batch. A single one is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)

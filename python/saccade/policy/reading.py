@@ -1,0 +1,100 @@
+"""Step 1 of :meth:`saccade.Policy.act`: parse and check one observation or several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeAlias, TypeVar
+
+import numpy as np
+
+from saccade._internal.arrays import Float32Array
+from saccade.errors import InputError
+from saccade.observations import ParsedObservation, ParsedState, Requirements, read, read_state
+
+#: One observation in a format of :mod:`saccade.observations`, with or without a batch axis.
+Observation: TypeAlias = Mapping[str, Any]
+#: One or several observations. Each may have been parsed already by :func:`saccade.observations.read`.
+Observations: TypeAlias = Observation | ParsedObservation | Sequence[Observation | ParsedObservation]
+
+Parsed = TypeVar("Parsed", bound=ParsedState, covariant=True)
+Kind = TypeVar("Kind", bound=ParsedState)
+
+
+@dataclass(frozen=True, eq=False)
+class Batch(Generic[Parsed]):
+    """Parsed observations that are computed together.
+
+    Attributes:
+        parsed: The observations, each of which may have several rows.
+        is_single: Whether one observation was given, and not a sequence.
+    """
+
+    parsed: Sequence[Parsed]
+    is_single: bool
+
+    def __iter__(self) -> Iterator[Parsed]:
+        return iter(self.parsed)
+
+    def __len__(self) -> int:
+        return len(self.parsed)
+
+    @property
+    def state(self) -> Float32Array:
+        """The states of all rows, ``(rows, state_history, state_width)`` in the robot's units."""
+        return np.concatenate([one.state for one in self.parsed])
+
+
+def is_observation(value: Any) -> bool:
+    """Whether a value is an observation or a sequence of them, and not an array."""
+    if isinstance(value, (list, tuple)):
+        return bool(value) and isinstance(value[0], Mapping | ParsedObservation)
+    return isinstance(value, Mapping | ParsedObservation)
+
+
+def read_observations(observations: Observations, needs: Requirements) -> Batch[ParsedObservation]:
+    """Parses and checks observations.
+
+    Raises:
+        InputError, ShapeError, DtypeError: One does not fit the robot, or was parsed for another policy.
+    """
+    listed, is_single = _listed(observations)
+    return Batch([_parsed(one, needs, read) for one in listed], is_single)
+
+
+def read_states(observations: Observations, needs: Requirements) -> Batch[ParsedState]:
+    """Parses and checks only the states of observations. Raises as :func:`read_observations`."""
+    listed, is_single = _listed(observations)
+    return Batch([_parsed(one, needs, read_state) for one in listed], is_single)
+
+
+def _parsed(
+    observation: Observation | ParsedObservation,
+    needs: Requirements,
+    reader: Callable[[Observation, Requirements], Kind],
+) -> Kind | ParsedObservation:
+    """An observation that was parsed before as it is; any other as the reader parses it."""
+    if not isinstance(observation, ParsedObservation):
+        return reader(observation, needs)
+    if observation.needs != needs:
+        raise InputError(
+            f"observation: expected what was read for this policy, got what was read for "
+            f"another: {observation.needs}, but {needs}"
+        )
+    return observation
+
+
+def _listed(observations: Observations) -> tuple[list[Any], bool]:
+    """Observations as a list, and whether only one was given.
+
+    Raises:
+        InputError: There is none.
+    """
+    if isinstance(observations, Mapping | ParsedObservation):
+        return [observations], True
+    found = list(observations) if isinstance(observations, (list, tuple)) else []
+    if not found:
+        raise InputError(
+            f"observation: expected a mapping, or several of them, got {type(observations).__name__}"
+        )
+    return found, False

@@ -1,0 +1,124 @@
+"""Step 4 of :meth:`saccade.Policy.act`: sample normalised actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from saccade._internal.arrays import Array, ArrayLike, float32
+from saccade.errors import InputError, ShapeError
+from saccade.head.chunking import Chunking
+from saccade.head.context import Context
+from saccade.head.intervention import Intervention
+from saccade.observations import ParsedState
+from saccade.policy.interfaces import Head
+from saccade.policy.reading import Batch
+from saccade.robots import Normalizer, padded
+
+
+@dataclass(frozen=True, eq=False)
+class Sampling:
+    """The options of one call of :meth:`saccade.Policy.sample`, which documents them."""
+
+    noise: ArrayLike | None = None
+    seed: Any = None
+    num_steps: int | None = None
+    integrator: str | None = None
+    num_samples: int | None = None
+    future_refresh: int | None = None
+    intervention: Intervention | Sequence[Intervention] | None = None
+    previous_chunk: Any = None
+    chunking: Chunking | None = None
+
+
+def sample_actions(
+    context: Context,
+    batch: Batch[ParsedState],
+    options: Sampling,
+    head: Head,
+    normalizer: Normalizer,
+    embodiment_id: int,
+) -> Array:
+    """Normalised actions for parsed observations, as :meth:`saccade.ActionHead.sample` returns them.
+
+    Raises:
+        InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.sample`.
+    """
+    state = batch.state
+    if len(state) != context.batch:
+        raise InputError(f"observation: expected {context.batch}, as many as in context, got {len(state)}")
+    if options.previous_chunk is not None:
+        options = replace(options, previous_chunk=_joined_chunks(options.previous_chunk, batch, normalizer))
+    if options.noise is not None and batch.is_single:
+        axes = 3 if options.num_samples is None else 4
+        options = replace(options, noise=_with_batch_axis(np.asarray(options.noise), axes, batch.parsed[0]))
+    return sample_state(context, state, options, head, normalizer, embodiment_id)
+
+
+def sample_state(
+    context: Context,
+    state: ArrayLike,
+    options: Sampling,
+    head: Head,
+    normalizer: Normalizer,
+    embodiment_id: int,
+) -> Array:
+    """Normalised actions for a state in the robot's units. Raises as :func:`sample_actions`."""
+    if options.previous_chunk is not None:
+        options = _continued(options, state, head, normalizer)
+    given = {name: value for name, value in vars(options).items() if value is not None}
+    return head.sample(context, normalizer.state(state), embodiment_id, **given)
+
+
+def _joined_chunks(given: Any, batch: Batch[ParsedState], normalizer: Normalizer) -> Any:
+    """The previous chunk of each observation, in its format, as one array."""
+    keys = tuple(group.key for group in normalizer.action_groups)
+    chunks = [given] if batch.is_single else list(given)
+    if len(chunks) != len(batch):
+        raise InputError(f"previous_chunk: expected {len(batch)}, got {len(chunks)}")
+    joined = [
+        _with_batch_axis(float32("previous_chunk", parsed.format.read_actions(chunk, keys)), 3, parsed)
+        for parsed, chunk in zip(batch, chunks, strict=True)
+    ]
+    if len({chunk.shape[1:] for chunk in joined}) != 1:
+        listed = ", ".join(str(chunk.shape) for chunk in joined)
+        raise ShapeError(f"previous_chunk: expected chunks of one length and width, got {listed}")
+    return np.concatenate(joined)
+
+
+def _with_batch_axis(array: Any, axes: int, parsed: ParsedState) -> Any:
+    """An array with a batch axis, which it may lack if the observation does."""
+    return array[None] if not parsed.is_batched and array.ndim == axes - 1 else array
+
+
+def _continued(options: Sampling, state: ArrayLike, head: Head, normalizer: Normalizer) -> Sampling:
+    """The options with the continued part of the previous chunk, normalised as the head takes it.
+
+    Its actions become the first of the new chunk, so they are normalised as these: each step may have
+    statistics of its own.
+    """
+    previous, chunking = float32("previous_chunk", options.previous_chunk), options.chunking
+    if isinstance(chunking, Chunking):
+        most = head.config.action_horizon
+        horizon = chunking.horizon or min(normalizer.action_horizon or most, most)
+        if previous.ndim < 2 or previous.shape[-2] < horizon:
+            raise ShapeError(
+                f"previous_chunk: expected a chunk of at least {horizon} actions (horizon of chunking), got "
+                f"shape {previous.shape}"
+            )
+        if not chunking.overlap <= horizon <= most:
+            raise InputError(
+                f"chunking: expected an overlap of at most {horizon} (horizon), and that to be at most "
+                f"{most}, which the head denoises, got an overlap of {chunking.overlap}"
+            )
+        if not chunking.overlap:  # nothing is continued
+            return replace(options, previous_chunk=None, chunking=None)
+        previous = previous[..., horizon - chunking.overlap : horizon, :]
+        chunking = replace(chunking, horizon=chunking.overlap)
+    normalised = np.asarray(normalizer.previous_chunk(previous, state))
+    return replace(
+        options, previous_chunk=padded(normalised, head.config.encoder_action_dim), chunking=chunking
+    )
