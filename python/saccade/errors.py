@@ -39,14 +39,14 @@ class MissingExtraError(SaccadeError, ModuleNotFoundError):
 
 
 def printable(message: str) -> str:
-    """Escapes control characters, except line breaks.
+    r"""Escapes control characters, except line breaks.
 
     Names and values from files appear in messages and may contain anything, escape sequences of terminals
     included.
 
     Example:
-        >>> print(printable("a\\x1b[2Jb"))
-        a\\x1b[2Jb
+        >>> print(printable("a\x1b[2Jb"))
+        a\x1b[2Jb
     """
     return "".join(
         character if character.isprintable() or character == "\n" else ascii(character)[1:-1]

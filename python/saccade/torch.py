@@ -326,8 +326,7 @@ def _place(weights: Sequence[torch.Tensor], heads: int, precision: str) -> tuple
 
 
 def _fingerprint(weights: Sequence[torch.Tensor]) -> bytes:
-    """A fingerprint of the weights: torch's version counters, the xor of the bits of each column, and
-    samples.
+    """A fingerprint of the weights: version counters, the xor of the bits of each column, and samples.
 
     The xor shows changes that torch does not count, unless changes in a column cancel (two rows swapped, an
     even number of signs flipped). Samples in every row and every column detect those as well, if they affect

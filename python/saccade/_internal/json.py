@@ -19,7 +19,9 @@ def dumps(
 
     Args:
         value: What `json.dumps` takes.
-        indent, ensure_ascii, default: As `json.dumps` takes them.
+        indent: As in `json.dumps`.
+        ensure_ascii: As in `json.dumps`.
+        default: As in `json.dumps`.
 
     Example:
         >>> dumps({"mean": float("nan"), "count": 2})

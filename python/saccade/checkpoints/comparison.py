@@ -72,8 +72,7 @@ def action_changes(
         config: Config of the source, as in ``resize``.
         features: A file of recorded observations, ``.npz`` or ``.safetensors``, see
             :func:`saccade.head.input_files.read_arrays`. Default: random observations of the first
-            embodiment,
-            which are less informative, because no robot produces them.
+            embodiment, which are less informative, because no robot produces them.
         seed: Seed of random observations, and of noise that the file does not contain.
         num_observations: Number of random observations.
         num_vl_tokens: Their number of vision-language tokens. 296 is what one camera produces in N1.5.

@@ -69,12 +69,12 @@ def describe(source: Source, config: Config = None) -> Description:
     """Describes a checkpoint by its ``config.json`` and the headers of its files. Reads no tensor.
 
     Args:
-        source, config: As for :meth:`saccade.ActionHead.from_pretrained`.
+        source: The checkpoint, as for :meth:`saccade.ActionHead.from_pretrained`.
+        config: Its config, as for :meth:`saccade.ActionHead.from_pretrained`.
 
     Raises:
-        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that
-        tensors need not
-            fit the config.
+        FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that tensors
+            need not fit the config.
     """
     return description_of(open_published(source, config), source)
 

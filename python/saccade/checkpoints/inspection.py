@@ -34,7 +34,8 @@ def inspect(
     One tensor, or the slice of one embodiment of it, is in memory at a time.
 
     Args:
-        source, config: As for :meth:`saccade.ActionHead.from_pretrained`.
+        source: The checkpoint, as for :meth:`saccade.ActionHead.from_pretrained`.
+        config: Its config, as for :meth:`saccade.ActionHead.from_pretrained`.
         reference: A checkpoint to compare with, tensor by tensor; for example the one that ``source`` was
             trained from.
         data_config: The data config of the robots of GR00T N1 and N1.5, as for

@@ -128,10 +128,9 @@ def quantize(
     and so are the other files of the directory: statistics, processors, tokenizers.
 
     :meth:`saccade.ActionHead.from_pretrained`, :meth:`saccade.Backbone.from_pretrained` and
-    :meth:`saccade.Policy.from_pretrained` read the
-    copy at every precision. At ``"int8"`` it gives the same bits as
-    the source at ``"int8"``. At the others, the weights are those that the integers represent. No other
-    program reads these weights.
+    :meth:`saccade.Policy.from_pretrained` read the copy at every precision. At ``"int8"`` it gives the same
+    bits as the source at ``"int8"``. At the others, the weights are those that the integers represent. No
+    other program reads these weights.
 
     One tensor at a time is in memory. The directory appears under its name when everything is written.
 
@@ -178,8 +177,8 @@ def convert(
     under its name when everything is written.
 
     Args:
-        source, config, out, head_only, force, progress: As in :func:`quantize`. Other programs need the
-            tensors outside the head.
+        source: As in :func:`quantize`.
+        out: As in :func:`quantize`.
         adapter: The directory or id of a LoRA adapter that PEFT saved (``adapter_config.json``,
             ``adapter_model.safetensors``). ``W + scaling * B A`` takes the place of each weight ``W`` that it
             adapts, and the tensors of its ``modules_to_save`` take the place of the source's, as by PEFT's
@@ -187,6 +186,7 @@ def convert(
             and rounded to that dtype. The adapter's other files (statistics, processors, lerobot's
             ``config.json``) take the place of the source's; if it has files that describe robots, those of
             the source are left out. A README of the adapter is not copied.
+        config: As in :func:`quantize`.
         embodiment_ids: The embodiments to keep. The layers of the others become zero. They keep their place,
             so that ids keep their numbers and every program that reads the source reads the copy. A note in
             the metadata of the files makes saccade refuse the ids that were removed. The zeros take no disk
@@ -196,6 +196,9 @@ def convert(
             the largest differences. int8 weights and their scales are kept.
         max_shard_bytes: Largest size of a file in bytes. A tensor that is larger gets a file of its own.
             Default: one file if the source has one, else 5 GB.
+        head_only: As in :func:`quantize`. Other programs need the tensors outside the head.
+        force: As in :func:`quantize`.
+        progress: As in :func:`quantize`.
 
     Raises:
         FileNotFoundError: ``source`` or the config does not exist.
@@ -245,12 +248,16 @@ def resize(
     Other programs do not read them. In those, r copies have r times the weight of the original.
 
     Args:
-        source, config, out, force, progress: As in :func:`quantize`.
+        source: As in :func:`quantize`.
+        out: As in :func:`quantize`.
         num_future_tokens: The new number. 0 removes all.
         perturbation: Root mean square of noise that is added to the copied tokens (the rows from N on),
             relative to the root mean square of all tokens, so that training can separate them. With noise,
             the copies are not exact.
         seed: Seed of the noise, at least 0.
+        config: As in :func:`quantize`.
+        force: As in :func:`quantize`.
+        progress: As in :func:`quantize`.
 
     Raises:
         FileNotFoundError: ``source`` or the config does not exist.

@@ -85,8 +85,10 @@ examples:
 
 @runtime_checkable
 class Command(Protocol):
-    """The interface of a command's module. A command of another distribution also has `EXTRAS`, its table of
-    optional packages (:class:`saccade._internal.extras.Extras`).
+    """The interface of a command's module.
+
+    A command of another distribution also has `EXTRAS`, its table of optional packages
+    (:class:`saccade._internal.extras.Extras`).
     """
 
     HELP: str
@@ -176,12 +178,12 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
 
 
 def describe(error: BaseException) -> str:
-    """What went wrong, on one line.
+    r"""What went wrong, on one line.
 
     Example:
         >>> describe(FileNotFoundError(2, "No such file or directory", "policy.safetensors"))
         'policy.safetensors: No such file or directory'
-        >>> describe(ValueError("first\\n  second"))
+        >>> describe(ValueError("first\n  second"))
         'first; second'
     """
     if isinstance(error, OSError) and error.strerror:

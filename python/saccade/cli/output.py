@@ -45,11 +45,11 @@ def prepare_streams() -> None:
 
 
 def replace_with_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Error handler of a codec: writes an ASCII replacement for what cannot be encoded.
+    r"""Error handler of a codec: writes an ASCII replacement for what cannot be encoded.
 
     Example:
         >>> codecs.register_error(REPLACE, replace_with_ascii)
-        >>> "R² 0.3–0.4 é \\udcff".encode("ascii", REPLACE)
+        >>> "R² 0.3–0.4 é \udcff".encode("ascii", REPLACE)
         b'R2 0.3-0.4 e ?'
     """
     if not isinstance(error, UnicodeEncodeError):

@@ -6,7 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from torch import Tensor, nn
 
 from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
@@ -18,10 +21,6 @@ from saccade.integrations import backbones, heads
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
 from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
 from saccade.integrations.weights import tensors_of
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor, nn
 
 #: Additional tolerance, relative to the noise, for rounding it at the start and after each of four steps. It
 #: matters for an untrained head, which hardly moves the noise.
@@ -54,19 +53,21 @@ def accelerate(
 
     Parts are recognised by their structure: the heads of lerobot and Isaac-GR00T, N1.5 to N1.7, and forks
     that :meth:`saccade.ActionHead.from_pretrained` supports, and the backbones of N1.5 and N1.7. The torch
-    weights stay
-    in memory. The copies in saccade take ``handle.head.nbytes`` and ``handle.backbone.nbytes`` more.
+    weights stay in memory. The copies in saccade take ``handle.head.nbytes`` and ``handle.backbone.nbytes``
+    more.
 
     Args:
         policy: `GrootPolicy` of lerobot, the policy or model of Isaac-GR00T, or the head itself.
         backbone: Whether the backbone computes in saccade too.
         precision: As in :meth:`saccade.ActionHead.from_pretrained`: one name for both parts, or with
-        `backbone` one for
-            each, as in ``{"backbone": "int8", "head": "bfloat16"}``. ``"float32"`` is exact up to rounding
-            for weights of any dtype.
+            `backbone` one for each, as in ``{"backbone": "int8", "head": "bfloat16"}``. ``"float32"`` is
+            exact up to rounding for weights of any dtype.
         num_threads: As in :meth:`saccade.ActionHead.from_pretrained`.
         embodiment_ids: The embodiments whose weights are copied. A call with another id is an error. Default:
             all.
+
+    Returns:
+        A handle, with which the originals are put back.
 
     Raises:
         InputError: `policy` does not contain exactly one head (and backbone), or a part is in training mode,
@@ -102,8 +103,7 @@ class Kinds:
 
 
 class Accelerated(StandIn[ActionHead]):
-    """The replacement of a torch head's `get_action`, and a handle to it and to the accelerated backbone.
-    Returned by :func:`accelerate`.
+    """The replacement of a torch head's `get_action`: what :func:`accelerate` returns.
 
     Any number of threads may call it. The weights may change: each call compares them, as far as
     :class:`saccade.integrations.weights.Watch` describes, and copies them again after a change, which takes
@@ -133,8 +133,9 @@ class Accelerated(StandIn[ActionHead]):
 
     @property
     def head(self) -> ActionHead:
-        """The head in saccade, with the current weights. Use it to look inside the head, as in
-        ``handle.head.trace(handle.head.encode(features), ...)``.
+        """The head in saccade, with the current weights.
+
+        It shows what the head computes: ``handle.head.trace(handle.head.encode(features), ...)``.
 
         Raises:
             InputError: As :attr:`module`, and as :func:`accelerate` if the weights have changed.
@@ -220,8 +221,6 @@ class Accelerated(StandIn[ActionHead]):
             InputError: The head is in training mode or has hooks, or a gradient is requested. Also as
                 :meth:`saccade.ActionHead.encode` and :meth:`saccade.ActionHead.sample`.
         """
-        import torch
-
         if options is not None and not self._takes_options:
             raise TypeError("get_action of this head takes no options")
         module = self.module
@@ -261,8 +260,6 @@ class Accelerated(StandIn[ActionHead]):
         return heads.settings_of(module)
 
     def _convert(self, module: nn.Module) -> ActionHead:
-        import torch
-
         self._kinds: dict[tuple[Any, ...], Kinds] = {}
         head = ActionHead.from_tensors(tensors_of(module), config=heads.config_of(module), **self._options)
         parameters = list(module.parameters())
@@ -278,8 +275,6 @@ class Accelerated(StandIn[ActionHead]):
 
         For a new combination the original runs on four tokens, and saccade must agree.
         """
-        import torch
-
         device = features.device.type
         autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
         key = (features.dtype, state.dtype, device, autocast)
@@ -319,8 +314,6 @@ class Accelerated(StandIn[ActionHead]):
 
 def draw(config: HeadConfig, batch: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """The noise `(batch, action_horizon, encoder_action_dim)`, drawn as in the original."""
-    import torch
-
     size = (batch, config.action_horizon, config.encoder_action_dim)
     return torch.randn(size=size, dtype=dtype, device=device)
 
@@ -354,8 +347,6 @@ def run(
 
 def most_active(module: nn.Module, embodiment_ids: Sequence[int]) -> int:
     """The embodiment whose decoders have the largest weights. It is a trained one, if there is any."""
-    import torch
-
     decoders = [
         parameter for name, parameter in module.named_parameters() if name.endswith("decoder.layer2.W")
     ]
@@ -370,8 +361,6 @@ def check_inputs(
     module: nn.Module, head: ActionHead, features: Tensor, state: Tensor
 ) -> tuple[Features, Features]:
     """A random observation of four tokens, with the dtypes and devices of `features` and `state`."""
-    import torch
-
     config, generator = head.config, torch.Generator().manual_seed(0)
     # On the CPU, whatever the default device is.
     shape = (1, len(CHECK_IMAGE), config.context_dim)
@@ -390,16 +379,14 @@ def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features]
     """Compares the original and saccade on the same inputs, from the same state of torch's generator.
 
     Args:
-        module: the original.
-        head: its copy in saccade.
-        inputs: backbone output and action input.
-        rounded: whether one of the two rounds to 8 bits.
+        module: The original.
+        head: Its copy in saccade.
+        inputs: Backbone output and action input.
+        rounded: Whether one of the two rounds to 8 bits.
 
     Raises:
-        InputError: the actions differ, or the original draws other random numbers.
+        InputError: The actions differ, or the original draws other random numbers.
     """
-    import torch
-
     backbone_output, action_input = inputs
     device = backbone_output.backbone_features.device
     theirs_output = Features(backbone_output)
@@ -434,6 +421,4 @@ def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features]
 
 def generator_state(device: torch.device) -> Tensor:
     """The state of torch's generator for this device."""
-    import torch
-
     return torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()

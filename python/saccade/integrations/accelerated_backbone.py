@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from torch import Tensor, nn
 
 from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
@@ -13,10 +16,6 @@ from saccade.head.options import LoadOptions
 from saccade.integrations import backbones
 from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
 from saccade.integrations.weights import tensors_of
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,6 @@ class AcceleratedBackbone(StandIn[Backbone]):
             InputError: The backbone has hooks inside, or there are inputs that saccade does not read. Also
                 as :meth:`saccade.Backbone.__call__`.
         """
-        import torch
-
         module = self.module
         parts = list(module.named_modules())
         if any(part.training for _, part in parts) or wants_gradient(module, vl_input):
@@ -94,8 +91,6 @@ class AcceleratedBackbone(StandIn[Backbone]):
         return backbones.settings_of(module)
 
     def _convert(self, module: nn.Module) -> Backbone:
-        import torch
-
         self._kinds: dict[tuple[Any, ...], Kinds] = {}
         backbone = Backbone.from_tensors(
             tensors_of(module),
@@ -116,8 +111,6 @@ class AcceleratedBackbone(StandIn[Backbone]):
 
         For a new combination the original runs on a random view, and saccade must agree.
         """
-        import torch
-
         to = torch.is_autocast_enabled(device.type) and torch.get_autocast_dtype(device.type)
         key = (device.type, to)
         kinds = self._kinds  # another thread may replace it when weights change
@@ -131,16 +124,12 @@ class AcceleratedBackbone(StandIn[Backbone]):
 @contextlib.contextmanager
 def autocast(device: torch.device) -> Iterator[None]:
     """Autocast to bfloat16, as lerobot's policies do."""
-    import torch
-
     with torch.autocast(device.type, torch.bfloat16):
         yield
 
 
 def wants_gradient(module: nn.Module, vl_input: Mapping[str, Any]) -> bool:
     """Whether a result of the original would have a gradient."""
-    import torch
-
     if not torch.is_grad_enabled():
         return False
     given = (value for value in vl_input.values() if isinstance(value, torch.Tensor))
@@ -156,16 +145,14 @@ def agree(module: nn.Module, backbone: Backbone, device: torch.device, rounded: 
     """Compares the original and saccade on the same random view.
 
     Args:
-        module: the original.
-        backbone: its copy in saccade.
-        device: where the original computes.
-        rounded: whether one of the two rounds to 8 bits.
+        module: The original.
+        backbone: Its copy in saccade.
+        device: Where the original computes.
+        rounded: Whether one of the two rounds to 8 bits.
 
     Raises:
-        InputError: the features differ.
+        InputError: The features differ.
     """
-    import torch
-
     given = backbones.check_inputs(module, backbone.config, device)
     result = type(module).forward(module, Features(given))
     theirs = result["backbone_features"]

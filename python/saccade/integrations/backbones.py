@@ -1,5 +1,4 @@
-"""Finds the torch backbone in a policy, and says how it is called: those of N1.5 and N1.7, recognised by
-structure.
+"""Finds the torch backbone in a policy, by structure, and calls it: those of N1.5 and N1.7.
 
 Both have `forward(vl_input)`, which takes what the policy's own processors prepare. In N1.5, names of inputs
 begin with `eagle_`.
@@ -8,16 +7,15 @@ begin with `eagle_`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from torch import Tensor, nn
 
 from saccade.backbone.config import BackboneConfig
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.integrations import modules
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor, nn
 
 #: What messages call it.
 NOUN = "backbone"
@@ -69,10 +67,10 @@ def find(policy: object) -> nn.Module:
     """The backbone in `policy`.
 
     Args:
-        policy: the backbone itself, a module that contains it, or an object that contains such a module.
+        policy: The backbone itself, a module that contains it, or an object that contains such a module.
 
     Raises:
-        InputError: there is none, or more than one.
+        InputError: There is none, or more than one.
     """
     wanted = (
         "backbone of GR00T N1.5 (a module with eagle_model and eagle_linear) or N1.7 (a module whose model "
@@ -100,11 +98,11 @@ def check(module: nn.Module, stand_in: object = None) -> None:
     """Checks that nothing but the backbone's parameters determines what it computes.
 
     Args:
-        module: the backbone.
-        stand_in: an accepted replacement of its `forward`.
+        module: The backbone.
+        stand_in: An accepted replacement of its `forward`.
 
     Raises:
-        InputError: the message lists every problem.
+        InputError: The message lists every problem.
     """
     parts = list(module.named_modules())
     problems = [
@@ -145,7 +143,7 @@ def config_of(module: nn.Module) -> dict[str, Any]:
     """The backbone's config, as :meth:`saccade.Backbone.from_tensors` takes it.
 
     Raises:
-        InputError: it contains values that JSON cannot represent.
+        InputError: It contains values that JSON cannot represent.
     """
     inner: Any = module
     language = language_model(module)
@@ -197,8 +195,8 @@ def inputs_of(module: nn.Module, vl_input: Mapping[str, Any]) -> BackboneInputs:
     """What saccade's backbone takes, from what the torch backbone is given.
 
     Raises:
-        InputError: there are inputs that saccade does not read, or padding that it does not reproduce.
-        ShapeError, DtypeError: a tensor does not fit.
+        InputError: There are inputs that saccade does not read, or padding that it does not reproduce.
+        ShapeError, DtypeError: A tensor does not fit.
     """
     prefix = "eagle_" if is_n15(module) else ""
     known = ("pixel_values", "input_ids", "attention_mask", "image_sizes")
@@ -242,8 +240,6 @@ def results_of(module: nn.Module, vl_input: Mapping[str, Any], features: Tensor)
 
 def check_inputs(module: nn.Module, config: BackboneConfig, device: torch.device) -> dict[str, Tensor]:
     """A random view with a few words around it, and one token of padding if that is as released."""
-    import torch
-
     given = config_of(module)
     generator = torch.Generator().manual_seed(0)
     merge, patch = config.merge, config.patch_size

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from torch import nn
 
 from saccade.errors import InputError
 from saccade.integrations import modules
-
-if TYPE_CHECKING:
-    from torch import nn
 
 #: Attributes of every head, in addition to `get_action`.
 PARTS = ("state_encoder", "action_encoder", "model", "num_inference_timesteps")
@@ -58,10 +57,10 @@ def find(policy: object) -> nn.Module:
     """The action head in `policy`.
 
     Args:
-        policy: the head itself, a module that contains it, or an object that contains such a module.
+        policy: The head itself, a module that contains it, or an object that contains such a module.
 
     Raises:
-        InputError: there is none, or more than one.
+        InputError: There is none, or more than one.
     """
     return modules.find(policy, is_head, f"GR00T action head, a module with get_action, {', '.join(PARTS)},")
 
@@ -80,11 +79,11 @@ def check(module: nn.Module, stand_in: object = None) -> None:
     """Checks that nothing but the head's parameters determines what it computes.
 
     Args:
-        module: the head.
-        stand_in: an accepted replacement of its `get_action`.
+        module: The head.
+        stand_in: An accepted replacement of its `get_action`.
 
     Raises:
-        InputError: the message lists every problem.
+        InputError: The message lists every problem.
     """
     problems = [
         *in_structure(module, stand_in),
@@ -127,7 +126,7 @@ def config_of(module: nn.Module) -> dict[str, Any]:
     """The head's config in the released names, as in `config.json`.
 
     Raises:
-        InputError: it contains values that JSON cannot represent.
+        InputError: It contains values that JSON cannot represent.
     """
     config = module.config
     # None and "" mean the same as an absent key. The default of model_type in transformers is "".

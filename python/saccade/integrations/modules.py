@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from types import MethodType
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from torch import nn
 
 from saccade.errors import InputError
-
-if TYPE_CHECKING:
-    from torch import nn
 
 #: Attributes of other objects that contain the module, or another such object.
 HOLDERS = ("model", "policy", "_groot_model", "action_head")
@@ -23,10 +23,8 @@ def held_by(policy: object) -> nn.Module:
     """The torch module in `policy`: itself, or what an object contains.
 
     Raises:
-        InputError: there is none, or it is compiled.
+        InputError: There is none, or it is compiled.
     """
-    from torch import nn
-
     held: Any = policy
     for _ in range(len(HOLDERS)):
         if isinstance(held, nn.Module):
@@ -49,12 +47,12 @@ def find(policy: object, is_wanted: Callable[[nn.Module], bool], wanted: str) ->
     """The only module in `policy` that is wanted.
 
     Args:
-        policy: the module itself, a module that contains it, or an object that contains such a module.
-        is_wanted: whether a module is one.
-        wanted: how a message names it.
+        policy: The module itself, a module that contains it, or an object that contains such a module.
+        is_wanted: Whether a module is one.
+        wanted: How a message names it.
 
     Raises:
-        InputError: there is none, or more than one.
+        InputError: There is none, or more than one.
     """
     found: dict[str, nn.Module] = {
         name or "itself": module for name, module in held_by(policy).named_modules() if is_wanted(module)
@@ -85,8 +83,6 @@ def records(function: object) -> bool:
 
 def in_code(module: nn.Module, noun: str) -> Iterator[str]:
     """Problems in the code of a module's parts: compiled ones."""
-    import torch
-
     for name, part in module.named_modules():
         where = name or f"the {noun}"
         if isinstance(part, torch.jit.ScriptModule):
@@ -97,8 +93,6 @@ def in_code(module: nn.Module, noun: str) -> Iterator[str]:
 
 def in_parameters(module: nn.Module, noun: str) -> Iterator[str]:
     """Problems in a module's weights."""
-    import torch
-
     parameters = dict(module.named_parameters())
     if not parameters:
         yield "it has no parameters"

@@ -7,14 +7,14 @@ import threading
 import weakref
 from abc import ABC, abstractmethod
 from types import MethodType
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
+
+import torch
+from torch import nn
 
 from saccade.errors import DtypeError, InputError
 from saccade.integrations import modules
 from saccade.integrations.weights import Watch
-
-if TYPE_CHECKING:
-    from torch import nn
 
 #: What saccade has in place of the module: an action head or a backbone.
 Engine = TypeVar("Engine")
@@ -146,8 +146,6 @@ class StandIn(ABC, Generic[Engine]):
 
     def _load(self, module: nn.Module) -> None:
         """Copies the weights, and compares the result with the original."""
-        import torch
-
         if torch.get_default_device().type == "meta":
             raise DtypeError(
                 "accelerate: expected a default device with memory, got meta; leave `with "

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor, nn
+import torch
+from torch import Tensor, nn
 
 #: Number of values of a tensor that each call compares, spread over its axes. Each is a read from memory.
 SAMPLES = 8
@@ -56,14 +53,12 @@ class Watch:
         return self._sampled() != self._values
 
     def _sampled(self) -> bytes:
-        import torch
-
         # As bytes, so that NaN equals itself.
         return torch.cat(self._samples).float().cpu().numpy().tobytes()
 
 
 def version(parameter: Tensor) -> int:
-    """torch's count of in-place changes. Tensors created in inference mode have none."""
+    """The count of in-place changes that torch keeps. Tensors created in inference mode have none."""
     return 0 if parameter.is_inference() else parameter._version
 
 

@@ -25,9 +25,7 @@ def tensor_shapes(sizes: BackboneSizes) -> Shapes:
 
 
 def unread_tensor_shapes(sizes: BackboneSizes) -> Shapes:
-    """Name and shape of tensors that published checkpoints hold and inference does not read: SigLIP's pooling
-    head, and the last norm of N1.7.
-    """
+    """Name and shape of tensors that are published but not read: SigLIP's pooling head, N1.7's last norm."""
     if sizes.version == "n1.7":
         yield "model.model.language_model.norm.weight", (sizes.text.width,)
         return
@@ -43,8 +41,10 @@ def unread_tensor_shapes(sizes: BackboneSizes) -> Shapes:
 
 
 def is_unread(name: str, sizes: BackboneSizes) -> bool:
-    """Whether a tensor below ``backbone.`` is known and not read: those of `unread_tensor_shapes`, a twin of
-    the embedding table, and layers that are not computed.
+    """Whether a tensor below ``backbone.`` is known and not read.
+
+    That are those of :func:`unread_tensor_shapes`, a twin of the embedding table, and layers that are not
+    computed.
     """
     if name.endswith("lm_head.weight") or ".vision_model.head." in name:
         return True
