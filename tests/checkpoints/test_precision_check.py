@@ -30,14 +30,14 @@ from tests.helpers.whole_checkpoints import CAMERAS, EMBODIMENT, HEIGHT, WIDTH, 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two moments."""
+    """Two pictures."""
     folder = tmp_path_factory.mktemp("frames")
     rng = np.random.default_rng(0)
-    for moment in ("1", "2"):
-        (folder / moment).mkdir()
+    for picture in ("1", "2"):
+        (folder / picture).mkdir()
         for name in CAMERAS:
             picture = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
-            picture.save(folder / moment / f"{name}.png")
+            picture.save(folder / picture / f"{name}.png")
     return folder
 
 
@@ -56,13 +56,13 @@ def test_the_numbers_are_those_of_the_policy(layout: str, frames: Path) -> None:
         assert one.nbytes == policy.backbone.nbytes + policy.head.nbytes  # type: ignore[attr-defined]
         assert one.milliseconds > 0
     reference = saccade.Policy.from_pretrained(source, embodiment=EMBODIMENT)
-    moments = read_frames(frames, reference, instruction="open it")
+    pictures = read_frames(frames, reference, instruction="open it")
     errors, largest = [], dict.fromkeys(one.actions.largest, 0.0)
-    for index, moment in enumerate(moments):
+    for index, picture in enumerate(pictures):
         apart = {}
         for key, loaded in (("theirs", reference), ("ours", policy)):
-            context = loaded.encode(moment.observation)
-            chunks = [loaded.sample(context, moment.observation, seed=3 + index, num_samples=NUM_SAMPLES)]
+            context = loaded.encode(picture.observation)
+            chunks = [loaded.sample(context, picture.observation, seed=3 + index, num_samples=NUM_SAMPLES)]
             apart[key] = (np.asarray(context.features[0].backbone_features[0]), chunks[0])
         theirs, ours = apart["theirs"], apart["ours"]
         errors += [np.linalg.norm(b - a) / np.linalg.norm(a) for a, b in zip(theirs[0], ours[0], strict=True)]
@@ -92,7 +92,7 @@ def test_ranges_are_those_of_the_statistics() -> None:
 def test_differences_are_the_largest_of_all_moments() -> None:
     groups = [Group("arm", 2, "min_max", np.zeros(2), np.array([2.0, 0.0]), np.array([True, False]))]
     exact = [{"arm": np.zeros((1, 3, 2), np.float32)} for _ in range(2)]
-    given = [{"arm": moment["arm"].copy()} for moment in exact]
+    given = [{"arm": picture["arm"].copy()} for picture in exact]
     given[0]["arm"][0, 1, 0] = -0.5
     given[1]["arm"][0, 2, 1] = 7.0  # a number that is constant
     found = difference(exact, given, groups)

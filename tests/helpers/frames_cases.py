@@ -11,7 +11,7 @@ from PIL import Image
 from tests.helpers.whole_checkpoints import CAMERAS, HEIGHT, WIDTH
 
 
-def write_moment(folder: Path, seed: int = 0, names: Sequence[str] | None = None) -> Path:
+def write_pictures(folder: Path, seed: int = 0, names: Sequence[str] | None = None) -> Path:
     """Writes a random picture for each name; default: a PNG for each camera."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
@@ -20,8 +20,8 @@ def write_moment(folder: Path, seed: int = 0, names: Sequence[str] | None = None
     return folder
 
 
-def write_moments(folder: Path, *names: str) -> Path:
+def write_pictures_of(folder: Path, *names: str) -> Path:
     """Writes a folder of pictures for each name; returns `folder`."""
     for seed, name in enumerate(names):
-        write_moment(folder / name, seed)
+        write_pictures(folder / name, seed)
     return folder

@@ -14,7 +14,7 @@ from PIL import Image
 from saccade import InputError, Policy, SaccadeError
 from saccade.observations import Requirements
 from saccade.observations.pictures import read_frames
-from tests.helpers.frames_cases import write_moment
+from tests.helpers.frames_cases import write_pictures
 from tests.helpers.policy_cases import policy
 from tests.helpers.whole_checkpoints import HEIGHT, WIDTH
 
@@ -32,48 +32,48 @@ def pixels(path: Path) -> NDArray[np.uint8]:
 
 
 def test_a_directory_of_pictures_is_one_moment(isaac: Policy, tmp_path: Path) -> None:
-    folder = write_moment(tmp_path / "table")
+    folder = write_pictures(tmp_path / "table")
     (folder / "notes.txt").write_text("not a picture")
     (folder / ".front.jpg").write_text("hidden")
     (folder / "state.json").write_text(json.dumps(STATE))
-    (moment,) = read_frames(folder, isaac, instruction="open the drawer")
-    assert (moment.name, moment.episode, moment.instruction) == ("table", None, "open the drawer")
-    assert list(moment.observation["video"]) == ["wrist", "front"]
-    for name, frames in moment.observation["video"].items():
+    (picture,) = read_frames(folder, isaac, instruction="open the drawer")
+    assert (picture.name, picture.episode, picture.instruction) == ("table", None, "open the drawer")
+    assert list(picture.observation["video"]) == ["wrist", "front"]
+    for name, frames in picture.observation["video"].items():
         assert np.array_equal(frames, pixels(folder / f"{name}.png")[None, None])
     for key, values in STATE.items():
-        assert np.array_equal(moment.observation["state"][key], np.array([[values]], np.float32))
-    isaac.encode(moment.observation)
+        assert np.array_equal(picture.observation["state"][key], np.array([[values]], np.float32))
+    isaac.encode(picture.observation)
 
 
 def test_what_is_not_given_is_that_of_the_example(isaac: Policy, tmp_path: Path) -> None:
-    (moment,) = read_frames(write_moment(tmp_path), isaac)
+    (picture,) = read_frames(write_pictures(tmp_path), isaac)
     example = isaac.example_observation()
-    assert moment.observation["language"] == example["language"]
+    assert picture.observation["language"] == example["language"]
     for key, values in example["state"].items():
-        assert np.array_equal(moment.observation["state"][key], values)
+        assert np.array_equal(picture.observation["state"][key], values)
 
 
 def test_folders_are_moments_in_the_order_of_their_numbers(isaac: Policy, tmp_path: Path) -> None:
     for number in (1, 2, 10):
-        write_moment(tmp_path / f"step{number}", number)
+        write_pictures(tmp_path / f"step{number}", number)
     (tmp_path / "step2" / "state.json").write_text(json.dumps([0.0] * 7))
     (tmp_path / "other.json").write_text(json.dumps(STATE))
     found = read_frames(tmp_path, isaac, state=tmp_path / "other.json")
-    assert [(moment.name, moment.episode) for moment in found] == [
+    assert [(picture.name, picture.episode) for picture in found] == [
         ("step1", None),
         ("step2", None),
         ("step10", None),
     ]
-    hands = [moment.observation["state"]["hand"][0, 0].tolist() for moment in found]
+    hands = [picture.observation["state"]["hand"][0, 0].tolist() for picture in found]
     assert hands == [[0.0, 1.0], [0.0, 0.0], [0.0, 1.0]]
 
 
 def test_folders_of_folders_are_episodes(isaac: Policy, tmp_path: Path) -> None:
     for name in ("pour/1", "pour/2", "wipe/1"):
-        write_moment(tmp_path / name)
+        write_pictures(tmp_path / name)
     found = read_frames(tmp_path, isaac)
-    assert [(moment.name, moment.episode) for moment in found] == [
+    assert [(picture.name, picture.episode) for picture in found] == [
         ("pour/1", "pour"),
         ("pour/2", "pour"),
         ("wipe/1", "wipe"),
@@ -82,15 +82,15 @@ def test_folders_of_folders_are_episodes(isaac: Policy, tmp_path: Path) -> None:
 
 def test_without_known_cameras_every_picture_is_a_view(tmp_path: Path) -> None:
     any_camera = policy("nvidia", Requirements())
-    folder = write_moment(tmp_path, names=("left.jpg", "above.png"))
-    (moment,) = read_frames(folder, any_camera)
-    assert list(moment.observation["video"]) == ["above", "left"]
+    folder = write_pictures(tmp_path, names=("left.jpg", "above.png"))
+    (picture,) = read_frames(folder, any_camera)
+    assert list(picture.observation["video"]) == ["above", "left"]
 
 
 def test_a_picture_stands_for_all_frames_of_its_camera(tmp_path: Path) -> None:
     both = policy("n16", Requirements(video_horizon=2))
-    (moment,) = read_frames(write_moment(tmp_path, names=["front.png"]), both)
-    frames = moment.observation["video"]["front"]
+    (picture,) = read_frames(write_pictures(tmp_path, names=["front.png"]), both)
+    frames = picture.observation["video"]["front"]
     assert frames.shape == (1, 2, HEIGHT, WIDTH, 3)
     assert np.array_equal(frames[0, 0], frames[0, 1])
 
@@ -99,33 +99,33 @@ def broken(folder: Path, kind: str) -> dict[str, Any]:
     """Makes a directory that cannot be read; returns arguments of `read_frames`."""
     if kind == "empty":
         folder.mkdir()
-    elif kind == "empty moment":
-        write_moment(folder / "1")
+    elif kind == "empty picture":
+        write_pictures(folder / "1")
         (folder / "2").mkdir()
     elif kind == "too deep":
-        write_moment(folder / "a" / "b" / "c")
+        write_pictures(folder / "a" / "b" / "c")
     elif kind == "missing":
-        write_moment(folder / "1")
-        write_moment(folder / "2", names=["front.png"])
+        write_pictures(folder / "1")
+        write_pictures(folder / "2", names=["front.png"])
     elif kind == "unknown":
-        write_moment(folder, names=("front.png", "wrist.png", "depth.png"))
+        write_pictures(folder, names=("front.png", "wrist.png", "depth.png"))
     elif kind == "twice":
-        write_moment(folder, names=("front.png", "front.jpg", "wrist.png"))
+        write_pictures(folder, names=("front.png", "front.jpg", "wrist.png"))
     elif kind == "both":
-        write_moment(write_moment(folder) / "1")
+        write_pictures(write_pictures(folder) / "1")
     elif kind == "size":
-        write_moment(folder)
+        write_pictures(folder)
         Image.fromarray(np.zeros((3, 2, 3), np.uint8)).save(folder / "front.png")
     elif kind == "text":
-        (write_moment(folder) / "front.png").write_text("no picture")
+        (write_pictures(folder) / "front.png").write_text("no picture")
     elif kind == "state":
-        (write_moment(folder) / "state.json").write_text("[1.0]")
+        (write_pictures(folder) / "state.json").write_text("[1.0]")
     elif kind == "part":
-        (write_moment(folder) / "state.json").write_text('{"arm": [0, 0, 0, 0, 0]}')
+        (write_pictures(folder) / "state.json").write_text('{"arm": [0, 0, 0, 0, 0]}')
     elif kind == "huge":
-        (write_moment(folder) / "state.json").write_text(f'{{"arm": [{10**400}]}}')
+        (write_pictures(folder) / "state.json").write_text(f'{{"arm": [{10**400}]}}')
     elif kind == "no state":
-        write_moment(folder)
+        write_pictures(folder)
         return {"state": folder / "missing.json"}
     return {}
 
@@ -134,7 +134,7 @@ def broken(folder: Path, kind: str) -> dict[str, Any]:
     ("kind", "message"),
     [
         ("empty", r"dir: expected pictures named after the cameras \(wrist.png, front.png\), or a folder of"),
-        ("empty moment", r"dir/2: expected pictures named after the cameras"),
+        ("empty picture", r"dir/2: expected pictures named after the cameras"),
         ("too deep", r"dir/a/b: expected pictures"),
         ("missing", r"dir/2: expected one picture for each camera \(wrist.png, front.png\), got front.png$"),
         ("unknown", r"dir: expected one picture for each camera \(.*\), got depth.png, front.png, wrist.png"),
@@ -165,4 +165,4 @@ def test_paths_that_are_not_there(isaac: Policy, tmp_path: Path) -> None:
 
 def test_an_instruction_must_be_text(isaac: Policy, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected valid Unicode"):
-        read_frames(write_moment(tmp_path), isaac, instruction="\ud800")
+        read_frames(write_pictures(tmp_path), isaac, instruction="\ud800")

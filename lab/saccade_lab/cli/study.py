@@ -97,7 +97,7 @@ def measure(args: argparse.Namespace) -> int:
 
     workers = workers_of(args)
     with output.progress_bar("loading", transient=True) as loading:
-        args.on_moment = lambda done, total: loading(done, total, "reading the pictures")
+        args.on_observation = lambda done, total: loading(done, total, "reading the pictures")
         study = load_study(args.study).from_arguments(args)
     out = writable_directory(args.out)
     with output.progress_bar(args.study) as update:

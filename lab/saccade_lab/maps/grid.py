@@ -17,7 +17,7 @@ from saccade.processor import Processor
 from saccade_lab.inside import parts_of
 from saccade_lab.maps.layout import WHOLE, Camera, Layout, Region, kind_of
 
-#: Axes of N1.7's patches: a patch holds the same picture twice, as if it were two moments of a video.
+#: Axes of N1.7's patches: a patch holds the same picture twice, as if it were two frames of a video.
 N17_TIME = 2
 
 

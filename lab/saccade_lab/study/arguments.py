@@ -12,7 +12,7 @@ from saccade.checkpoints.hub import resolve
 from saccade.errors import InputError
 from saccade_lab.flags import check_tasks
 from saccade_lab.parallel.arguments import workers_of
-from saccade_lab.study.moments import Moments
+from saccade_lab.study.pictures import PictureSource
 from saccade_lab.study.recording import Recording
 from saccade_lab.study.source import Source
 
@@ -24,8 +24,8 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
     """Creates the source from parsed arguments.
 
     Args:
-        args: as `saccade._internal.lab_flags.add_rollout_arguments` declares them, and for studies that take
-            pictures `add_frames`. With `on_moment`, see `Moments`, that is called while pictures are encoded.
+        args: as `saccade_lab.flags.add_rollout_arguments` declares them, and for studies that take
+            pictures `add_frames`. `on_observation` is that of `PictureSource`.
         refused: options of the study that cannot be used with recorded observations.
 
     Raises:
@@ -36,7 +36,7 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
     if "frames" in args:
         check_frames(args, "features", "config", "tasks", "episodes", *refused)
         if args.frames is not None:
-            return moments_of(args)
+            return pictures_of(args)
     if args.features is not None:
         return recording_of(args, *refused)
     if args.config is not None:
@@ -84,9 +84,9 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
     return found
 
 
-def moments_of(args: argparse.Namespace) -> Moments:
+def pictures_of(args: argparse.Namespace) -> PictureSource:
     """Creates a source of pictures from parsed arguments, and looks at them; errors as `source_of`."""
-    found = Moments(
+    found = PictureSource(
         checkpoint=str(resolve(checkpoint_of(args))),
         frames=path_text(args.frames),
         instruction=args.instruction,
@@ -100,8 +100,8 @@ def moments_of(args: argparse.Namespace) -> Moments:
         seed=args.seed,
         num_threads=None if workers_of(args).alone else 1,
     )
-    # The backbone takes seconds for a moment. Equal sources share what it found; a function stays here.
-    _ = replace(found, on_moment=getattr(args, "on_moment", None)).all
+    # The backbone takes seconds for an observation. Equal sources share what it found; a function stays here.
+    _ = replace(found, on_observation=getattr(args, "on_observation", None)).all
     return found
 
 

@@ -23,7 +23,7 @@ from saccade_lab.maps.grid import by_token, region_of, view_pictures
 from saccade_lab.maps.layout import Camera
 from saccade_lab.maps.occlusion import Place, behind, measure
 from saccade_lab.maps.view import View, from_policy
-from tests.helpers.frames_cases import write_moment, write_moments
+from tests.helpers.frames_cases import write_pictures, write_pictures_of
 from tests.helpers.whole_checkpoints import CAMERAS, DATA, EMBODIMENT, HEIGHT, WIDTH, whole
 
 LAYOUTS = ("isaac", "lerobot", "n16", "n17")
@@ -201,7 +201,7 @@ def test_a_map_covers_the_part_of_the_picture_that_tokens_see() -> None:
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_moments(tmp_path / "table", "1", "2")
+    folder = write_pictures_of(tmp_path / "table", "1", "2")
     words = ["--checkpoint", str(whole("isaac")), "--frames", str(folder), "--row", "1", "--cell", "4"]
     words += ["--instruction", "open the drawer", "--blocks", "0", "--steps", "0", "--num-threads", "1"]
     assert main(["attention", *words, "--out", str(tmp_path / "out"), "--json"]) == 0
@@ -246,8 +246,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 def test_bad_input_is_one_line(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    paths = {"frames": write_moment(tmp_path / "frames"), "missing": tmp_path / "missing"}
-    paths["one"] = write_moment(tmp_path / "one", names=["front.png"])
+    paths = {"frames": write_pictures(tmp_path / "frames"), "missing": tmp_path / "missing"}
+    paths["one"] = write_pictures(tmp_path / "one", names=["front.png"])
     given = [word.format(**paths) for word in words]
     out = tmp_path / "out"
     assert main(["attention", "--checkpoint", str(whole("isaac")), *given, "--out", str(out)]) == 2

@@ -20,13 +20,13 @@ from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.study import derivatives as head_derivatives
 from saccade_lab.study import input_derivatives as derivatives
 from saccade_lab.study.cell import Cell
-from saccade_lab.study.moments import Moments, encode
+from saccade_lab.study.pictures import PictureSource, encode
 from saccade_lab.study.questions.gradients import Gradients
 from saccade_lab.study.questions.patching import Patching
 from saccade_lab.study.questions.patching_section import FROM_FILE
 from saccade_lab.study.table import read_provenance, read_table
 from tests.checkpoints.test_hub import NAME, cached
-from tests.helpers.frames_cases import write_moment, write_moments
+from tests.helpers.frames_cases import write_pictures, write_pictures_of
 from tests.helpers.whole_checkpoints import EMBODIMENT, whole
 
 torch.set_num_threads(1)
@@ -36,8 +36,8 @@ TOLD = "open the drawer"
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three moments of two episodes."""
-    return write_moments(tmp_path_factory.mktemp("frames") / "table", "pour/1", "pour/2", "wipe/1")
+    """Three pictures of two episodes."""
+    return write_pictures_of(tmp_path_factory.mktemp("frames") / "table", "pour/1", "pour/2", "wipe/1")
 
 
 @functools.cache
@@ -63,7 +63,7 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # A file does not say how many action dimensions the robot has.
-    monkeypatch.setattr(Moments, "action_width", property(lambda source: source.config.action_dim))
+    monkeypatch.setattr(PictureSource, "action_width", property(lambda source: source.config.action_dim))
     arms = ["--arms", "future-unread,future-blind,action-blind", "--seed", "5"]
     assert study("cuts", frames, tmp_path / "frames", *arms, layout=layout) == 0
     printed = capsys.readouterr().out
@@ -71,9 +71,9 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     assert "It is not known which episode" not in printed
     policy = loaded(layout)
     rows = []
-    for moment in read_frames(frames, policy, instruction=TOLD):
-        (features,) = policy.encode(moment.observation).features
-        rows.append(head_inputs(policy, moment.observation, features))
+    for picture in read_frames(frames, policy, instruction=TOLD):
+        (features,) = policy.encode(picture.observation).features
+        rows.append(head_inputs(policy, picture.observation, features))
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(row, name) for row in rows])
         for name in ("backbone_features", "state", "embodiment_id", "image_mask")
@@ -92,7 +92,7 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
 
 
 def test_only_the_dimensions_of_the_robot_count(frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Moments(str(whole("isaac")), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1)
+    source = PictureSource(str(whole("isaac")), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1)
     head, width = source.head(), loaded("isaac").normalizer.head_action_width
     assert 0 < width < head.config.action_dim
     receiver, donor = source.observed("frames", 0), source.all.row(2)
@@ -122,10 +122,14 @@ def test_progress_is_by_moment(frames: Path) -> None:
     told: list[tuple[int, int]] = []
     encode.cache_clear()
     given: dict[str, Any] = {"checkpoint": str(whole("isaac")), "embodiment": EMBODIMENT, "num_threads": 1}
-    watched = Moments(frames=str(frames), on_moment=lambda done, total: told.append((done, total)), **given)
+    watched = PictureSource(
+        frames=str(frames), on_observation=lambda done, total: told.append((done, total)), **given
+    )
     assert len(watched.all) == 3
     assert told == [(1, 3), (2, 3), (3, 3)]
-    assert Moments(frames=str(frames), **given).all is watched.all  # the same source, and nothing is repeated
+    assert (
+        PictureSource(frames=str(frames), **given).all is watched.all
+    )  # the same source, and nothing is repeated
     assert len(told) == 3
 
 
@@ -143,25 +147,25 @@ def test_a_published_id(frames: Path, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_hash_covers_what_the_policy_sees(frames: Path, tmp_path: Path) -> None:
     def digest(folder: Path, instruction: str = TOLD) -> str:
-        source = Moments(str(whole("isaac")), str(folder), instruction, num_threads=1)
+        source = PictureSource(str(whole("isaac")), str(folder), instruction, num_threads=1)
         return str(source.describe()["frames"]["sha256"])
 
-    same = write_moments(tmp_path / "again", "pour/1", "pour/2", "wipe/1")
-    other = write_moments(tmp_path / "other", "pour/1", "pour/2", "wipe/2")
+    same = write_pictures_of(tmp_path / "again", "pour/1", "pour/2", "wipe/1")
+    other = write_pictures_of(tmp_path / "other", "pour/1", "pour/2", "wipe/2")
     assert digest(same) == digest(frames)
     assert len({digest(frames), digest(frames, "push"), digest(other)}) == 3
 
 
 def test_prompts_of_other_lengths_are_padded_exactly(tmp_path: Path) -> None:
-    """Frames of other sizes have other numbers of tokens in N1.7; each moment is as it is alone."""
-    wide = write_moments(tmp_path / "both", "1", "2")
+    """Frames of other sizes have other numbers of tokens in N1.7; each picture is as it is alone."""
+    wide = write_pictures_of(tmp_path / "both", "1", "2")
     for name in ("wrist", "front"):
         (wide / "2" / f"{name}.png").unlink()
     write_wide(wide / "2")
-    source = Moments(str(whole("n17")), str(wide), TOLD, embodiment=EMBODIMENT, num_threads=1)
+    source = PictureSource(str(whole("n17")), str(wide), TOLD, embodiment=EMBODIMENT, num_threads=1)
     assert source.all.drop_vl is not None
     for row, name in enumerate(("1", "2")):
-        alone = Moments(str(whole("n17")), str(wide / name), TOLD, embodiment=EMBODIMENT, num_threads=1)
+        alone = PictureSource(str(whole("n17")), str(wide / name), TOLD, embodiment=EMBODIMENT, num_threads=1)
         noise = source.observed("frames", row)
         expected = source.actions(noise, None)
         observation = alone.all
@@ -186,7 +190,7 @@ def test_patching_from_another_instruction(
     printed = capsys.readouterr().out
     assert "instruction, future rows in all blocks: the chunk moves" in printed
     assert "Control, all rows in all blocks: a share of 1.0000, as expected." in printed
-    source = Moments(str(whole("isaac")), str(frames), TOLD, other_instruction=other, num_threads=1)
+    source = PictureSource(str(whole("isaac")), str(frames), TOLD, other_instruction=other, num_threads=1)
     assert source.others is not None
     assert source.others.num_vl_tokens > source.all.num_vl_tokens
     policy = loaded("isaac")
@@ -200,14 +204,14 @@ def test_patching_from_another_instruction(
 def test_patching_from_another_directory_and_from_another_episode(
     frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_moment(tmp_path / "other", seed=9)
+    write_pictures(tmp_path / "other", seed=9)
     words = ["--blocks", "3", "--steps", "0"]
     assert study("patching", frames, tmp_path / "a", *words, "--other-frames", str(tmp_path / "other")) == 0
     assert set(table_of(tmp_path / "a", "patching")["kind"]) == {"frames"}
     assert study("patching", frames, tmp_path / "b", *words) == 0
     donors = table_of(tmp_path / "b", "patching").drop_duplicates("seed").set_index("seed")["donor_seed"]
     assert donors.to_dict() == {0: 2, 1: 2, 2: 0}
-    one = write_moment(tmp_path / "one")
+    one = write_pictures(tmp_path / "one")
     assert study("patching", one, tmp_path / "c", *words) == 0
     assert "there is no donor for it" in capsys.readouterr().out
 
@@ -222,7 +226,7 @@ def test_tokens_at_run_time(frames: Path, tmp_path: Path, capsys: pytest.Capture
 @pytest.mark.parametrize("layout", ["isaac", "lerobot", "n16", "n17"])
 def test_derivatives_are_those_of_one_graph(layout: str, frames: Path) -> None:
     """Against torch's derivative of the actions by pixels, through backbone and head at once."""
-    source = Moments(str(whole(layout)), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1)
+    source = PictureSource(str(whole(layout)), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1)
     encoded = encode(source)
     inputs, layout_of_row = encoded.inputs[0], encoded.layouts[0]
     head, backbone = (

@@ -29,8 +29,8 @@ from saccade_lab.flags import add_frames, add_rollout_arguments
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS
 from saccade_lab.study.cell import Cell, Rows
-from saccade_lab.study.moments import Moments, encode
 from saccade_lab.study.paths import ALL_PATHS, PATHS
+from saccade_lab.study.pictures import PictureSource, encode
 from saccade_lab.study.questions.gradients_section import section
 from saccade_lab.study.recording import Recorded
 from saccade_lab.study.section import Section
@@ -171,17 +171,17 @@ class Gradients(Study):
                 paths.append(derivatives.shares(parts))
         rows = sensitivity_rows(sensitivities, derivatives.row_groups(head))
         rows += path_rows(paths) if paths else [{"note": NO_TOKENS}]
-        if isinstance(self.source, Moments):
+        if isinstance(self.source, PictureSource):
             assert by_vl is not None
             rows += self.of_inputs(self.source, seed, by_vl)
         return rows
 
-    def of_inputs(self, source: Moments, row: int, by_vl: torch.Tensor) -> Rows:
-        """Derivatives by the tokens of the prompt and by the pixels of a moment.
+    def of_inputs(self, source: PictureSource, row: int, by_vl: torch.Tensor) -> Rows:
+        """Derivatives by the tokens of the prompt and by the pixels of an observation.
 
         Args:
             source: The source.
-            row: Which moment.
+            row: Which observation.
             by_vl: Derivatives by the vision-language tokens, `(projections, T_vl, context_dim)`.
         """
         import torch
@@ -226,7 +226,7 @@ class Gradients(Study):
             sensitivities.append(derivatives.action_sensitivity(*given))
             if head.config.num_future_tokens:
                 paths.append(derivatives.path_derivatives(*given))
-            elif isinstance(self.source, Moments):
+            elif isinstance(self.source, PictureSource):
                 paths.append({ALL_PATHS: derivatives.vl_derivative(*given)})
         sensitivity = sensitivities[0] if self.source.closed_loop else derivatives.pooled(sensitivities)
         if not paths:

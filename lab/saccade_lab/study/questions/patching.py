@@ -20,7 +20,7 @@ from saccade_lab.flags import add_frames, add_rollout_arguments
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS
 from saccade_lab.study.cell import Cell, Rows
-from saccade_lab.study.moments import Moments
+from saccade_lab.study.pictures import PictureSource
 from saccade_lab.study.questions.patching_section import (
     ABOUT,
     ALL,
@@ -166,7 +166,7 @@ class Pair:
 
 def kind_of(source: Source) -> str:
     """The kind of donors of recorded observations."""
-    if isinstance(source, Moments) and source.others is not None:
+    if isinstance(source, PictureSource) and source.others is not None:
         return WITH_INSTRUCTION if source.other_frames is None else WITH_FRAMES
     return FROM_FILE
 

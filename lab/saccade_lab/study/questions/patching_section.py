@@ -33,7 +33,7 @@ ABOUT = {
     **KINDS,
     FROM_FILE: "an observation of another episode, same embodiment",
     WITH_INSTRUCTION: "the same pictures and state, with the other instruction",
-    WITH_FRAMES: "the moment in the same place of the other directory, with its state",
+    WITH_FRAMES: "the observation in the same place of the other directory, with its state",
 }
 GROUPS: dict[str, tuple[str, ...]] = {
     "future": ("future",),

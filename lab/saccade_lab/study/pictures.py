@@ -32,23 +32,23 @@ Preprocessing = Literal["lerobot", "isaac"]
 
 
 @dataclass(frozen=True)
-class Moments(Recorded):
-    """A whole checkpoint, and pictures of moments for it.
+class PictureSource(Recorded):
+    """A whole checkpoint, and observations from pictures for it.
 
-    The policy encodes all moments once in a process, and is then let go. Where a study needs the head, it is
-    loaded alone, in float32: what computes gradients in torch has the memory for itself.
+    The policy encodes all observations once in a process, and is then let go. Where a study needs the head,
+    it is loaded alone, in float32: what computes gradients in torch has the memory for itself.
 
     Attributes:
         checkpoint: A checkpoint that `saccade.Policy.from_pretrained` reads.
         frames: Directory of the pictures, see `saccade.observations.pictures.read_frames`.
         instruction, state: As `read_frames` takes them.
-        other_frames, other_instruction: Of the moments to compare with. Where one is None, it is that of the
-            moments themselves; with both None there are none.
+        other_frames, other_instruction: Of the observations to compare with. Where one is None, it is that of
+            the others; with both None nothing is compared.
         embodiment, preprocessing, tokenizer: As `saccade.Policy.from_pretrained` takes them.
         precision: How the backbone computes.
         seed: Seed of random tokens and of the noise.
         num_threads: Number of threads. Default: that of the engine.
-        on_moment: Called with the number of encoded moments and that of all, while the policy encodes them.
+        on_observation: Called after each encoded observation, with its number and that of all.
     """
 
     checkpoint: str
@@ -63,7 +63,7 @@ class Moments(Recorded):
     tokenizer: str | None = None
     seed: int = 0
     num_threads: int | None = None
-    on_moment: Callable[[int, int], None] | None = field(default=None, compare=False, repr=False)
+    on_observation: Callable[[int, int], None] | None = field(default=None, compare=False, repr=False)
     task: ClassVar[str] = "frames"
 
     @property
@@ -79,7 +79,7 @@ class Moments(Recorded):
         return {
             "checkpoint": self.describe_head(encoded.identity),
             "frames": {
-                **described(self.frames, encoded.moments),
+                **described(self.frames, encoded.pictures),
                 "episodes": num_episodes(encoded.observation),
                 "noise": f"{NOISES} draws an observation",
                 "precision": self.precision,
@@ -115,27 +115,27 @@ class Moments(Recorded):
 
     @property
     def others(self) -> HeadInputs | None:
-        """For each moment the one in the same place of the other directory, or with the other instruction."""
+        """The observation to compare with each: of the other directory, or with the other instruction."""
         return encode(self).other_observation
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:
-        """See `Source`; with the name of the moment."""
-        return {**super().labels(task, seed), "moment": encode(self).moments[seed].name}
+        """See `Source`; with the name of the picture."""
+        return {**super().labels(task, seed), "moment": encode(self).pictures[seed].name}
 
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """What a policy made of the moments of a source.
+    """What a policy made of the observations of a source.
 
     Attributes:
         config: Config of the head.
         identity: Name and hash of the checkpoint.
         preprocessing: How frames and words were prepared.
         action_width: Number of the head's action dimensions that the robot uses.
-        moments, others: The moments, and those to compare them with.
+        pictures, others: The observations, and those to compare them with.
         observation, other_observation: The same as the head takes them; None without others.
-        inputs: What the backbone was given for each of `moments`.
-        layouts: What is at each position of each of `moments`.
+        inputs: What the backbone was given for each of `pictures`.
+        layouts: What is at each position of each of `pictures`.
         backbone_config: Config of the backbone.
     """
 
@@ -143,7 +143,7 @@ class Encoded:
     identity: dict[str, str]
     preprocessing: str
     action_width: int
-    moments: Sequence[PictureObservation]
+    pictures: Sequence[PictureObservation]
     others: Sequence[PictureObservation]
     observation: HeadInputs
     other_observation: HeadInputs | None
@@ -153,8 +153,8 @@ class Encoded:
 
 
 @functools.lru_cache(maxsize=1)
-def encode(source: Moments) -> Encoded:
-    """Loads the policy and encodes all moments; cached for the next cell."""
+def encode(source: PictureSource) -> Encoded:
+    """Loads the policy and encodes all observations; cached for the next cell."""
     policy = Policy.from_pretrained(
         source.checkpoint,
         embodiment=source.embodiment,
@@ -164,34 +164,34 @@ def encode(source: Moments) -> Encoded:
         num_threads=source.num_threads,
     )
     parts = parts_of(policy)
-    moments = moments_of(source, policy, source.frames, source.instruction)
+    pictures = pictures_of(source, policy, source.frames, source.instruction)
     others: list[PictureObservation] = []
     if (source.other_frames, source.other_instruction) != (None, None):
-        told = source.instruction if source.other_instruction is None else source.other_instruction
-        found = moments_of(source, policy, source.other_frames or source.frames, told)
-        others = [found[place % len(found)] for place in range(len(moments))]
+        words = source.instruction if source.other_instruction is None else source.other_instruction
+        found = pictures_of(source, policy, source.other_frames or source.frames, words)
+        others = [found[place % len(found)] for place in range(len(pictures))]
     seen, compared, given, layouts = [], [], [], []
-    for place, moment in enumerate(moments):
-        (inputs,) = inputs_of(policy, moment.observation)
+    for place, picture in enumerate(pictures):
+        (inputs,) = inputs_of(policy, picture.observation)
         context = context_of(policy, features_of(policy, [inputs]))
-        seen.append(head_inputs(policy, moment.observation, context.features[0]))
+        seen.append(head_inputs(policy, picture.observation, context.features[0]))
         given.append(inputs)
-        frames = read(moment.observation, policy.requirements).frames[0]
+        frames = read(picture.observation, policy.requirements).frames[0]
         layouts.append(layout_of(policy, frames, inputs, context.features[0].views))
         if others:  # views with the same frames are not computed again
             other = others[place].observation
             (features,) = features_of(policy, inputs_of(policy, other), previous=context)
             compared.append(head_inputs(policy, other, features))
-        if source.on_moment is not None:
-            source.on_moment(place + 1, len(moments))
+        if source.on_observation is not None:
+            source.on_observation(place + 1, len(pictures))
     return Encoded(
         config=parts.head.config,
         identity=checkpoint_identity(Path(source.checkpoint)),
         preprocessing=parts.processor.preprocessing,
         action_width=policy.normalizer.head_action_width,
-        moments=moments,
+        pictures=pictures,
         others=others,
-        observation=joined(seen, moments),
+        observation=joined(seen, pictures),
         other_observation=joined(compared, others) if others else None,
         inputs=given,
         layouts=layouts,
@@ -205,15 +205,15 @@ def head_of(checkpoint: str, embodiment_id: int, num_threads: int | None) -> Act
     return ActionHead.from_pretrained(checkpoint, embodiment_ids=[embodiment_id], num_threads=num_threads)
 
 
-def moments_of(
-    source: Moments, policy: Policy, directory: str, instruction: str | None
+def pictures_of(
+    source: PictureSource, policy: Policy, directory: str, instruction: str | None
 ) -> list[PictureObservation]:
-    """The moments of a directory, with the state of the source."""
+    """The observations of a directory, with the state of the source."""
     state = None if source.state is None else Path(source.state)
     return read_frames(Path(directory), policy, instruction=instruction, state=state)
 
 
-def joined(observations: Sequence[HeadInputs], moments: Sequence[PictureObservation]) -> HeadInputs:
+def joined(observations: Sequence[HeadInputs], pictures: Sequence[PictureObservation]) -> HeadInputs:
     """Observations of one row each as one, the shorter ones padded and their padding dropped.
 
     The head drops padding exactly: each has the bits that it has alone.
@@ -222,7 +222,7 @@ def joined(observations: Sequence[HeadInputs], moments: Sequence[PictureObservat
     longest = int(lengths.max())
     masks = [pad_tokens(one.image_mask, longest) for one in observations if one.image_mask is not None]
     dropped = np.arange(longest) >= lengths[:, None]
-    episodes = [moment.episode for moment in moments]
+    episodes = [picture.episode for picture in pictures]
     return HeadInputs(
         np.concatenate([pad_tokens(one.backbone_features, longest) for one in observations]),
         np.concatenate([one.state for one in observations]),
@@ -233,19 +233,19 @@ def joined(observations: Sequence[HeadInputs], moments: Sequence[PictureObservat
     )
 
 
-def described(directory: str, moments: Sequence[PictureObservation]) -> dict[str, Any]:
-    """What identifies moments, as JSON values; the hash covers names, pixels, states and instruction."""
+def described(directory: str, pictures: Sequence[PictureObservation]) -> dict[str, Any]:
+    """What identifies observations, as JSON values; the hash covers names, pixels, states and instruction."""
     digest = hashlib.sha256()
-    for moment in moments:
-        given = moment.observation
+    for picture in pictures:
+        given = picture.observation
         values = {key: np.asarray(state).tolist() for key, state in given["state"].items()}
-        digest.update(json.dumps([moment.name, moment.instruction, values]).encode())
+        digest.update(json.dumps([picture.name, picture.instruction, values]).encode())
         for name, frames in given["video"].items():
             digest.update(f"{name} {frames.shape}".encode())
             digest.update(frames.tobytes())
     return {
         "name": Path(directory).resolve().name,
         "sha256": digest.hexdigest(),
-        "observations": len(moments),
-        "instruction": moments[0].instruction,
+        "observations": len(pictures),
+        "instruction": pictures[0].instruction,
     }
