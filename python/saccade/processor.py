@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import ArrayLike, Float32Array, frame, int64, integer, text
+from saccade._internal.hub import PUBLISHED, cache, cached, resolve
 from saccade.backbone.inputs import BackboneInputs
-from saccade.checkpoints.hub import PUBLISHED, cache, cached, resolve
 from saccade.errors import InputError, ShapeError
 
 #: The views of one observation: by camera name, or in the order of the prompt.

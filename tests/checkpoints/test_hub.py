@@ -14,7 +14,7 @@ import pytest
 
 import saccade
 from saccade import cli
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.errors import InputError
 from tests.helpers import layouts
 
@@ -108,7 +108,7 @@ def test_a_download_that_was_cut_short(cache: Path, checkpoint: Path, leave_out:
 def test_without_huggingface_hub_both_commands_are_named(tmp_path: Path) -> None:
     program = (
         "import sys; sys.modules['huggingface_hub'] = None\n"
-        "from saccade.checkpoints.hub import resolve\n"
+        "from saccade._internal.hub import resolve\n"
         f"try: resolve({NAME!r})\n"
         "except FileNotFoundError as error: print(error)"
     )

@@ -22,7 +22,7 @@ PACKAGES = {
         ("diffusers", "lerobot", "lerobot_policy_saccade", "safetensors", "scipy", "torch", "transformers"),
         "torch",
     ),
-    **dict.fromkeys(("msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
+    **dict.fromkeys(("griffe", "msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
     **dict.fromkeys(("saccade.integrations", "saccade.torch", "saccade_lab.reference"), "torch"),
     **dict.fromkeys(("benches", "studies", "why_32", "saccade_lab"), "lab"),
     **dict.fromkeys(("gymnasium", "imageio", "joblib", "jinja2", "matplotlib", "mujoco", "pandas"), "lab"),

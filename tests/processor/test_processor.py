@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade.checkpoints import hub
+from saccade._internal import hub
 from saccade.errors import CheckpointError
 from tests.helpers.processor_cases import (
     AS_IT_IS,

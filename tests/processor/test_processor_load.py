@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade.checkpoints import hub
+from saccade._internal import hub
 from saccade.errors import CheckpointError, InputError
 from saccade.processor import tokenizer_path
 from tests.helpers.processor_cases import AS_IT_IS, DATA, TOKENIZER, assert_same

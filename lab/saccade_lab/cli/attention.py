@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
 def compute(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
     from saccade._internal.files import checkpoint_identity
-    from saccade.checkpoints.hub import resolve
+    from saccade._internal.hub import resolve
 
     checkpoint = args.checkpoint
     if checkpoint is None:

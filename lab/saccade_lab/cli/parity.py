@@ -19,7 +19,7 @@ from saccade._internal import flags as arguments
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.environment import cpu_name
 from saccade._internal.flags import UsageError
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.cli import output
 from saccade.head.inputs import HeadInputs
 from saccade_lab.extras import LAB, require

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from saccade._internal.files import path_text
 from saccade._internal.flags import check_frames
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.errors import InputError
 from saccade_lab.flags import check_tasks
 from saccade_lab.parallel.arguments import workers_of

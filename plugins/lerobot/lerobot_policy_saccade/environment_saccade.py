@@ -1,6 +1,7 @@
 """saccade's simulated tasks as environments of lerobot: ``--env.type=saccade --env.task=reach``."""
 
 import importlib
+import importlib.util
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -8,7 +9,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from saccade._internal.extras import require
+from saccade._internal.extras import SACCADE
+from saccade.errors import MissingExtraError
 
 
 @EnvConfig.register_subclass("saccade")
@@ -22,7 +24,7 @@ class SaccadeEnv(EnvConfig):
         image_size: Pixels along each side of the cameras' frames. Default: that of the bundled policy.
 
     Raises:
-        saccade.MissingExtraError: The extra ``sim`` is not installed.
+        saccade.MissingExtraError: saccade_lab or its extra ``sim`` is not installed.
         saccade.InputError: There is no such task.
     """
 
@@ -33,11 +35,16 @@ class SaccadeEnv(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if importlib.util.find_spec("saccade_lab") is None:
+            raise MissingExtraError(
+                f"saccade_lab is not installed. Install with: {SACCADE.install_lab()}", name="saccade_lab"
+            )
         # Not at the top: it chooses how MuJoCo draws, which concerns only those who use these tasks.
+        from saccade_lab.extras import LAB
         from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE
         from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 
-        require("mujoco", "metaworld")
+        LAB.require("mujoco", "metaworld")
         find_task(self.task)
         size = self.image_size or DEFAULT_IMAGE_SIZE
         shapes: dict[str, tuple[FeatureType, tuple[int, ...], str]] = {

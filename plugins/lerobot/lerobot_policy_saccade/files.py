@@ -9,7 +9,7 @@ from typing import Any
 from huggingface_hub import snapshot_download
 from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError, RevisionNotFoundError
 
-from saccade.checkpoints.hub import PUBLISHED, resolve
+from saccade._internal.hub import PUBLISHED, resolve
 from saccade.errors import InputError
 from saccade.processor import tokenizer_path
 

@@ -6,7 +6,7 @@ from typing import Any
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 import saccade
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.robots import read_json
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import ArrayLike, as_stored, check_precision, mask_bytes
+from saccade._internal.hub import resolve
 from saccade.backbone.config import BackboneConfig
 from saccade.backbone.features import BackboneFeatures, check_backbone_record, made
 from saccade.backbone.inputs import BackboneInputs
-from saccade.checkpoints.hub import resolve
 from saccade.errors import DtypeError, InputError
 from saccade.head.config import to_json
 from saccade.head.options import optional_integer

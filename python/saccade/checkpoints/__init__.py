@@ -1,11 +1,17 @@
-"""Checkpoints without torch: describing them, reading tensors, writing changed copies.
+"""Checkpoints: what they contain, how their precisions differ, and changed copies. Needs no torch.
 
-`description` recognises layout and version, `rewriting` quantises, converts and resizes.
-`inspection` examines every tensor; it needs `saccade.bench`, so it is imported
-only on request: `from saccade.checkpoints.inspection import inspect`.
+`description` recognises layout and version, and `inspection` examines every tensor. `rewriting` quantises,
+converts and resizes. `precisions` compares the precisions of a whole checkpoint, and `comparison` the actions
+of a checkpoint and its resized copy. `random_checkpoint` writes checkpoints to try things with, of the sizes
+in `published`.
 """
 
+from saccade.checkpoints.bundled import demo_checkpoint
+from saccade.checkpoints.comparison import ActionChanges, action_changes
 from saccade.checkpoints.description import Description, describe, read_tensors
+from saccade.checkpoints.findings import Inspection
+from saccade.checkpoints.inspection import inspect
+from saccade.checkpoints.precisions import PrecisionCheck, check_precisions
 from saccade.checkpoints.rewriting import (
     ConvertReport,
     QuantizeReport,
@@ -17,13 +23,20 @@ from saccade.checkpoints.rewriting import (
 )
 
 __all__ = [
+    "ActionChanges",
     "ConvertReport",
     "Description",
+    "Inspection",
+    "PrecisionCheck",
     "QuantizeReport",
     "ResizeReport",
     "Written",
+    "action_changes",
+    "check_precisions",
     "convert",
+    "demo_checkpoint",
     "describe",
+    "inspect",
     "quantize",
     "read_tensors",
     "resize",

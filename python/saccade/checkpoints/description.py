@@ -10,7 +10,7 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.head.config import HeadConfig, to_json
 
 #: A checkpoint: a directory, one ``.safetensors`` file, or a published id.

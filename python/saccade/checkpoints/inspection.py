@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from saccade._internal.arrays import PRECISIONS
+from saccade._internal.hub import resolve
 from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, Memory
-from saccade.checkpoints.hub import resolve
 from saccade.checkpoints.resemblance import Reference
 from saccade.checkpoints.survey import Slice, Survey
 from saccade.checkpoints.tokens import token_statistics

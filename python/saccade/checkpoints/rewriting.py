@@ -11,8 +11,8 @@ from typing import Any
 import saccade._saccade as _saccade
 from saccade._internal.arrays import integer, optional_integers, text
 from saccade._internal.files import sha256_of
+from saccade._internal.hub import resolve
 from saccade.checkpoints.description import Config, Source
-from saccade.checkpoints.hub import resolve
 from saccade.errors import InputError
 from saccade.head.config import to_json
 

@@ -18,8 +18,8 @@ import saccade._saccade as _saccade
 from saccade._internal import flags as arguments
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import UsageError
+from saccade._internal.hub import resolve
 from saccade.checkpoints.bundled import demo_checkpoint
-from saccade.checkpoints.hub import resolve
 from saccade.checkpoints.random_checkpoint import head as random_head
 from saccade.checkpoints.whole import robots_of
 from saccade.cli import EXIT_OK, output

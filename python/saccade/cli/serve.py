@@ -144,12 +144,12 @@ def run(args: argparse.Namespace) -> int:
     if args.api_token == "":
         raise UsageError("--api-token: expected some text, got none")
     require("serve")
-    import saccade
+    from saccade.policy.policy import Policy
     from saccade.serve import Server
     from saccade.serve.connections import bind
 
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
-    policy = saccade.Policy.from_pretrained(args.checkpoint, **policy_options(args))
+    policy = Policy.from_pretrained(args.checkpoint, **policy_options(args))
     # What a first call sets up is not left to the first client.
     policy.act(policy.example_observation(), seed=0, num_steps=args.num_steps)
     log = make_log(args.log)

@@ -26,7 +26,7 @@ from saccade._internal.arrays import (
     optional_integers,
     result,
 )
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.errors import DtypeError, InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig, to_json

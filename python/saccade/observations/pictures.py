@@ -8,16 +8,15 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 
 from saccade._internal.arrays import UInt8Array
 from saccade.errors import InputError, SaccadeError
-from saccade.observations import read
-
-if TYPE_CHECKING:
-    from saccade.policy.policy import Policy
+from saccade.observations.formats import read
+from saccade.observations.requirements import Requirements
+from saccade.robots import Normalizer
 
 #: Endings of the files that are taken for pictures. Others are left alone.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
@@ -27,6 +26,21 @@ MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV
 
 STATE = "state.json"
 LARGEST = float(np.finfo(np.float32).max)
+
+
+class Robot(Protocol):
+    """What is needed of a :class:`saccade.Policy`: its robot's requirements and statistics."""
+
+    @property
+    def requirements(self) -> Requirements:
+        """As :attr:`saccade.Policy.requirements`."""
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """The robot's statistics."""
+
+    def example_observation(self) -> dict[str, Any]:
+        """As :meth:`saccade.Policy.example_observation`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +67,7 @@ class PictureObservation:
 
 
 def read_frames(
-    directory: Path, policy: Policy, *, instruction: str | None = None, state: Path | None = None
+    directory: Path, policy: Robot, *, instruction: str | None = None, state: Path | None = None
 ) -> list[PictureObservation]:
     """The observations of a directory, in the order of their names (2 before 10).
 
@@ -121,7 +135,7 @@ def read_frames(
     return found
 
 
-def observation_folders(directory: Path, policy: Policy) -> list[Path]:
+def observation_folders(directory: Path, policy: Robot) -> list[Path]:
     """The folders of a directory that are observations, see :func:`read_frames`.
 
     Raises:
@@ -148,7 +162,7 @@ def observation_folders(directory: Path, policy: Policy) -> list[Path]:
     return below(directory, 2)
 
 
-def pictures_in(folder: Path, policy: Policy) -> dict[str, Path]:
+def pictures_in(folder: Path, policy: Robot) -> dict[str, Path]:
     """The picture of each camera in a folder, in the order of the prompt.
 
     Raises:
@@ -173,7 +187,7 @@ def pictures_in(folder: Path, policy: Policy) -> dict[str, Path]:
     return {name: by_name[name] for name in names}
 
 
-def example_names(policy: Policy) -> str:
+def example_names(policy: Robot) -> str:
     """Possible names of the pictures of an observation, for messages."""
     cameras = policy.requirements.cameras
     names = ["front"] if cameras is None else [camera.name for camera in cameras]
@@ -210,7 +224,7 @@ def by_number(path: Path) -> list[tuple[int, str]]:
 
 
 def observation(
-    policy: Policy, pictures: Mapping[str, Path], instruction: str | None, state: Any
+    policy: Robot, pictures: Mapping[str, Path], instruction: str | None, state: Any
 ) -> dict[str, Any]:
     """An observation in Isaac-GR00T's nested format, with a batch of one.
 

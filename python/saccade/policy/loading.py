@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
+from saccade._internal.hub import resolve
 from saccade.backbone.backbone import Backbone
-from saccade.checkpoints.hub import resolve
 from saccade.errors import CheckpointError, InputError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from saccade.checkpoints.hub import resolve
+from saccade._internal.hub import resolve
 from saccade.errors import CheckpointError
 from saccade.robots.building import Dims, Options, size_of
 from saccade.robots.data_configs import data_config

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from saccade import _saccade
+import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from saccade._internal import hub
 from saccade._internal.json import dumps
-from saccade.checkpoints import hub
 from saccade.errors import CheckpointError
 from saccade.robots import LANGUAGE_KEY, read_json
 from saccade.robots.reading import processor_folder

@@ -13,8 +13,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from saccade._internal.hub import resolve
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.checkpoints.hub import resolve
 from saccade.checkpoints.random_checkpoint.backbone_tensors import is_unread
 from saccade.errors import CheckpointError
 
