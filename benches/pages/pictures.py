@@ -28,8 +28,7 @@ IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 
 def frames(video: Path, every: int, width: int) -> Iterator[Image.Image]:
     """Every `every`-th frame of a video and its last one, `width` pixels wide."""
-    with imageio.get_reader(video) as reader:
-        pictures = [Image.fromarray(np.asarray(frame)) for frame in reader]
+    pictures = [Image.fromarray(np.asarray(frame)) for frame in imageio.mimread(video, memtest=False)]
     for picture in [*pictures[:-1:every], pictures[-1]]:
         yield picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
 

@@ -125,7 +125,7 @@ episodes of saccade's tasks with `--policy.type` and with `--policy.path`; their
 
 - **lerobot 0.4.0 to 0.4.3, 0.5.0, 0.6.0**: the files of their heads equal those of the releases above (in
   0.4.0 to 0.4.2 the policy around the head differs).
-- **N1, N1.6, the two-decoder fork and its split arms**: `tests/test_integrations.py` has classes of the same
+- **N1, N1.6, the two-decoder fork and its split arms**: `tests/integrations` has classes of the same
   structure with saccade's own arithmetic. The fork's own head file was run once by hand, with errors as
   above.
 - **Isaac-GR00T's classes** are in no package, so they are not run here. N1.5's head is lerobot's. N1.6's and
