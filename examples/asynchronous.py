@@ -1,13 +1,13 @@
 """Asynchronous inference: the effect of delay in closed loop, with and without real-time chunking.
 
-    python examples/asynchronous.py                     2 episodes of each task in each arm, a minute
+    python examples/asynchronous.py                     2 episodes of each task and condition, a minute
     python examples/asynchronous.py --episodes 30       the run of docs/real-time.md; resumes after a stop
     python examples/asynchronous.py report              print the tables and draw the figure again
 
 The bundled policy drives the simulated robot. A chunk of actions arrives `delay` control ticks after its
 observation; until then the robot keeps executing the last chunk. The first `delay` actions of the new chunk
 are therefore in the past when it arrives, and the robot jumps from one chunk into the middle of the next.
-There are two arms, with the same layouts, instructions and noise:
+There are two conditions, with the same layouts, instructions and noise:
 
 plain     the new chunk is sampled independently of the last one
 chunked   the head gets the last chunk as `previous_chunk=`. Its next `delay` actions will be executed, so
@@ -15,7 +15,7 @@ chunked   the head gets the last chunk as `previous_chunk=`. Its next `delay` ac
           (`saccade.Chunking`)
 
 The delay is counted in ticks, not in seconds, so a seed gives the same run on any machine.
-Needs the extra `study`.
+Needs saccade_lab with its extra `study`.
 """
 
 from __future__ import annotations

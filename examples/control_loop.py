@@ -1,4 +1,4 @@
-"""A control loop: an action every 100 ms while a whole policy looks and samples in the background.
+"""A control loop: an action every 100 ms while a policy encodes and samples in the background.
 
     python examples/control_loop.py --small               a small random checkpoint, a few seconds
     python examples/control_loop.py                       N1.5's size, random: writes 4.8 GB once

@@ -1,11 +1,11 @@
-"""A study with your own arm and metric: what happens without the two longest future tokens?
+"""A study with your own condition and metric: what happens without the two longest future tokens?
 
     python examples/own_study.py                                               the bundled policy, simulated
     python examples/own_study.py --checkpoint CHECKPOINT --features FILE.npz   any checkpoint, on a recording
 
-The arm is compared with the unchanged head on the same episodes and noise. Results are kept in --out, so a
-later run with more episodes measures only the new ones. `saccade study report OUT` writes a report. Needs the
-extra `study`.
+The condition is compared with the unchanged head on the same episodes and noise. Results are kept in --out,
+so a later run with more episodes measures only the new ones. `saccade study report OUT` writes a report.
+Needs saccade_lab with its extra `study`.
 """
 
 import argparse

@@ -6,7 +6,7 @@
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
     make bench-peers PEERS_ARGS="--only throughput --rounds 3 --minutes 120"
                        chunks per second of 1, 8 and 32 observations at once, on 1 thread to all cores
-    make bench-peers PEERS_ARGS="--only policy"            the whole policy, frames and words to a chunk
+    make bench-peers PEERS_ARGS="--only policy"            the whole policy, images and instruction to a chunk
     python -m benches.peers report                         write the report of existing measurements
     python -m benches.peers report --write                 write docs/results/performance.md and its figures
     python -m benches.peers report --only policy --write   write docs/results/policy-speed.md

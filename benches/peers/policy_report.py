@@ -22,8 +22,8 @@ LEROBOT_BF16 = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
 GOALS = tuple(
     Goal(f"{what}, {work}", "policy", work, LEROBOT_BF16, ours, least, beyond)
     for what, ours, least, beyond in (
-        ("frames + words to a chunk, int8", "policy-saccade-int8", 3.0, 4.5),
-        ("frames + words to a chunk, bfloat16", "policy-saccade-bfloat16", 1.7, 2.5),
+        ("images + instruction to a chunk, int8", "policy-saccade-int8", 3.0, 4.5),
+        ("images + instruction to a chunk, bfloat16", "policy-saccade-bfloat16", 1.7, 2.5),
         ("accelerate(policy, backbone=True), bfloat16", "policy-accelerate-bfloat16", 1.6, 2.3),
     )
     for work in Case("policy", 1).works
@@ -58,8 +58,9 @@ def write(results: Results, folder: Path) -> None:
 def page(measured: list[Results]) -> str:
     """docs/results/policy-speed.md: all machines, one after the other."""
     parts = [
-        "# The whole policy, measured",
-        "From frames and words to a chunk of actions: N1.5 at its published size with seeded random weights. "
+        "# Speed of the whole policy",
+        "From camera images and an instruction to a chunk of actions: N1.5 at its published size with "
+        "seeded random weights. "
         '`make bench-peers PEERS_ARGS="--only policy"` measures a machine and keeps the numbers in '
         "`benches/peers/results/policy/`, one file per CPU family; "
         "`python -m benches.peers report --only policy --write` writes this page from these files.",

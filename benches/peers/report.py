@@ -84,7 +84,7 @@ def page(measured: list[Results]) -> str:
     """docs/results/performance.md: all machines, one after the other."""
     names = "; ".join(results.cpu for results in measured)  # names have commas
     parts = [
-        "# Performance",
+        "# Speed of the action head",
         f"CPUs measured: {names}. A number of one CPU says little about another. `make bench-peers` measures "
         "a machine in half an hour and keeps the numbers in `benches/peers/results/`, one file per CPU "
         "family; `python -m benches.peers report --write` writes this page from these files.",

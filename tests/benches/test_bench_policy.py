@@ -110,7 +110,7 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     autocast = CONTENDERS["policy-lerobot-bfloat16"].label
     assert [(row[0], *row[1:]) for row in rows if "1 view" in row[0]] == [
         (
-            "| frames + words to a chunk, int8, 1 view",
+            "| images + instruction to a chunk, int8, 1 view",
             autocast,
             "2",
             "3.0 x (4.5 x)",
@@ -118,7 +118,7 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
             "yes |",
         ),
         (
-            "| frames + words to a chunk, bfloat16, 1 view",
+            "| images + instruction to a chunk, bfloat16, 1 view",
             autocast,
             "2",
             "1.7 x (2.5 x)",
