@@ -401,7 +401,7 @@ def test_what_is_no_observation_is_an_error() -> None:
 
 def test_a_head_alone_samples_for_observations_and_does_not_look() -> None:
     whole = policy("isaac")
-    alone = saccade.Policy(whole.head, embodiment="new_embodiment")  # type: ignore[attr-defined]
+    alone = saccade.Policy(whole.head, embodiment="new_embodiment")
     assert (alone.backbone, alone.processor) == (None, None)
     given = nested(whole)
     for call in (alone.act, alone.encode):

@@ -20,12 +20,12 @@ import saccade
 from saccade.checkpoints import describe, random_checkpoint
 from saccade.checkpoints.whole import robots_of
 from saccade_lab.reference import ActionHead as Reference
-from tests.helpers import released
+from tests.helpers import paths
 from tests.helpers.policy_cases import inputs_of
 from tests.helpers.reference_cases import relative_error
 from tests.helpers.tensor_files import read_tensor_file
 
-ROBOTS = released.DATA / "robots"
+ROBOTS = paths.DATA / "robots"
 N15, N16 = ROBOTS / "n15" / "13-history", ROBOTS / "n16_n17" / "14-n16-history"
 
 Arrays = dict[str, npt.NDArray[Any]]

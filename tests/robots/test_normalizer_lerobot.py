@@ -19,8 +19,8 @@ import saccade
 from saccade import Normalizer
 from tests.helpers import layouts
 from tests.helpers.normalizer_cases import as_array, draw, edit, step_config
+from tests.helpers.paths import DATA
 from tests.helpers.published import sidecars
-from tests.helpers.released import DATA
 
 
 @pytest.fixture(scope="module")

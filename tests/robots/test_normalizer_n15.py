@@ -14,8 +14,8 @@ import saccade
 from saccade import Normalizer
 from saccade.robots import RELEASED
 from tests.helpers.normalizer_cases import as_array, data_config, draw, metadata
+from tests.helpers.paths import DATA
 from tests.helpers.published import sidecars
-from tests.helpers.released import DATA
 
 
 def isaac_n15(mode: str, x: NDArray[Any], stats: dict[str, list[float]]) -> NDArray[Any]:
@@ -102,7 +102,7 @@ def test_a_rotation_and_gr1_need_a_data_config() -> None:
     said = Normalizer.from_pretrained(values, data_config=data_config())
     plain = Normalizer.from_pretrained(metadata(), data_config=data_config())
     assert np.array_equal(as_array(said.state(draw(1, 5))), as_array(plain.state(draw(1, 5))))
-    with pytest.raises(saccade.InputError, match="data_config: expected one for source: gr1"):
+    with pytest.raises(saccade.InputError, match="data_config: expected one for id_or_path: gr1"):
         Normalizer.from_pretrained(metadata("gr1"))
 
 

@@ -12,8 +12,8 @@ import pytest
 import saccade
 from saccade import Normalizer
 from tests.helpers.normalizer_cases import as_array, draw, load_processor, processor, row
+from tests.helpers.paths import DATA
 from tests.helpers.published import sidecars
-from tests.helpers.released import DATA
 
 
 @pytest.mark.parametrize("percentiles", [False, True])

@@ -14,9 +14,9 @@ import pytest
 
 import saccade
 from saccade.checkpoints import random_checkpoint
-from tests.helpers import released
+from tests.helpers import paths
 
-DATA = released.DATA / "robots"
+DATA = paths.DATA / "robots"
 
 #: Files that say what a robot is.
 ABOUT = ("processor_config.json", "statistics.json", "embodiment_id.json", "experiment_cfg/metadata.json")

@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 
 import saccade
-from tests.helpers import released
+from tests.helpers import paths
 from tests.helpers.tensor_files import read_tensor_file
 
-DATA = released.DATA / "robots"
+DATA = paths.DATA / "robots"
 
 #: The released numbers, as the fixtures were checked.
 TOLERANCE = 1e-5

@@ -7,7 +7,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 
 import saccade
 from saccade._internal.hub import resolve
-from saccade.robots import read_json
+from saccade._internal.small_files import read_json
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.hub import resolve
+from saccade._internal.small_files import read_json
 from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, Memory
@@ -17,7 +18,7 @@ from saccade.checkpoints.tokens import token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.errors import InputError, SaccadeError
 from saccade.head.config import to_json
-from saccade.robots import DataConfigLike, read_json
+from saccade.robots import DataConfigLike
 from saccade.robots.embodiments import IDS
 
 

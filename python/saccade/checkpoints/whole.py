@@ -10,11 +10,12 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import PRECISIONS
+from saccade._internal.small_files import read_json
 from saccade.backbone.config import BackboneConfig
 from saccade.errors import CheckpointError, SaccadeError
 from saccade.observations import Requirements, read_requirements
 from saccade.processor import Processor
-from saccade.robots import DataConfigLike, Normalizer, read_json
+from saccade.robots import DataConfigLike, Normalizer
 from saccade.robots.reading import OWN_DATA_CONFIG, processor_folder
 
 

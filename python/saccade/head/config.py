@@ -5,17 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import integer
+from saccade._internal.small_files import read_small
 from saccade.errors import CheckpointError
-
-#: A longer file is refused. The engine has the same limit for the config in a checkpoint's directory.
-MOST_BYTES = 100_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,13 +157,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
         FileNotFoundError, CheckpointError: As :func:`to_json`.
     """
     try:
-        about = Path(path).stat()
-        # Reading a pipe might wait forever, and a device might never end.
-        if not stat.S_ISREG(about.st_mode):
-            raise ValueError("not a regular file")
-        if about.st_size > MOST_BYTES:
-            raise ValueError(f"more than {MOST_BYTES} bytes")
-        return Path(path).read_text(encoding="utf-8")
+        return read_small(Path(path)).decode("utf-8")
     except FileNotFoundError:
         raise FileNotFoundError(f"config: no such file: {os.fspath(path)}") from None
     except (OSError, TypeError, ValueError) as error:

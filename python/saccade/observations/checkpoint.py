@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError
 from saccade.observations.lerobot import IMAGE, IMAGES
 from saccade.observations.requirements import Camera, Requirements
-from saccade.robots import Robot, read_json
+from saccade.robots import Robot
 from saccade.robots.building import size_of
 from saccade.robots.lerobot_pipeline import read_pipeline
+from saccade.robots.lerobot_steps import PREPROCESSOR
 from saccade.robots.reading import processor_folder, processor_version
 
 #: lerobot's groot policies know this camera by two names.
@@ -55,7 +57,9 @@ def _from_files(folder: Path, robot: Robot) -> Requirements:
 
 def _lerobot(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirements | None:
     """lerobot: the policy's features, sorted by name; or N1.7's keys that are among them, in their order."""
-    pipeline = read_pipeline(folder, values)
+    pipeline = robot.pipeline
+    if pipeline is None or pipeline.where != str(folder / PREPROCESSOR):  # statistics of another checkpoint
+        pipeline = read_pipeline(folder, values)
     if pipeline is None:
         return None
     pack = pipeline.pack.config

@@ -38,8 +38,9 @@ class Parts:
 
 
 def load_parts(
-    source: str | os.PathLike[str],
+    id_or_path: str | os.PathLike[str],
     *,
+    revision: str | None,
     embodiment: str | int | None,
     preprocessing: Preprocessing | None,
     tokenizer: str | os.PathLike[str] | None,
@@ -56,7 +57,7 @@ def load_parts(
     What is quick to load comes first, so that a mistake is found before gigabytes are read.
     """
     precisions = precisions_of_parts(precision)
-    path = resolve(source)
+    path = resolve(id_or_path, revision)
     check_whole(path)
     config = HeadConfig(**_saccade.Published.open(os.fspath(path), None).config())
     if isinstance(normalizer, Normalizer):

@@ -119,8 +119,9 @@ class Policy:
     @classmethod
     def from_pretrained(
         cls,
-        source: str | os.PathLike[str],
+        id_or_path: str | os.PathLike[str],
         *,
+        revision: str | None = None,
         embodiment: str | int | None = None,
         preprocessing: Preprocessing | None = None,
         tokenizer: str | os.PathLike[str] | None = None,
@@ -137,7 +138,9 @@ class Policy:
         Of the head, only the layers of the chosen embodiment are loaded.
 
         Args:
-            source: The directory or id of a checkpoint, as for :meth:`saccade.ActionHead.from_pretrained`.
+            id_or_path: The directory or id of a checkpoint, as for
+                :meth:`saccade.ActionHead.from_pretrained`.
+            revision: A branch, tag or commit of the id. Default: ``main``.
             embodiment: Tag or id of the robot. Required if the checkpoint has statistics of several robots.
             preprocessing: ``"lerobot"`` or ``"isaac"``: how frames and instruction are prepared. It must be
                 the way of the program that trained the checkpoint. Default: by version and layout; see
@@ -160,7 +163,7 @@ class Policy:
                 ``{"letter_box_transform": True}``; see :meth:`saccade.Processor.from_pretrained`.
 
         Raises:
-            FileNotFoundError: ``source``, a file of the checkpoint or the tokenizer does not exist.
+            FileNotFoundError: ``id_or_path``, a file of the checkpoint or the tokenizer does not exist.
             CheckpointError: The checkpoint is damaged, or holds only a head or only a backbone. The message
                 says which part is missing.
             InputError: An option is out of range.
@@ -172,7 +175,8 @@ class Policy:
             ...     return policy.act(policy.example_observation(), seed=0)
         """
         parts = load_parts(
-            source,
+            id_or_path,
+            revision=revision,
             embodiment=embodiment,
             preprocessing=preprocessing,
             tokenizer=tokenizer,

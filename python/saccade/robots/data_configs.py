@@ -14,8 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.files import read_json
 from saccade.robots.rotations import SIZES
 
 #: A name of `RELEASED`, the path of a JSON file, or its contents.

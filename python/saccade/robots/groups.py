@@ -12,9 +12,7 @@ from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError, ShapeError
 from saccade.robots import rotations
 from saccade.robots.data_configs import DataConfig
-
-#: The ways to normalise a group.
-MODES = ("min_max", "q99", "mean_std", "scale", "binary", "sin_cos", "none")
+from saccade.robots.lerobot_steps import Pipeline
 
 Statistics: TypeAlias = "npt.NDArray[np.floating[Any]]"
 
@@ -210,6 +208,7 @@ class Robot:
         gripper: The number of the action that becomes ``-sign(2 g - 1)``, as LIBERO's gripper has it in
             lerobot; or None.
         data_config: The data config of N1 and N1.5, or None.
+        pipeline: The processors of a policy that lerobot saved, or None.
     """
 
     embodiment: str | None
@@ -226,3 +225,4 @@ class Robot:
     offsets: npt.NDArray[np.bool_] | None = None
     gripper: int | None = None
     data_config: DataConfig | None = None
+    pipeline: Pipeline | None = None

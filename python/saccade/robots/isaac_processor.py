@@ -12,22 +12,18 @@ from saccade.errors import CheckpointError
 from saccade.robots.building import Builder, Options, finished, width_of
 from saccade.robots.embodiments import IDS, choose
 from saccade.robots.groups import Group, Reference, Robot
+from saccade.robots.lerobot_steps import IMAGE_OPTIONS, action_steps
 from saccade.robots.rotations import POSES
 
 #: Versions by the class of the processor.
 CLASSES = {"Gr00tN1d6Processor": "n1.6", "Gr00tN1d7Processor": "n1.7"}
 
-#: Arguments of the processors. ``saccade.Processor`` reads those of images and words.
+#: Arguments of the processors. ``saccade.Processor`` reads those of images and text.
 OPTIONS = (
+    *IMAGE_OPTIONS,
     "modality_configs",
-    "image_crop_size",
-    "image_target_size",
-    "use_albumentations",
     "random_rotation_angle",
     "color_jitter_params",
-    "shortest_image_edge",
-    "crop_fraction",
-    "model_name",
     "model_type",
     "formalize_language",
     "max_state_dim",
@@ -420,9 +416,8 @@ def _check_horizons(
         builder.problems.append(f"max_action_horizon: expected an integer, got {most!r:.60}")
         return
     for tag, config in configs.items():
-        action = config.get("action") if isinstance(config, Mapping) else None
-        steps = action.get("delta_indices") if isinstance(action, Mapping) else None
-        if isinstance(steps, list) and len(steps) > most:
+        steps = action_steps(config)
+        if len(steps) > most:
             builder.problems.append(
                 f"{tag} has chunks of {len(steps)} actions, expected at most {most} (max_action_horizon)"
             )

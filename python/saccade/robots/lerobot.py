@@ -25,7 +25,8 @@ from saccade.robots.isaac_processor import (
     refuse_unknown_fields,
     single_row,
 )
-from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
+from saccade.robots.lerobot_pipeline import read_pipeline
+from saccade.robots.lerobot_steps import DECODE, Pipeline, action_steps
 from saccade.robots.rotations import POSES
 
 STATE, ACTION = "observation.state", "action"
@@ -92,6 +93,7 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
         trained_horizon=trained,
         offsets=offsets,
         gripper=gripper,
+        pipeline=pipeline,
     )
 
 

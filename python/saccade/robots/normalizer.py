@@ -31,8 +31,8 @@ class Normalizer(Robot):
     """Converts a robot's state to the input of the head, and the output of the head to the robot's actions.
 
     The head works on values of about -1 to 1, zero-padded to widths that all robots share. The statistics for
-    the conversion are stored with the weights. :meth:`load` reads them and applies them as the code that
-    trained the checkpoint does.
+    the conversion are stored with the weights. :meth:`from_pretrained` reads them, and they are applied as in
+    the code that trained the checkpoint.
 
     The attributes are those of :class:`saccade.robots.Robot`.
 
@@ -52,9 +52,10 @@ class Normalizer(Robot):
     @classmethod
     def from_pretrained(
         cls,
-        source: str | os.PathLike[str] | Mapping[str, Any],
+        id_or_path: str | os.PathLike[str] | Mapping[str, Any],
         embodiment: str | int | None = None,
         *,
+        revision: str | None = None,
         data_config: DataConfigLike | None = None,
         state_dim: int | None = None,
         action_dim: int | None = None,
@@ -73,9 +74,10 @@ class Normalizer(Robot):
           ...}, "action": ...}``, or the same with ``"mean"`` and ``"std"``.
 
         Args:
-            source: The directory or id of a checkpoint, one of these files, or a mapping.
+            id_or_path: The directory or id of a checkpoint, one of these files, or a mapping.
             embodiment: Tag or id of the robot, or the name that the release has for the tag. Required if the
                 statistics are of several robots.
+            revision: A branch, tag or commit of the id. Default: ``main``.
             data_config: N1 and N1.5: the data config of the checkpoint, by the name that Isaac-GR00T gives
                 it, as the path of a JSON file, or as a mapping; see ``docs/robots.md``. It says which keys
                 are used, in which order, and how. Default: all keys in the order of the file, min-max
@@ -85,7 +87,7 @@ class Normalizer(Robot):
             action_dim: Width of the head's actions. Default: likewise.
 
         Raises:
-            FileNotFoundError: ``source`` or the file of ``data_config`` does not exist.
+            FileNotFoundError: ``id_or_path`` or the file of ``data_config`` does not exist.
             CheckpointError: There are no statistics, they are damaged, or something in the files is not known
                 and could change the answer. The message lists every problem.
             InputError: An option does not fit the statistics.
@@ -96,7 +98,7 @@ class Normalizer(Robot):
             None if action_dim is None else integer("action_dim", action_dim),
             None if data_config is None else read_data_config(data_config),
         )
-        return cls(**vars(read(source, options)))
+        return cls(**vars(read(id_or_path, revision, options)))
 
     @property
     def state_slices(self) -> dict[str, slice]:

@@ -8,12 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from saccade._internal.arrays import integer
 from saccade._internal.hub import resolve
-from saccade.errors import CheckpointError
-from saccade.robots.building import Dims, Options, size_of
+from saccade._internal.small_files import read_json
+from saccade.errors import CheckpointError, InputError
+from saccade.robots.building import Builder, Dims, Options, finished, size_of
 from saccade.robots.data_configs import data_config
-from saccade.robots.files import read_json
-from saccade.robots.flat import flat_robot
+from saccade.robots.embodiments import N15_IDS
 from saccade.robots.groups import Robot
 from saccade.robots.isaac_metadata import metadata_robot
 from saccade.robots.isaac_processor import CLASSES, processor_robot
@@ -29,16 +32,23 @@ OWN_DATA_CONFIG = "experiment_cfg/data_config.json"
 MODEL_TYPES = {"Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
 
 
-def read(source: str | os.PathLike[str] | Mapping[str, Any], options: Options) -> Robot:
-    """The robot that ``source`` describes; see :meth:`saccade.Normalizer.from_pretrained`.
+def read(
+    id_or_path: str | os.PathLike[str] | Mapping[str, Any], revision: str | None, options: Options
+) -> Robot:
+    """The robot that a checkpoint or a mapping describes; see :meth:`saccade.Normalizer.from_pretrained`.
 
     Raises:
         FileNotFoundError, CheckpointError, InputError: As there.
     """
-    where = "source" if isinstance(source, Mapping) else str(resolve(source))
+    if not isinstance(id_or_path, Mapping):
+        where = str(resolve(id_or_path, revision))
+    elif revision is None:
+        where = "id_or_path"
+    else:
+        raise InputError(f"revision: expected None with a mapping, got {revision!r}")
     try:
-        if isinstance(source, Mapping):
-            return _from_values(source, options, where)
+        if isinstance(id_or_path, Mapping):
+            return _from_values(id_or_path, options, where)
         return _from_path(Path(where), options)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         # A file may contain anything in place of an object.
@@ -121,7 +131,30 @@ def _from_values(values: Mapping[str, Any], options: Options, where: str, dims: 
     if "statistics" in values and "modalities" in values:
         tag = str(values.get("embodiment_tag", "new_embodiment"))
         return metadata_robot({tag: values}, options, where, dims)
-    return flat_robot(values, options, where, dims)
+    return _flat(values, options, where, dims)
+
+
+def _flat(values: Any, options: Options, where: str, dims: Dims) -> Robot:
+    """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well.
+
+    Raises:
+        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
+    """
+    options.refuse_data_config(where)
+    builder = Builder(where, np.float32)
+    groups = []
+    for kind, other in (("state", "observation.state"), ("action", "action")):
+        found = values.get(kind, values.get(other)) if isinstance(values, Mapping) else None
+        has_bounds = isinstance(found, Mapping) and {"min", "max"} <= set(found)
+        groups.append(builder.group(kind, found, "min_max" if has_bounds else "mean_std"))
+    state, action = builder.check(groups)
+    # The statistics do not name a robot, so the request does.
+    tag, embodiment_id, asked = None, None, options.embodiment
+    if isinstance(asked, str):
+        tag, embodiment_id = asked, N15_IDS.get(asked)
+    elif asked is not None:
+        embodiment_id = integer("embodiment", asked, least=0)
+    return finished(where, options, tag, embodiment_id, (state,), (action,), dims)
 
 
 def _dims(config: Mapping[str, Any]) -> Dims:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._internal import hub
 from saccade._internal.json import dumps
+from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError
-from saccade.robots import LANGUAGE_KEY, read_json
+from saccade.robots import LANGUAGE_KEY
 from saccade.robots.reading import processor_folder
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Reads the small files of statistics in a checkpoint's directory."""
+"""Reads small files that are held in memory at once: JSON, and the tensors of statistics."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy.typing as npt
 import saccade._saccade as _saccade
 from saccade.errors import CheckpointError, printable
 
-#: A larger file is refused, since it is read at once. No robot's statistics are larger.
-MOST_BYTES = 1 << 26
+#: A larger file is refused, since it is read at once. The engine has the same limit for its JSON files.
+MOST_BYTES = 100_000_000
 
 #: How the text of a Git LFS pointer begins: what a clone holds in place of a file that was not downloaded.
 POINTER = b"version https://git-lfs.github.com/spec/v1"
@@ -41,7 +41,7 @@ def read_json(path: Path) -> dict[str, Any]:
         CheckpointError: It contains something else.
     """
     try:
-        values = json.loads(_bytes(path))
+        values = json.loads(read_small(path))
     except FileNotFoundError:
         raise FileNotFoundError(printable(f"{path}: no such file")) from None
     except (OSError, ValueError, RecursionError) as error:
@@ -59,7 +59,7 @@ def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
         CheckpointError: It is damaged.
     """
     try:
-        _check_small(path)
+        check_small(path)
         tensors = {}
         for name, (dtype, shape, content) in _saccade.read_stored(str(path)).items():
             if dtype not in DTYPES:
@@ -72,13 +72,19 @@ def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
     return tensors
 
 
-def _bytes(path: Path) -> bytes:
-    """The content of a small file."""
-    _check_small(path)
+def read_small(path: Path) -> bytes:
+    """The content of a small file. Raises as :func:`check_small`."""
+    check_small(path)
     return path.read_bytes()
 
 
-def _check_small(path: Path) -> None:
+def check_small(path: Path) -> None:
+    """Checks that a path is a regular file of at most `MOST_BYTES`, and not a Git LFS pointer.
+
+    Raises:
+        OSError: The file does not exist or cannot be read.
+        ValueError: It is something else.
+    """
     about = path.stat()
     # Reading a pipe might wait forever, and a device might never end.
     if not stat.S_ISREG(about.st_mode):
