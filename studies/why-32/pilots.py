@@ -56,11 +56,11 @@ def main() -> None:
     if not (backbone / "model.safetensors").exists():
         train(demos, backbone, BACKBONE, lambda progress: None)
     train(demos, directory, settings, lambda progress: None, start=backbone)
-    policy = Policy.load(directory, num_threads=1)
+    policy = Policy.from_pretrained(directory, num_threads=1)
     for task in policy.config.tasks:
         environment = environment_for(policy, task)
         if args.blind:
-            environment.observe = functools.partial(grey, environment.observe)
+            environment.observe = functools.partial(grey, environment.observe)  # type: ignore[method-assign]
         episodes = [run_episode(environment, policy, FIRST_SEED + number) for number in range(EPISODES)]
         environment.close()
         print(f"{directory.name} {task}: {sum(one.success for one in episodes)} of {EPISODES}", flush=True)

@@ -1,4 +1,4 @@
-"""Power of the confirmatory tests of `saccade study answer`, as a table in Markdown.
+"""Power of the confirmatory tests of this study, as a table in Markdown.
 
     python studies/why-32/power.py [EPISODES]
 

@@ -1,7 +1,7 @@
 """A second analysis of the core of this study, from its table and the README alone.
 
 `python studies/why-32/reanalysis.py` prints the check of the data, the primary and secondary tests,
-robustness checks, and what is odd. It shares no code with `saccade study answer`. All differences are in
+robustness checks, and what is odd. It shares no code with `why_32`. All differences are in
 percentage points; the slope is in points per unit of log2(N + 1).
 """
 

@@ -5,7 +5,7 @@ success and held-out losses of each recipe, and the differences between recipes 
 tasks together, and for each alone. They are exploratory, so there are no p values. Then come the one
 test of these stages, that of the new pairs with more steps, and the same policies under arms, the core's
 among them: other numbers of Euler steps, cuts, merged or random tokens and other softmax weights. It shares
-no code with `saccade study answer`.
+no code with `why_32`.
 Differences are in percentage points; the slope is in points per unit of log2(N + 1).
 """
 
@@ -27,8 +27,8 @@ VLSA, VISION = "vlsa", ("patch-32", "patch-8", "two-cameras")
 STAGES = ("scaled", "alignment", "numbers", "compute", VISION[0], VLSA, *VISION[1:], "aligned-again")
 # The arms of other numbers of Euler steps than four, which are those of the arm "plain".
 EULER = ("steps of 1", "steps of 2", "steps of 8")
-CHANGES = ("future-unread", "future-blind", "rows-blind", "future-redrawn")
-CHANGES += ("1 merged", "4 merged", "mass of 4", "mass of 32")
+CUTS = ("future-unread", "future-blind", "rows-blind", "future-redrawn")
+CHANGES = (*CUTS, "1 merged", "4 merged", "mass of 4", "mass of 32")
 COUNTS = (0, 1, 4, 16, 32, 64)
 PARTS = {"both tasks": TASKS, **{task: (task,) for task in TASKS}}
 CORE = ("n-0", "n-4", "n-32")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from saccade.cli import EXIT_OK, Parser, output
 from saccade_lab.extras import LAB, require
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
-from saccade_lab.study.study import STUDIES, load_study
+from saccade_lab.study.study import STUDIES, Study, load_study
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -87,44 +86,53 @@ def run(args: argparse.Namespace) -> int:
         return run_report(args)
     recorded = [getattr(args, name, None) for name in ("features", "frames")]
     require("study" if recorded == [None, None] else "study --features")
-    return measure(args)
+    kind = load_study(args.study)
+    show(kind, compute(kind, args), args.json)
+    return EXIT_OK
 
 
-def measure(args: argparse.Namespace) -> int:
-    """Checks the arguments, works through the cells with a progress bar, and prints the conclusions."""
+def compute(kind: type[Study], args: argparse.Namespace) -> Path:
+    """Checks the arguments, and works through the cells with a progress bar.
+
+    Args:
+        kind: The study.
+        args: As its `add_arguments` and `add_common_arguments` declare them.
+
+    Returns:
+        The directory of the table.
+    """
     from saccade_lab.study.run import Finished
     from saccade_lab.study.run import run as run_study
 
     workers = workers_of(args)
     with output.progress_bar("loading", transient=True) as loading:
         args.on_observation = lambda done, total: loading(done, total, "reading the pictures")
-        study = load_study(args.study).from_arguments(args)
+        study = kind.from_arguments(args)
     out = writable_directory(args.out)
-    with output.progress_bar(args.study) as update:
+    with output.progress_bar(kind.name) as update:
 
         def on_done(finished: Finished, done: int, total: int) -> None:
             update(done, total, finished.cell.name)
 
         run_study(study, out, workers=workers, on_done=on_done)
-    show(args.study, out, args.json)
-    return EXIT_OK
+    return out
 
 
-def show(name: str, out: Path, as_json: bool) -> None:
+def show(kind: type[Study], out: Path, as_json: bool) -> None:
     """Prints the conclusions that the table supports, and where it is."""
     from saccade_lab.study import table as tables
 
-    provenance = tables.read_provenance(tables.provenance_path(out, name))
+    path = tables.table_path(out, kind.name)
+    provenance = tables.read_provenance(tables.provenance_path(out, kind.name))
     if as_json:
         rows: list[dict[str, Any]] = json.loads(
-            tables.read_table(tables.table_path(out, name)).to_json(orient="records", double_precision=15)
+            tables.read_table(path).to_json(orient="records", double_precision=15)
         )
         output.print_json({"provenance": vars(provenance), "rows": rows}, indent=2)
         return
-    section = load_study(name).summarise(tables.read_table(tables.table_path(out, name)), provenance)
-    for line in (*section.answer, *section.concluded):
-        print("- " + re.sub(r"\[([^]]*)\]\(#[^)]*\)", r"\1", line))  # links are for the report
-    print(f"table   {tables.table_path(out, name)}")
+    for line in kind.summarise(tables.read_table(path), provenance).concluded:
+        print(f"- {line}")
+    print(f"table   {path}")
     print(f"report  saccade study report {out}")
 
 

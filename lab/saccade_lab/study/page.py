@@ -24,13 +24,11 @@ class SavedPicture:
         caption: As in `section.Figure`.
         file: Its path relative to the report, for the Markdown.
         data: The whole picture as a `data:` URI, for the HTML.
-        table: As in `section.Figure`.
     """
 
     caption: str
     file: str
     data: str
-    table: str = ""
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ def to_html(markdown: str, pictures: Mapping[str, str]) -> str:
     for token, following in itertools.pairwise(tokens):
         if token.type == "heading_open" and token.tag == "h1":
             title = following.content
-        if token.type == "heading_open" and token.tag in ("h2", "h4"):
+        if token.type == "heading_open" and token.tag == "h2":
             token.attrSet("id", anchor(following.content))
         for child in token.children or ():
             if child.type == "image":

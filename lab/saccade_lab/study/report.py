@@ -16,7 +16,7 @@ from saccade_lab.study.study import STUDIES, load_study
 from saccade_lab.study.table import provenance_path, read_study, table_path
 
 ATTENTION = "attention"  # the directory that `saccade attention` writes
-SEPARATE = ("answer", "fast")  # studies with a question of their own: one of these alone names no others
+SEPARATE = ("fast",)  # studies with a question of their own: one of these alone names no others
 PNG_DOTS_PER_INCH = 130
 
 
@@ -45,7 +45,7 @@ def write_report(directory: Path) -> tuple[Path, Path]:
     separate = len(measured) == 1 and measured[0] in SEPARATE
     words, about = Prose("words"), measured[0] if separate else ""
     title = words.line("report_title", about)
-    opening = words.paragraphs("report_opening", about, (directory / "README.md").exists())
+    opening = words.paragraphs("report_opening")
     parts = [make_part(directory, name) for name in (measured if separate else STUDIES)]
     if (directory / ATTENTION).is_dir():
         parts.append(attention_part(directory))
@@ -105,7 +105,7 @@ def draw(directory: Path, name: str, figure: Figure) -> SavedPicture:
         buffer = io.BytesIO()
         figure.picture.savefig(buffer, format="svg", metadata={"Date": None})
     svg = as_uri("image/svg+xml", buffer.getvalue())
-    return SavedPicture(figure.caption, f"figures/{name}.png", svg, figure.table)
+    return SavedPicture(figure.caption, f"figures/{name}.png", svg)
 
 
 def as_uri(kind: str, content: bytes) -> str:

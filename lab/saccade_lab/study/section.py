@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure as Picture
 from saccade_lab.study.statistics import LOSS_THAT_MATTERS, Estimate, scaled, verdict
 
 FEWEST = 10  # clusters that a bootstrap needs
+PACKAGE = "saccade_lab.study"  # whose folder `pages` has the templates of the general questions
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,11 @@ class Figure:
         name: Name of its file, unique in its section: lower-case words separated by hyphens.
         caption: Description of the drawing, with units, and of the error bars.
         picture: Drawn by :mod:`saccade_lab.study.figures`.
-        table: Heading of the table that it is drawn above. Empty for a figure that comes before the tables.
     """
 
     name: str
     caption: str
     picture: Picture
-    table: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,6 @@ class Grid:
     rows: Sequence[Sequence[str]]
     note: str = ""
 
-    @property
-    def heading(self) -> str:
-        """What it is referred to by: "Table 3" if its caption begins with "Table 3. ", else nothing."""
-        found = re.match(r"(Table \d+)\. ", self.caption)
-        return found[1] if found else ""
-
 
 @dataclass(frozen=True)
 class Section:
@@ -67,10 +59,6 @@ class Section:
         figures, grids: The results.
         concluded: Sentences that say what the intervals show.
         not_shown: Sentences that say what the study cannot show.
-        answer: Sentences that the section begins with, before its figures; for a study with one question.
-        commands: Commands that compute the section again, for one with an answer.
-        reproduction: Paragraphs below these commands: what a repetition needs.
-        comparisons: Sentences on comparisons that the answer only counts, and on those not measured.
     """
 
     title: str
@@ -79,10 +67,6 @@ class Section:
     grids: Sequence[Grid] = ()
     concluded: Sequence[str] = ()
     not_shown: Sequence[str] = ()
-    answer: Sequence[str] = ()
-    commands: Sequence[str] = ()
-    reproduction: Sequence[str] = ()
-    comparisons: Sequence[str] = ()
 
 
 def number(estimate: Estimate, digits: int) -> str:
@@ -120,10 +104,10 @@ def points(difference: Estimate) -> str:
 
 
 @functools.cache
-def templates() -> Environment:
-    """The templates of `pages/`, with the filters that write numbers."""
+def templates(package: str = PACKAGE) -> Environment:
+    """The templates of a package's folder `pages`, with the filters that write numbers."""
     environment = Environment(
-        loader=PackageLoader("saccade_lab.study", "pages"),
+        loader=PackageLoader(package, "pages"),
         autoescape=lambda name: bool(name and name.endswith(".html.jinja")),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -148,6 +132,7 @@ class Prose:
 
     Args:
         name: Name of the template.
+        package: The package that has it.
         values: Variables of the template.
 
     Example:
@@ -155,8 +140,8 @@ class Prose:
         'not measured, there are no demonstrations'
     """
 
-    def __init__(self, name: str, **values: Any) -> None:
-        self._module = templates().get_template(f"{name}.md.jinja").make_module(values)
+    def __init__(self, name: str, *, package: str = PACKAGE, **values: Any) -> None:
+        self._module = templates(package).get_template(f"{name}.md.jinja").make_module(values)
 
     def line(self, macro: str, *arguments: Any, **named: Any) -> str:
         """The text of a macro on one line."""

@@ -6,14 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from saccade.policy.interfaces import Head
 from saccade_lab.study.arms import Arm
 from saccade_lab.study.questions.cuts import ARMS as CUTS
 from saccade_lab.study.questions.resized import merged
 from saccade_lab.study.questions.sweeps import equal_mass
 from saccade_lab.study.questions.sweeps_results import PLAIN
 from saccade_lab.study.source import episode_rng
-
-from saccade.policy.interfaces import Head
 
 if TYPE_CHECKING:
     from saccade_lab.sim.rollout import Episode

@@ -1,14 +1,13 @@
-"""What the command line of `saccade study answer` chooses: stages, recipes and arms of the plan."""
+"""What the command line chooses: stages, recipes and arms of the plan."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Collection, Iterable, Iterator
 
-from saccade_lab.study.questions.sweeps_results import PLAIN
-
 from saccade._internal.flags import add_list, check_known
 from saccade.errors import InputError
+from saccade_lab.study.questions.sweeps_results import PLAIN
 from why_32.arms import ARMS, PolicyArm
 from why_32.measured import MEASURED
 from why_32.plan import CORE_STAGE, PILOT, Plan, PlannedPolicy

@@ -1,4 +1,4 @@
-"""What `saccade study answer` compares: sums of weighted success rates of policies of one training seed."""
+"""What the study compares: sums of weighted success rates of policies of one training seed."""
 
 from __future__ import annotations
 

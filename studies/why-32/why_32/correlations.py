@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from saccade_lab.study.statistics import Estimate, bootstrap
 from scipy.stats import rankdata
+
+from saccade_lab.study.statistics import Estimate, bootstrap
 
 Float64Array = npt.NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from saccade_lab.training.settings import TrainingSettings
 
 from benches.work import encode_work, sample_work, total
 from saccade.cli.timing import Call
+from saccade_lab.training.settings import TrainingSettings
 from why_32.plan import Recording
 
 
@@ -47,6 +47,7 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
         recording: Its demonstrations.
     """
     import torch
+
     from saccade_lab.sim.tasks import find_task
     from saccade_lab.training.learner import NUM_TARGETS, Batch, Learner
     from saccade_lab.training.train import policy_config

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from saccade_lab.study.cell import Rows
-
 from why_32 import measures, patching, probes, specialise
 from why_32.plan import Plan, PlannedPolicy
 

@@ -11,13 +11,14 @@ from typing import TypeAlias
 
 import pandas as pd
 from matplotlib.figure import Figure as Picture
+
 from saccade_lab.study import figures
 from saccade_lab.study.questions.patching_section import ALL, GROUPS
 from saccade_lab.study.section import Figure, Grid, Prose, number
 from saccade_lab.study.sign_flip import sign_flip
 from saccade_lab.study.statistics import Estimate
 from saccade_lab.study.table import truths
-
+from why_32 import report
 from why_32.contrasts import CORE
 from why_32.measured import FIRST_EPISODES
 from why_32.measures import MEASURES, NAMES
@@ -34,15 +35,16 @@ COMPARED = ("learned", "random", "learned minus random")
 PARTS = {"explained": "share explained", "ratio": "ratio"}
 
 
-def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Grid]]:
-    """The figure and the tables, as far as something is measured.
+def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Grid], dict[str, str]]:
+    """The figure and the tables, as far as something is measured, and `Answered.above`.
 
     Args:
         table: Table of the study.
         place: Number of the first table.
     """
-    prose = Prose("answer_measured")
+    prose = report.prose("answer_measured")
     pictures: list[Figure] = []
+    above: dict[str, str] = {}
     grids: list[Grid] = []
     rows = table[table["kind"] == MEASURES]
     if len(rows):
@@ -52,7 +54,8 @@ def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Gri
         rows, first = ordered(rows), place + len(grids)
         maps = compared(rows[rows["weight"] == KEPT], "overlap")
         picture = overlap_picture(maps)
-        pictures.append(Figure("overlap", prose.line("caption_picture"), picture, f"Table {first}"))
+        pictures.append(Figure("overlap", prose.line("caption_picture"), picture))
+        above["overlap"] = f"Table {first}"
         learned = rows[rows["tokens"] == LEARNED]
         grids += [
             overlap_grid(prose.line("caption_overlap", first), maps),
@@ -70,7 +73,7 @@ def of_measured(table: pd.DataFrame, place: int) -> tuple[list[Figure], list[Gri
     if len(rows):
         cpu = str(rows["cpu"].iloc[0])
         grids.append(time_grid(prose.line("caption_times", place + len(grids), cpu), ordered(rows)))
-    return pictures, grids
+    return pictures, grids, above
 
 
 def mean(values: pd.Series) -> Estimate | None:

@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.linear_probes import Frames
 from saccade_lab.study.paths import DIRECT
 from saccade_lab.study.questions.cuts import ARMS as CUTS
 from saccade_lab.study.source import episode_rng
-
 from why_32.probes import frames_of_means, r2_of_positions
 
 if TYPE_CHECKING:
-    from saccade_lab.study.simulator import Recorded, Simulator
-
     from saccade.head.head import ActionHead
+    from saccade_lab.study.simulator import Recorded, Simulator
 
 #: The stage that measures them, for trained policies with tokens.
 MEASURES = "measures"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import pandas as pd
+
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.questions.patching import Pair, patched, simulated_pair
 from saccade_lab.study.questions.patching_section import measured_rows, shares

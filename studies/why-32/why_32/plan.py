@@ -1,4 +1,4 @@
-"""What `saccade study answer` trains and judges: every constant of the study is in this file.
+"""What the study trains and judges: every constant of the study is in this file.
 
 The plan is that of the page that was written before the first measurement, and of its section "Deviations".
 Do not change a number without changing that page.
@@ -10,12 +10,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from saccade.errors import InputError
 from saccade_lab.sim.cameras import DEFAULT_CAMERAS
 from saccade_lab.sim.demos import RecordingSettings
 from saccade_lab.sim.tasks import check_evaluation_seeds
 from saccade_lab.training.settings import TrainingSettings, released_std
-
-from saccade.errors import InputError
 
 
 @dataclass(frozen=True)

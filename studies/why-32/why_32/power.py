@@ -1,14 +1,14 @@
-"""The power of the confirmatory tests of `saccade study answer`, by simulating the analysis itself."""
+"""The power of the confirmatory tests, by simulating the analysis itself."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from saccade_lab.study.sign_flip import sign_flip_p
-from saccade_lab.study.statistics import CONFIDENCE, holm
 
 from saccade.errors import InputError
+from saccade_lab.study.sign_flip import sign_flip_p
+from saccade_lab.study.statistics import CONFIDENCE, holm
 from why_32.contrasts import CONFIRMATORY, CORE
 
 

@@ -7,15 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from saccade.head.intervention import ROW_GROUPS
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.linear_probes import FOLDS, PROPRIO, VL, Frames, Input, join, probe
 
-from saccade.head.intervention import ROW_GROUPS
-
 if TYPE_CHECKING:
-    from saccade_lab.study.simulator import Recorded
-
     from saccade.head.head import ActionHead
+    from saccade_lab.study.simulator import Recorded
 
 #: The stage, for all trained policies.
 PROBES = "probes"

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+
 from saccade_lab.study.section import FEWEST
 from saccade_lab.study.statistics import Estimate
-
 from why_32.contrasts import EXPLORATORY
 from why_32.correlations import correlated, correlated_within
 from why_32.measures import CUT, MEASURES, NAMES

@@ -1,4 +1,4 @@
-"""The analysis of `saccade study answer`, from its table alone: policies are paired by training seed."""
+"""The analysis of the study, from its table alone: policies are paired by training seed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+
+from saccade.errors import InputError
 from saccade_lab.study.questions.sweeps_results import PLAIN
 from saccade_lab.study.sign_flip import SignFlip, sign_flip
 from saccade_lab.study.statistics import CONFIDENCE, Estimate, holm
 from saccade_lab.study.table import truths
-
-from saccade.errors import InputError
 from why_32.arms import ARMS
 from why_32.contrasts import CONFIRMATORY, EXPLORATORY, MARGIN, Contrast
 from why_32.correlations import correlated

@@ -1,4 +1,4 @@
-"""The report's section of `saccade study answer`: a few sentences, a figure, tables by stage."""
+"""The report's section: a few sentences, a figure, tables by stage."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
+
 from saccade_lab.study import figures
-from saccade_lab.study.section import Figure, Grid, Prose, Section, number, points
+from saccade_lab.study.section import Figure, Grid, Prose, number, points
 from saccade_lab.study.sign_flip import sign_flip
 from saccade_lab.study.statistics import Estimate, scaled
 from saccade_lab.study.table import Provenance
-
+from why_32 import report
 from why_32.arms import ARMS
 from why_32.contrasts import CORE, LONGER, MARGIN, NEW_SEEDS, SCALED
 from why_32.measured_section import of_measured
 from why_32.measures import CUT, MEASURES, NAMES
 from why_32.plan import CORE_STAGE, Plan
 from why_32.relations import Relation, relations
+from why_32.report import Answered
 from why_32.results import (
     PLATEAU,
     Change,
@@ -45,7 +47,7 @@ from why_32.results import (
 )
 
 
-def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
+def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Answered:
     """The study's part of the report. It has no result before the core is complete.
 
     Args:
@@ -59,9 +61,9 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
     core = next(one for one in stages if one.stage == CORE_STAGE)
     results = found if core.done == core.planned else None
     known = known_facts(plan, found, core, tasks, seeds)
-    pictures, grids, comparisons = [], list[Grid](), list[str]()
+    pictures, grids, comparisons, above = list[Figure](), list[Grid](), list[str](), dict[str, str]()
     if results is None:
-        prose = Prose("answer", **known, places={})
+        prose = report.prose("answer", **known, places={})
         answer = prose.points("not_judged")
     else:
         tests, others = confirmed(found), explored(found)
@@ -75,7 +77,7 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         places = {name: place for place, name in enumerate(names, start=1)}
         contrasts = {one.contrast.name: (one, stage) for stage, of in others.items() for one in of}
         of_core, by_task = losses(table, found), judged_by_task(table, tasks, seeds)
-        prose = Prose(
+        prose = report.prose(
             "answer",
             **known,
             places=places,
@@ -91,7 +93,8 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         answer, comparisons = prose.points("answer"), prose.points("comparisons")
         pictures.append(Figure("success", prose.line("caption_success"), success_picture(found)))
         caption = prose.line("caption_losses")
-        pictures.append(Figure("losses", caption, loss_picture(of_core), f"Table {places['policies']}"))
+        pictures.append(Figure("losses", caption, loss_picture(of_core)))
+        above["losses"] = f"Table {places['policies']}"
         grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, table)]
         for stage, compared in others.items():
             caption = prose.line("caption_contrasts", places[stage], stage)
@@ -102,14 +105,15 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         if everywhere:
             caption = prose.line("caption_relations", places[MEASURES], CUT)
             grids.append(relation_grid(caption, related, everywhere))
-        more_pictures, more_grids = of_measured(table, len(grids) + 1)
+        more_pictures, more_grids, more_above = of_measured(table, len(grids) + 1)
         pictures += more_pictures
         grids += more_grids
+        above |= more_above
     grids.append(progress_grid(prose.line("caption_progress", len(grids) + 1), stages))
     of_pilots = pilots(table)
     if of_pilots:
         grids.append(pilot_grid(of_pilots, tasks))
-    return Section(
+    return Answered(
         title=prose.line("title"),
         summary=prose.paragraphs("summary"),
         figures=pictures,
@@ -119,10 +123,11 @@ def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Section:
         commands=COMMANDS,
         reproduction=prose.paragraphs("reproduction"),
         comparisons=comparisons,
+        above=above,
     )
 
 
-COMMANDS = ("saccade study answer --out DIR", "saccade study report DIR")
+COMMANDS = ("python -m why_32 run --out DIR", "python -m why_32 report DIR")
 
 
 def known_facts(
@@ -336,7 +341,7 @@ def pilot_grid(found: Sequence[Pilot], tasks: Sequence[str]) -> Grid:
     for one in found:
         rates = [f"{100 * one.rates[task]:.0f}" if task in one.rates else "" for task in tasks]
         lines.append([one.policy, f"{one.loss:.4f}", *rates])
-    return Grid(Prose("answer").line("caption_pilots"), ("policy", "held-out loss", *tasks), lines)
+    return Grid(report.prose("answer").line("caption_pilots"), ("policy", "held-out loss", *tasks), lines)
 
 
 def percent(result: ContrastResult) -> str:

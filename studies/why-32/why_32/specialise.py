@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+from saccade._internal.arrays import Float32Array
+from saccade.head.intervention import Intervention
 from saccade_lab.maps.record import reads_vl
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.questions.cuts import redrawn
 from saccade_lab.study.questions.sweeps import equal_mass
-
-from saccade._internal.arrays import Float32Array
-from saccade.head.intervention import Intervention
 
 if TYPE_CHECKING:
     from saccade.head.context import Context

@@ -1,4 +1,4 @@
-"""`saccade study answer`: trains the policies of the plan and judges them, stage after stage."""
+"""Trains the policies of the plan and judges them, stage after stage."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
-from saccade_lab.study.cell import Cell, Rows
-from saccade_lab.study.runs import Planned, read_run, saved_step
-from saccade_lab.study.section import Section
-from saccade_lab.study.study import Study
-from saccade_lab.study.table import Provenance, read_table, table_path
-from saccade_lab.training.settings import STATE_FILE, features_name
 
 from saccade._internal.files import checkpoint_identity, sha256_of
 from saccade._internal.json import changed
 from saccade.errors import InputError
+from saccade_lab.study.cell import Cell, Rows
+from saccade_lab.study.runs import Planned, read_run, saved_step
+from saccade_lab.study.study import Study
+from saccade_lab.study.table import Provenance, read_table, table_path
+from saccade_lab.training.settings import STATE_FILE, features_name
 from why_32 import choice
 from why_32 import plan as plans
 from why_32.arms import ARMS, find_arm, judge
 from why_32.costs import cost
 from why_32.measured import FIRST_EPISODES, MEASURED
 from why_32.plan import CORE_STAGE, PILOT, Backbone, Plan, PlannedPolicy, Recording
+from why_32.report import Answered
 from why_32.section import section
 from why_32.times import TIMES, UNTRAINED, latencies
 
@@ -38,10 +38,10 @@ demonstrations, which only training needs; missing ones are recorded again. The 
 is named, and is no result.
 
 examples:
-  saccade study answer --stages pilot --out out/answer
-  saccade study answer --stages core --jobs 2 --out out/answer
-  saccade study answer --stages steps --recipes n-0,n-32 --arms steps-of-2 --out out/answer
-  saccade study answer --out out/answer
+  python -m why_32 run --stages pilot --out out/why-32
+  python -m why_32 run --stages core --jobs 2 --out out/why-32
+  python -m why_32 run --stages steps --recipes n-0,n-32 --arms steps-of-2 --out out/why-32
+  python -m why_32 run --out out/why-32
 """
 RECORDING, BACKBONE, TRAINING, EPISODES = "recording", "backbone", "training", "episodes"
 SEEDS_TOGETHER = 2  # training seeds of a stage that are trained before they are judged, but for the core
@@ -429,7 +429,7 @@ class Answer(Study):
         return directory
 
     @classmethod
-    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
+    def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Answered:
         """See `Study`."""
         return section(table, provenance, plans.PLAN)
 

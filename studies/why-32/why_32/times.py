@@ -6,11 +6,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from saccade._internal.files import write_json
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.questions.sweeps_cost import cost
 from saccade_lab.study.runs import SETTINGS_FILE, read_run
-
-from saccade._internal.files import write_json
 from why_32.plan import Plan, PlannedPolicy, Recording
 
 #: The stage. It is the last one and a single cell, so that nothing else of the study runs beside it.

@@ -293,7 +293,7 @@ def test_the_report_of_every_study_needs_no_simulator(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "report.md").read_text(encoding="utf-8").count(
         "(not measured)"
-    ) == 3  # tvl, vlsa, answer
+    ) == 2  # tvl, vlsa
 
 
 BARE = """

@@ -1,4 +1,4 @@
-"""What `saccade study answer` measures of trained policies, and how well it predicts the effect of a cut."""
+"""What the study measures of trained policies, and how well it predicts the effect of a cut."""
 
 from __future__ import annotations
 
@@ -13,23 +13,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from answer_tables import plan_of, provenance_of, rows_of
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from saccade.cli import main
+from saccade.head.intervention import Intervention
 from saccade_lab.reference import ActionHead
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
 from saccade_lab.sim.tasks import find_task
 from saccade_lab.study.linear_probes import PROPRIO, VL, Frames, join, probe
-from saccade_lab.study.questions.patching_section import GROUPS, measured_rows, shares
+from saccade_lab.study.questions.patching_section import measured_rows, shares
 from saccade_lab.study.questions.probes import frames_of
 from saccade_lab.study.simulator import Simulator
-from saccade_lab.study.table import read_table, write_table
-from safetensors.torch import load_file, save_file
-from torch import Tensor
+from saccade_lab.study.table import read_table
 from why_32 import measures, patching, probes, specialise
-from why_32.section import section
 from why_32.specialise import KEPT, LEARNED, LOST, RANDOM, WEIGHTS, Removal
-
-from saccade.cli import main
-from saccade.head.intervention import Intervention
 
 TASKS = ("button-press-topdown",)
 
@@ -132,32 +130,6 @@ def test_a_single_row_is_its_own_mean(tmp_path: Path) -> None:
     assert {row["block"] for row in rows if row["group"] == "state"} == set(range(4))
     (cheap,) = measures.measure(str(one), TASKS, range(5))
     assert cheap["probe_r2"] is None
-
-
-def test_probes_have_a_table(tmp_path: Path) -> None:
-    """Means over training seeds, a column for each block; the inputs have a single number."""
-    rows = rows_of({name: [0.5] * 6 for name in ("n-0", "n-4", "n-32")})
-    trained = rows[rows["kind"] == "training"]
-    seeds = trained["training_seed"]
-    places = [("vl_embs", -1, 0.75), ("action", 0, 0.25), ("future", 0, 0.0), ("future", 1, 0.5)]
-    probed = [
-        trained.assign(kind="probes", group=group, block=block, r2=r2 + 0.01 * seeds)
-        for group, block, r2 in places
-    ]
-    probed = [one[(one["num_future_tokens"] > 0) | (one["group"] != "future")] for one in probed]
-    patched = [trained.assign(kind="patching", group=group, block="all", share=0.5) for group in GROUPS]
-    for more in ([], patched):  # which make the column of blocks one of words
-        table = pd.concat([rows, *probed, *more]).assign(validation_loss=0.05)
-        write_table([dict(row) for _, row in table.iterrows()], tmp_path / "answer.csv")
-        grid = section(read_table(tmp_path / "answer.csv"), provenance_of(), plan_of(6)).grids[-2]
-        assert grid.columns == ("recipe", "policies", "rows", "input", "block 0", "block 1")
-        assert [row[:3] for row in grid.rows] == [
-            ["n-0", "6", "vl_embs"],
-            ["n-0", "6", "action"],
-            *([name, "6", rows] for name in ("n-4", "n-32") for rows in ("vl_embs", "action", "future")),
-        ]
-        assert grid.rows[0][3:] == ["0.78 (0.75 to 0.80)", "", ""]
-        assert [cell.split(" ")[0] for cell in grid.rows[-1][3:]] == ["", "0.03", "0.53"]
 
 
 def test_attention_mass_is_that_of_the_trace() -> None:

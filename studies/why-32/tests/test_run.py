@@ -1,11 +1,8 @@
-"""`saccade study answer` on a tiny plan: real training and real episodes, stage after stage; costs."""
+"""The study on a tiny plan: real training and real episodes, stage after stage; costs."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,7 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from answer_cases import PLAN, RECORDING, TASK, TINY, recipe
+from tiny_plan import PLAN, RECORDING, TASK, TINY, recipe
+
+from saccade._internal.files import sha256_of
+from saccade.errors import InputError
+from saccade.head.intervention import Intervention
 from saccade_lab.sim import graphics
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.rollout import environment_for, run_episode
@@ -26,13 +27,9 @@ from saccade_lab.study.table import read_provenance, read_table
 from saccade_lab.training import train
 from why_32 import arms, costs, measures
 from why_32 import plan as plans
+from why_32.__main__ import main
 from why_32.measured import MEASURED
 from why_32.study import Answer
-
-from saccade._internal.files import sha256_of
-from saccade.cli import main
-from saccade.errors import InputError
-from saccade.head.intervention import Intervention
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -51,14 +48,7 @@ def quick() -> Iterator[None]:
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of the first stage."""
     out = tmp_path_factory.mktemp("core")
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        assert main(["study", "answer", "--stages", "core", "--out", str(out)]) == 0
-    assert re.search(
-        r"^- (In these policies|Whether) .* \(no interval; .*; table 1, `--stages core`\)\.( .*)?$",
-        printed.getvalue(),
-        re.M,
-    )
+    assert main(["run", "--stages", "core", "--out", str(out)]) == 0
     return out
 
 
@@ -150,7 +140,7 @@ def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.Cap
     shutil.rmtree(out / "answer" / "demos")
     before = times(out)
     cells = {path: path.stat().st_mtime_ns for path in out.glob("answer/cells/*")}
-    arguments = ["study", "answer", "--stages", "core", "--out", str(out)]
+    arguments = ["run", "--stages", "core", "--out", str(out)]
     assert main(arguments) == 0
     assert times(out) == before
     assert {path: path.stat().st_mtime_ns for path in out.glob("answer/cells/*")} == cells
@@ -176,9 +166,6 @@ def test_nothing_is_trained_twice(core: Path, tmp_path: Path, capsys: pytest.Cap
     assert "n-32-seed-1: no such policy; it was trained, with the hash" in capsys.readouterr().err
     provenance = read_provenance(out / "answer.json")
     assert (provenance.done, provenance.total) == (13, 14)
-    section = Answer.summarise(read_table(out / "answer.csv"), provenance)
-    assert "n-32-seed-1 (0 of 2 episodes)." in section.summary[-1]
-    assert section.answer[0].startswith("No result yet: 5 of the 6 policies of the core are trained")
 
 
 def test_a_policy_in_training_is_continued(core: Path, tmp_path: Path) -> None:
@@ -237,7 +224,7 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     monkeypatch.delitem(arms.ARMS, "steps")  # which has an arm of that name
     out = tmp_path / "out"
     shutil.copytree(core, out)
-    assert main(["study", "answer", "--stages", "instrument", "--out", str(out)]) == 0
+    assert main(["run", "--stages", "instrument", "--out", str(out)]) == 0
     table: Any = read_table(out / "answer.csv")
     assert read_provenance(out / "answer.json").total == 14 + 4
     found = table[table["kind"] == "episodes"].set_index(["policy", "arm", "seed"])
@@ -260,10 +247,6 @@ def test_arms_of_trained_policies(core: Path, tmp_path: Path, monkeypatch: pytes
     (stepped / "config.json").write_text(json.dumps(config))
     row = found.loc[("n-0-seed-0", "steps of 1", 0)]
     assert (row["success"], row["control_steps"]) == expected(stepped, 0, None)
-    section = Answer.summarise(table, read_provenance(out / "answer.json"))
-    assert section.grids[-2].columns == ("recipe", "future-unread", "steps of 1")
-    assert {row[0] for row in section.grids[-2].rows} == {"n-4", "n-0"}
-    assert list(section.grids[-1].rows[2]) == ["instrument", "4", "6"]
 
 
 def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
@@ -273,7 +256,7 @@ def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
         shutil.rmtree(out / "answer" / "policies" / name)
     done = 14
     for stage in MEASURED:  # one after the other: a stage with failures is the last
-        assert main(["study", "answer", "--stages", stage, "--out", str(out)]) != 0
+        assert main(["run", "--stages", stage, "--out", str(out)]) != 0
         provenance = read_provenance(out / "answer.json")
         # Of the core's six policies two have no tokens, and three are not there.
         with_weights, planned = (3, 6) if stage == "probes" else (1, 4)
@@ -288,9 +271,6 @@ def test_stages_that_measure(core: Path, tmp_path: Path) -> None:
     rows = table[(table["kind"] == "patching") & (table["block"] == "all")].set_index("group")
     assert set(rows["pairs"]) == {2}
     assert rows["share"].isna().all()  # what is hardly trained acts alike in all layouts
-    section = Answer.summarise(table, provenance)
-    assert [grid.columns[0] for grid in section.grids].count("recipe") >= 4
-    assert section.grids[-2].rows == [["n-4", "", "", "", ""]]
     (row,) = table[table["kind"] == "measures"].to_dict("records")
     assert (row["policy"], row["training_seed"], row["num_future_tokens"]) == ("n-4-seed-0", 0, 4)
     directory = str(out / "answer" / "policies" / "n-4-seed-0")
@@ -305,26 +285,21 @@ def test_latencies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(sweeps_cost, "ROUNDS", 5)
     out = tmp_path / "out"
     shutil.copytree(core, out)
-    assert main(["study", "answer", "--stages", "times", "--out", str(out)]) == 0
+    assert main(["run", "--stages", "times", "--out", str(out)]) == 0
     provenance = read_provenance(out / "answer.json")
     assert (provenance.done, provenance.total) == (15, 15)
     table: Any = read_table(out / "answer.csv")
     rows = table[table["kind"] == "times"]
     assert list(rows["policy"]) == ["n-0-seed-0", "n-4-seed-0", "n-32-seed-0"]
     assert rows["sample_ratio"].iloc[0] == 1
-    section = Answer.summarise(table, provenance)
-    assert [row[0] for row in section.grids[-2].rows] == ["n-0", "n-4", "n-32"]
-    assert section.grids[-2].columns[:3] == ("recipe", "weights", "T_vl")
-    assert section.grids[-2].rows[0][4] == "1.00 (1.00 to 1.00)"
-    assert list(section.grids[-1].rows[-1]) == ["times", "3", "4"]
-    assert main(["study", "answer", "--stages", "alignment,times", "--out", str(out)]) == 0
+    assert main(["run", "--stages", "alignment,times", "--out", str(out)]) == 0
     table = read_table(out / "answer.csv")
     rows = table[table["kind"] == "times"]
     assert list(rows["policy"]) == ["n-0-seed-0", "n-4-seed-0", "n-32-seed-0", "n-4-aligned-seed-0"]
     # Of some policies only the hash is kept: the next one of the recipe is timed, or an untrained one.
     for gone in ("n-4-seed-0", "n-4-aligned-seed-0", "n-4-aligned-seed-1"):
         shutil.rmtree(out / "answer" / "policies" / gone)
-    assert main(["study", "answer", "--stages", "times", "--out", str(out)]) == 0
+    assert main(["run", "--stages", "times", "--out", str(out)]) == 0
     table = read_table(out / "answer.csv")
     rows = table[table["kind"] == "times"].set_index("policy")
     assert list(rows.index) == ["n-0-seed-0", "n-4-seed-1", "n-32-seed-0", "n-4-aligned-seed-0"]
@@ -333,16 +308,13 @@ def test_latencies(core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     # It is as large as those that were trained.
     for size in ("head_bytes", "context_bytes", "num_vl_tokens"):
         assert rows.loc["n-4-aligned-seed-0", size] == rows.loc["n-4-seed-1", size]
-    section = Answer.summarise(table, read_provenance(out / "answer.json"))
-    weights = [row[:2] for row in section.grids[-2].rows]
-    assert weights == [["n-0", "trained"], ["n-4", "trained"], ["n-32", "trained"], ["n-4-aligned", "first"]]
 
 
 def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:
     """They are run if they are named, on episodes of their own; a blind one is judged without pictures."""
     out = tmp_path / "out"
     shutil.copytree(core, out)
-    assert main(["study", "answer", "--stages", "pilot", "--out", str(out)]) == 0
+    assert main(["run", "--stages", "pilot", "--out", str(out)]) == 0
     table: Any = read_table(out / "answer.csv")
     assert read_provenance(out / "answer.json").total == 14 + 2 + 2
     pilots = table[(table["kind"] == "episodes") & (table["stage"] == "pilot")]
@@ -355,14 +327,6 @@ def test_pilots_are_no_results(core: Path, tmp_path: Path) -> None:
         row = pilots.set_index(["policy", "seed"]).loc[(name, seed)]
         assert (row["success"], row["control_steps"]) == (episode.success, episode.steps)
     environment.close()
-    section = Answer.summarise(table, read_provenance(out / "answer.json"))
-    *results, shown = section.grids
-    assert shown.caption.startswith("Pilots, which are no results")
-    assert shown.columns == ("policy", "held-out loss", TASK)
-    assert [row[0] for row in shown.rows] == [name, "n-4-pilot-seed-100"]
-    assert results == list(
-        Answer.summarise(read_table(core / "answer.csv"), read_provenance(core / "answer.json")).grids
-    )
     # Stages that train nothing, and those that are run by default, have no pilots.
     study = Answer(PLAN, ("instrument",)).begin(out)
     assert not [policy for policy, _ in study.judged("instrument") if "pilot" in policy.name]

@@ -1,23 +1,20 @@
-"""Which measures are correlated with what a cut costs in `saccade study answer`: in all, within recipes."""
+"""Which measures are correlated with what a cut costs: in all, within recipes."""
 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from answer_tables import CORE, plan_of, provenance_of, rows_of, section_of
-from saccade_lab.study.section import Section, number
-from saccade_lab.study.sign_flip import sign_flip
-from saccade_lab.study.statistics import Estimate
+from made_tables import rows_of
 from scipy.stats import pearsonr, rankdata, spearmanr
+
+from saccade_lab.study.statistics import Estimate
 from why_32.correlations import correlated_within, correlation_within, rank_correlation
 from why_32.relations import Relation, by_seed, relations
 from why_32.results import judged
-from why_32.section import relation_grid, section
 
 SEEDS = 12
 #: Success without and with the cut, of ten episodes: what it costs is known, and larger for 32 tokens.
@@ -45,12 +42,6 @@ def measured(**measures: dict[str, list[float]]) -> pd.DataFrame:
 
 def related(table: pd.DataFrame) -> list[Relation]:
     return relations(table, judged(table, ("a", "b"), range(10)), ("a", "b"), range(10))
-
-
-def report(table: pd.DataFrame) -> Section:
-    """The report's section on a table, and N = 0."""
-    whole = pd.concat([table, rows_of({"n-0": [0.1] * SEEDS})])
-    return section(whole.assign(validation_loss=0.05), provenance_of(), plan_of(SEEDS))
 
 
 def test_between_perfect_and_within_nil() -> None:
@@ -138,57 +129,6 @@ def test_measures_are_related_to_what_a_cut_costs() -> None:
     ]
     assert not replace(found[0], seeds=9).predicts
     assert not replace(found[1], policies=9).tells_recipes
-
-    whole = report(table)
-    relation, means = whole.grids[-3:-1]
-    assert relation.columns[0] == "measure"
-    assert [(row[1], row[4]) for row in relation.rows] == [("23", "23")] * 3
-    assert relation.rows[1][2:4] == [number(found[1].within, 2), number(found[1].together, 2)]
-    assert re.fullmatch(
-        r"Exploratory: of the cheap measures, change of the chunk by the cut \(1.00, 1.00 to 1.00\) is "
-        r"correlated "
-        r"with the success that this cut costs, among policies of the same N \(rank correlation within "
-        r"each recipe, "
-        r"over 23 policies of the core, 95 % interval over training seeds; \[table 5\]\(#table-5\), "
-        r"`--stages core,instrument,measures`\); attention of action rows to future rows "
-        r"\(-0.14, -0.53 to 0.29; of all N together 0.\d\d, 0.\d\d to 0.\d\d\) is only shown to tell one N "
-        r"from another; "
-        r"for share of the gradient through future rows \(the same for all policies of a recipe, or the "
-        r"cut costs "
-        r"all the same\) even that is undecided\. All this holds for small policies, in one simulator, on "
-        r"a and b; "
-        r"it says nothing about GR00T N1.5 itself\.",
-        whole.answer[4],
-    ), whole.answer[4]
-    unknown = report(table.assign(chunk_change=np.nan, attention_mass=np.nan)).answer[4]
-    assert unknown.startswith(
-        "Exploratory: of the cheap measures, none is shown to be correlated with the success that this cut "
-        "costs "
-        "among policies of the same N (rank"
-    )
-    assert " this is undecided. " in unknown
-    assert section_of(CORE).answer[4].startswith("Not measured: which cheap measure is correlated with the")
-
-    # Means by recipe, by hand; what no policy has is left empty.
-    assert means.columns[:3] == ("recipe", "policies", "change of the chunk by the cut")
-    assert [row[:2] for row in means.rows] == [["n-4", "11"], ["n-32", "12"]]
-    expected = sign_flip(3 * COST["n-32"] + 1).difference
-    assert means.rows[1][2] == number(expected, 3)
-    assert [row[5] for row in means.rows] == ["", ""]
-
-
-def test_policies_of_other_stages_count_in_the_second_numbers_only() -> None:
-    noise = {name: list(np.random.default_rng(0).random(SEEDS)) for name in PLAIN}
-    table = measured(attention_mass=noise)
-    core = related(table)
-    other = table[table["policy"] == "n-32-seed-3"]
-    other = other.assign(stage="numbers", policy="n-16-seed-3", recipe="n-16", num_future_tokens=16)
-    grid = report(pd.concat([table, other])).grids[-3]
-    (row,) = grid.rows
-    assert (row[1], row[4]) == ("24", "25")
-    assert row[2:4] == [number(core[0].within, 2), number(core[0].together, 2)]
-    alone = relation_grid("", [], core)
-    assert [row[1:5] for row in alone.rows] == [["0", "", "", "24"]]
 
 
 def test_without_intervals() -> None:

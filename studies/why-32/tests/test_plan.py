@@ -1,16 +1,19 @@
-"""The plan of `saccade study answer`: what is refused, its arms and contrasts, what its policies cost."""
+"""Plans: what is refused, phases and arms, what policies cost."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from answer_cases import PLAN, RECORDING, TASK, TINY, recipe
+from tiny_plan import PLAN, RECORDING, TASK, TINY, recipe
+
+from benches.work import encode_work, sample_work, total
+from saccade.cli.timing import Call
+from saccade.errors import InputError
 from saccade_lab.reference.layers import TABLE_STD
 from saccade_lab.sim import graphics
 from saccade_lab.sim.policy import num_vl_tokens
@@ -20,14 +23,9 @@ from saccade_lab.training.settings import TrainingSettings
 from why_32 import arms, costs
 from why_32 import plan as plans
 from why_32 import study as studies
-from why_32.contrasts import CONFIRMATORY, EXPLORATORY
+from why_32.__main__ import main
 from why_32.measured import MEASURED
 from why_32.study import Answer
-
-from benches.work import encode_work, sample_work, total
-from saccade.cli import main
-from saccade.cli.timing import Call
-from saccade.errors import InputError
 
 
 def test_policies_that_are_measured() -> None:
@@ -171,34 +169,6 @@ def test_costs_that_are_matched() -> None:
     assert abs(steps * without().sample - settings.steps * wanted.sample) <= without().sample / 2
 
 
-def test_the_plan_s_matched_numbers_are_those_that_are_counted() -> None:
-    (plain,) = [one for one in plans.PLAN.recordings if one.name == "plain"]
-    assert plans.SCALED.num_future_tokens == 32
-    assert costs.matched_width(plans.SCALED, plain) == plans.WIDTH
-    assert costs.matched_steps(plans.SCALED, plain) == plans.STEPS
-
-
-def test_every_contrast_is_of_recipes_of_the_plan() -> None:
-    """And every recipe of the plan is in a contrast of its stage, or in the core."""
-    contrasts = [*CONFIRMATORY, *itertools.chain.from_iterable(EXPLORATORY.values())]
-    names = {one.name for one in plans.PLAN.recipes if one.stage != plans.PILOT}
-    assert set().union(*(one.recipes for one in contrasts)) == names
-    assert plans.PLAN.stages == (plans.PILOT, "core", *EXPLORATORY)
-
-
-def test_every_recipe_of_the_plan_fits_its_backbone() -> None:
-    """What `saccade train` compares before it starts from a backbone."""
-    for one in plans.PLAN.recipes:
-        backbone = plans.PLAN.backbone(one)
-        recording = plans.PLAN.recording(backbone.recording)
-        head, alone = (
-            train.policy_config(each.training, recording.settings, list(recording.counts)).to_dict()
-            for each in (one, backbone)
-        )
-        assert head["backbone_cfg"] == alone["backbone_cfg"]
-        assert head["simulation_cfg"] == alone["simulation_cfg"]
-
-
 def test_plans_that_cannot_be(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -219,7 +189,7 @@ def test_plans_that_cannot_be(
     with pytest.raises(InputError, match="expected evaluation seeds"):
         replace(PLAN, seeds=range(2_000_000, 2_000_025))
     monkeypatch.setattr(graphics, "check", lambda: None)
-    assert main(["study", "answer", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
+    assert main(["run", "--stages", "cor", "--out", str(tmp_path / "out")]) == 2
     assert (
         "--stages: unknown name 'cor', expected one of pilot, core, scaled, alignment"
         in capsys.readouterr().err
@@ -257,7 +227,7 @@ def test_plans_that_cannot_be(
         ),
     ):
         words = ["--stages", "steps", *chosen, "--out", str(tmp_path / "out")]
-        assert main(["study", "answer", *words]) == 2
+        assert main(["run", *words]) == 2
         assert said in capsys.readouterr().err
 
 

@@ -1,4 +1,4 @@
-"""A plan of the study `answer` as small as it can be."""
+"""A plan of the study as small as it can be."""
 
 from __future__ import annotations
 

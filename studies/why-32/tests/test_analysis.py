@@ -1,4 +1,4 @@
-"""The analysis of `saccade study answer` by hand: tests, findings and power."""
+"""The analysis by hand: tests, findings and power."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from answer_tables import FEWER, MORE, rows_of
+from made_tables import FEWER, MORE, rows_of
+
+from saccade.errors import InputError
 from saccade_lab.study.sign_flip import sign_flip
 from saccade_lab.study.statistics import holm
 from why_32.contrasts import CONFIRMATORY, EXPLORATORY, difference, in_parts, slope
 from why_32.power import power
 from why_32.results import changes, confirmed, judged, over_seeds
-
-from saccade.errors import InputError
 
 RATES = {
     "n-0": [0.1, 0.3, 0.2, 0.4, 0.2, 0.3, 0.1],
