@@ -15,7 +15,7 @@ from saccade.errors import ShapeError
 from saccade.policy.policy import Policy
 from saccade.processor import Processor
 from saccade_lab.inside import parts_of
-from saccade_lab.maps.layout import WHOLE, Camera, Layout, Region, kind_of
+from saccade_lab.maps.layout import WHOLE, Layout, Region, ViewLayout, kind_of
 
 #: Axes of N1.7's patches: a patch holds the same picture twice, as if it were two frames of a video.
 N17_TIME = 2
@@ -55,7 +55,7 @@ def layout_of(
         height, width = frames[name].shape[:2]
         if (height, width) not in regions:
             regions[height, width] = region_of(processor, config, height, width)
-        cameras.append(Camera(name, int(found[0]), rows, columns, regions[height, width]))
+        cameras.append(ViewLayout(name, int(found[0]), rows, columns, regions[height, width]))
     texts = processor.texts(ids)
     is_image = ids == config.image_token_id
     tokens = [kind_of(position, text) for position, text in enumerate(texts) if not is_image[position]]

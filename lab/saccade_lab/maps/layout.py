@@ -38,7 +38,7 @@ GRAMMAR = "parts KIND:SIZE[=NAME] with commas, such as text:14,image:16x16=left,
 
 
 @dataclass(frozen=True)
-class Camera:
+class ViewLayout:
     """The patches of one picture: consecutive positions, row by row from the top left.
 
     Attributes:
@@ -87,13 +87,13 @@ class Layout:
     Example:
         >>> layout = parse_layout("text:2,image:2x2=left,special:1=</img>,pad:*", num_tokens=9)
         >>> layout.cameras
-        (Camera(name='left', start=2, rows=2, columns=2, region=(0.0, 0.0, 1.0, 1.0)),)
+        (ViewLayout(name='left', start=2, rows=2, columns=2, region=(0.0, 0.0, 1.0, 1.0)),)
         >>> {name: positions.tolist() for name, positions in layout.parts().items()}
         {'left': [2, 3, 4, 5], 'text': [0, 1], 'special': [6], 'pad': [7, 8]}
     """
 
     num_tokens: int
-    cameras: tuple[Camera, ...]
+    cameras: tuple[ViewLayout, ...]
     tokens: tuple[Token, ...]
 
     def __post_init__(self) -> None:
@@ -199,14 +199,14 @@ def parse_layout(text: str, num_tokens: int, names: Sequence[str] | None = None)
             f"layout: {text!r} has {sum(sizes)} positions{' and *' if open_parts else ''}, "
             f"the features have T_vl {num_tokens}"
         )
-    cameras: list[Camera] = []
+    cameras: list[ViewLayout] = []
     tokens: list[Token] = []
     position = 0
     for (kind, grid, name), given_size in zip(parts, sizes, strict=True):
         size = left if grid is None else given_size
         if kind == "image":
             assert grid is not None
-            cameras.append(Camera(name or f"camera {len(cameras) + 1}", position, *grid))
+            cameras.append(ViewLayout(name or f"camera {len(cameras) + 1}", position, *grid))
         else:
             label = name or kind
             for index in range(size):
@@ -315,7 +315,7 @@ def _from_mask(
     names: Sequence[str],
 ) -> Layout:
     edges = np.flatnonzero(np.diff(np.concatenate(([0], image.astype(np.int8), [0]))))
-    cameras: list[Camera] = []
+    cameras: list[ViewLayout] = []
     for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         length = stop - start
         rows, columns = grid or square(length, f"{what}: a run at position {start}")
@@ -325,7 +325,7 @@ def _from_mask(
                 f"{rows * columns} ({rows} x {columns} per picture); the prompt may have been cut off"
             )
         for first in range(start, stop, rows * columns):
-            cameras.append(Camera(f"camera {len(cameras) + 1}", first, rows, columns))
+            cameras.append(ViewLayout(f"camera {len(cameras) + 1}", first, rows, columns))
     tokens = []
     for position in np.flatnonzero(~image).tolist():
         kind = "pad" if padding[position] else "special" if special[position] else "text"

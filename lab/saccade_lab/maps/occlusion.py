@@ -19,7 +19,7 @@ from saccade.head.inputs import HeadInputs
 from saccade.observations import view_places
 from saccade.policy.encoding import PolicyContext
 from saccade.policy.policy import Policy
-from saccade_lab.maps.layout import Camera, Layout
+from saccade_lab.maps.layout import Layout, ViewLayout
 
 MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the policy
 NOISES = 8  # draws that `other_noise` is computed from
@@ -29,7 +29,7 @@ NOISES = 8  # draws that `other_noise` is computed from
 class Place:
     """Patches of one camera that are removed together."""
 
-    camera: Camera
+    camera: ViewLayout
     rows: slice
     columns: slice
 
@@ -107,7 +107,7 @@ def behind(place: Place, height: int, width: int) -> tuple[slice, slice]:
     """The rows and columns of a frame of this size that a place sees; empty outside the frame.
 
     Example:
-        >>> camera = Camera("front", 0, 4, 4, (0.25, -0.5, 0.75, 1.5))
+        >>> camera = ViewLayout("front", 0, 4, 4, (0.25, -0.5, 0.75, 1.5))
         >>> behind(Place(camera, slice(1, 2), slice(0, 4)), 8, 8)
         (slice(0, 4, None), slice(2, 6, None))
     """

@@ -18,7 +18,7 @@ from PIL import Image
 from saccade._internal.arrays import Float32Array
 from saccade._internal.files import write_atomically
 from saccade_lab.maps.drawing import CAMERA_COLOURS, CHANGE, HEAT, MATRIX_COLOURS, borders, ranges, show
-from saccade_lab.maps.layout import Camera
+from saccade_lab.maps.layout import ViewLayout
 from saccade_lab.maps.notes import GROUP_COLOURS, KIND_COLOURS, NO_FUTURE, NO_IMAGES, NO_PICTURES
 from saccade_lab.maps.record import BASELINES, MEAN, Maps
 
@@ -385,7 +385,7 @@ class Sheet:
             for camera in self.cameras
         }
 
-    def _aspect(self, camera: Camera) -> float:
+    def _aspect(self, camera: ViewLayout) -> float:
         """Width by height."""
         picture = self.maps.view.images.get(camera.name)
         return camera.columns / camera.rows if picture is None else picture.shape[1] / picture.shape[0]

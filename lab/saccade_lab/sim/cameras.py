@@ -6,7 +6,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraPose:
     """A camera on a sphere around the point that it looks at.
 
     Attributes:
@@ -24,7 +24,7 @@ class Camera:
     elevation: float
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Camera":
+    def from_dict(cls, values: Mapping[str, Any]) -> "CameraPose":
         """Reads what `to_dict` wrote."""
         x, y, z = (float(value) for value in values["lookat"])
         numbers = {key: float(values[key]) for key in ("distance", "azimuth", "elevation")}
@@ -37,10 +37,10 @@ class Camera:
 
 CENTRE = (0.0, 0.72, 0.12)  # of the workspace on the table
 DEFAULT_CAMERAS = (
-    Camera("left", CENTRE, 0.95, 145.0, -35.0),
-    Camera("right", CENTRE, 0.95, 35.0, -35.0),
-    Camera("top", CENTRE, 0.8, 90.0, -75.0),
+    CameraPose("left", CENTRE, 0.95, 145.0, -35.0),
+    CameraPose("right", CENTRE, 0.95, 35.0, -35.0),
+    CameraPose("top", CENTRE, 0.8, 90.0, -75.0),
 )
 # Pixels along each side. Isaac-GR00T's preprocessing crops 68 to 64, which is then not resampled.
 DEFAULT_IMAGE_SIZE = 68
-VIDEO_CAMERA = Camera("video", (0.0, 0.68, 0.15), 1.25, 140.0, -28.0)
+VIDEO_CAMERA = CameraPose("video", (0.0, 0.68, 0.15), 1.25, 140.0, -28.0)

@@ -22,7 +22,7 @@ from saccade._internal.files import write_atomically, write_json
 from saccade.errors import InputError, SaccadeError
 from saccade_lab.parallel import ALONE, Lost, Workers, each
 from saccade_lab.sim import environment_cache
-from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, Camera
+from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, CameraPose
 from saccade_lab.sim.experts import Expert, NoiseBursts
 from saccade_lab.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
 
@@ -51,7 +51,7 @@ class RecordingSettings:
 
     image_size: int = DEFAULT_IMAGE_SIZE
     frame_stride: int = 3
-    cameras: tuple[Camera, ...] = DEFAULT_CAMERAS
+    cameras: tuple[CameraPose, ...] = DEFAULT_CAMERAS
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -64,7 +64,7 @@ class RecordingSettings:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RecordingSettings:
         """Reads what `to_dict` wrote."""
-        cameras = tuple(Camera.from_dict(camera) for camera in values["cameras"])
+        cameras = tuple(CameraPose.from_dict(camera) for camera in values["cameras"])
         return cls(int(values["image_size"]), int(values["frame_stride"]), cameras)
 
 

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from saccade._internal.arrays import UInt8Array
 from saccade.errors import InputError, ShapeError
 from saccade_lab.sim import graphics
-from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, VIDEO_CAMERA, Camera
+from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, VIDEO_CAMERA, CameraPose
 from saccade_lab.sim.rendering import Renderer, prepare_model
 from saccade_lab.sim.scenarios import StepOutcome
 from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
@@ -64,7 +64,7 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         task: str,
         *,
         image_size: int = DEFAULT_IMAGE_SIZE,
-        cameras: Sequence[Camera] = DEFAULT_CAMERAS,
+        cameras: Sequence[CameraPose] = DEFAULT_CAMERAS,
         blanked: Collection[str] = (),
         render_mode: str | None = None,
     ) -> None:
@@ -156,7 +156,7 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         }
         return self.last_observation
 
-    def _picture(self, camera: Camera) -> UInt8Array:
+    def _picture(self, camera: CameraPose) -> UInt8Array:
         """The current image of one of the policy's cameras."""
         if camera.name in self.blanked:
             return np.zeros((self.image_size, self.image_size, 3), dtype=np.uint8)
@@ -209,7 +209,7 @@ def make_world(scene: str) -> Any:
     return ALL_V3_ENVIRONMENTS[scene]()
 
 
-def observation_space(cameras: Sequence[Camera], image_size: int) -> spaces.Dict:
+def observation_space(cameras: Sequence[CameraPose], image_size: int) -> spaces.Dict:
     """The space of `TaskEnvironment.observe`."""
     shape = (image_size, image_size, 3)
     return spaces.Dict(

@@ -20,7 +20,7 @@ import numpy as np
 
 from saccade._internal.arrays import UInt8Array
 from saccade_lab.sim import graphics
-from saccade_lab.sim.cameras import Camera
+from saccade_lab.sim.cameras import CameraPose
 from saccade_lab.sim.scenarios import Ball
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def average_down(picture: UInt8Array, factor: int) -> UInt8Array:
     return averaged
 
 
-def free_camera(camera: Camera) -> mujoco.MjvCamera:
+def free_camera(camera: CameraPose) -> mujoco.MjvCamera:
     """The camera in MuJoCo's form."""
     view = graphics.load_mujoco().MjvCamera()
     view.lookat[:] = camera.lookat
@@ -119,7 +119,7 @@ class Renderer:
         open_renderers.add(self)
         close_all_at_exit()
 
-    def draw(self, data: mujoco.MjData, camera: Camera, balls: Iterable[Ball] = ()) -> UInt8Array:
+    def draw(self, data: mujoco.MjData, camera: CameraPose, balls: Iterable[Ball] = ()) -> UInt8Array:
         """The picture `(size, size, 3)`, with balls that the simulation does not have.
 
         Raises:

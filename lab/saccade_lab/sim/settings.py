@@ -18,7 +18,7 @@ from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.processor import Processor
 from saccade.robots import LANGUAGE_KEY, Normalizer
-from saccade_lab.sim.cameras import Camera
+from saccade_lab.sim.cameras import CameraPose
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
 TOKENIZER_FILE, METADATA_FILE = "tokenizer.json", "experiment_cfg/metadata.json"
@@ -46,7 +46,7 @@ class SimulationConfig:
     """
 
     tasks: tuple[str, ...]
-    cameras: tuple[Camera, ...]
+    cameras: tuple[CameraPose, ...]
     image_size: int
     execute_steps: int
 
@@ -63,7 +63,7 @@ class SimulationConfig:
             values = whole["simulation_cfg"]
             config = cls(
                 tasks=tuple(str(task) for task in values["tasks"]),
-                cameras=tuple(Camera.from_dict(camera) for camera in values["cameras"]),
+                cameras=tuple(CameraPose.from_dict(camera) for camera in values["cameras"]),
                 image_size=int(values["image_size"]),
                 execute_steps=int(values["execute_steps"]),
             )

@@ -14,7 +14,7 @@ class Camera:
     Attributes:
         name: Its name, without prefix.
         height, width: The size of its frames where the release refuses other sizes; otherwise None.
-        alias: Another name, accepted if an observation does not have `name`.
+        alias: Another name, accepted if an observation does not have ``name``.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Requirements:
             Otherwise it is the released default.
         any_annotation: Whether the only key that contains "annotation" is the instruction, whatever it is
             called, as in Isaac-GR00T N1 and N1.5.
-        takes_extra_cameras: Whether cameras beyond `cameras` are views too. All are then sorted by name, as
+        takes_extra_cameras: Whether cameras beyond ``cameras`` are views too. All are then sorted by name, as
             in lerobot. Otherwise they are ignored.
         rename_map: Keys of lerobot's format and the names that they get before anything else is read.
         observation_indices, action_indices: The steps of observations and actions, which a server reports to

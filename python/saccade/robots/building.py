@@ -84,7 +84,7 @@ class Builder:
         Args:
             key: Its name.
             statistics: Statistics by name.
-            mode: One of `STATISTICS`.
+            mode: One of ``STATISTICS``.
             by_step: Whether there may be a row for each step of a chunk.
             **switches: The remaining fields of :class:`Group`; ``size`` is that of the statistics by default.
         """

@@ -1,7 +1,7 @@
 """Data configs of Isaac-GR00T N1 and N1.5: which keys a policy uses, in which order, and how.
 
 A checkpoint of N1.5 does not contain its data config. It is passed by the name that the released code gives
-it, or as a JSON file or mapping with the fields of `DataConfig`.
+it, or as a JSON file or mapping with the fields of ``DataConfig``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.rotations import SIZES
 
-#: A name of `RELEASED`, the path of a JSON file, or its contents.
+#: A name of ``RELEASED``, the path of a JSON file, or its contents.
 DataConfigLike: TypeAlias = "str | os.PathLike[str] | Mapping[str, Any] | DataConfig"
 
 #: What may be done with a key. Keys without a mode are passed on unchanged.
@@ -43,7 +43,7 @@ class DataConfig:
             ``annotation`` in its name.
         observation_indices: Steps of the frames and states of an observation, relative to now; the last is 0.
         action_indices: Steps of the actions of a chunk. The head denoises as many.
-        state_modes, action_modes: One of `MODES` by key. ``sin_cos`` is for states, ``scale`` too.
+        state_modes, action_modes: One of ``MODES`` by key. ``sin_cos`` is for states, ``scale`` too.
         target_rotations: The representation that the head has of a rotation, by key. Metadata says which one
             the robot has.
     """

@@ -113,7 +113,7 @@ def choose(
             The id then selects the head's embodiment.
         tags: The tags that have statistics.
         ids: Ids by tag.
-        version: As in `resolved`.
+        version: As in ``resolved``.
         where: The file, for messages.
         needs: What each robot needs, for the message.
 

@@ -19,7 +19,7 @@ Statistics: TypeAlias = "npt.NDArray[np.floating[Any]]"
 
 @dataclass(frozen=True)
 class Conversion:
-    """A rotation that robot and head have in different representations, keys of `rotations.SIZES`."""
+    """A rotation that robot and head have in different representations, keys of ``rotations.SIZES``."""
 
     robot: str
     head: str

@@ -127,7 +127,7 @@ def _check_order(
 def _offsets(
     ends: Builder, steps: list[Step], steps_after: list[Step], relative: str
 ) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-    """Names for `Pipeline.offset_names`."""
+    """Names for ``Pipeline.offset_names``."""
     enabled = [step for step in steps_after if step.name == ABSOLUTE and step.config.get("enabled")]
     if not enabled:
         return None

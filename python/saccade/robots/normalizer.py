@@ -248,7 +248,7 @@ class Normalizer(Robot):
         actions: Float32Array,
         latest: Float32Array,
     ) -> Float32Array:
-        """Applies `Group.absolute` or `Group.relative` to the groups that have a reference."""
+        """Applies ``Group.absolute`` or ``Group.relative`` to the groups that have a reference."""
         if all(group.reference is None for group in self.action_groups):
             return actions
         states, parts = self.state_slices, []
@@ -328,7 +328,7 @@ class Normalizer(Robot):
 def _mapped(
     values: Float32Array, groups: tuple[Group, ...], direction: Callable[[Group, Float32Array], Float32Array]
 ) -> Float32Array:
-    """Applies `Group.to_head` or `Group.to_robot` to every group, and concatenates the results."""
+    """Applies ``Group.to_head`` or ``Group.to_robot`` to every group, and concatenates the results."""
     parts, start = [], 0
     for group in groups:
         size = group.size if direction is Group.to_head else group.width

@@ -75,7 +75,7 @@ def processor_version(folder: Path, values: Mapping[str, Any]) -> str | None:
 
 
 def _from_path(path: Path, options: Options) -> Robot:
-    """The robot of one file, or of the first of `FILES` in a directory that has statistics."""
+    """The robot of one file, or of the first of ``FILES`` in a directory that has statistics."""
     if not os.path.isdir(path):  # noqa: PTH112 (Path.is_dir raises OSError if a name is too long)
         return _from_values(read_json(path), options, str(path))
     for name, reader in FILES.items():

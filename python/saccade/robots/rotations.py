@@ -41,7 +41,7 @@ def converted(values: npt.NDArray[Any], source: str, target: str) -> Float64Arra
 
     Args:
         values: ``(..., SIZES[source])``.
-        source, target: Keys of `SIZES`.
+        source, target: Keys of ``SIZES``.
 
     Returns:
         ``(..., SIZES[target])`` float64. NaN where the numbers are no rotation, such as a quaternion of
@@ -104,7 +104,7 @@ def composed(reference: npt.NDArray[Any], relative: npt.NDArray[Any], form: str)
     Args:
         reference: The reference pose, ``(..., size)``.
         relative: The relative poses, ``(..., size)``.
-        form: A key of `POSES`, which says the size.
+        form: A key of ``POSES``, which says the size.
     """
     turn, place = _pose(reference, form)
     inner, offset = _pose(relative, form)
@@ -112,7 +112,7 @@ def composed(reference: npt.NDArray[Any], relative: npt.NDArray[Any], form: str)
 
 
 def relative_to(reference: npt.NDArray[Any], poses: npt.NDArray[Any], form: str) -> Float64Array:
-    """The inverse of `composed`: R_ref^T R and R_ref^T (t - t_ref)."""
+    """The inverse of ``composed``: R_ref^T R and R_ref^T (t - t_ref)."""
     turn, place = _pose(reference, form)
     outer, position = _pose(poses, form)
     back = np.swapaxes(turn, -1, -2)

@@ -20,7 +20,7 @@ from saccade.observations import view_places
 from saccade_lab.inside import features_of, inputs_of, parts_of
 from saccade_lab.maps.drawing import HEAT, show
 from saccade_lab.maps.grid import by_token, region_of, view_pictures
-from saccade_lab.maps.layout import Camera
+from saccade_lab.maps.layout import ViewLayout
 from saccade_lab.maps.occlusion import Place, behind, measure
 from saccade_lab.maps.view import View, from_policy
 from tests.helpers.frames_cases import write_pictures, write_pictures_of
@@ -137,7 +137,7 @@ def test_the_frame_behind_a_token_is_what_the_token_sees(layout: str) -> None:
 
 
 def test_behind_is_cut_off_at_the_edges() -> None:
-    beside = Camera("front", 0, 4, 4, (-0.5, 0.0, 1.5, 1.0))
+    beside = ViewLayout("front", 0, 4, 4, (-0.5, 0.0, 1.5, 1.0))
     assert behind(Place(beside, slice(0, 4), slice(0, 1)), 8, 8) == (slice(0, 8), slice(0, 0))
     assert behind(Place(beside, slice(0, 4), slice(0, 4)), 8, 8) == (slice(0, 8), slice(0, 8))
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from saccade.errors import InputError, ShapeError
 from saccade_lab.maps.layout import (
-    Camera,
     Layout,
     Token,
+    ViewLayout,
     from_image_mask,
     from_input_ids,
     parse_grid,
@@ -61,7 +61,7 @@ def test_every_position_is_in_one_part() -> None:
 def test_pictures_without_anything_between_them_are_split() -> None:
     ids = np.array([1, 2] + [9] * 24 + [3])
     layout = from_input_ids(ids, image_token_index=9, grid=(3, 4))
-    assert layout.cameras == (Camera("camera 1", 2, 3, 4), Camera("camera 2", 14, 3, 4))
+    assert layout.cameras == (ViewLayout("camera 1", 2, 3, 4), ViewLayout("camera 2", 14, 3, 4))
 
 
 def test_an_attention_mask_says_what_padding_is() -> None:
@@ -96,9 +96,9 @@ def test_no_image_token_is_an_error_that_says_how_to_go_on() -> None:
 def test_an_image_mask() -> None:
     mask = np.array([False, True, True, True, True, False, True, True, True, True, False])
     layout = from_image_mask(mask)
-    assert layout.cameras == (Camera("camera 1", 1, 2, 2), Camera("camera 2", 6, 2, 2))
+    assert layout.cameras == (ViewLayout("camera 1", 1, 2, 2), ViewLayout("camera 2", 6, 2, 2))
     assert [token.name for token in layout.tokens] == ["text 0", "text 5", "text 10"]
-    assert from_image_mask(mask, grid=(1, 4)).cameras[0] == Camera("camera 1", 1, 1, 4)
+    assert from_image_mask(mask, grid=(1, 4)).cameras[0] == ViewLayout("camera 1", 1, 1, 4)
     assert [camera.start for camera in from_image_mask(mask, grid=(2, 1)).cameras] == [1, 3, 6, 8]
     names = ["push", *["x"] * 4, "</img>", *["x"] * 4, "a < b"]
     assert from_image_mask(mask, names=names).parts()["special"].tolist() == [5]
@@ -110,7 +110,7 @@ def test_an_image_mask() -> None:
 
 def test_a_layout_written_by_hand() -> None:
     layout = parse_layout("text:2=word, image:2x3=left, image:4, special:1=</img>, text:*, pad:2", 18)
-    assert layout.cameras == (Camera("left", 2, 2, 3), Camera("camera 2", 8, 2, 2))
+    assert layout.cameras == (ViewLayout("left", 2, 2, 3), ViewLayout("camera 2", 8, 2, 2))
     assert [(token.position, token.kind, token.name) for token in layout.tokens] == [
         (0, "text", "word 1"),
         (1, "text", "word 2"),
@@ -162,11 +162,11 @@ def test_two_cameras_of_one_name_are_an_error() -> None:
 
 def test_positions_are_described_once() -> None:
     with pytest.raises(ShapeError, match="position 2 is described 0 times"):
-        Layout(3, (Camera("left", 0, 1, 2),), ())
+        Layout(3, (ViewLayout("left", 0, 1, 2),), ())
     with pytest.raises(ShapeError, match="position 1 is described 2 times"):
-        Layout(2, (Camera("left", 0, 1, 2),), (Token(1, "text", "x"),))
+        Layout(2, (ViewLayout("left", 0, 1, 2),), (Token(1, "text", "x"),))
     with pytest.raises(ShapeError, match="positions 1 to 4, expected 0 to 2"):
-        Layout(3, (Camera("left", 1, 2, 2),), ())
+        Layout(3, (ViewLayout("left", 1, 2, 2),), ())
 
 
 @pytest.mark.parametrize(("text", "grid"), [("16x16", (16, 16)), ("3x4", (3, 4)), ("64", (8, 8))])

@@ -14,7 +14,7 @@ from safetensors.torch import save_file as save_torch_file
 
 import saccade
 from saccade.errors import InputError, ShapeError
-from saccade_lab.maps.layout import Camera
+from saccade_lab.maps.layout import ViewLayout
 from saccade_lab.maps.view import LayoutOptions, View, from_file, from_simulator
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import Policy
@@ -58,7 +58,7 @@ def test_a_file_of_features(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.observation.backbone_features, arrays["backbone_features"])
     np.testing.assert_array_equal(found.observation.noise, arrays["noise"])
     assert found.observation.embodiment_id == arrays["embodiment_id"][0]
-    assert found.layout.cameras == (Camera("camera 1", 20, 16, 16),)
+    assert found.layout.cameras == (ViewLayout("camera 1", 20, 16, 16),)
     assert found.images["camera 1"].shape == (32, 32, 3)
     by_hand = taken(tmp_path / "f.npz", text="text:20,image:16x16=left,text:*")
     assert list(by_hand.images) == ["left"]
@@ -100,7 +100,7 @@ def test_a_row_of_a_batch(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.observation.backbone_features, given.backbone_features[1:])
     np.testing.assert_array_equal(found.observation.state, given.state[1:])
     assert found.observation.embodiment_id == given.embodiment_id[1]
-    assert found.layout.cameras == (Camera("camera 1", 2, 2, 2),)
+    assert found.layout.cameras == (ViewLayout("camera 1", 2, 2, 2),)
     assert found.layout.parts()["pad"].tolist() == [0]
     with pytest.raises(InputError, match="--row: given 2"):
         from_file(path, config, row=2, options=LayoutOptions(), seed=0)

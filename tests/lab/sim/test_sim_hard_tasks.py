@@ -18,7 +18,7 @@ import saccade_lab.sim  # noqa: F401  (registers the environments)
 from saccade import InputError
 from saccade.cli import main
 from saccade_lab.sim import demos, graphics
-from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, Camera
+from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, CameraPose
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.experts import Expert
 from saccade_lab.sim.scenarios import TOUCH, Ball, BallScenario, Fork, StereoReach, TwoGoals
@@ -51,7 +51,7 @@ def go_to(environment: TaskEnvironment, target: Float64Array, steps: int = 150) 
     return done
 
 
-def eye_and_forward(camera: Camera) -> tuple[Float64Array, Float64Array]:
+def eye_and_forward(camera: CameraPose) -> tuple[Float64Array, Float64Array]:
     """Position and viewing direction of a camera."""
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -59,7 +59,7 @@ def eye_and_forward(camera: Camera) -> tuple[Float64Array, Float64Array]:
     return np.array(camera.lookat) - camera.distance * forward, forward
 
 
-def seen_at(camera: Camera, points: Float64Array, size: int) -> tuple[Float64Array, Float64Array]:
+def seen_at(camera: CameraPose, points: Float64Array, size: int) -> tuple[Float64Array, Float64Array]:
     """Where a pinhole camera sees points `(n, 3)`: pixels from the middle, right and up; and their scale.
 
     The scale is that of lengths there, in pixels a metre.
