@@ -36,8 +36,9 @@ from numpy.typing import NDArray
 
 import saccade
 from saccade._internal.environment import cpu_name
-from saccade._internal.files import writable_directory, write_json
+from saccade._internal.files import write_json
 from saccade.errors import InputError
+from saccade_lab.files import writable_directory
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.rollout import Episode, environment_for

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import (
     Arguments,
+    UsageError,
     add_checkpoint,
     add_config,
     add_features,
@@ -18,7 +19,14 @@ from saccade._internal.flags import (
     add_seed,
     check_known,
 )
+from saccade.errors import InputError
 from saccade_lab.sim.tasks import TASKS
+
+#: The flags that `add_frames` declares besides `--frames`.
+WITH_FRAMES = (
+    *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
+    *("other_frames", "other_instruction"),  # of `saccade study patching`
+)
 
 
 def add_tasks(parser: Arguments, help: str = "tasks to run (default: all that the policy knows)") -> None:
@@ -41,12 +49,29 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
     add_preprocessing(seen)
 
 
+def check_frames(args: argparse.Namespace, *refused: str) -> None:
+    """Checks the flags of `add_frames`.
+
+    Args:
+        args: Parsed arguments.
+        refused: Names of arguments that cannot be combined with `--frames`: they are None where not given.
+
+    Raises:
+        UsageError: One needs `--frames`, or cannot be combined with it.
+    """
+    wrong, rule = (WITH_FRAMES, "only with") if args.frames is None else (refused, "not with")
+    given = [name for name in wrong if getattr(args, name, None) is not None]
+    if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise UsageError(f"{flags}: {rule} --frames")
+
+
 def add_rollout_arguments(parser: Arguments, episodes: int) -> None:
     """Declares which episodes of which policy a study runs, or which recorded observations it reads.
 
     Args:
-        parser: parser of the study.
-        episodes: default number per task. It is kept as `args.default_episodes`, and `args.episodes` is None
+        parser: Parser of the study.
+        episodes: Default number per task. It is kept as `args.default_episodes`, and `args.episodes` is None
             where the flag is absent, because with `--features` the flag may not be given.
     """
     add_checkpoint(
@@ -65,7 +90,7 @@ def check_tasks(names: Iterable[str]) -> None:
     """Checks the names of tasks; needs no simulator.
 
     Raises:
-        InputError: one is unknown; lists those that are known.
+        InputError: One is unknown; lists those that are known.
     """
     check_known("--tasks", names, known_tasks())
 
@@ -73,3 +98,21 @@ def check_tasks(names: Iterable[str]) -> None:
 def known_tasks() -> tuple[str, ...]:
     """The names of all tasks; needs no simulator."""
     return tuple(TASKS)
+
+
+def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:
+    """Distinct indices below `count` in increasing order; None gives all of them.
+
+    Raises:
+        InputError: One is out of range.
+
+    Example:
+        >>> indices("--blocks", (3, 0), 4), indices("--blocks", None, 4)
+        ((0, 3), (0, 1, 2, 3))
+    """
+    if given is None:
+        return tuple(range(count))
+    found = tuple(sorted(set(given)))
+    if found and (found[0] < 0 or found[-1] >= count):
+        raise InputError(f"{flag}: given {', '.join(map(str, found))}, expected 0 to {count - 1}")
+    return found

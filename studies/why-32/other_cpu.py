@@ -16,7 +16,7 @@ import pandas as pd
 from joblib import Parallel, delayed
 
 import saccade
-from saccade._internal.files import checkpoint_identity
+from saccade_lab.files import checkpoint_identity
 from saccade_lab.sim import environment_cache
 from saccade_lab.study.questions.sweeps_results import PLAIN
 from saccade_lab.study.table import read_table, truths

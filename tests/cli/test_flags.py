@@ -10,6 +10,7 @@ import pytest
 from saccade import InputError, cli
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
+from saccade_lab.flags import indices
 
 
 @pytest.mark.parametrize("command", ["act", "inspect", "convert", "quantize", "resize", "serve"])
@@ -91,9 +92,9 @@ def test_resize_names_the_flag(
 
 
 def test_indices() -> None:
-    assert arguments.indices("--blocks", None, 3) == (0, 1, 2)
+    assert indices("--blocks", None, 3) == (0, 1, 2)
     with pytest.raises(InputError, match="--blocks: given 0, 4, expected 0 to 3"):
-        arguments.indices("--blocks", (4, 0), 4)
+        indices("--blocks", (4, 0), 4)
 
 
 def test_the_help_of_a_default() -> None:

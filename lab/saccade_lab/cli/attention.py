@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import writable_directory, write_json
+from saccade._internal.files import write_json
 from saccade._internal.flags import UsageError
 from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
+from saccade_lab.files import writable_directory
 
 if TYPE_CHECKING:
     from saccade.head.config import HeadConfig
@@ -144,8 +145,8 @@ def run(args: argparse.Namespace) -> int:
 
 def compute(args: argparse.Namespace) -> Maps:
     """Loads the head and the observation, and computes everything that is shown."""
-    from saccade._internal.files import checkpoint_identity
     from saccade._internal.hub import resolve
+    from saccade_lab.files import checkpoint_identity
 
     checkpoint = args.checkpoint
     if checkpoint is None:
@@ -165,10 +166,10 @@ def maps_of(args: argparse.Namespace, checkpoint: dict[str, str], head: ActionHe
     from saccade_lab.maps import record
     from saccade_lab.maps.occlusion import cell_for
 
-    blocks = arguments.indices("--blocks", args.blocks, head.config.num_layers)
-    steps = arguments.indices("--steps", args.steps, head.config.num_steps)
+    blocks = lab_flags.indices("--blocks", args.blocks, head.config.num_layers)
+    steps = lab_flags.indices("--steps", args.steps, head.config.num_steps)
     named = args.heads not in (None, ("mean",))
-    heads = arguments.indices("--heads", args.heads if named else None, head.config.num_heads)
+    heads = lab_flags.indices("--heads", args.heads if named else None, head.config.num_heads)
     few = probabilities(head.config, view, len(blocks), len(steps)) <= MAX_PROBABILITIES
     shown = heads if named or (args.heads is None and few) else ()
     selection = record.Selection(blocks, steps, heads, shown)
@@ -199,7 +200,7 @@ def check(args: argparse.Namespace) -> None:
     if args.task is not None:
         arguments.check_known("--task", [args.task], lab_flags.known_tasks())
     of_file = ("layout", "grid", "image_token_index")
-    arguments.check_frames(args, "features", "task", "after", "config", *of_file)
+    lab_flags.check_frames(args, "features", "task", "after", "config", *of_file)
     if args.features is not None and (args.task is not None or args.after):
         raise UsageError("--features, --task: expected one observation, from a file or from the simulator")
     if args.features is None and args.frames is None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import writable_directory
 from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
+from saccade_lab.files import writable_directory
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import path_text, writable_directory, write_atomically, write_json
+from saccade._internal.files import write_atomically, write_json
 from saccade._internal.policy_flags import add_data_config, add_overrides
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade.errors import SaccadeError
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
+from saccade_lab.files import path_text, writable_directory
 from saccade_lab.parallel import Lost, Workers, each
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of

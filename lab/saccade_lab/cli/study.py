@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import writable_directory
 from saccade.cli import EXIT_OK, Parser, output
 from saccade_lab.extras import LAB, require
+from saccade_lab.files import writable_directory
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.study.study import STUDIES, Study, load_study

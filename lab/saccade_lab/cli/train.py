@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import writable_directory
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade_lab.extras import LAB, require
+from saccade_lab.files import writable_directory
 
 if TYPE_CHECKING:
     from saccade_lab.training.settings import TrainingSettings
@@ -121,7 +121,7 @@ def training_settings(args: argparse.Namespace) -> TrainingSettings:
     """The settings that the arguments ask for.
 
     Raises:
-        InputError: they do not fit each other.
+        InputError: They do not fit each other.
     """
     from saccade_lab.training.settings import TrainingSettings
 

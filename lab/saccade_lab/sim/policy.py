@@ -13,12 +13,12 @@ import numpy as np
 
 import saccade
 from saccade._internal.arrays import Float32Array
-from saccade._internal.files import checkpoint_identity
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.head.intervention import Intervention
 from saccade.policy.interfaces import Head
 from saccade.processor import Processor
 from saccade.robots import LANGUAGE_KEY
+from saccade_lab.files import checkpoint_identity
 from saccade_lab.inside import context_of, features_of, inputs_of
 from saccade_lab.sim.settings import CONFIG_FILE, FILES, GROUPS, SimulationConfig
 from saccade_lab.sim.tasks import find_task

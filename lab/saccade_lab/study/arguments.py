@@ -6,11 +6,10 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from saccade._internal.files import path_text
-from saccade._internal.flags import check_frames
 from saccade._internal.hub import resolve
 from saccade.errors import InputError
-from saccade_lab.flags import check_tasks
+from saccade_lab.files import path_text
+from saccade_lab.flags import check_frames, check_tasks
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.study.pictures import PictureSource
 from saccade_lab.study.recording import Recording

@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from saccade._internal.files import checkpoint_identity
 from saccade.backbone.config import BackboneConfig
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
@@ -23,6 +22,7 @@ from saccade.observations import read
 from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.encoding import pad_tokens
 from saccade.policy.policy import Policy
+from saccade_lab.files import checkpoint_identity
 from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of, parts_of
 from saccade_lab.maps.grid import layout_of
 from saccade_lab.maps.layout import Layout

@@ -11,11 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from saccade._internal.arrays import Float32Array
-from saccade._internal.files import checkpoint_identity, sha256_of
+from saccade._internal.files import sha256_of
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
+from saccade_lab.files import checkpoint_identity
 from saccade_lab.study.source import Source, episode_rng
 
 NOISES = 4  # drawn for each observation that has none

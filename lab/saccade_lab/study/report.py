@@ -8,8 +8,9 @@ from pathlib import Path
 
 import matplotlib as mpl
 
-from saccade._internal.files import writable_directory, write_atomically
+from saccade._internal.files import write_atomically
 from saccade.errors import InputError
+from saccade_lab.files import writable_directory
 from saccade_lab.study.page import Part, SavedPicture, to_html, to_markdown
 from saccade_lab.study.section import Figure, Prose, Section
 from saccade_lab.study.study import STUDIES, load_study

@@ -15,9 +15,9 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 
-from saccade._internal.files import sha256_of, writable_directory, write_json
-from saccade._internal.json import changed
+from saccade._internal.files import sha256_of, write_json
 from saccade.errors import InputError, SaccadeError
+from saccade_lab.files import changed, writable_directory
 from saccade_lab.machine import cpu_name
 from saccade_lab.parallel import ALONE, Lost, Workers, each
 from saccade_lab.study.cell import Cell, Rows, digest, plain, sortable

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from saccade._internal.files import checkpoint_identity
 from saccade.errors import InputError
+from saccade_lab.files import checkpoint_identity
 
 if TYPE_CHECKING:
     from saccade_lab.training.settings import TrainingSettings

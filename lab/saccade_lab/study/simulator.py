@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import ArrayLike, Float32Array
-from saccade._internal.files import path_text
 from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
@@ -20,6 +19,7 @@ from saccade.head.input_files import BoolArray
 from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
 from saccade.policy.interfaces import Head
+from saccade_lab.files import path_text
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
 from saccade_lab.sim.rollout import Episode, environment_for, run_episode

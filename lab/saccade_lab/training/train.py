@@ -30,10 +30,10 @@ from torch import Tensor
 
 from saccade._internal.arrays import Float32Array
 from saccade._internal.files import sha256_of, write_atomically, write_json
-from saccade._internal.json import changed
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.processor import Processor
+from saccade_lab.files import changed
 from saccade_lab.reference.backbone import BackboneFeatures
 from saccade_lab.sim import demos
 from saccade_lab.sim.allocator import keep_freed_memory

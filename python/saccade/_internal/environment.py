@@ -75,12 +75,12 @@ def cpu_name() -> str:
 
 
 def _name_in(cpuinfo: str) -> str:
-    """What /proc/cpuinfo calls the first processor; empty if nothing does.
+    r"""What /proc/cpuinfo calls the first processor; empty if nothing does.
 
     Example:
-        >>> _name_in("model name\\t: Some CPU 3000\\n")
+        >>> _name_in("model name\t: Some CPU 3000\n")
         'Some CPU 3000'
-        >>> _name_in("CPU implementer\\t: 0x41\\nCPU part\\t: 0xd0b\\n")
+        >>> _name_in("CPU implementer\t: 0x41\nCPU part\t: 0xd0b\n")
         'implementer 0x41 part 0xd0b'
     """
     pairs = [line.partition(":") for line in reversed(cpuinfo.splitlines())]

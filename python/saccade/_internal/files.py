@@ -1,6 +1,5 @@
 """Files: written so that a reader never sees half of one, and hashed."""
 
-import errno
 import hashlib
 import os
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
     by it.
 
     Raises:
-        OSError: the file cannot be written; names `path`.
+        OSError: The file cannot be written; names `path`.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
@@ -40,32 +39,6 @@ def write_json(path: Path, value: Any) -> None:
         temporary.write_text(dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def path_text(path: Path) -> str:
-    """A path as text that contains a separator, so that it cannot be taken for a word.
-
-    Example:
-        >>> path_text(Path("reach")), path_text(Path("out/reach"))
-        ('./reach', 'out/reach')
-    """
-    return str(path) if os.sep in str(path) else f"{os.curdir}{os.sep}{path}"
-
-
-def writable_directory(path: Path) -> Path:
-    """Creates the directory if it does not exist, and checks that files can be written to it.
-
-    Raises:
-        OSError: it cannot be created or written to, or is not a directory.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise NotADirectoryError(errno.ENOTDIR, "exists and is not a directory", str(path)) from None
-    probe = path / f".writable.{os.getpid()}"
-    probe.touch()
-    probe.unlink()
-    return path
-
-
 def sha256_of(*paths: Path) -> str:
     """SHA-256 of files, one after the other, read in blocks."""
     digest = hashlib.sha256()
@@ -74,26 +47,3 @@ def sha256_of(*paths: Path) -> str:
             while block := file.read(1 << 24):
                 digest.update(block)
     return digest.hexdigest()
-
-
-def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
-    """`name` and `sha256` of a checkpoint.
-
-    The hash covers the tensors and what decides how they are used: config, tokenizer and statistics, where
-    there are such files.
-    """
-    directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
-    tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
-    companions = [
-        directory / name
-        for name in (
-            "config.json",
-            "tokenizer.json",
-            "experiment_cfg/metadata.json",
-            "experiment_cfg/data_config.json",
-        )
-    ]
-    return {
-        "name": checkpoint.resolve().name,
-        "sha256": sha256_of(*filter(Path.is_file, companions), *tensors),
-    }

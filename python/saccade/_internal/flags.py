@@ -28,7 +28,7 @@ class StoreNumber(argparse.Action):
     """Stores a number and refuses one outside `minimum <= number < below`.
 
     Raises:
-        UsageError: when the argument is parsed; names the flag, the number given and the range.
+        UsageError: When the argument is parsed; names the flag, the number given and the range.
     """
 
     def __init__(
@@ -60,11 +60,11 @@ class StoreList(argparse.Action):
     """Stores the items of a list as a tuple, in the order given, each once.
 
     Args:
-        item: converts a word to an item; raises `ValueError` for a word that is not a number.
-        minimum: smallest value, for items that are numbers.
+        item: Converts a word to an item; raises `ValueError` for a word that is not a number.
+        minimum: Smallest value, for items that are numbers.
 
     Raises:
-        UsageError: when the argument is parsed: the list is empty, or contains something other than numbers
+        UsageError: When the argument is parsed: the list is empty, or contains something other than numbers
             of at least `minimum`.
     """
 
@@ -164,13 +164,13 @@ def add_list(
     """Declares a list, see `StoreList`; `args` then holds a tuple, or `default` where the flag is absent.
 
     Args:
-        parser: parser of the command.
-        flag: its name, in the plural.
-        item: converts a word to an item, for example `int`.
-        metavar: what an item is called.
-        minimum: smallest value, for items that are numbers.
-        default: value of `args` without the flag.
-        help: help text, which must state the default.
+        parser: Parser of the command.
+        flag: Its name, in the plural.
+        item: Converts a word to an item, for example `int`.
+        metavar: What an item is called.
+        minimum: Smallest value, for items that are numbers.
+        default: Value of `args` without the flag.
+        help: Help text, which must state the default.
     """
     parser.add_argument(
         flag,
@@ -242,19 +242,12 @@ def embodiment(word: str) -> str | int:
     return int(word) if word.isdecimal() else word
 
 
-#: The flags that `add_frames` declares besides `--frames`.
-WITH_FRAMES = (
-    *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
-    *("other_frames", "other_instruction"),  # of `saccade study patching`
-)
-
-
 def add_pictures(parser: Arguments, flag: str) -> None:
     """Declares a directory of pictures, an instruction and a state, for `read_frames`.
 
     Args:
-        parser: parser or group.
-        flag: flag of the directory.
+        parser: Parser or group.
+        flag: Flag of the directory.
     """
     parser.add_argument(
         flag,
@@ -270,23 +263,6 @@ def add_pictures(parser: Arguments, flag: str) -> None:
         help="JSON: the robot's state in its own units, for observations without a state.json (default: "
         "the middle of its range)",
     )
-
-
-def check_frames(args: argparse.Namespace, *refused: str) -> None:
-    """Checks the flags of `add_frames`.
-
-    Args:
-        args: Parsed arguments.
-        refused: Names of arguments that cannot be combined with `--frames`: they are None where not given.
-
-    Raises:
-        UsageError: One needs `--frames`, or cannot be combined with it.
-    """
-    wrong, rule = (WITH_FRAMES, "only with") if args.frames is None else (refused, "not with")
-    given = [name for name in wrong if getattr(args, name, None) is not None]
-    if given:
-        flags = ", ".join("--" + name.replace("_", "-") for name in given)
-        raise UsageError(f"{flags}: {rule} --frames")
 
 
 def add_num_threads(
@@ -324,27 +300,9 @@ def check_known(flag: str, given: Iterable[str], known: Iterable[str]) -> None:
     """Checks names.
 
     Raises:
-        InputError: one is unknown; lists those that are known.
+        InputError: One is unknown; lists those that are known.
     """
     known = list(known)
     for name in given:
         if name not in known:
             raise InputError(f"{flag}: unknown name {name!r}, expected one of {', '.join(known)}")
-
-
-def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:
-    """Distinct indices below `count` in increasing order; None gives all of them.
-
-    Raises:
-        InputError: one is out of range.
-
-    Example:
-        >>> indices("--blocks", (3, 0), 4), indices("--blocks", None, 4)
-        ((0, 3), (0, 1, 2, 3))
-    """
-    if given is None:
-        return tuple(range(count))
-    found = tuple(sorted(set(given)))
-    if found and (found[0] < 0 or found[-1] >= count):
-        raise InputError(f"{flag}: given {', '.join(map(str, found))}, expected 0 to {count - 1}")
-    return found

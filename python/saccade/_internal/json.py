@@ -1,4 +1,4 @@
-"""JSON as RFC 8259 defines it: numbers that are not finite become ``null``; what differs between objects."""
+"""JSON as RFC 8259 defines it: numbers that are not finite become ``null``."""
 
 from __future__ import annotations
 
@@ -51,13 +51,3 @@ def _finite(value: Any) -> Any:
 def _finite_key(key: Any) -> Any:
     """A key is a string in JSON: a number that is not finite keeps its name."""
     return str(key) if isinstance(key, float) and not math.isfinite(key) else key
-
-
-def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """The names whose values differ. One that is missing counts as None.
-
-    Example:
-        >>> changed({"steps": 1, "seed": 0}, {"seed": 0, "width": 8})
-        ['steps', 'width']
-    """
-    return [name for name in {**before, **now} if before.get(name) != now.get(name)]

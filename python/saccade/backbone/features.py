@@ -75,12 +75,12 @@ class BackboneFeatures:
 
     @property
     def attention_mask(self) -> Array:
-        """bool ``(batch, T)``, True where a token is not padding, as it was given."""
+        """Booleans ``(batch, T)``, True where a token is not padding, as it was given."""
         return self._arrays[1]
 
     @property
     def image_mask(self) -> Array:
-        """bool ``(batch, T)``, True for tokens of views."""
+        """Booleans ``(batch, T)``, True for tokens of views."""
         return self._arrays[2]
 
     @property

@@ -32,7 +32,7 @@ def prepare_streams() -> None:
     """Makes both streams accept any text, whatever their encoding is.
 
     Raises:
-        OutputError: standard output is closed.
+        OutputError: Standard output is closed.
     """
     if sys.stdout is None:
         raise OutputError("standard output is closed")
@@ -65,8 +65,8 @@ def flush() -> None:
     """Flushes standard output.
 
     Raises:
-        BrokenPipeError: whoever read it is gone.
-        OutputError: it cannot be written.
+        BrokenPipeError: Whoever read it is gone.
+        OutputError: It cannot be written.
     """
     try:
         sys.stdout.flush()

@@ -211,7 +211,7 @@ class Accelerated(StandIn[ActionHead]):
                 `backbone_attention_mask` and `image_mask`, bool `(batch, T_vl)`.
             action_input: `state (batch, num_states, state_dim)` and `embodiment_id (batch,)`. With
                 real-time chunking also `action`, the previous chunk.
-            options: options of real-time chunking, for heads that support it.
+            options: Options of real-time chunking, for heads that support it.
 
         Returns:
             An instance of the original's class with `action_pred (batch, action_horizon, action_dim)` in the

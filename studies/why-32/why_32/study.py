@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 
 import pandas as pd
 
-from saccade._internal.files import checkpoint_identity, sha256_of
-from saccade._internal.json import changed
+from saccade._internal.files import sha256_of
 from saccade.errors import InputError
+from saccade_lab.files import changed, checkpoint_identity
 from saccade_lab.study.cell import Cell, Rows
 from saccade_lab.study.runs import Planned, read_run, saved_step
 from saccade_lab.study.study import Study

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from saccade._internal.arrays import UInt8Array
-from saccade._internal.files import path_text
 from saccade.errors import InputError
+from saccade_lab.files import path_text
 from saccade_lab.parallel import ALONE, Lost, Workers, each, files
 from tests.helpers.parallel_cases import Square
 

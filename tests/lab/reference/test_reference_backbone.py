@@ -16,10 +16,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from saccade import BackboneInputs, CheckpointError, InputError, ShapeError
-from saccade.checkpoints import backbone_tensors
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.checkpoints.published import RELEASED
+from saccade.checkpoints.random_checkpoint import backbone_tensors
 from saccade_lab.reference import Backbone, BackboneFeatures
+from saccade_lab.reference.backbone.loading import is_unread
 from tests.helpers import upstream_backbones
 from tests.helpers.reference_backbone_cases import random_inputs, random_sizes, randomised
 
@@ -194,8 +195,8 @@ def test_names_and_shapes_are_listed_without_torch(version: str) -> None:
     assert listed == held
     unread = dict(backbone_tensors.unread_tensor_shapes(sizes))
     assert not unread.keys() & listed.keys()
-    assert all(backbone_tensors.is_unread(name, sizes) for name in unread)
-    assert not any(backbone_tensors.is_unread(name, sizes) for name in listed)
+    assert all(is_unread(name, sizes) for name in unread)
+    assert not any(is_unread(name, sizes) for name in listed)
 
 
 def test_the_size_of_the_published_backbone() -> None:

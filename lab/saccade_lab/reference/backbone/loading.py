@@ -15,7 +15,6 @@ from torch import Tensor
 
 from saccade._internal.hub import resolve
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.checkpoints.random_checkpoint.backbone_tensors import is_unread
 from saccade.errors import CheckpointError
 
 #: Prefixes of the names of a backbone's tensors, in checkpoints by NVIDIA and by lerobot.
@@ -84,3 +83,18 @@ class Checkpoint:
             listed = "; ".join(sorted(problems))
             raise CheckpointError(f"{self.source}: {len(problems)} tensors do not fit the config: {listed}")
         return tensors
+
+
+def is_unread(name: str, sizes: BackboneSizes) -> bool:
+    """Whether a tensor below ``backbone.`` is known and not read.
+
+    That are those of `backbone_tensors.unread_tensor_shapes`, a twin of the embedding table, and layers that
+    are not computed.
+    """
+    if name.endswith("lm_head.weight") or ".vision_model.head." in name:
+        return True
+    if sizes.version == "n1.7" and name == "model.model.language_model.norm.weight":
+        return True
+    _, found, rest = name.partition(".language_model.")
+    layer = rest.removeprefix("model.").removeprefix("layers.").split(".")[0]
+    return bool(found) and layer.isdecimal() and int(layer) >= sizes.num_layers

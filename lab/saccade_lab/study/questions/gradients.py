@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from saccade._internal.files import path_text
 from saccade._internal.flags import add_integer
 from saccade.errors import InputError
 from saccade.head.input_files import MASKS
 from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import ROW_GROUPS
+from saccade_lab.files import path_text
 from saccade_lab.flags import add_frames, add_rollout_arguments
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import pandas as pd
 
-from saccade._internal.files import path_text
 from saccade._internal.flags import add_integer, add_list, add_seed
 from saccade.errors import InputError
 from saccade.head.intervention import Intervention
+from saccade_lab.files import path_text
 from saccade_lab.flags import add_episodes, add_tasks, check_tasks
 from saccade_lab.study.cell import Cell, Rows
 from saccade_lab.study.questions.sweeps_cost import cost

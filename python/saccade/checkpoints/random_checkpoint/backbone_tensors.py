@@ -40,21 +40,6 @@ def unread_tensor_shapes(sizes: BackboneSizes) -> Shapes:
     yield from _linear(f"{head}.mlp.fc2", sizes.vision.mlp_width, width)
 
 
-def is_unread(name: str, sizes: BackboneSizes) -> bool:
-    """Whether a tensor below ``backbone.`` is known and not read.
-
-    That are those of :func:`unread_tensor_shapes`, a twin of the embedding table, and layers that are not
-    computed.
-    """
-    if name.endswith("lm_head.weight") or ".vision_model.head." in name:
-        return True
-    if sizes.version == "n1.7" and name == "model.model.language_model.norm.weight":
-        return True
-    _, found, rest = name.partition(".language_model.")
-    layer = rest.removeprefix("model.").removeprefix("layers.").split(".")[0]
-    return bool(found) and layer.isdecimal() and int(layer) >= sizes.num_layers
-
-
 def _linear(name: str, inputs: int, outputs: int) -> Shapes:
     yield f"{name}.weight", (outputs, inputs)
     yield f"{name}.bias", (outputs,)

@@ -6,98 +6,21 @@ prompts of these words have exactly the ids of the published tokenizer; other te
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from saccade.errors import InputError
 
+_VOCABULARY = json.loads(Path(__file__).with_name("vocabulary.json").read_text(encoding="utf-8"))
+
 #: Words as byte-level BPE spells them ("Ġ" is a space), and their published ids.
-WORDS = {
-    "Ġa": 264,
-    "Ġare": 525,
-    "Ġand": 323,
-    "Ġassistant": 17847,
-    "Ġhelpful": 10950,
-    "Ġthe": 279,
-    "Ġit": 432,
-    "Ġdrawer": 26482,
-    "Ġdrop": 5943,
-    "Ġdon": 1513,
-    "Ġup": 705,
-    "Ġred": 2518,
-    "Ġblock": 2504,
-    "You": 2610,
-    "system": 8948,
-    "assistant": 77091,
-    "push": 9077,
-    "user": 872,
-    "image": 1805,
-    "open": 2508,
-    "Pick": 36953,
-    "'t": 944,
-    "['": 677,
-    "']": 660,
-    '["': 1183,
-    '"]': 1341,
-    "Ġg": 342,
-}
+WORDS: Mapping[str, int] = _VOCABULARY["words"]
 
 #: The added tokens in the order of their ids, and whether they are special.
-ADDED = {
-    **dict.fromkeys(
-        (
-            "<|endoftext|>",
-            "<|im_start|>",
-            "<|im_end|>",
-            "<|object_ref_start|>",
-            "<|object_ref_end|>",
-            "<|box_start|>",
-            "<|box_end|>",
-            "<|quad_start|>",
-            "<|quad_end|>",
-            "<|vision_start|>",
-            "<|vision_end|>",
-            "<|vision_pad|>",
-            "<|image_pad|>",
-            "<|video_pad|>",
-        ),
-        True,
-    ),
-    **dict.fromkeys(
-        (
-            "<tool_call>",
-            "</tool_call>",
-            "<|fim_prefix|>",
-            "<|fim_middle|>",
-            "<|fim_suffix|>",
-            "<|fim_pad|>",
-            "<|repo_name|>",
-            "<|file_sep|>",
-            "<tool_response>",
-            "</tool_response>",
-            "<think>",
-            "</think>",
-        ),
-        False,
-    ),
-    **dict.fromkeys(
-        (
-            "<IMG_CONTEXT>",
-            "<img>",
-            "</img>",
-            "<box>",
-            "</box>",
-            "<quad>",
-            "</quad>",
-            "<ref>",
-            "</ref>",
-            "<interval>",
-            "</interval>",
-        ),
-        True,
-    ),
-}
+ADDED: Mapping[str, bool] = _VOCABULARY["added"]
 
 #: The id of the first added token in the published vocabulary.
 FIRST_ADDED = 151643
@@ -112,9 +35,9 @@ def tokenizer(*, published_ids: bool, words: Sequence[str] = ()) -> dict[str, An
     """The content of ``tokenizer.json``.
 
     Args:
-        published_ids: whether tokens have their published ids, for a table of 151680 rows. Otherwise the ids
+        published_ids: Whether tokens have their published ids, for a table of 151680 rows. Otherwise the ids
             have no gaps; without `words` there are fewer than 512.
-        words: words that are one token each, at the beginning of a text and after a space, in addition to
+        words: Words that are one token each, at the beginning of a text and after a space, in addition to
             `WORDS`. Only without published ids.
 
     Raises:
