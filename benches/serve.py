@@ -227,7 +227,7 @@ def server(checkpoint: Path, args: argparse.Namespace, log: Path) -> Iterator[Ru
         RuntimeError: It does not start, or does not end with status 0.
     """
     command = [sys.executable, "-m", "saccade", "serve", str(checkpoint), "--port", "0", "--log", "json"]
-    command += ["--precision", args.precision]
+    command += ["--precision", args.precision, "--request-seconds", "3600"]
     if args.num_threads is not None:
         command += ["--num-threads", str(args.num_threads)]
     with log.open("wb") as output, subprocess.Popen(command, stdout=output) as process:

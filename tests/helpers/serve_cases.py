@@ -1,7 +1,7 @@
 """Helpers of the server's tests: a policy in memory, servers in threads, raw clients.
 
 The policy has the interface of `saccade.Policy` and no weights, so that tests of the protocol are fast and
-show which requests were computed together. Real checkpoints are served in `test_serve_policy.py`.
+show which requests were computed together. Real checkpoints are served in `tests/serve/test_checkpoints.py`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,13 @@ import zmq
 from saccade.observations import Camera, ParsedObservation, Requirements
 from saccade.policy.encoding import PolicyContext
 from saccade.serve import Limits, Server
-from saccade.serve.connections import bind
+from saccade.serve.transport import bind
 
 HORIZON, WIDTH, BUCKETS = 8, 3, 1000
+PONG = {"status": "ok", "message": "Server is running"}
+#: What ZMTP 3 begins with, and the first command of a REQ socket.
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+READY = b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ"
 GROUPS = (SimpleNamespace(key="arm", size=2), SimpleNamespace(key="gripper", size=1))
 
 
@@ -51,11 +55,13 @@ class MemoryPolicy:
         chunkings: The `Chunking` of each call of `sample`, or None.
         steps: The number of Euler steps of each call of `sample`, or None.
         gate: Features are computed once it is set.
+        begun: The sizes of the batches that have come to the gate.
         nbytes: Size of its backbone.
     """
 
     version: str = "n1.5"
     batches: list[int] = field(default_factory=list)
+    begun: list[int] = field(default_factory=list)
     chunkings: list[Any] = field(default_factory=list)
     steps: list[int | None] = field(default_factory=list)
     gate: threading.Event = field(default_factory=threading.Event)
@@ -78,7 +84,8 @@ class MemoryPolicy:
         )
 
     def encode_many(self, inputs: Sequence[Any], *, previous: Sequence[Any] = ()) -> list[Any]:
-        self.gate.wait(30)
+        self.begun.append(len(inputs))
+        self.gate.wait(60)
         self.batches.append(len(inputs))
         if any(one.crashes for one in inputs):
             raise MemoryError("crashed")
@@ -132,6 +139,9 @@ class MemoryLog:
 
     def warnings(self) -> list[str]:
         return [str(line["message"]) for line in self.lines if line["event"] == "warning"]
+
+    def requests(self) -> list[dict[str, Any]]:
+        return [line for line in self.lines if line["event"] == "request"]
 
 
 @dataclass
@@ -191,6 +201,30 @@ def ask(made: zmq.Socket[bytes], value: Any) -> Any:
     return msgpack.unpackb(made.recv(), object_hook=decoded)
 
 
+def post(made: zmq.Socket[bytes], value: Any, envelope: tuple[bytes, ...] = (b"",)) -> None:
+    """Sends a request from a DEALER, and returns when the server has read it.
+
+    The server reads the requests of a client in their order, and answers a ping at once.
+    """
+    for request in (value, {"endpoint": "ping"}):
+        made.send_multipart([*envelope, packed(request)])
+    assert answer(made) == PONG
+
+
+def ping(port: int) -> Any:
+    """The answer to a ping on a new connection.
+
+    The server has noticed every connection that was closed before.
+    """
+    with requester(port) as made:
+        return ask(made, {"endpoint": "ping"})
+
+
+def answer(made: zmq.Socket[bytes]) -> Any:
+    """The next answer to a DEALER, decoded."""
+    return msgpack.unpackb(made.recv_multipart()[-1], object_hook=decoded)
+
+
 def packed(value: Any) -> bytes:
     """msgpack with arrays as `.npy` bytes."""
 
@@ -238,6 +272,18 @@ def get_action(seen: Any = None, **options: Any) -> dict[str, Any]:
 def connect(port: int, data: bytes = b"") -> socket.socket:
     """A TCP connection on which some bytes were sent."""
     made = socket.create_connection(("127.0.0.1", port), timeout=10)
+    made.sendall(data)
+    return made
+
+
+def shake_hands(port: int, data: bytes = b"") -> socket.socket:
+    """A TCP connection that has greeted as a REQ socket does, and then sent some bytes."""
+    made = connect(port, GREETING + READY)
+    received = b""
+    while b"READY" not in received:
+        piece = made.recv(4096)
+        assert piece, received
+        received += piece
     made.sendall(data)
     return made
 

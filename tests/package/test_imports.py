@@ -166,7 +166,6 @@ def test_no_circle_of_packages(package: Path) -> None:
 REGISTRIES = {
     "saccade",  # its submodules, when they are first used
     "saccade.cli",  # the command that was given
-    "saccade.serve",  # its classes, which need optional packages
     "lerobot_policy_saccade.environment_saccade",  # the package of a robot's environment
     "saccade_lab.reference.lerobot_head",  # a module of lerobot
     "saccade_lab.study.study",  # the study that was given, which may be the user's

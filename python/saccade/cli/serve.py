@@ -67,6 +67,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TEXT",
         help=f"refuse requests without this api_token (default: ${TOKEN_VARIABLE}, else none is needed)",
     )
+    served.add_argument(
+        "--secret-key",
+        metavar="FILE",
+        help="encrypt with CURVE: the server's file NAME.key_secret (default: no encryption)",
+    )
+    served.add_argument(
+        "--client-keys",
+        metavar="FOLDER",
+        help="with --secret-key: public keys NAME.key of the clients that may connect (default: any client "
+        "that knows the server's public key)",
+    )
     served.add_argument("--allow-kill", action="store_true", help="let clients stop the server")
     served.add_argument(
         "--modality-form",
@@ -91,20 +102,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=5.0,
         help="time that a request waits for other clients at most; one client alone never waits",
     )
-    most = parser.add_argument_group("limits, beyond which a request is answered with an error")
+    arguments.add_number(
+        batching,
+        "--request-seconds",
+        minimum=0.1,
+        below=86_400,
+        default=limits.request_seconds,
+        help="drop a request that is older before it is computed; Isaac-GR00T's clients wait 15 s",
+    )
+    most = parser.add_argument_group("limits")
     arguments.add_number(
         most,
         "--max-message-mb",
         minimum=0.001,
         below=4000,
         default=limits.message_bytes / 1e6,
-        help="size of a request, in millions of bytes",
+        help="size of a request, in millions of bytes; a larger one costs its connection",
     )
     arguments.add_integer(
         most, "--max-array-elements", default=limits.array_elements, help="elements of an array"
-    )
-    arguments.add_integer(
-        most, "--max-depth", default=limits.depth, help="nesting of maps and lists in a request"
     )
     arguments.add_integer(most, "--max-values", default=limits.objects, help="values in a request")
     arguments.add_integer(most, "--max-rows", default=limits.rows, help="observations in a request")
@@ -115,16 +131,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         minimum=0.001,
         below=1e6,
         default=limits.waiting_bytes / 1e6,
-        help="size of all requests that arrive or are not yet answered, in millions of bytes",
+        help="size of all requests that are not yet answered, in millions of bytes",
     )
-    arguments.add_integer(most, "--max-clients", default=limits.clients, help="connections")
+    arguments.add_integer(most, "--max-clients", default=limits.clients, help="connections; more are closed")
     arguments.add_number(
         most,
         "--stall-seconds",
         minimum=0.1,
         below=86_400,
         default=limits.stall_seconds,
-        help="close a connection that stalls in the middle of a request or an answer",
+        help="close a connection that is silent or unfinished for so long",
     )
     arguments.add_integer(
         most, "--max-sessions", default=limits.sessions, help="sessions; then the least used is forgotten"
@@ -143,11 +159,15 @@ def run(args: argparse.Namespace) -> int:
     """Takes the port, loads, and serves until it is stopped."""
     if args.api_token == "":
         raise UsageError("--api-token: expected some text, got none")
+    if args.client_keys is not None and args.secret_key is None:
+        raise UsageError("--client-keys: expected --secret-key with it, got none")
     require("serve")
     from saccade.policy.policy import Policy
     from saccade.serve import Server
-    from saccade.serve.connections import bind
+    from saccade.serve.keys import read_server_keys
+    from saccade.serve.transport import bind
 
+    keys = None if args.secret_key is None else read_server_keys(args.secret_key, args.client_keys)
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
     policy = Policy.from_pretrained(args.checkpoint, **policy_options(args))
     # What a first call sets up is not left to the first client.
@@ -159,6 +179,7 @@ def run(args: argparse.Namespace) -> int:
             listener,
             log,
             limits=limits_of(args),
+            keys=keys,
             max_batch=args.max_batch,
             max_wait_ms=args.max_wait_ms,
             seed=args.seed,
@@ -190,7 +211,6 @@ def limits_of(args: argparse.Namespace) -> Limits:
     return Limits(
         message_bytes=int(1e6 * args.max_message_mb),
         array_elements=args.max_array_elements,
-        depth=args.max_depth,
         objects=args.max_values,
         rows=args.max_rows,
         waiting=args.max_waiting,
@@ -198,5 +218,6 @@ def limits_of(args: argparse.Namespace) -> Limits:
         clients=args.max_clients,
         sessions=args.max_sessions,
         session_seconds=args.session_seconds,
+        request_seconds=args.request_seconds,
         stall_seconds=args.stall_seconds,
     )

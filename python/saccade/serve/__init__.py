@@ -1,14 +1,12 @@
 """A server for robots that speak Isaac-GR00T's protocol, and a small client. Needs the extra `serve`.
 
-A request passes through these files, from the bottom up: `zmtp` (frames of a connection), `connections`
-(sockets), `pickles` and `packing` with `npy` (bytes to values, within the `limits`), `requests` (values to
-calls), `batching` (which are computed together), `engine` with `sessions` (actions), and back. `server` joins
-them.
+A request passes through these files: `transport` (ZeroMQ), `pickles` and `packing` with `npy` (bytes to
+values, within the `limits`), `requests` (values to calls), `batching` (which are computed together), `engine`
+with `sessions` (actions), and back. `server` joins them.
 """
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal.extras import SACCADE
@@ -20,13 +18,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Client", "Limits", "Server", "ServerError"]
 
-_MODULES = {"Client": "client", "ServerError": "client", "Server": "server"}
-
 # The limits are also shown by `saccade serve --help`, which needs no optional packages.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
+        if name not in __all__:
             raise AttributeError(f"module 'saccade.serve' has no attribute {name!r}")
         SACCADE.require("zmq", "msgpack")
-        return getattr(importlib.import_module(f"saccade.serve.{_MODULES[name]}"), name)
+        from saccade.serve.client import Client, ServerError
+        from saccade.serve.server import Server
+
+        return {"Client": Client, "Server": Server, "ServerError": ServerError}[name]

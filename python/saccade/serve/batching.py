@@ -28,7 +28,8 @@ class Job:
         inputs: What the backbone takes, or why there is none, once it is prepared.
         is_claimed: Whether a thread has begun to prepare it while it waits.
         received: When it arrived, on the clock of `time.perf_counter`.
-        reply: What is answered; only the server reads it.
+        reply: Where the answer goes; only the server reads it.
+        num_bytes: Size of the request.
         milliseconds: How long each part took.
     """
 
@@ -40,6 +41,7 @@ class Job:
     is_claimed: bool = False
     received: float = field(default_factory=time.perf_counter)
     reply: Any = None
+    num_bytes: int = 0
     milliseconds: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import zmq
 
-from saccade.errors import SaccadeError
+from saccade.errors import InputError, SaccadeError
+from saccade.serve.keys import read_pair, read_public
 from saccade.serve.limits import Limits
 from saccade.serve.packing import pack, unpack
 
@@ -25,6 +27,12 @@ class Client:
         port: Its port.
         timeout: Seconds after which a request fails.
         api_token: The server's secret, or None.
+        server_key: File with the public key of an encrypted server (``NAME.key``), or None for no encryption.
+        secret_key: File with the keys of this client (``NAME.key_secret``), or None for new ones, which a
+            server accepts that does not restrict its clients.
+
+    Raises:
+        InputError: A key file is missing or is none, or ``secret_key`` is given without ``server_key``.
 
     Example:
         >>> from saccade.serve import Client
@@ -41,7 +49,13 @@ class Client:
         *,
         timeout: float = 60.0,
         api_token: str | None = None,
+        server_key: str | Path | None = None,
+        secret_key: str | Path | None = None,
     ) -> None:
+        if secret_key is not None and server_key is None:
+            raise InputError("secret_key: expected a server_key with it, got None")
+        self._server_key = None if server_key is None else read_public(server_key)
+        self._keys = zmq.curve_keypair() if secret_key is None else read_pair(secret_key)
         self._address = f"tcp://{host}:{port}"
         self._timeout, self._api_token = timeout, api_token
         self._context = zmq.Context()
@@ -103,6 +117,10 @@ class Client:
         if self._socket is None:
             self._socket = self._context.socket(zmq.REQ)
             self._socket.setsockopt(zmq.LINGER, 0)
+            if self._server_key is not None:
+                self._socket.setsockopt(zmq.CURVE_SERVERKEY, self._server_key)
+                self._socket.setsockopt(zmq.CURVE_PUBLICKEY, self._keys[0])
+                self._socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys[1])
             self._socket.connect(self._address)
         self._socket.send(message)
         if not self._socket.poll(int(1e3 * self._timeout)):

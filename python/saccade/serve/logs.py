@@ -1,17 +1,18 @@
 """The log of a server: lines for people, JSON lines for machines, or one live line on a terminal.
 
-Lines are written by a thread of their own, so a full disk or a reader that stalls does not hold up the
-server. Lines that cannot be written are counted.
+A thread of `logging` writes the lines, so a full disk or a reader that stalls does not hold up the server.
+Lines that cannot be written are counted.
 """
 
 from __future__ import annotations
 
-import itertools
+import logging
+import logging.handlers
 import os
+import queue
 import shutil
 import threading
 import time
-from collections import deque
 from typing import Any, Protocol
 
 from saccade._internal.json import dumps
@@ -20,9 +21,6 @@ from saccade.serve.statistics import line
 
 #: Lines that wait to be written; more are lost, and counted.
 MOST_LINES = 10_000
-#: Lines that are written by one call at most, and the seconds in which they gather.
-LINES_AT_ONCE = 512
-GATHERING_SECONDS = 0.02
 #: Warnings a second that are written; more are counted.
 MOST_WARNINGS = 20
 #: Back to the start of the line of a terminal, and erases it.
@@ -42,7 +40,7 @@ class Log(Protocol):
         """Something that happens rarely: ``listening``, ``warning``, ``stopping``, ``stopped``."""
 
     def request(self, **fields: Any) -> None:
-        """A request was answered."""
+        """A request was answered or dropped."""
 
     def statistics(self, summary: dict[str, Any]) -> None:
         """What was done so far."""
@@ -51,58 +49,72 @@ class Log(Protocol):
         """Writes what waits, if that is possible."""
 
 
+class _Queued(logging.handlers.QueueHandler):
+    """Appends records to a queue, and never waits; those for which there is no room are counted."""
+
+    lost = 0
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """See `QueueHandler`."""
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self.lost += 1
+
+
+class _Written(logging.handlers.QueueListener):
+    """Writes records to a file descriptor. It takes no lock, for which the end of the program would wait."""
+
+    lost = 0
+
+    def __init__(self, waiting: queue.Queue[Any], descriptor: int) -> None:
+        super().__init__(waiting)
+        self._descriptor = descriptor
+
+    def handle(self, record: logging.LogRecord) -> None:
+        """See `QueueListener`. A record that cannot be written is counted."""
+        data = record.getMessage().encode("utf-8", "backslashreplace")
+        try:
+            while data:
+                data = data[os.write(self._descriptor, data) :]
+        except OSError:  # a full disk, a closed pipe
+            self.lost += 1
+
+
 class Writer:
-    """Writes lines to a file descriptor in a thread of its own.
+    """Writes text to a file descriptor in a thread of its own.
 
     Args:
         descriptor: The file descriptor. It is not closed.
     """
 
     def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._lines: deque[bytes] = deque()
-        self._changed = threading.Condition()
-        self._closing = threading.Event()
-        self.lost = 0
-        self._thread = threading.Thread(target=self._run, name="saccade-serve-log", daemon=True)
-        self._thread.start()
+        self._waiting: queue.Queue[Any] = queue.Queue(MOST_LINES)
+        self._queued = _Queued(self._waiting)
+        self._written = _Written(self._waiting, descriptor)
+        self._logger = logging.Logger("saccade.serve")
+        self._logger.addHandler(self._queued)
+        self._written.start()
+
+    @property
+    def lost(self) -> int:
+        """Number of texts that were not written."""
+        return self._queued.lost + self._written.lost
 
     def write(self, text: str) -> None:
         """Appends text, with its line break; never waits."""
-        with self._changed:
-            if len(self._lines) >= MOST_LINES:
-                self.lost += 1
-                return
-            self._lines.append(text.encode("utf-8", "backslashreplace"))
-            self._changed.notify()  # which costs nothing while lines gather
+        self._logger.info("%s", text)
 
     def close(self, seconds: float = 2.0) -> None:
-        """Writes the waiting lines, for at most the given number of seconds."""
-        with self._changed:
-            self._closing.set()
-            self._changed.notify()
-        self._thread.join(seconds)
+        """Writes what waits, for at most the given number of seconds."""
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while not self._lines and not self._closing.is_set():
-                    self._changed.wait()
-                if not self._lines:
-                    return
-            self._closing.wait(GATHERING_SECONDS)
-            with self._changed:
-                count = min(len(self._lines), LINES_AT_ONCE)
-                lines = [self._lines.popleft() for _ in range(count)]
-            self._write(lines)
+        def end() -> None:
+            self._waiting.join()
+            self._written.stop()
 
-    def _write(self, lines: list[bytes]) -> None:
-        data, written = b"".join(lines), 0
-        try:
-            while written < len(data):
-                written += os.write(self._descriptor, data[written:])
-        except OSError:  # a full disk, a closed pipe
-            self.lost += sum(end > written for end in itertools.accumulate(map(len, lines)))
+        ending = threading.Thread(target=end, daemon=True)
+        ending.start()
+        ending.join(seconds)
 
 
 class _Limited:

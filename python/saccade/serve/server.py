@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import signal
 import socket
 import threading
 import time
-import weakref
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -20,14 +17,14 @@ from saccade._internal import hub
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import engine, modalities, pickles
 from saccade.serve.batching import Job, Queue
-from saccade.serve.connections import Connection, Connections, address_of
+from saccade.serve.keys import ServerKeys
 from saccade.serve.limits import Limits
 from saccade.serve.logs import Log
 from saccade.serve.packing import pack, unpack
 from saccade.serve.requests import PING, UNAUTHORIZED, Call, Token, action_answer, check_num_steps, parse
 from saccade.serve.sessions import Sessions
 from saccade.serve.statistics import Statistics
-from saccade.serve.zmtp import Request
+from saccade.serve.transport import Envelope, Peer, Transport, address_of
 
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
@@ -36,8 +33,19 @@ if TYPE_CHECKING:
 LONGEST_ERROR = 4000
 #: Seconds between two checks of the files of the checkpoint.
 WATCH_SECONDS = 5.0
-#: Time to send the last answers, once all are computed.
-FLUSH_SECONDS = 5.0
+
+
+class Dropped(SaccadeError):
+    """A request that is not computed.
+
+    Args:
+        why: Key of the statistics: ``"gone"`` or ``"late"``.
+        message: The same for people.
+    """
+
+    def __init__(self, why: str, message: str) -> None:
+        super().__init__(message)
+        self.why = why
 
 
 class Server:
@@ -45,9 +53,10 @@ class Server:
 
     Args:
         policy: The policy.
-        listener: The socket that clients will connect to, from :func:`saccade.serve.connections.bind`.
+        listener: The socket that clients will connect to, from :func:`saccade.serve.transport.bind`.
         log: Where it says what happens.
-        limits: What it takes at most.
+        limits: Its limits.
+        keys: Keys for encryption, from :func:`saccade.serve.keys.read_server_keys`, or None for none.
         max_batch: Observations that are computed at a time: together, or with a small policy in a batch for
             each thread.
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
@@ -60,6 +69,7 @@ class Server:
 
     Attributes:
         address: Its address, ``tcp://host:port``.
+        num_workers: Number of threads that compute.
 
     Raises:
         CheckpointError: A file of the checkpoint is damaged.
@@ -73,6 +83,7 @@ class Server:
         log: Log,
         *,
         limits: Limits = Limits(),  # noqa: B008 (it is immutable)
+        keys: ServerKeys | None = None,
         max_batch: int = 16,
         max_wait_ms: float = 5.0,
         seed: int | None = None,
@@ -90,23 +101,24 @@ class Server:
             num_steps = check_num_steps("num_steps", num_steps, self._most_steps)
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
-        self._forms: weakref.WeakKeyDictionary[Connection, str] = weakref.WeakKeyDictionary()
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
         self._engine = engine.Engine(policy, self._sessions, num_steps)
-        workers = min(self._engine.num_workers, max_batch)
-        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, workers)
+        self.num_workers = min(self._engine.num_workers, max_batch)
+        self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self.num_workers)
         self._statistics = Statistics()
         self.address = address_of(listener)
-        self._connections = Connections(listener, limits, self._on_request, self._on_problem)
         self._finished: deque[tuple[engine.Outcome, bytes]] = deque()
-        self._unanswered = 0
+        self._unanswered = self._unanswered_bytes = 0
         self._stopping: str | None = None
         self._is_draining = False
-        self._watched = _stamps(policy.head.source)
+        source = policy.head.source
+        self._folder = None if source is None else hub.resolve(source)
+        self._watched = _stamps(self._folder)
         self._workers = [
             threading.Thread(target=self._compute, name=f"saccade-serve-{number}", daemon=True)
-            for number in range(workers)
+            for number in range(self.num_workers)
         ]
+        self._transport = Transport(listener, limits, self._warn, keys)
 
     def stop(self, why: str) -> None:
         """Ends :meth:`run` once all requests that were accepted are answered.
@@ -114,7 +126,7 @@ class Server:
         May be called by any thread, and by signal handlers.
         """
         self._stopping = self._stopping or why
-        self._connections.wake()
+        self._transport.wake()
 
     def stop_on_signals(self) -> None:
         """SIGTERM and SIGINT call :meth:`stop`; a second one has its usual effect."""
@@ -136,14 +148,15 @@ class Server:
         Raises:
             OSError: Another program took the address.
         """
-        self._connections.listen()
+        self._transport.listen()
         self._log.event("listening", address=self.address, policy=repr(self._policy), pid=os.getpid())
         for worker in self._workers:
             worker.start()
         spoken = watched = time.monotonic()
         try:
             while not self._is_done():
-                self._connections.poll(0.05 if self._stopping else 0.5)
+                for envelope, payload in self._transport.requests(0.05 if self._stopping else 0.5):
+                    self._on_request(envelope, payload)
                 self._send_finished()
                 now = time.monotonic()
                 if now - spoken >= self._log.every:
@@ -154,7 +167,7 @@ class Server:
                     self._watch()
         finally:
             self._queue.close()
-            self._connections.close()
+            self._transport.close()
         self._log.statistics(self._statistics.summary())
         assert self._stopping is not None
         self._log.event("stopped", requests=self._statistics.requests.total(), errors=self._statistics.errors)
@@ -166,85 +179,88 @@ class Server:
             return False
         if not self._is_draining:
             self._is_draining = True
-            self._flushed_by = float("inf")
             self._log.event("stopping", reason=self._stopping, unanswered=self._unanswered)
-            self._connections.refuse_new()
             self._queue.close()
-        if self._unanswered:
-            return False
-        self._flushed_by = min(self._flushed_by, time.monotonic() + FLUSH_SECONDS)
-        return not self._connections.num_unsent or time.monotonic() > self._flushed_by
+        return not self._unanswered
 
-    def _on_request(self, connection: Connection, request: Request) -> None:
+    def _on_request(self, envelope: Envelope, payload: memoryview) -> None:
         """Answers a request at once, or appends it to the queue."""
         received = time.perf_counter()
-        endpoint, error = "unreadable", None
+        client, endpoint, error = envelope.peer, "unreadable", None
         try:
-            if not request.is_complete:
-                raise InputError(self._too_large(request.size))
-            if pickles.is_pickle(request.payload):
-                self._connections.send(connection, request, pickles.refusal(request.payload))
-                error = pickles.REFUSAL
-                return
-            message = unpack(request.payload, self._limits)
-            if not self._token.allows(message.value):
-                raise InputError(UNAUTHORIZED)
-            call = parse(message.value, self._most_steps, self._seed)
-            endpoint = call.endpoint
-            if endpoint == "get_action":
-                parsed = self._read(call)
-                reply = (connection, replace(request, payload=bytearray()))  # the payload was unpacked
-                self._enqueue(
-                    Job(call, parsed, connection, message.is_msgpack_numpy, received=received, reply=reply)
+            if client.chose_identity:
+                raise InputError(
+                    "socket: expected no routing id of its own, since an answer could reach another client "
+                    "with the same one"
                 )
-                return
-            self._connections.send(connection, request, pack(self._answer(connection, call)))
+            if pickles.is_pickle(payload):
+                error, answer = pickles.REFUSAL, pickles.refusal(payload)
+            else:
+                message = unpack(payload, self._limits)
+                if not self._token.allows(message.value):
+                    raise InputError(UNAUTHORIZED)
+                call = parse(message.value, self._most_steps, self._seed)
+                endpoint = call.endpoint
+                if endpoint == "get_action":
+                    parsed = self._read(call, len(payload))
+                    self._enqueue(
+                        Job(
+                            call,
+                            parsed,
+                            client,
+                            message.is_msgpack_numpy,
+                            received=received,
+                            reply=envelope,
+                            num_bytes=len(payload),
+                        )
+                    )
+                    return
+                answer = pack(self._answer(client, call))
         except Exception as caught:
             error = describe(caught)
-            self._connections.send(connection, request, pack({"error": error}))
-        finally:
-            if error is not None or endpoint != "get_action":
-                self._note(connection, endpoint, error)
+            answer = pack({"error": error})
+        self._transport.send(envelope, answer)
+        self._note(client, endpoint, error)
 
-    def _too_large(self, size: int) -> str:
-        if size > self._limits.message_bytes:
-            return f"message: expected at most {self._limits.message_bytes} bytes, got {size}"
-        return (
-            f"busy: {self._connections.held} bytes of requests wait, and {size} more are too many; try again"
-        )
-
-    def _answer(self, connection: Connection, call: Call) -> Any:
+    def _answer(self, client: Peer, call: Call) -> Any:
         """The answer to everything but ``get_action``."""
         if call.endpoint == "ping":
             return PING
         if call.endpoint == "get_modality_config":
-            return self._modalities[self._forms.get(connection, self._form)]
+            return self._modalities[client.modality_form or self._form]
         if call.endpoint == "reset":
-            self._sessions.reset(call.options.session, connection)
+            self._sessions.reset(call.options.session, client)
             return {}
         if not self._allow_kill:
             raise InputError("kill: refused, since the server was started without --allow-kill")
         self.stop("kill")
         return {"status": "ok", "message": "Server is stopping"}
 
-    def _read(self, call: Call) -> observations.ParsedObservation:
+    def _read(self, call: Call, num_bytes: int) -> observations.ParsedObservation:
         """The observations of a request, if it can be taken."""
         if self._stopping is not None:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
+        if self._unanswered_bytes + num_bytes > self._limits.waiting_bytes:
+            raise InputError(
+                f"busy: {self._unanswered_bytes} bytes of requests wait, and {num_bytes} more are too many; "
+                "try again"
+            )
         return observations.read(call.observation, self._policy.requirements, self._limits.rows)
 
     def _enqueue(self, job: Job) -> None:
-        connection, _ = job.reply
-        self._forms[connection] = "text" if job.call.is_bare else "map"
+        job.reply.peer.modality_form = "text" if job.call.is_bare else "map"
         self._unanswered += 1
+        self._unanswered_bytes += job.num_bytes
         self._queue.put(job)
 
     def _compute(self) -> None:
         """What a thread does that computes."""
         while (jobs := self._queue.take()) is not None:
-            outcomes = self._engine.run(jobs)
+            dropped = {job: error for job in jobs if (error := self._dropped(job)) is not None}
+            outcomes = [engine.Outcome(job, error=error) for job, error in dropped.items()]
+            outcomes += self._engine.run([job for job in jobs if job not in dropped])
             self._queue.done(jobs)
             for outcome in outcomes:
                 payload = None
@@ -257,7 +273,20 @@ class Server:
                     assert outcome.error is not None
                     payload = pack({"error": describe(outcome.error)})
                 self._finished.append((outcome, payload))
-            self._connections.wake()
+            self._transport.wake()
+
+    def _dropped(self, job: Job) -> Dropped | None:
+        """Why a request is not computed, if nobody waits for its answer any more."""
+        if not job.reply.peer.is_connected:
+            return Dropped("gone", "dropped: its client is gone")
+        waited = time.perf_counter() - job.received
+        if waited > self._limits.request_seconds:
+            return Dropped(
+                "late",
+                f"dropped: it waited {waited:.1f} s, more than the {self._limits.request_seconds:g} s of "
+                "--request-seconds",
+            )
+        return None
 
     def _packed(self, outcome: engine.Outcome) -> bytes:
         """The answer of a request that was computed."""
@@ -269,32 +298,38 @@ class Server:
     def _send_finished(self) -> None:
         while self._finished:
             outcome, payload = self._finished.popleft()
-            connection, request = outcome.job.reply
-            self._connections.send(connection, request, payload)
+            job = outcome.job
+            is_sent = self._transport.send(job.reply, payload)
             self._unanswered -= 1
+            self._unanswered_bytes -= job.num_bytes
             error = None if outcome.error is None else describe(outcome.error)
-            total = 1e3 * (time.perf_counter() - outcome.job.received)
-            if error is None:
+            if isinstance(outcome.error, Dropped):
+                self._statistics.dropped[outcome.error.why] += 1
+            elif not is_sent:
+                self._statistics.dropped["unsent"] += 1
+                error = error or "computed, but its client is gone or does not read"
+            total = 1e3 * (time.perf_counter() - job.received)
+            if outcome.error is None:
                 self._statistics.computed(outcome, total)
-            milliseconds = {**outcome.job.milliseconds, "total": total}
+            milliseconds = {**job.milliseconds, "total": total}
             self._note(
-                connection,
+                job.reply.peer,
                 "get_action",
                 error,
                 batch=outcome.batch,
                 milliseconds={part: round(value, 3) for part, value in milliseconds.items()},
             )
 
-    def _note(self, connection: Connection, endpoint: str, error: str | None, **fields: Any) -> None:
+    def _note(self, client: Peer, endpoint: str, error: str | None, **fields: Any) -> None:
         self._statistics.count(endpoint, is_error=error is not None)
-        self._log.request(client=connection.name, endpoint=endpoint, error=error, **fields)
+        self._log.request(client=client.name, endpoint=endpoint, error=error, **fields)
 
-    def _on_problem(self, client: str, message: str) -> None:
+    def _warn(self, client: str, message: str) -> None:
         self._log.event("warning", client=client, message=message)
 
     def _watch(self) -> None:
         """Says once if the checkpoint was replaced; the policy is in memory."""
-        stamps = _stamps(self._policy.head.source)
+        stamps = _stamps(self._folder)
         if stamps != self._watched:
             self._watched = stamps
             self._log.event(
@@ -312,21 +347,15 @@ def describe(error: BaseException) -> str:
     return printable("; ".join(line.strip() for line in text.splitlines()))[:LONGEST_ERROR]
 
 
-@functools.cache
-def _folder(source: str) -> Path:
-    return hub.resolve(source)
-
-
-def _stamps(source: str | None) -> tuple[Any, ...]:
+def _stamps(path: Path | None) -> tuple[Any, ...]:
     """What changes if the files of a checkpoint do."""
-    if source is None:
+    if path is None:
         return ()
     found: list[Any] = []
     try:
-        folder = _folder(source)
-        for path in sorted(folder.iterdir()) if folder.is_dir() else [folder]:
-            stat = path.stat()
-            found.append((path.name, stat.st_ino, stat.st_size, stat.st_mtime_ns))
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            stat = file.stat()
+            found.append((file.name, stat.st_ino, stat.st_size, stat.st_mtime_ns))
     except OSError as error:
         found.append(error.errno)
     return tuple(found)

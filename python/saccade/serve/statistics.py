@@ -18,13 +18,16 @@ class Statistics:
     """Counts and latencies since the start; one thread uses it.
 
     Attributes:
-        requests: Number of answers by endpoint; ``"unreadable"`` for requests that had none.
-        errors: Number of answers that were errors.
+        requests: Number of requests by endpoint; ``"unreadable"`` for those that had none.
+        errors: Number of them that did not get what they asked for.
+        dropped: Number of them by why nobody got their answer: ``"gone"`` and ``"late"`` were not computed,
+            ``"unsent"`` were computed in vain.
     """
 
     def __init__(self) -> None:
         self.requests: Counter[str] = Counter()
         self.errors = 0
+        self.dropped: Counter[str] = Counter()
         self._started = time.monotonic()
         self._milliseconds: dict[str, deque[float]] = {
             part: deque(maxlen=WINDOW) for part in (*PARTS, "total")
@@ -33,7 +36,7 @@ class Statistics:
         self._times: deque[float] = deque(maxlen=WINDOW)
 
     def count(self, endpoint: str, *, is_error: bool) -> None:
-        """Counts an answer."""
+        """Counts a request."""
         self.requests[endpoint] += 1
         self.errors += is_error
 
@@ -53,15 +56,16 @@ class Statistics:
         """Everything, for JSON.
 
         Returns:
-            ``requests`` and ``errors`` since the start, ``per_second`` over the last actions, ``batch`` (mean
-            number of observations computed together, as a request sees it), and ``milliseconds``: ``p50`` and
-            ``p99`` by part.
+            ``requests``, ``errors`` and ``dropped`` since the start, ``per_second`` over the last actions,
+            ``batch`` (mean number of observations computed together, as a request sees it), and
+            ``milliseconds``: ``p50`` and ``p99`` by part.
         """
         span = time.monotonic() - self._times[0] if self._times else 0.0
         return {
             "seconds": round(time.monotonic() - self._started, 3),
             "requests": dict(self.requests),
             "errors": self.errors,
+            "dropped": dict(self.dropped),
             "per_second": round(len(self._times) / span, 3) if span > 0 else 0.0,
             "batch": round(float(np.mean(self._batches)), 2) if self._batches else 0.0,
             "milliseconds": {
@@ -83,6 +87,8 @@ def line(summary: dict[str, Any]) -> str:
         '0 requests, 0 errors'
     """
     text = f"{sum(summary['requests'].values())} requests, {summary['errors']} errors"
+    if summary["dropped"]:
+        text += f", {sum(summary['dropped'].values())} dropped"
     parts = summary["milliseconds"]
     if parts:
         shown = ", ".join(f"{part} {value['p50']:.1f}/{value['p99']:.1f}" for part, value in parts.items())

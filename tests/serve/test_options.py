@@ -6,19 +6,20 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import zmq
 
 import saccade
 from saccade.errors import InputError
 from saccade.observations import Camera, ParsedObservation
 from saccade.serve import Client, Server, ServerError, engine, modalities
-from saccade.serve.connections import bind
+from saccade.serve.transport import bind
 from tests.helpers import whole_checkpoints
 from tests.helpers.released import load_released
 from tests.helpers.serve_cases import (
@@ -26,9 +27,12 @@ from tests.helpers.serve_cases import (
     HORIZON,
     MemoryLog,
     MemoryPolicy,
+    answer,
     ask,
     flat_observation,
+    get_action,
     observation,
+    post,
     requester,
     serving,
     wait_until,
@@ -70,13 +74,12 @@ def test_an_answer_says_what_was_applied_and_how_long_it_took() -> None:
 def test_the_latency_is_from_receipt_to_answer() -> None:
     policy = MemoryPolicy()
     policy.gate.clear()
-    with serving(policy) as running, ThreadPoolExecutor(1) as threads, Client(port=running.port) as client:
-        answer = threads.submit(client.get_action, observation())
-        wait_until(lambda: running.server._unanswered == 1)
+    with serving(policy) as running, requester(running.port, zmq.DEALER) as client:
+        post(client, get_action())
         policy.gate.set()
-        latency = answer.result()[1]["latency_ms"]
-        wait_until(lambda: any(line["event"] == "request" for line in running.log.lines))
-        (line,) = (line for line in running.log.lines if line["event"] == "request")
+        latency = answer(client)[1]["latency_ms"]
+        wait_until(lambda: len(running.log.requests()) == 2)
+        line = running.log.requests()[-1]
         parts = line["milliseconds"]
         assert sum(parts[part] for part in engine.PARTS) - 0.1 <= latency <= parts["total"] + 0.1
 
@@ -122,20 +125,14 @@ def test_requests_with_other_steps_are_sampled_apart() -> None:
     policy = MemoryPolicy()
     policy.gate.clear()
     steps = [None, 2, 4, 2, None, 4]
-    with serving(policy) as running:
-
-        def act(number: int) -> dict[str, Any]:
-            with Client(port=running.port) as client:
-                options = {"seed": number, "num_steps": steps[number]}
-                return dict(client.get_action(observation(number), options)[1]["applied_options"])
-
-        with ThreadPoolExecutor(6) as threads:
-            first = threads.submit(act, 0)
-            wait_until(lambda: running.server._unanswered == 1 and not len(running.server._queue))
-            others = [threads.submit(act, number) for number in range(1, 6)]
-            wait_until(lambda: running.server._unanswered == 6)
-            policy.gate.set()
-            applied = [first.result(), *(other.result() for other in others)]
+    with serving(policy) as running, ExitStack() as stack:
+        clients = [stack.enter_context(requester(running.port, zmq.DEALER)) for _ in steps]
+        for number, client in enumerate(clients):
+            post(client, get_action(observation(number), seed=number, num_steps=steps[number]))
+            if number == 0:  # it is being computed, and waits no more
+                wait_until(lambda: policy.begun == [1])
+        policy.gate.set()
+        applied = [answer(client)[1]["applied_options"] for client in clients]
     assert policy.batches == [1, 5]
     assert sorted(policy.steps[1:], key=str) == [2, 4, None]
     assert [one.get("num_steps") for one in applied] == steps

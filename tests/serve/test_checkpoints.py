@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zmq.auth
 
 import saccade
 from saccade import Policy
@@ -100,7 +101,7 @@ def test_an_answer_has_the_same_bits_alone_and_among_others(layout: str, size: s
             return client.get_action(flat(seen) if seed % 2 else seen, {"seed": seed})[0]
 
     with serving(whole, max_batch=8, max_wait_ms=2000.0) as running, ThreadPoolExecutor(6) as threads:
-        assert len(running.server._workers) == {"small": 2, "large": 1}[size]
+        assert running.server.num_workers == {"small": 2, "large": 1}[size]
         together = list(threads.map(act, range(6)))
     sizes = {line["batch"] for line in running.log.lines if line["event"] == "request"}
     assert max(sizes) > 1
@@ -210,7 +211,7 @@ def time_of_pool() -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="needs Linux's times of threads")
-def test_a_thread_computes_alone_while_others_do_and_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_computes_alone_while_others_do_and_no_longer() -> None:
     whole, seen = policy("nvidia"), nested("nvidia", 1)
 
     def uses_pool(call: Callable[[], Any]) -> bool:
@@ -227,9 +228,10 @@ def test_a_thread_computes_alone_while_others_do_and_no_longer(monkeypatch: pyte
     wait_until(lambda: uses_pool(lambda: whole.act(seen, seed=0)))
     assert not uses_pool(lambda: made.run(jobs()))
     wait_until(lambda: uses_pool(lambda: whole.act(seen, seed=0)), 10)
-    monkeypatch.setattr(made, "_outcomes", lambda jobs: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        made.run(jobs())
+    failing = jobs()
+    for job in failing:
+        job.inputs = [None]
+    assert all(outcome.error is not None for outcome in made.run(failing))
     wait_until(lambda: uses_pool(lambda: whole.act(seen, seed=0)), 10)
 
 
@@ -310,6 +312,51 @@ def test_a_full_disk_under_the_log(tmp_path: Path) -> None:
             _, errors = process.communicate(timeout=60)
             assert process.returncode == 0
             assert all("data config" in line for line in errors.splitlines())
+
+
+def test_a_log_that_nobody_reads_does_not_hold_up_the_end() -> None:
+    with command(whole_checkpoints.whole("nvidia"), "--log", "json") as (process, port):
+        with requester(port, seconds=60) as made:
+            for _ in range(2000):  # more lines than a pipe holds
+                assert ask(made, {"endpoint": "ping"})["status"] == "ok"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+
+
+def test_an_encrypted_command(tmp_path: Path) -> None:
+    (tmp_path / "clients").mkdir()
+    for name in ("server", "robot"):
+        zmq.auth.create_certificates(tmp_path, name)
+    (tmp_path / "robot.key").rename(tmp_path / "clients" / "robot.key")
+    words = ["--secret-key", str(tmp_path / "server.key_secret"), "--client-keys", str(tmp_path / "clients")]
+    keys: dict[str, Any] = {
+        "server_key": tmp_path / "server.key",
+        "secret_key": tmp_path / "robot.key_secret",
+    }
+    with command(whole_checkpoints.whole("nvidia"), *words) as (_, port):
+        with Client(port=port, **keys) as client:
+            assert client.call("ping")["status"] == "ok"
+        with Client(port=port, timeout=0.5) as client, pytest.raises(TimeoutError):
+            client.call("ping")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--client-keys", "x"], "--client-keys: expected --secret-key with it, got none"),
+        (["--secret-key", "missing.key_secret"], "missing.key_secret: expected a key file"),
+    ],
+)
+def test_keys_that_cannot_be_used_are_one_line(words: list[str], message: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "saccade", "serve", "no/such/checkpoint", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_live_line_on_a_terminal_and_ctrl_c() -> None:
