@@ -13,11 +13,13 @@ import reanalysis
 import reanalysis_stages
 import unpack
 
-from saccade._internal.files import checkpoint_identity
+from saccade.errors import InputError
+from saccade_lab.files import checkpoint_identity
 from saccade_lab.study.cell import Cell
 from saccade_lab.study.table import read_study, read_table
 from why_32.__main__ import main
 from why_32.results import confirmed, judged
+from why_32.study import Answer
 
 STUDY = Path(__file__).parent.parent
 
@@ -42,6 +44,17 @@ def test_the_report_is_what_its_command_writes(tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "report.md").read_text() == (STUDY / "report.md").read_text()
     figures = [{path.name for path in (folder / "figures").iterdir()} for folder in (tmp_path, STUDY)]
     assert figures[0] == figures[1]
+
+
+def test_a_table_without_the_whole_core_has_no_report(table: pd.DataFrame) -> None:
+    """Nothing is judged before; nor are sentences written about what was not measured."""
+    provenance = read_study(STUDY, "answer")[1]
+    some = table[table["stage"].isin(("core", "scaled", "compute")) | table["stage"].isna()]
+    with pytest.raises(InputError, match=r"35 policies of the core with all episodes, expected 36"):
+        Answer.summarise(some[some["policy"] != "n-4-seed-3"], provenance)
+    cut = some["arm"] == "future-unread"
+    with pytest.raises(InputError, match=r"the table lacks n-4 future-unread, n-32 future-unread, measures"):
+        Answer.summarise(some[~cut], provenance)
 
 
 def test_the_second_analysis_finds_the_same(table: pd.DataFrame, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from saccade._internal import flags
-from saccade._internal.files import writable_directory
 from saccade.cli import EXIT_OK, Parser, describe, plain_warnings, refuse, terminable
 from saccade.errors import SaccadeError
 from saccade_lab.cli.study import compute
+from saccade_lab.files import writable_directory
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.study.table import read_study, table_path
 from why_32.report import write_report

@@ -13,6 +13,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
+from saccade.errors import InputError
 from saccade_lab.study import figures
 from saccade_lab.study.section import Figure, Grid, Prose, number, points
 from saccade_lab.study.sign_flip import sign_flip
@@ -46,85 +47,104 @@ from why_32.results import (
     stopped,
 )
 
+#: What the sentences of the answer are about, beside the tests: names of exploratory contrasts, and recipes
+#: under arms.
+CONTRASTS = (
+    "n-32-scaled minus n-0-scaled",
+    "n-32-scaled minus n-4-scaled",
+    "n-32-long minus n-0-long, new six: tested",
+    "n-32-long minus n-0-long, all twelve: estimate",
+)
+CHANGED = (("n-4", CUT), ("n-32", CUT), ("n-32", "1 merged"), ("n-32", "mass of 4"))
+
 
 def section(table: pd.DataFrame, provenance: Provenance, plan: Plan) -> Answered:
-    """The study's part of the report. It has no result before the core is complete.
+    """The report's section.
 
     Args:
         table: Table of the study.
         provenance: Its provenance, whose settings say which episodes every policy runs.
         plan: The plan, which says which policies there should be.
+
+    Raises:
+        InputError: The core is not complete, before which nothing is judged, or what the answer is about was
+            not measured.
     """
     tasks, seeds = provenance.settings["tasks"], provenance.settings["episodes"]
     found = judged(table, tasks, seeds)
     stages = progress(table, found, plan, tasks, seeds)
     core = next(one for one in stages if one.stage == CORE_STAGE)
-    results = found if core.done == core.planned else None
-    known = known_facts(plan, found, core, tasks, seeds)
-    pictures, grids, comparisons, above = list[Figure](), list[Grid](), list[str](), dict[str, str]()
-    if results is None:
-        prose = report.prose("answer", **known, places={})
-        answer = prose.points("not_judged")
-    else:
-        tests, others = confirmed(found), explored(found)
-        changed = changes(table, found, tasks, seeds)
-        of_stages = {stage: [arm.name for arm in of_stage] for stage, of_stage in ARMS.items()}
-        by_stage = {stage: [one for one in changed if one.arm in of_stages[stage]] for stage in of_stages}
-        by_stage = {stage: of_stage for stage, of_stage in by_stage.items() if of_stage}
-        everywhere = relations(table, found, tasks, seeds)
-        related = relations(table, found, tasks, seeds, [CORE_STAGE])
-        names = ["tests", "policies", *others, *by_stage, *([MEASURES] if everywhere else [])]
-        places = {name: place for place, name in enumerate(names, start=1)}
-        contrasts = {one.contrast.name: (one, stage) for stage, of in others.items() for one in of}
-        of_core, by_task = losses(table, found), judged_by_task(table, tasks, seeds)
-        prose = report.prose(
-            "answer",
-            **known,
-            places=places,
-            tests=tests,
-            cuts={one.recipe: one for one in changed if one.arm == CUT},
-            arms={(one.recipe, one.arm): one for one in changed},
-            contrasts=contrasts,
-            related=related,
-            of_loss=of_core.correlation,
-            stopped=functools.partial(stopped, table),
-            **functions(plan, contrasts),
-        )
-        answer, comparisons = prose.points("answer"), prose.points("comparisons")
-        pictures.append(Figure("success", prose.line("caption_success"), success_picture(found)))
-        caption = prose.line("caption_losses")
-        pictures.append(Figure("losses", caption, loss_picture(of_core)))
-        above["losses"] = f"Table {places['policies']}"
-        grids += [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, table)]
-        for stage, compared in others.items():
-            caption = prose.line("caption_contrasts", places[stage], stage)
-            grids.append(contrast_grid(caption, compared, by_task))
-        for stage, of_stage in by_stage.items():
-            caption = prose.line("caption_changes", places[stage], stage)
-            grids.append(change_grid(caption, of_stage, of_stages[stage]))
-        if everywhere:
-            caption = prose.line("caption_relations", places[MEASURES], CUT)
-            grids.append(relation_grid(caption, related, everywhere))
-        more_pictures, more_grids, more_above = of_measured(table, len(grids) + 1)
-        pictures += more_pictures
-        grids += more_grids
-        above |= more_above
+    tests, others = confirmed(found), explored(found)
+    changed = changes(table, found, tasks, seeds)
+    contrasts = {one.contrast.name: (one, stage) for stage, of in others.items() for one in of}
+    arms = {(one.recipe, one.arm): one for one in changed}
+    everywhere = relations(table, found, tasks, seeds)
+    related = relations(table, found, tasks, seeds, [CORE_STAGE])
+    check_complete(core, contrasts, arms, related)
+    of_stages = {stage: [arm.name for arm in of_stage] for stage, of_stage in ARMS.items()}
+    by_stage = {stage: [one for one in changed if one.arm in of_stages[stage]] for stage in of_stages}
+    by_stage = {stage: of_stage for stage, of_stage in by_stage.items() if of_stage}
+    names = ["tests", "policies", *others, *by_stage, MEASURES]
+    places = {name: place for place, name in enumerate(names, start=1)}
+    of_core, by_task = losses(table, found), judged_by_task(table, tasks, seeds)
+    prose = report.prose(
+        "answer",
+        **known_facts(plan, found, core, tasks, seeds),
+        places=places,
+        tests=tests,
+        arms=arms,
+        contrasts=contrasts,
+        related=related,
+        of_loss=of_core.correlation,
+        stopped=functools.partial(stopped, table),
+        **functions(plan, contrasts),
+    )
+    grids = [test_grid(prose, tests, by_task), policy_grid(prose, found, by_task, table)]
+    for stage, compared in others.items():
+        grids.append(contrast_grid(prose.line("caption_contrasts", places[stage], stage), compared, by_task))
+    for stage, of_stage in by_stage.items():
+        caption = prose.line("caption_changes", places[stage], stage)
+        grids.append(change_grid(caption, of_stage, of_stages[stage]))
+    grids.append(relation_grid(prose.line("caption_relations", places[MEASURES], CUT), related, everywhere))
+    pictures, more_grids, above = of_measured(table, len(grids) + 1)
+    grids += more_grids
     grids.append(progress_grid(prose.line("caption_progress", len(grids) + 1), stages))
-    of_pilots = pilots(table)
-    if of_pilots:
-        grids.append(pilot_grid(of_pilots, tasks))
+    of_success = Figure("success", prose.line("caption_success"), success_picture(found))
+    of_loss = Figure("losses", prose.line("caption_losses"), loss_picture(of_core))
     return Answered(
         title=prose.line("title"),
         summary=prose.paragraphs("summary"),
-        figures=pictures,
-        grids=grids,
+        figures=[of_success, of_loss, *pictures],
+        grids=[*grids, pilot_grid(pilots(table), tasks)],
         not_shown=prose.points("not_shown"),
-        answer=answer,
+        answer=prose.points("answer"),
         commands=COMMANDS,
         reproduction=prose.paragraphs("reproduction"),
-        comparisons=comparisons,
-        above=above,
+        comparisons=prose.points("comparisons"),
+        above={"losses": f"Table {places['policies']}", **above},
     )
+
+
+def check_complete(
+    core: Progress,
+    contrasts: Collection[str],
+    arms: Collection[tuple[str, str]],
+    related: Sequence[Relation],
+) -> None:
+    """Refuses a table without all that the answer is about; arguments as `section` has them.
+
+    Raises:
+        InputError: The core is not complete, or something is missing.
+    """
+    if core.done != core.planned:
+        raise InputError(
+            f"the table has {core.done} policies of the core with all episodes, expected {core.planned}"
+        )
+    lacking = [name for name in CONTRASTS if name not in contrasts]
+    lacking += [" ".join(one) for one in CHANGED if one not in arms]
+    lacking += [] if related else [MEASURES]
+    if lacking:
+        raise InputError(f"the table lacks {', '.join(lacking)}")
 
 
 COMMANDS = ("python -m why_32 run --out DIR", "python -m why_32 report DIR")
@@ -140,7 +160,6 @@ def known_facts(
         "episodes": len(tasks) * len(seeds),
         "margin": f"{100 * MARGIN:.0f}",
         "labels": NAMES,
-        "done": core.done,
         "planned": core.planned,
         "core": sorted({one.training.num_future_tokens for one in policies}),
         "num_seeds": len({one.seed for one in policies}),
