@@ -6,6 +6,7 @@ it, or as a JSON file or mapping with the fields of ``DataConfig``.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -116,11 +117,7 @@ def _from_mapping(values: Mapping[str, Any], where: str) -> DataConfig:
         problems += [] if problems else _mapping_problems(values)
     if problems:
         raise InputError(f"{where}: " + "; ".join(problems))
-    taken: dict[str, Any] = {
-        name: dict(values[name]) if isinstance(values[name], Mapping) else tuple(values[name])
-        for name in names
-    }
-    return DataConfig(**taken)
+    return _made({name: values[name] for name in names})
 
 
 def says_nothing(value: Any) -> bool:
@@ -175,125 +172,18 @@ def _mapping_problems(values: Mapping[str, Any]) -> list[str]:
     return problems
 
 
-def _config(
-    video: str,
-    state: str,
-    action: str | None,
-    language: str,
-    state_modes: str | Mapping[str, str] = "min_max",
-    action_modes: str | Mapping[str, str] = "min_max",
-    rotations: Mapping[str, str] | None = None,
-) -> DataConfig:
-    """A released config. Keys are separated by spaces; one mode is for all of them."""
+def _made(values: Mapping[str, Any]) -> DataConfig:
+    """A data config of checked fields."""
+    taken: dict[str, Any] = {
+        name: dict(value) if isinstance(value, Mapping) else tuple(value) for name, value in values.items()
+    }
+    return DataConfig(**taken)
 
-    def keys(kind: str, names: str) -> tuple[str, ...]:
-        return tuple(f"{kind}.{name}" for name in names.split())
-
-    def modes(kind: str, names: str, given: str | Mapping[str, str]) -> dict[str, str]:
-        if isinstance(given, str):
-            return dict.fromkeys(keys(kind, names), given)
-        return {f"{kind}.{name}": mode for name, mode in given.items()}
-
-    action = state if action is None else action
-    return DataConfig(
-        keys("video", video),
-        keys("state", state),
-        keys("action", action),
-        (f"annotation.{language}",),
-        (0,),
-        tuple(range(16)),
-        modes("state", state, state_modes),
-        modes("action", action, action_modes),
-        rotations or {},
-    )
-
-
-_TASK = LANGUAGE_KEY.removeprefix("annotation.")
-_SHORT, _COARSE = "human.task_description", "human.coarse_action"
-
-_GR1_ARMS = "left_arm right_arm left_hand right_hand"
-_G1_BODY = "left_leg right_leg waist left_arm right_arm left_hand right_hand"
-_GENIE1 = (
-    "left_arm_joint_position right_arm_joint_position left_effector_position right_effector_position "
-    "head_position waist_position"
-)
-_XYZ = "x y z roll pitch yaw gripper"
-#: Actions of single numbers of which only the gripper is scaled by its bounds.
-_XYZ_MEAN_STD = {name: "min_max" if name == "gripper" else "mean_std" for name in _XYZ.split()}
-
-
-def _bimanual_panda(last_camera: str, hands: tuple[str, str], mode: str) -> DataConfig:
-    """Two Panda arms with grippers or hands, named by what comes after the side, in state and in action."""
-    sides = ("right", "left")
-    of_state, of_action = hands
-    return _config(
-        f"right_wrist_view left_wrist_view {last_camera}",
-        " ".join(f"{side}_arm_eef_pos {side}_arm_eef_quat {side}_{of_state}" for side in sides),
-        " ".join(f"{side}_arm_eef_pos {side}_arm_eef_rot {side}_{of_action}" for side in sides),
-        _TASK,
-        {f"{side}_{name}": "min_max" for side in sides for name in ("arm_eef_pos", of_state)},
-        {f"{side}_{of_action}": mode for side in sides},
-        {f"state.{side}_arm_eef_quat": "rotation_6d" for side in sides},
-    )
-
-
-_ARMS_WAIST = _config("ego_view", f"{_GR1_ARMS} waist", None, _COARSE, "sin_cos")
-_ARMS_ONLY = _config("ego_view", _GR1_ARMS, None, _TASK, "sin_cos")
-_UPPER_BODY = _config("front_view", f"{_GR1_ARMS} waist neck", None, _TASK)
 
 #: The released data configs of N1.5 by name, then N1's old names, then the classes of the released examples.
 RELEASED: Mapping[str, DataConfig] = {
-    "fourier_gr1_arms_waist": _ARMS_WAIST,
-    "fourier_gr1_arms_only": _ARMS_ONLY,
-    "fourier_gr1_full_upper_body": _UPPER_BODY,
-    "bimanual_panda_gripper": _bimanual_panda("front_view", ("gripper_qpos", "gripper_close"), "binary"),
-    "bimanual_panda_hand": _bimanual_panda("ego_view", ("hand", "hand"), "min_max"),
-    "single_panda_gripper": _config(
-        "left_view right_view wrist_view",
-        "end_effector_position_relative end_effector_rotation_relative gripper_qpos base_position "
-        "base_rotation",
-        "end_effector_position end_effector_rotation gripper_close base_motion control_mode",
-        _TASK,
-        "min_max",
-        {
-            "end_effector_position": "min_max",
-            "end_effector_rotation": "min_max",
-            "gripper_close": "binary",
-            "base_motion": "min_max",
-            "control_mode": "binary",
-        },
-        {
-            "state.end_effector_rotation_relative": "rotation_6d",
-            "state.base_rotation": "rotation_6d",
-        },
-    ),
-    "so100": _config("webcam", "single_arm gripper", None, _SHORT),
-    "so100_dualcam": _config("front wrist", "single_arm gripper", None, _SHORT),
-    "unitree_g1": _config("rs_view", _GR1_ARMS, None, _SHORT),
-    "unitree_g1_full_body": _config("rs_view", _G1_BODY, None, _SHORT),
-    "oxe_droid": _config(
-        "exterior_image_1 exterior_image_2 wrist_image",
-        "eef_position eef_rotation gripper_position",
-        "eef_position_delta eef_rotation_delta gripper_position",
-        "language.language_instruction",
-        {"eef_position": "min_max", "gripper_position": "min_max"},
-        {"gripper_position": "binary"},
-        {"state.eef_rotation": "rotation_6d", "action.eef_rotation_delta": "axis_angle"},
-    ),
-    "agibot_genie1": _config(
-        "top_head hand_left hand_right", _GENIE1, f"{_GENIE1} robot_velocity", "language.action_text"
-    ),
-    "gr1_arms_waist": _ARMS_WAIST,
-    "gr1_arms_only": _ARMS_ONLY,
-    "gr1_full_upper_body": _UPPER_BODY,
-    "examples.Libero.custom_data_config:LiberoDataConfig": _config("image wrist_image", _XYZ, None, _TASK),
-    "examples.Libero.custom_data_config:LiberoDataConfigMeanStd": _config(
-        "image wrist_image", _XYZ, None, _TASK, "min_max", _XYZ_MEAN_STD
-    ),
-    "examples.SimplerEnv.custom_data_config:FractalDataConfig": _config(
-        "image", "x y z rx ry rz rw gripper", _XYZ, _TASK, "min_max", _XYZ_MEAN_STD
-    ),
-    "examples.SimplerEnv.custom_data_config:BridgeDataConfig": _config(
-        "image_0", "x y z roll pitch yaw pad gripper", _XYZ, _TASK
-    ),
+    name: _made(values)
+    for name, values in json.loads(
+        Path(__file__).with_name("released_data_configs.json").read_text(encoding="utf-8")
+    ).items()
 }

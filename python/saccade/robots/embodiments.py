@@ -1,74 +1,34 @@
 """Embodiment tags: the released tables of ids, and how a request names a robot.
 
-Ids belong to a release. ``robocasa_panda_omron`` is 13 in N1.6 and 10 in N1.7.
+Ids belong to a release. ``robocasa_panda_omron`` is 13 in N1.6 and 10 in N1.7. An argument ``embodiment`` is
+a tag or an id; ``embodiment_id`` is always a number, and ``embodiment_ids`` are several.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from saccade._internal.arrays import integer
 from saccade.errors import InputError
 
-#: Isaac-GR00T N1 and N1.5. ``genie1_gripper`` is an old name of ``agibot_genie1``.
-N15_IDS = {
-    "new_embodiment": 31,
-    "agibot_genie1": 26,
-    "genie1_gripper": 26,
-    "gr1": 24,
-    "oxe_droid": 17,
-}
+_RELEASED = json.loads(Path(__file__).with_name("released_embodiments.json").read_text(encoding="utf-8"))
 
-N16_IDS = {
-    "oxe_google": 0,
-    "oxe_widowx": 1,
-    "libero_panda": 2,
-    "unitree_g1": 8,
-    "new_embodiment": 10,
-    "robocasa_panda_omron": 13,
-    "oxe_droid": 16,
-    "gr1": 20,
-    "behavior_r1_pro": 24,
-}
-
-N17_IDS = {
-    "simpler_env_google": 0,
-    "simpler_env_widowx": 1,
-    "libero_sim": 2,
-    "new_embodiment": 10,
-    "robocasa_panda_omron": 10,
-    "robocasa_gr1_tabletop": 10,
-    "unitree_g1_sonic": 11,
-    "oxe_droid_relative_eef_relative_joint": 24,
-    "real_g1_relative_eef_relative_joints": 25,
-    "unitree_g1_full_body_with_waist_height_nav_cmd": 25,
-    "real_r1_pro_sharpa_relative_eef": 26,
-    "real_r1_pro_sharpa_relative_eef_human": 26,
-    "real_r1_pro_sharpa_relative_eef_maxinsights": 26,
-    "real_r1_pro_sharpa_relative_eef_mecka": 26,
-    "xdof_relative_eef_relative_joint": 27,
-    "xdof_relative_eef_relative_joint_subtask": 27,
-}
-
-#: Robots whose keys an error lists.
-MOST_LISTED = 4
+#: The ids of each release by tag. In N1 and N1.5, ``genie1_gripper`` is an old name of ``agibot_genie1``.
+N15_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.5"]
+N16_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.6"]
+N17_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.7"]
 
 #: Released ids by version of the model.
 IDS: Mapping[str, Mapping[str, int]] = {"n1": N15_IDS, "n1.5": N15_IDS, "n1.6": N16_IDS, "n1.7": N17_IDS}
 
 #: Names of N1.7 that differ from their tag in more than case. A name takes precedence over a tag:
 #: ``unitree_g1`` is another robot in N1.6.
-N17_NAMES = {
-    "xdof": "xdof_relative_eef_relative_joint",
-    "xdof_subtask": "xdof_relative_eef_relative_joint_subtask",
-    "real_g1": "real_g1_relative_eef_relative_joints",
-    "real_r1_pro_sharpa": "real_r1_pro_sharpa_relative_eef",
-    "real_r1_pro_sharpa_human": "real_r1_pro_sharpa_relative_eef_human",
-    "real_r1_pro_sharpa_maxinsights": "real_r1_pro_sharpa_relative_eef_maxinsights",
-    "real_r1_pro_sharpa_mecka": "real_r1_pro_sharpa_relative_eef_mecka",
-    "unitree_g1": "unitree_g1_full_body_with_waist_height_nav_cmd",
-    "libero_panda": "libero_sim",
-}
+N17_NAMES: Mapping[str, str] = _RELEASED["names"]["n1.7"]
+
+#: Robots whose keys an error lists.
+MOST_LISTED = 4
 
 
 def resolved(text: str, version: str | None, tags: Iterable[str]) -> str:

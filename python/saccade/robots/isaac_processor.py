@@ -12,32 +12,16 @@ from saccade.errors import CheckpointError
 from saccade.robots.building import Builder, Options, finished, width_of
 from saccade.robots.embodiments import IDS, choose
 from saccade.robots.groups import Group, Reference, Robot
-from saccade.robots.lerobot_steps import IMAGE_OPTIONS, action_steps
+from saccade.robots.lerobot_steps import KNOWN, action_steps
 from saccade.robots.rotations import POSES
 
 #: Versions by the class of the processor.
 CLASSES = {"Gr00tN1d6Processor": "n1.6", "Gr00tN1d7Processor": "n1.7"}
 
-#: Arguments of the processors. ``saccade.Processor`` reads those of images and text.
-OPTIONS = (
-    *IMAGE_OPTIONS,
-    "modality_configs",
-    "random_rotation_angle",
-    "color_jitter_params",
-    "model_type",
-    "formalize_language",
-    "max_state_dim",
-    "max_action_dim",
-    "max_action_horizon",
-    "use_percentiles",
-    "clip_outliers",
-    "apply_sincos_state_encoding",
-    "use_relative_action",
-    "extra_augmentation_config",
-    "transformers_loading_kwargs",
-)
-#: Those that only N1.7 has. ``use_mean_std`` is never read, and ``state_dropout_prob`` by training only.
-N17_OPTIONS = ("letter_box_transform", "use_mean_std", "exclude_state", "state_dropout_prob")
+#: Arguments of the processors, then those that only N1.7 has. ``saccade.Processor`` reads those of images and
+#: text. ``use_mean_std`` is never read, and ``state_dropout_prob`` by training only.
+OPTIONS: list[str] = KNOWN["isaac"]["processor"]
+N17_OPTIONS: list[str] = KNOWN["isaac"]["processor_n1.7"]
 
 #: Fields of a modality config, and of one of its action configs with the values that are known.
 MODALITY = (

@@ -5,6 +5,7 @@ Every step is on a list of what is known, with its options. ``lerobot_pipeline``
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,92 +27,18 @@ RELATIVE, ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 #: The name of RELATIVE in lerobot 0.5, the last with N1.5. Neither release can load the other's.
 DELTA = "delta_actions_processor"
 
-#: Options of both releases' steps that pack an observation.
-_PACK = (
-    "state_horizon",
-    "action_horizon",
-    "max_state_dim",
-    "max_action_dim",
-    "language_key",
-    "formalize_language",
-    "embodiment_tag",
-    "embodiment_mapping",
-    "normalize_min_max",
-)
-#: Options of images that N1.7's step and the processors of Isaac-GR00T N1.6 and N1.7 have.
-IMAGE_OPTIONS = (
-    "model_name",
-    "image_crop_size",
-    "image_target_size",
-    "shortest_image_edge",
-    "crop_fraction",
-    "use_albumentations",
-)
-#: The steps of the preprocessor and their options. ``saccade.Processor`` reads those of images and text.
-BEFORE: Mapping[str, tuple[str, ...]] = {
-    RENAME: ("rename_map",),
-    BATCH: (),
-    **dict.fromkeys((RELATIVE, DELTA), ("enabled", "exclude_joints", "action_names")),
-    PACK_N15: _PACK,
-    "groot_eagle_encode_v3": ("tokenizer_assets_repo",),
-    "groot_eagle_collate_v3": ("tokenizer_assets_repo",),
-    PACK_N17: (
-        *_PACK,
-        "valid_action_horizon",
-        "video_horizon",
-        "state_dropout_prob",
-        "clip_outliers",
-        "use_percentiles",
-        "video_modality_keys",
-        "raw_stats",
-        "modality_config",
-    ),
-    "groot_n1_7_vlm_encode_v1": (*IMAGE_OPTIONS, "letter_box_transform", "device"),
-    DEVICE: ("device", "float_dtype"),
-}
-#: The steps of the postprocessor.
-AFTER: Mapping[str, tuple[str, ...]] = {
-    UNPACK_N15: ("env_action_dim", "normalize_min_max"),
-    UNPACK_N17: (
-        "env_action_dim",
-        "normalize_min_max",
-        "clip_normalized_action",
-        "libero_gripper_action",
-        "libero_gripper_binarize",
-    ),
-    DECODE: (
-        "env_action_dim",
-        "raw_stats",
-        "modality_config",
-        "use_percentiles",
-        "use_relative_action",
-        "action_decode_transform",
-    ),
-    ABSOLUTE: ("enabled",),
-    DEVICE: ("device", "float_dtype"),
-}
+#: What is known: steps of lerobot's processors with their options, keys of its config, and the options of
+#: Isaac-GR00T's processors.
+KNOWN = json.loads(Path(__file__).with_name("known_options.json").read_text(encoding="utf-8"))
 
+#: The steps of the preprocessor and of the postprocessor with their options. Options of images and text are
+#: read by ``saccade.Processor``.
+BEFORE: Mapping[str, list[str]] = KNOWN["lerobot"]["preprocessor"]
+AFTER: Mapping[str, list[str]] = KNOWN["lerobot"]["postprocessor"]
 #: Keys of ``config.json`` of all releases. lerobot refuses others.
-CONFIG = frozenset(
-    """
-    type action_decode_transform balance_dataset_weights balance_trajectory_weights base_model_path batch_size
-    chunk_size dataloader_num_workers dataset_paths device embodiment_tag image_size input_features license
-    lora_alpha lora_dropout lora_full_model lora_rank max_action_dim max_state_dim max_steps model_params_fp32
-    n_action_steps n_obs_steps normalization_mapping num_inference_timesteps optimizer_betas optimizer_eps
-    optimizer_lr optimizer_weight_decay output_dir output_features pretrained_path pretrained_revision private
-    push_to_hub relative_exclude_joints repo_id report_to resume rtc_ramp_rate save_steps tags
-    tokenizer_assets_repo tune_diffusion_model tune_llm tune_projector tune_top_llm_layers tune_visual
-    tune_vlln use_amp use_bf16 use_flash_attention use_peft use_relative_actions video_backend warmup_ratio
-    """.split()  # noqa: SIM905
-)
+CONFIG = frozenset(KNOWN["lerobot"]["config"])
 #: Keys that saccade reads besides: sizes of a part of the model, and several action decoders, of forks.
-CONFIG_OF_PARTS = frozenset(
-    """
-    action_head_cfg backbone_cfg eagle_config text_config vision_config select_layer use_multi_action_heads
-    split_arm_heads num_target_vision_tokens action_arm_dim action_claw_dim action_left_arm_dim
-    action_right_arm_dim
-    """.split()  # noqa: SIM905
-)
+CONFIG_OF_PARTS = frozenset(KNOWN["lerobot"]["config_of_parts"])
 
 #: lerobot replaces these of N1.5 by N1.7's when it loads a policy.
 MIGRATED = {"chunk_size": (50, 40), "n_action_steps": (50, 40)}
