@@ -170,7 +170,7 @@ def test_small_requests_of_one_client_leave_others_their_turn() -> None:
 
         def read() -> None:
             count = 0
-            while count < 5_000 * len(packed(PONG)):
+            while count < 5_000 * (4 + len(packed(PONG))):
                 count += len(made.recv(1 << 16))
             done.set()
 
@@ -180,6 +180,7 @@ def test_small_requests_of_one_client_leave_others_their_turn() -> None:
         made.sendall(frames)
         assert ping(running.port) == PONG
         assert done.wait(60)
+        assert running.log.warnings() == []
 
 
 def test_a_client_that_does_not_read_loses_answers() -> None:

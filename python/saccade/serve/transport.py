@@ -23,8 +23,11 @@ from zmq.utils.monitor import parse_monitor_message
 from saccade.serve.keys import ServerKeys
 from saccade.serve.limits import Limits
 
-#: Messages of one connection that libzmq holds in each direction.
-HIGH_WATER_MARK = 32
+#: Requests of one connection that libzmq holds; more wait in the network.
+MOST_UNREAD_REQUESTS = 32
+#: Answers to one connection that libzmq holds; more are not sent. It is many times `READ_AT_ONCE`, so only
+#: a client that does not read loses answers.
+MOST_UNSENT_ANSWERS = 1000
 #: Frames before the request, which are sent back before the answer, and bytes of each.
 MOST_ENVELOPE_FRAMES = 8
 MOST_ENVELOPE_BYTES = 255
@@ -254,8 +257,8 @@ class Transport:
         options = {
             zmq.ROUTER_MANDATORY: 1,  # send says if a client is gone or does not read
             zmq.MAXMSGSIZE: self._limits.message_bytes,
-            zmq.SNDHWM: HIGH_WATER_MARK,
-            zmq.RCVHWM: HIGH_WATER_MARK,
+            zmq.SNDHWM: MOST_UNSENT_ANSWERS,
+            zmq.RCVHWM: MOST_UNREAD_REQUESTS,
             zmq.HANDSHAKE_IVL: stall,
             # A client is heard within the sum of both.
             zmq.HEARTBEAT_IVL: max(1, stall // 3),
