@@ -36,8 +36,8 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for picture in ("1", "2"):
         (folder / picture).mkdir()
         for name in CAMERAS:
-            picture = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
-            picture.save(folder / picture / f"{name}.png")
+            image = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
+            image.save(folder / picture / f"{name}.png")
     return folder
 
 
@@ -53,7 +53,7 @@ def test_the_numbers_are_those_of_the_policy(layout: str, frames: Path) -> None:
     for one in (exact, others[-1]):
         policy = saccade.Policy.from_pretrained(source, embodiment=EMBODIMENT, precision=one.precision)
         assert policy.backbone is not None
-        assert one.nbytes == policy.backbone.nbytes + policy.head.nbytes  # type: ignore[attr-defined]
+        assert one.nbytes == policy.backbone.nbytes + policy.head.nbytes
         assert one.milliseconds > 0
     reference = saccade.Policy.from_pretrained(source, embodiment=EMBODIMENT)
     pictures = read_frames(frames, reference, instruction="open it")

@@ -29,8 +29,9 @@ from saccade_lab.reference.random_weights import (
     whole_config,
 )
 from tests.helpers import layouts
+from tests.helpers.paths import DATA
 from tests.helpers.reference_cases import relative_error, small_config
-from tests.helpers.released import DATA, NAMES, VARIANTS, Released, load_released
+from tests.helpers.released import NAMES, VARIANTS, Released, load_released
 
 
 @pytest.fixture(params=[*NAMES, *VARIANTS])
