@@ -91,7 +91,7 @@ def test_a_killed_run_keeps_what_was_done(tmp_path: Path) -> None:
         f"work = Square(Path({str(tmp_path / 'log')!r}), dies=(3,))\n"
         f"run_cells('demo', cells(1, 2, 3, 4), work, Path({str(tmp_path / 'out')!r}), settings=SETTINGS)\n"
     )
-    killed = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2], check=False)
+    killed = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[3], check=False)
     assert killed.returncode == 9
     half = tables.read_provenance(tmp_path / "out" / "demo.json")
     assert (half.done, half.total, half.complete) == (2, 4, False)
