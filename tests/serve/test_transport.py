@@ -154,6 +154,12 @@ def test_a_request_that_trickles_in_costs_its_connection() -> None:
         assert ping(running.port) == PONG
 
 
+@pytest.mark.parametrize("seconds", [0.1, 86_399.0])
+def test_limits_of_the_times(seconds: float) -> None:
+    with serving(limits=Limits(stall_seconds=seconds)) as running:
+        assert ping(running.port) == PONG
+
+
 def test_many_idle_connections() -> None:
     with serving(limits=Limits(stall_seconds=2.0)) as running, contextlib.ExitStack() as stack:
         idle = [stack.enter_context(connect(running.port)) for _ in range(100)]

@@ -117,14 +117,21 @@ class Writer:
         ending.join(seconds)
 
 
-class _Limited:
-    """Limits the number of warnings a second."""
+class _Lines:
+    """What all logs do: write to a file descriptor, and limit the number of warnings a second."""
 
-    def __init__(self) -> None:
+    every = STATISTICS_SECONDS
+
+    def __init__(self, descriptor: int) -> None:
+        self._writer = Writer(descriptor)
         self._second, self._passed, self._held = 0, 0, 0
 
-    def passes(self) -> int | None:
-        """Whether one more may be written: the number of those before it that were not, or None."""
+    def close(self) -> None:
+        """See :class:`Log`."""
+        self._writer.close()
+
+    def _left_out(self) -> int | None:
+        """The number of warnings that were not written before this one, or None if this is not either."""
         now = int(time.monotonic())
         if now != self._second:
             self._second, self._passed = now, 0
@@ -136,23 +143,19 @@ class _Limited:
         return held
 
 
-class JsonLog:
+class JsonLog(_Lines):
     """JSON lines on standard output: an object with ``event`` and ``time`` (seconds since 1970) each.
 
     Events: ``listening``, ``request``, ``statistics``, ``warning``, ``stopping``, ``stopped``.
     """
 
-    every = STATISTICS_SECONDS
-
     def __init__(self, descriptor: int = 1) -> None:
-        self._writer = Writer(descriptor)
-        self._limited = _Limited()
+        super().__init__(descriptor)
 
     def event(self, name: str, **fields: Any) -> None:
         """See :class:`Log`."""
         if name == "warning":
-            held = self._limited.passes()
-            if held is None:
+            if (held := self._left_out()) is None:
                 return
             fields |= {"left_out": held} if held else {}
         self._write(name, fields)
@@ -165,32 +168,24 @@ class JsonLog:
         """See :class:`Log`."""
         self._write("statistics", {**summary, "lost_lines": self._writer.lost})
 
-    def close(self) -> None:
-        """See :class:`Log`."""
-        self._writer.close()
-
     def _write(self, name: str, fields: dict[str, Any]) -> None:
         self._writer.write(
             dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str) + "\n"
         )
 
 
-class TextLog:
+class TextLog(_Lines):
     """Lines on standard error: what happens, errors, and statistics where there are new requests."""
 
-    every = STATISTICS_SECONDS
-
     def __init__(self, descriptor: int = 2) -> None:
-        self._writer = Writer(descriptor)
-        self._limited = _Limited()
+        super().__init__(descriptor)
         self._last = ""
 
     def event(self, name: str, **fields: Any) -> None:
         """See :class:`Log`."""
         text = _described(name, fields)
         if name == "warning":
-            held = self._limited.passes()
-            if held is None:
+            if (held := self._left_out()) is None:
                 return
             text += f" (and {held} more)" if held else ""
         self._line(text)
@@ -206,10 +201,6 @@ class TextLog:
         if summary["requests"] and (text.partition(";")[0] != self._last.partition(";")[0]):
             self._line(text)
         self._last = text
-
-    def close(self) -> None:
-        """See :class:`Log`."""
-        self._writer.close()
 
     def _line(self, text: str) -> None:
         self._writer.write(f"saccade serve: {printable(text)}\n")

@@ -36,6 +36,8 @@ READ_AT_ONCE = 64
 #: Time for the last answers to be sent when the socket is closed.
 FLUSH_SECONDS = 5.0
 BACKLOG = 128
+#: Milliseconds that a heartbeat can announce.
+LONGEST_TTL = 6_553_500
 #: Of the authentication of clients.
 DOMAIN = "saccade"
 #: Files that the server opens besides those of connections.
@@ -263,7 +265,7 @@ class Transport:
             # A client is heard within the sum of both.
             zmq.HEARTBEAT_IVL: max(1, stall // 3),
             zmq.HEARTBEAT_TIMEOUT: max(1, stall - stall // 3),
-            zmq.HEARTBEAT_TTL: stall,
+            zmq.HEARTBEAT_TTL: min(stall, LONGEST_TTL),
             zmq.TCP_KEEPALIVE: 1,
             zmq.IPV6: int(self._family == socket.AF_INET6),
         }
