@@ -16,6 +16,9 @@ from tests.helpers.tiers import TIERS, tier_of
 # pytest-xdist tells its workers the width of the terminal. The programs under test see no terminal.
 os.environ.pop("COLUMNS", None)
 
+# No test asks the real Hub; huggingface_hub reads this when it is imported.
+os.environ["HF_HUB_OFFLINE"] = "1"
+
 # No deadline: the machine may be shared. On CI every run draws the same examples, so a failure is caused by
 # the change and not by the draw.
 hypothesis.settings.register_profile(

@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import ArrayLike, Float32Array, frame, int64, integer, text
-from saccade._internal.hub import PUBLISHED, cache, cached, resolve
+from saccade._internal.hub import locate_published, resolve
+from saccade._internal.hub_files import PROCESSOR, TOKENIZER
+from saccade._internal.warning import warn
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError, ShapeError
 
@@ -124,7 +126,7 @@ class Processor:
             >>> saccade.Processor.from_pretrained("n1.5-backbone.safetensors", tokenizer="tokenizer.json")
             <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
         """
-        held = _saccade.ProcessorSource(os.fspath(resolve(id_or_path, revision)))
+        held = _source(id_or_path, revision)
         chosen = None if preprocessing is None else text("preprocessing", preprocessing)
         processor = cls.__new__(cls)
         replaced = None if options is None else _to_json(options)
@@ -278,54 +280,57 @@ _text = text  # in a method with an argument of that name
 
 
 def tokenizer_path(
-    source: str | os.PathLike[str], tokenizer: str | os.PathLike[str] | None = None
+    id_or_path: str | os.PathLike[str], tokenizer: str | os.PathLike[str] | None = None
 ) -> Path | None:
     """Where :meth:`Processor.from_pretrained` finds the tokenizer, if that is outside the checkpoint.
 
     Args:
-        source, tokenizer: As in :meth:`Processor.from_pretrained`, which says what is raised.
+        id_or_path, tokenizer: As in :meth:`Processor.from_pretrained`, which lists the errors.
 
     Returns:
-        A file or a directory. None: the checkpoint's own is used.
+        A file or a directory. None if the checkpoint has a tokenizer and no other is requested.
     """
-    found = _tokenizer_of(_saccade.ProcessorSource(os.fspath(resolve(source))), tokenizer)
+    found = _tokenizer_of(_source(id_or_path, None), tokenizer)
     return None if found is None else Path(found)
 
 
+def _source(id_or_path: str | os.PathLike[str], revision: str | None) -> _saccade.ProcessorSource:
+    return _saccade.ProcessorSource(os.fspath(resolve(id_or_path, revision, files=PROCESSOR)))
+
+
 def _tokenizer_of(source: _saccade.ProcessorSource, given: Any) -> str | None:
-    """The path of the tokenizer that is read instead of the checkpoint's own; None for that one."""
+    """The path of the tokenizer to read instead of the checkpoint's own; None for that one."""
     if given is not None:
         return _tokenizer(given)
     return None if source.has_tokenizer else _published_tokenizer(source)
 
 
 def _tokenizer(given: Any) -> str:
-    """The path of a tokenizer that is given as a path or as a published id."""
-    try:
-        path = os.fspath(given)
-    except TypeError:
-        path = None
-    if not isinstance(path, str) or "\0" in path:
-        raise InputError(f"tokenizer: expected a path, got {given!r}")
-    published = PUBLISHED.fullmatch(path)
-    if published is None or os.path.exists(path):  # noqa: PTH110 (of a name that is too long Path.exists raises)
-        return path
-    folder = cached(published["id"], published["revision"])
-    return path if folder is None else str(folder)
+    """The path of a tokenizer that is given as a path or as an id."""
+    return os.fspath(resolve(given, files=TOKENIZER, argument="tokenizer"))
 
 
 def _published_tokenizer(source: _saccade.ProcessorSource) -> str:
-    """The tokenizer of a checkpoint that has none, from the local cache."""
+    """The tokenizer for a checkpoint without one: that of its release, or else one with the same ids.
+
+    Raises:
+        FileNotFoundError: None of them can be had.
+        PermissionError: The Hub denies access to one that comes first.
+    """
+    problems: list[str] = []
     for name in source.published:
-        folder = cached(name)
-        if folder is not None and any(
-            all((folder / file).is_file() for file in files)
-            for files in (("tokenizer.json",), ("vocab.json", "merges.txt"))
-        ):
-            return str(folder)
+        try:
+            found = locate_published(name, files=TOKENIZER, argument="tokenizer").path
+        except FileNotFoundError as error:
+            problems.append(str(error))
+            continue
+        if problems:
+            warn(f"tokenizer: using {name} in place of {source.published[0]} ({problems[0]})")
+        return os.fspath(found)
     commands = [f"hf download {name} {' '.join(source.needed_files)}" for name in source.published]
+    listed = "".join(f"\n  {problem}" for problem in problems)
     raise FileNotFoundError(
-        f"tokenizer: the checkpoint has none, and neither has the cache {cache()}. Download that of "
+        f"tokenizer: the checkpoint has none, and no published one can be used:{listed}\nDownload that of "
         f"{source.version.upper()} with: {' or: '.join(commands)}. Or pass tokenizer=, a tokenizer.json or a "
         "directory with vocab.json and merges.txt"
     )
@@ -337,7 +342,7 @@ def _to_json(options: Any) -> str:
     try:
         return json.dumps(dict(options), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"options: expected values that JSON has: {error}") from None
+        raise InputError(f"options: expected values that JSON can represent: {error}") from None
 
 
 def _batch(frames: Any, instruction: Any) -> tuple[Sequence[Any], Sequence[str | None]]:

@@ -123,7 +123,7 @@ def action_of(width: int) -> dict[str, PolicyFeature]:
     ("options", "message"),
     [
         ({"checkpoint": None}, "checkpoint: expected a path or an id, got none"),
-        ({"checkpoint": "no/such"}, "no/such: no such path, and not in the cache"),
+        ({"checkpoint": "no/such"}, "no/such: no such path, .*not in the cache"),
         ({"device": "cuda"}, "device: expected 'cpu', got 'cuda'"),
         ({"n_action_steps": 0}, "n_action_steps: expected at least 1, got 0"),
         ({"n_action_steps": 17}, "n_action_steps: expected at most 16"),

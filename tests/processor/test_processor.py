@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade._internal import hub
+from saccade._internal import hub_cache
 from saccade.errors import CheckpointError
 from tests.helpers.processor_cases import (
     AS_IT_IS,
@@ -119,7 +119,9 @@ def tokenizer_of_qwen3() -> Path | None:
     if given:
         return Path(given)
     names = ("lerobot/eagle2hg-processor-groot-n1p5", "Qwen/Qwen3-VL-2B-Instruct", "nvidia/Cosmos-Reason2-2B")
-    folders = [folder for folder in map(hub.cached, names) if folder is not None]
+    folders = [
+        folder for folder in (hub_cache.folder_of(name, "main") for name in names) if folder is not None
+    ]
     files = ("tokenizer.json", "vocab.json")
     return next((one for one in folders if any((one / file).is_file() for file in files)), None)
 

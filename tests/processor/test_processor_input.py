@@ -323,7 +323,7 @@ def test_instructions_that_are_no_text(instruction: Any) -> None:
             {"options": {"crop_fraction": 1.5}},
             "crop_fraction: expected a number above 0 and up to 1, got 1.5",
         ),
-        ({"options": {"crop_fraction": float("nan")}}, "values that JSON has"),
+        ({"options": {"crop_fraction": float("nan")}}, "values that JSON can represent"),
         ({"options": {"image_mean": [0.4, 0.5, 0.5]}}, "image_mean: expected 0.5"),
         ({"options": {"do_normalize": False}}, "do_normalize: expected true"),
         ({"options": {"resample": 2}}, "resample: expected 3"),

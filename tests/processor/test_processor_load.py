@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade._internal import hub
+from saccade._internal import hub_cache
 from saccade.errors import CheckpointError, InputError
 from saccade.processor import tokenizer_path
 from tests.helpers.processor_cases import AS_IT_IS, DATA, TOKENIZER, assert_same
@@ -414,7 +415,7 @@ def test_the_released_tokenizer_in_the_cache(cache: Path, fixture: str, name: st
     assert str(cache) in str(error.value)
     snapshot = in_cache(cache, name)
     assert "tokens=443" in repr(saccade.Processor.from_pretrained(source))
-    assert hub.cached(name) == snapshot
+    assert hub_cache.folder_of(name, "main") == snapshot
     assert tokenizer_path(source) == tokenizer_path(source, name) == snapshot
     assert "tokens=443" in repr(saccade.Processor.from_pretrained(source, tokenizer=name))
     assert "tokens=443" in repr(saccade.Processor.from_pretrained(source, tokenizer=f"{name}@4af2b622"))
@@ -433,24 +434,28 @@ def test_limits_of_the_released_processor(cache: Path) -> None:
 
 
 def test_where_the_cache_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from huggingface_hub import constants
-
+    monkeypatch.setitem(sys.modules, "huggingface_hub.constants", None)
     for variable in ("HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "HF_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert hub.cache() == tmp_path / ".cache" / "huggingface" / "hub"
+    assert hub_cache.cache() == tmp_path / ".cache" / "huggingface" / "hub"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert hub.cache() == tmp_path / "xdg" / "huggingface" / "hub"
+    assert hub_cache.cache() == tmp_path / "xdg" / "huggingface" / "hub"
     monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
-    assert hub.cache() == tmp_path / "home" / "hub"
+    assert hub_cache.cache() == tmp_path / "home" / "hub"
     monkeypatch.setenv("HF_HUB_CACHE", "~/cache")
-    assert hub.cache() == tmp_path / "cache"
-    assert constants.REPO_ID_SEPARATOR == "--"
+    assert hub_cache.cache() == tmp_path / "cache"
 
 
-@pytest.mark.parametrize("name", ["no/such", "no-such.json", "../no/such", "no/such@main"])
+@pytest.mark.parametrize("name", ["no-such.json", "../no/such", "./no/such"])
 def test_no_such_tokenizer(name: str) -> None:
     with pytest.raises(FileNotFoundError, match="tokenizer: no such file or directory"):
+        saccade.Processor("n1.5", name)
+
+
+@pytest.mark.parametrize("name", ["no/such", "no/such@main"])
+def test_no_such_published_tokenizer(name: str) -> None:
+    with pytest.raises(FileNotFoundError, match=r"tokenizer: no/such: no such path.*hf download no/such"):
         saccade.Processor("n1.5", name)
 
 

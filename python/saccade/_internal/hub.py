@@ -1,135 +1,214 @@
-"""Finds published checkpoints in the local cache of ``huggingface_hub``.
+"""Paths of checkpoints: local ones, and those of repositories on the Hugging Face Hub.
 
-Every function and command that accepts a checkpoint resolves it here.
+Every function and command that accepts a checkpoint resolves it here. :mod:`saccade._internal.hub_download`
+downloads, :mod:`saccade._internal.hub_cache` reads the local cache.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
-from saccade._internal.extras import pip_install
+from saccade._internal import hub_cache
+from saccade._internal.hub_download import Offline, download, list_files, neighbour
+from saccade._internal.hub_files import WHOLE, absent_files, missing_files
+from saccade._internal.warning import warn
 from saccade.errors import InputError
 
 #: ``owner/name``, optionally followed by ``@`` and a branch, tag or commit.
-PUBLISHED = re.compile(r"(?P<id>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(?P<revision>[\w./-]+))?")
+PUBLISHED = re.compile(
+    r"(?![^@]*(--|\.\.))(?P<id>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(?P<revision>[\w./-]+))?", re.ASCII
+)
+#: A branch, tag or commit. Names with ``..`` are none in git.
+REVISION = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*", re.ASCII)
+COMMIT = re.compile(r"[0-9a-f]{40}")
+DEFAULT_REVISION = "main"
 
 
-def resolve(id_or_path: str | os.PathLike[str], revision: str | None = None) -> Path:
-    """The path of a checkpoint.
+@dataclass(frozen=True)
+class Location:
+    """Where the files of a checkpoint are.
+
+    Attributes:
+        path: A file or a directory. For an id, the directory of one commit in the local cache.
+        id: The id of a published repository; None for a local path.
+        commit: The commit that ``revision`` named when it was resolved; None for a local path.
+    """
+
+    path: Path
+    id: str | None = None
+    commit: str | None = None
+
+
+def resolve(
+    id_or_path: str | os.PathLike[str],
+    revision: str | None = None,
+    *,
+    files: tuple[str, ...] = WHOLE,
+    argument: str = "id_or_path",
+) -> Path:
+    """The path of a checkpoint, which is downloaded if it is the id of a published one.
 
     Args:
-        id_or_path: A path, or the id of a published checkpoint, such as ``nvidia/GR00T-N1.5-3B`` or
-            ``nvidia/GR00T-N1.5-3B@main``. An existing path takes precedence. The files of an id are looked up
-            in the local cache of ``huggingface_hub`` (environment variables ``HF_HOME`` and
-            ``HF_HUB_CACHE``). Nothing is downloaded.
+        id_or_path: A path, or an id such as ``nvidia/GR00T-N1.5-3B`` or ``nvidia/GR00T-N1.5-3B@main``. An
+            existing path takes precedence. An id has exactly one slash; ``./model`` and ``/x/y`` are paths.
         revision: A branch, tag or commit of the id. Default: ``main``.
+        files: Patterns of the files that are needed, one of the groups of
+            :mod:`saccade._internal.hub_files`. Only these are downloaded.
+        argument: Name of the argument, for messages.
 
     Returns:
-        The directory of an id. A path is returned unchanged, whether it exists or not.
+        For an id, the directory of its revision in the cache of ``huggingface_hub`` (environment variables
+        ``HF_HOME`` and ``HF_HUB_CACHE``). A path is returned unchanged, whether it exists or not.
 
     Raises:
-        InputError: ``id_or_path`` is not a path, or ``revision`` is given with a path.
-        FileNotFoundError: ``id_or_path`` is an id, but neither the path exists nor are the files of the id
-            in the cache. The message contains a command that downloads them.
+        InputError: ``id_or_path`` is not a path, or ``revision`` is not a revision or is given with a path.
+        FileNotFoundError: The id or revision does not exist, or its files are not in the cache and cannot be
+            downloaded. The message says what to do.
+        PermissionError: The Hub denies access to the repository.
 
     Example:
         >>> resolve("policy.safetensors").name
         'policy.safetensors'
     """
+    return locate(id_or_path, revision, files=files, argument=argument).path
+
+
+def locate(
+    id_or_path: str | os.PathLike[str],
+    revision: str | None = None,
+    *,
+    files: tuple[str, ...] = WHOLE,
+    argument: str = "id_or_path",
+) -> Location:
+    """As :func:`resolve`, with the id and the commit that the path belongs to."""
+    text = _text(id_or_path, argument)
+    if revision is not None:
+        _check_revision(revision)
+    published = parse(text)
+    if published is None:
+        if revision is not None:
+            raise InputError(f"revision: expected None with a path, got {revision!r} with {text}")
+        _check_cached_folder(Path(text), files, argument)
+        return Location(Path(text))
+    name, own_revision = published
+    if revision is not None and own_revision is not None:
+        raise InputError(f"revision: expected None with {text}, which names one, got {revision!r}")
+    if own_revision is not None:
+        _check_revision(own_revision)
+    return locate_published(name, revision or own_revision, files=files, argument=argument)
+
+
+def parse(text: str) -> tuple[str, str | None] | None:
+    """The id and revision that ``text`` names; None if it is a path.
+
+    Whatever exists on this machine is a path, and so is whatever does not have the form of an id.
+    """
+    published = PUBLISHED.fullmatch(text)
+    if published is None or text.endswith((".safetensors", ".json")):
+        return None
+    # Path.exists raises OSError if a name is too long.
+    if os.path.exists(text):  # noqa: PTH110
+        return None
+    return published["id"], published["revision"]
+
+
+def locate_published(
+    name: str, revision: str | None = None, *, files: tuple[str, ...] = WHOLE, argument: str = "id_or_path"
+) -> Location:
+    """As :func:`locate` for an id, whatever exists under this name on this machine.
+
+    A revision that is a commit is taken from the cache without asking the Hub if all of its files are there.
+    Otherwise the Hub is asked which commit and which files the revision has, and missing files are
+    downloaded. Without a connection the commit that the cache has for the revision is used.
+    """
+    revision = revision or DEFAULT_REVISION
+    if COMMIT.fullmatch(revision):
+        folder = hub_cache.folder_of(name, revision)
+        listed = None if folder is None else hub_cache.read_listing(folder)
+        if folder is not None and listed is not None and not missing_files(folder, files, listed):
+            return Location(folder, name, revision)
     try:
-        text = os.fspath(id_or_path)
+        commit, listed = list_files(name, revision, argument)
+    except Offline as offline:
+        return _from_cache(name, revision, files, argument, offline)
+    absent = absent_files(files, listed)
+    if absent:
+        raise FileNotFoundError(
+            f"{argument}: {_shown(name, revision)}: the repository has no {', '.join(absent)}"
+        )
+    folder = hub_cache.folder_of(name, commit)
+    if folder is None or missing_files(folder, files, listed):
+        folder = download(name, commit, files, listed, argument)
+    hub_cache.write_listing(folder, listed)
+    hub_cache.write_revision(name, revision, commit)
+    return Location(folder, name, commit)
+
+
+def _from_cache(
+    name: str, revision: str, files: tuple[str, ...], argument: str, offline: Offline
+) -> Location:
+    """The commit that the cache has for a revision.
+
+    Raises:
+        FileNotFoundError: It has none, or files of it are missing.
+    """
+    shown = _shown(name, revision)
+    start = f"{argument}: {shown}: no such path{neighbour(name)}, {offline.reason}, and "
+    command = f"hf download {name}" + ("" if revision == DEFAULT_REVISION else f" --revision {revision}")
+    remedy = f"{offline.remedy}Download it with: {command}. Or pass the path of a directory"
+    folder = hub_cache.folder_of(name, revision)
+    if folder is None:
+        raise FileNotFoundError(f"{start}it is not in the cache {hub_cache.cache()}. {remedy}")
+    listed = hub_cache.read_listing(folder)
+    missing = missing_files(folder, files, listed)
+    if missing:
+        raise FileNotFoundError(
+            f"{start}the cache contains only a part of it ({folder} lacks {', '.join(missing)}). {remedy}"
+        )
+    if listed is None:
+        warn(
+            f"{shown}: {folder} was not downloaded by saccade, and {offline.reason}: it is not known whether "
+            "all files of the repository are there. A missing processor or statistics file changes results"
+        )
+    if offline.is_unexpected:
+        warn(f"{shown}: {offline.reason}: using {folder.name} from the cache, which may not be the newest")
+    return Location(folder, name, folder.name)
+
+
+def _check_cached_folder(path: Path, files: tuple[str, ...], argument: str) -> None:
+    """Checks a path that is the folder of a commit in the cache, as :func:`resolve` returns it.
+
+    Raises:
+        FileNotFoundError: Files were not downloaded, because a call before did not need them.
+    """
+    listed = hub_cache.read_listing(path) if path.parent.name == "snapshots" else None
+    missing = [] if listed is None else missing_files(path, files, listed)
+    if missing:
+        raise FileNotFoundError(
+            f"{argument}: {path} is a part of a published repository and lacks {', '.join(missing)}: pass "
+            "the id of the repository, so that they are downloaded"
+        )
+
+
+def _check_revision(revision: object) -> None:
+    if not isinstance(revision, str) or REVISION.fullmatch(revision) is None:
+        raise InputError(f"revision: expected a branch, tag or commit, got {revision!r}")
+
+
+def _text(id_or_path: object, argument: str) -> str:
+    try:
+        text = os.fspath(id_or_path)  # type: ignore[call-overload]
     except TypeError:
         text = None
     if not isinstance(text, str):
-        raise InputError(f"id_or_path: expected a path, got {type(id_or_path).__name__}")
+        raise InputError(f"{argument}: expected a path or an id, got {type(id_or_path).__name__}")
     if "\0" in text:
-        raise InputError(f"id_or_path: expected a path without null characters, got {text!r}")
-    path = Path(text)
-    published = PUBLISHED.fullmatch(text)
-    is_file = text.endswith((".safetensors", ".json"))
-    # Of a name that is too long Path.exists raises OSError.
-    if published is None or is_file or os.path.exists(path):  # noqa: PTH110
-        if revision is not None:
-            raise InputError(f"revision: expected None with a path, got {revision!r} with {text}")
-        return path
-    return _snapshot(published["id"], revision or published["revision"])
+        raise InputError(f"{argument}: expected a path without null characters, got {text!r}")
+    return text
 
 
-def cached(name: str, revision: str | None = None) -> Path | None:
-    """The directory of a published repository in the local cache, whichever of its files it contains.
-
-    Needs no other package, unlike :func:`resolve`. Nothing is downloaded.
-
-    Args:
-        name: An id such as ``Qwen/Qwen3-VL-2B-Instruct``.
-        revision: A branch, tag or commit. Default: ``main``.
-
-    Returns:
-        None if it is not there.
-    """
-    repository = cache() / f"models--{name.replace('/', '--')}"
-    revision = revision or "main"
-    try:
-        commit = (repository / "refs" / revision).read_text(encoding="utf-8").strip()
-    except (OSError, ValueError):
-        commit = revision
-    folder = repository / "snapshots" / commit
-    return folder if folder.is_dir() else None
-
-
-def cache() -> Path:
-    """The directory in which ``huggingface_hub`` keeps published repositories."""
-    given = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE")
-    if given:
-        return Path(given).expanduser()
-    home = os.environ.get("HF_HOME")
-    if home:
-        return Path(home).expanduser() / "hub"
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "huggingface" / "hub"
-
-
-def _snapshot(name: str, revision: str | None) -> Path:
-    """The directory of a revision in the cache."""
-    download = f"hf download {name}" + ("" if revision is None else f" --revision {revision}")
-    start = f"id_or_path: {name}{'' if revision is None else '@' + revision}: no such path, and "
-    try:
-        from huggingface_hub import snapshot_download
-    except ImportError:
-        raise FileNotFoundError(
-            f"{start}huggingface_hub, which downloads published checkpoints, is not installed. Install it "
-            f"with: {pip_install('huggingface_hub')}, then run: {download}"
-        ) from None
-    try:
-        folder = Path(snapshot_download(name, revision=revision, local_files_only=True))
-    except (FileNotFoundError, ValueError):  # it is not in the cache; it is not an id
-        from huggingface_hub.constants import HF_HUB_CACHE
-
-        raise FileNotFoundError(
-            f"{start}not in the cache {HF_HUB_CACHE}. Download it with: {download}"
-        ) from None
-    missing = _missing(folder)
-    if missing:
-        raise FileNotFoundError(
-            f"{start}the cache contains only a part of it ({folder} lacks {', '.join(missing)}). Download "
-            f"the rest with: {download}"
-        )
-    return folder
-
-
-def _missing(folder: Path) -> list[str]:
-    """Required files that a partial download does not contain."""
-    if (folder / "adapter_config.json").exists():  # an adapter alone, whose readers say what it lacks
-        return []
-    missing = [] if (folder / "config.json").exists() else ["config.json"]
-    indexes = sorted(folder.glob("*.safetensors.index.json"))
-    if not indexes:
-        return missing if any(folder.glob("*.safetensors")) else [*missing, "*.safetensors"]
-    try:
-        shards = set(json.loads(indexes[0].read_text(encoding="utf-8"))["weight_map"].values())
-        return missing + sorted(shard for shard in shards if not (folder / shard).exists())
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return missing  # the reader of the index reports what is wrong with it
+def _shown(name: str, revision: str) -> str:
+    return name if revision == DEFAULT_REVISION else f"{name}@{revision}"

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import ArrayLike, as_stored, check_precision, mask_bytes
-from saccade._internal.hub import resolve
+from saccade._internal.hub_files import BACKBONE
+from saccade._internal.loaded import Loaded
 from saccade.backbone.config import BackboneConfig
-from saccade.backbone.features import BackboneFeatures, check_backbone_record, made
+from saccade.backbone.features import RECORDS, BackboneFeatures, made
 from saccade.backbone.inputs import BackboneInputs
-from saccade.errors import DtypeError, InputError
+from saccade.errors import InputError
 from saccade.head.config import to_json
 from saccade.head.options import optional_integer
+from saccade.head.trace import check_record
 
 
-class Backbone:
+class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
     """A loaded backbone. Create one with :meth:`from_pretrained` or :meth:`from_tensors`.
 
     A backbone is immutable: any number of threads may call it at the same time. The features of an
@@ -34,16 +34,9 @@ class Backbone:
         (1, 287, 2048)
     """
 
-    def __init__(
-        self,
-        backbone: _saccade.Backbone,
-        source: str | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> None:
-        self._backbone = backbone
-        self._source = source
-        self._options = options
-        self._config = BackboneConfig(**backbone.config())
+    _engine_class = _saccade.Backbone
+    _config_class = BackboneConfig
+    _files = BACKBONE
 
     @classmethod
     def from_pretrained(
@@ -94,12 +87,12 @@ class Backbone:
             InputError: An option is out of range.
         """
         check_precision(precision)
-        path = os.fspath(resolve(id_or_path, revision))
-        config_text = None if config is None else to_json(config)
-        threads = optional_integer("num_threads", num_threads)
-        backbone = _saccade.Backbone.load(path, config_text, precision, threads)
-        options = {"config": config_text, "precision": precision, "num_threads": threads}
-        return cls(backbone, str(Path(path).absolute()), options)
+        options = {  # in the order of the engine's arguments
+            "config": None if config is None else to_json(config),
+            "precision": precision,
+            "num_threads": optional_integer("num_threads", num_threads),
+        }
+        return cls._load(id_or_path, revision, options)
 
     @classmethod
     def from_tensors(
@@ -135,36 +128,6 @@ class Backbone:
         threads = optional_integer("num_threads", num_threads)
         held = as_stored(tensors)
         return cls(_saccade.Backbone.from_tensors(held, config_text, precision, threads))
-
-    @property
-    def config(self) -> BackboneConfig:
-        """Sizes and switches of the backbone."""
-        return self._config
-
-    @property
-    def source(self) -> str | None:
-        """Absolute path of the checkpoint that it was loaded from; None after :meth:`from_tensors`."""
-        return self._source
-
-    @property
-    def num_threads(self) -> int:
-        """Number of threads that a call uses."""
-        return self._backbone.num_threads
-
-    @property
-    def precision(self) -> str:
-        """How the backbone computes: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
-        return self._backbone.precision
-
-    @property
-    def isa(self) -> str:
-        """Instruction set of the kernels, one of those that :func:`saccade.show_config` lists."""
-        return self._backbone.isa
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the weights in memory, in bytes."""
-        return self._backbone.nbytes
 
     def __call__(
         self,
@@ -227,37 +190,23 @@ class Backbone:
             for value in values:
                 if not isinstance(value, kind):
                     raise InputError(f"{name}: expected saccade.{kind.__name__}, got {type(value).__name__}")
-        keep = check_backbone_record(record)
-        encoded = self._backbone.encode(
+        keep = check_record(record, RECORDS)
+        encoded = self._engine.encode(
             [_plain(given) for given in inputs], [given._held for given in previous], *keep
         )
-        token = self._config.image_token_id
+        token = self.config.image_token_id
         return [
             made(held, recorded if any(keep) else None, given, token)
             for (held, recorded), given in zip(encoded, inputs, strict=True)
         ]
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        if self._source is None:
-            raise DtypeError(
-                "a backbone made by Backbone.from_tensors cannot be pickled or copied, because it has no "
-                "file to be loaded from: write its tensors to a checkpoint and use Backbone.from_pretrained"
-            )
-        return _load, (self._source, self._options)
-
     def __repr__(self) -> str:
-        config = self._config
+        config = self.config
         return (
             f"<saccade.Backbone {config.version} width={config.width} num_layers={config.num_layers} "
             f"vision_num_layers={config.vision_num_layers} precision={self.precision} isa={self.isa} "
             f"num_threads={self.num_threads}>"
         )
-
-
-def _load(source: str, options: dict[str, Any]) -> Backbone:
-    """Unpickles a backbone by loading its checkpoint again."""
-    config, rest = options["config"], {name: value for name, value in options.items() if name != "config"}
-    return Backbone.from_pretrained(source, config=None if config is None else json.loads(config), **rest)
 
 
 def _plain(inputs: BackboneInputs) -> dict[str, Any]:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Array, like_features
-from saccade.errors import DtypeError, InputError
+from saccade._internal.handle import Handle
+from saccade.errors import InputError
 
 #: What can be recorded.
 RECORDS = ("hidden", "vision", "image_tokens")
@@ -47,7 +48,7 @@ class BackboneRecord:
         return f"<saccade.BackboneRecord {' '.join(counts)} {self.nbytes / 1e6:,.1f} MB>"
 
 
-class BackboneFeatures:
+class BackboneFeatures(Handle):
     """The features of observations. Returned by :class:`saccade.Backbone`.
 
     Besides the features it holds what a later call may take from it (``previous``): the pixels and tokens of
@@ -55,6 +56,11 @@ class BackboneFeatures:
     use it at the same time. ``copy.copy`` and ``copy.deepcopy`` return the object itself. It cannot be
     pickled.
     """
+
+    _not_pickled = (
+        "BackboneFeatures cannot be pickled, because they belong to one loaded backbone: pickle the array "
+        "backbone_features"
+    )
 
     def __init__(
         self,
@@ -113,39 +119,12 @@ class BackboneFeatures:
         shown = sum(int(array.nbytes) for array in self._arrays)
         return self._held.nbytes + shown + (0 if self._record is None else self._record.nbytes)
 
-    def __copy__(self) -> BackboneFeatures:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> BackboneFeatures:
-        return self
-
-    def __reduce__(self) -> NoReturn:
-        raise DtypeError(
-            "BackboneFeatures cannot be pickled, because they belong to one loaded backbone: pickle the "
-            "array backbone_features"
-        )
-
     def __repr__(self) -> str:
         views = ", ".join(self._views)
         return (
             f"<saccade.BackboneFeatures batch={self.batch} num_tokens={self.num_tokens} views=[{views}] "
             f"nbytes={self.nbytes}>"
         )
-
-
-def check_backbone_record(record: Any) -> tuple[bool, bool, bool]:
-    """Whether to record hidden rows, patches of views, and tokens of views.
-
-    Raises:
-        InputError: ``record`` contains anything but the names in ``RECORDS``.
-    """
-    try:
-        names = None if isinstance(record, str) else list(record)
-    except TypeError:
-        names = None
-    if names is None or any(not isinstance(name, str) or name not in RECORDS for name in names):
-        raise InputError(f"record: expected a tuple of names among {', '.join(RECORDS)}, got {record!r}")
-    return "hidden" in names, "vision" in names, "image_tokens" in names
 
 
 def made(

@@ -41,7 +41,6 @@ class Chunking:
         It begins with the last 11 actions of the old one, the first 3 of which are executed while it is
         computed:
 
-        >>> import importlib.resources
         >>> import numpy as np, saccade
         >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
         >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))

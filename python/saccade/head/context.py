@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
-
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Array, like_features
-from saccade.errors import DtypeError
+from saccade._internal.handle import Handle
 from saccade.head.trace import Record
 
 
-class Context:
+class Context(Handle):
     """An encoded observation. Returned by :meth:`saccade.ActionHead.encode`.
 
     It contains the keys and values of every cross-attention block. It is immutable: any number of calls and
     threads may use it at the same time. ``copy.copy`` and ``copy.deepcopy`` return the context itself. It
     cannot be pickled.
     """
+
+    _not_pickled = (
+        "a Context cannot be pickled, because it belongs to one loaded head: pickle the backbone features "
+        "and call head.encode again"
+    )
 
     def __init__(self, held: _saccade.Context, use_torch: bool, record: Record | None) -> None:
         self._held = held
@@ -56,18 +59,6 @@ class Context:
         """The ``image_mask`` given to :meth:`saccade.ActionHead.encode`, bool ``(batch, T_vl)``, or None."""
         mask = self._held.image_mask()
         return None if mask is None else like_features(mask, self._torch)
-
-    def __copy__(self) -> Context:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Context:
-        return self
-
-    def __reduce__(self) -> NoReturn:
-        raise DtypeError(
-            "a Context cannot be pickled, because it belongs to one loaded head: pickle the backbone "
-            "features and call head.encode again"
-        )
 
     def __repr__(self) -> str:
         return f"<saccade.Context batch={self.batch} num_vl_tokens={self.num_vl_tokens} nbytes={self.nbytes}>"

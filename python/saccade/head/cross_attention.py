@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, NoReturn, overload
+from typing import Literal, overload
 
 import numpy as np
 
@@ -21,15 +21,21 @@ from saccade._internal.arrays import (
     result,
     text,
 )
+from saccade._internal.handle import Handle
 from saccade.errors import DtypeError, InputError
 
 
-class KeyValues:
+class KeyValues(Handle):
     """Keys and values of :class:`CrossAttention`, computed once. Returned by :meth:`CrossAttention.project`.
 
     Immutable: any number of calls and threads may use them at the same time. ``copy.copy`` and
     ``copy.deepcopy`` return the object itself. It cannot be pickled.
     """
+
+    _not_pickled = (
+        "KeyValues cannot be pickled, because they belong to one CrossAttention: pickle the tokens and call "
+        "project again"
+    )
 
     def __init__(self, held: _saccade.KeyValues, use_torch: bool) -> None:
         self._held = held
@@ -50,20 +56,8 @@ class KeyValues:
         """Size in memory, in bytes."""
         return self._held.nbytes
 
-    def __copy__(self) -> KeyValues:
-        return self
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> KeyValues:
-        return self
-
-    def __reduce__(self) -> NoReturn:
-        raise DtypeError(
-            "KeyValues cannot be pickled, because they belong to one CrossAttention: pickle the tokens and "
-            "call project again"
-        )
-
-
-class CrossAttention:
+class CrossAttention(Handle):
     """Multi-head cross-attention with its projections: ``to_out(softmax(q k^T / sqrt(head_dim)) v)``.
 
     Attention heads are contiguous slices of the width, as in the released head (``Attention`` of diffusers).
@@ -96,6 +90,11 @@ class CrossAttention:
         (2, 5, 64)
     """
 
+    _not_pickled = (
+        "a CrossAttention cannot be pickled, because its weights are packed for this machine: pickle the "
+        "tensors and create it again"
+    )
+
     def __init__(
         self, tensors: Mapping[str, ArrayLike], num_heads: int, *, precision: str = "float32"
     ) -> None:
@@ -110,18 +109,6 @@ class CrossAttention:
             if not np.isfinite(array).all():
                 raise InputError(f"tensors[{name!r}]: expected finite values")
         self._attention = _saccade.CrossAttention(arrays, integer("num_heads", num_heads), precision)
-
-    def __copy__(self) -> CrossAttention:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> CrossAttention:
-        return self
-
-    def __reduce__(self) -> NoReturn:
-        raise DtypeError(
-            "a CrossAttention cannot be pickled, because its weights are packed for this machine: pickle the "
-            "tensors and create it again"
-        )
 
     @property
     def num_heads(self) -> int:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import saccade._saccade as _saccade
@@ -14,8 +11,6 @@ from saccade._internal.arrays import (
     ArrayLike,
     Float32Array,
     apart,
-    as_stored,
-    check_precision,
     float32,
     indices,
     int64,
@@ -23,15 +18,13 @@ from saccade._internal.arrays import (
     is_torch,
     like_features,
     mask_bytes,
-    optional_integers,
     result,
 )
-from saccade._internal.hub import resolve
-from saccade.errors import DtypeError, InputError
+from saccade.errors import InputError
 from saccade.head.chunking import Chunking
-from saccade.head.config import HeadConfig, to_json
 from saccade.head.context import Context
 from saccade.head.intervention import Intervention
+from saccade.head.loading import LoadedHead
 from saccade.head.options import (
     check_integrator,
     noise_or_draw,
@@ -42,7 +35,7 @@ from saccade.head.options import (
 from saccade.head.trace import Record, Trace, check_record
 
 
-class ActionHead:
+class ActionHead(LoadedHead):
     """A loaded action head. Create one with :meth:`from_pretrained` or :meth:`from_tensors`.
 
     A head is immutable: any number of threads may call it at the same time. The result of an observation has
@@ -56,7 +49,6 @@ class ActionHead:
     Example:
         The head of the bundled demo policy, on the features of two observations:
 
-        >>> import importlib.resources
         >>> import numpy as np, saccade
         >>> demo = saccade.demo_checkpoint()
         >>> head = saccade.ActionHead.from_pretrained(demo)
@@ -71,213 +63,6 @@ class ActionHead:
         >>> head.sample(context, state, embodiment_id=0, seed=7, num_samples=4).shape
         (2, 4, 16, 4)
     """
-
-    def __init__(
-        self,
-        head: _saccade.ActionHead,
-        source: str | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> None:
-        self._head = head
-        self._source = source
-        self._options = options
-        self._config = HeadConfig(**head.config())
-
-    @classmethod
-    def from_pretrained(
-        cls,
-        id_or_path: str | os.PathLike[str],
-        *,
-        revision: str | None = None,
-        config: Mapping[str, Any] | str | os.PathLike[str] | None = None,
-        embodiment_ids: Sequence[int] | None = None,
-        action_horizon: int | None = None,
-        num_states: int | None = None,
-        precision: str = "float32",
-        num_threads: int | None = None,
-    ) -> ActionHead:
-        """Loads a head from a checkpoint.
-
-        The tensors of the head have the prefix ``action_head.``, ``_groot_model.action_head.`` or none.
-        Tensors outside the prefix are ignored. Inside it every tensor must be known, present and of the right
-        shape. Tensors that ``saccade quantize`` stored as int8 can be loaded at every precision.
-
-        Args:
-            id_or_path: A directory (``config.json`` and one or more ``.safetensors`` files, with or without
-                an index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache
-                of ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``.
-            revision: A branch, tag or commit of the id. Default: ``main``.
-            config: A dict or the path of a JSON file: the config of a whole checkpoint (with
-                ``action_head_cfg``, or flat as those of N1.6 and N1.7) or of the head alone.
-                Default: the ``config.json`` in the directory of the weights. A config that lerobot wrote does
-                not contain the sizes of the head, so they are read from the shapes of the tensors.
-            embodiment_ids: Load the layers of these embodiments only. Ids keep their numbers. Default: all.
-            action_horizon: Number of actions that the head denoises, in place of the config's
-                ``action_horizon``. At most ``max_positions`` if the head adds positions to the actions. For
-                fine-tunes whose config gives another number than they were trained with. Default: that of the
-                config. The ``config.json`` of a lerobot policy has none, so it is that of the published model
-                that lerobot starts from: 16 for N1.5, 40 for N1.7, whatever ``chunk_size`` is.
-            num_states: Number of states in an observation, for models that were trained with several
-                (``observation_indices`` of the data config of N1 and N1.5, ``delta_indices`` of the states
-                of N1.6). Each has a state row of its own. Default: 1. N1.7 makes one row of
-                ``config.state_history`` states and takes no other number.
-            precision: How the head computes. The residual stream, norms, softmax and all sums of floating
-                point products are float32 at every precision.
-
-                - ``"float32"``: exact up to rounding. Weights stored as bfloat16 stay bfloat16 in memory,
-                  which loses nothing.
-                - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16,
-                  which keeps 8 bits. Takes half the memory of float32 weights, and is faster on a CPU with a
-                  bfloat16 dot product.
-                - ``"int8"``: the attention and feed-forward layers of all blocks multiply 8-bit integers,
-                  with a scale for each output of the weights and one for each row of the inputs. Takes a
-                  quarter of the memory, and is the fastest. Everything else is as in ``"bfloat16"``.
-
-                ``docs/precision.md`` has the measured accuracy of each.
-            num_threads: Number of threads that a call uses. Default: the environment variable
-                ``SACCADE_NUM_THREADS``, else the number of physical cores that the process may use (CPU
-                affinity and container quota included).
-
-        Raises:
-            FileNotFoundError: ``id_or_path`` or the config does not exist.
-            CheckpointError: The config or the weights are damaged or do not fit each other. The message lists
-                every problem.
-            InputError: An option is out of range.
-        """
-        check_precision(precision)
-        path = os.fspath(resolve(id_or_path, revision))
-        config_text = None if config is None else to_json(config)
-        ids = optional_integers("embodiment_ids", embodiment_ids)
-        horizon = optional_integer("action_horizon", action_horizon)
-        states = optional_integer("num_states", num_states)
-        threads = optional_integer("num_threads", num_threads)
-        head = _saccade.ActionHead.load(path, config_text, ids, horizon, states, precision, threads)
-        options = {
-            "config": config_text,
-            "embodiment_ids": ids,
-            "action_horizon": horizon,
-            "num_states": states,
-            "precision": precision,
-            "num_threads": threads,
-        }
-        return cls(head, str(Path(path).absolute()), options)
-
-    @classmethod
-    def from_tensors(
-        cls,
-        tensors: Mapping[str, ArrayLike],
-        *,
-        config: Mapping[str, Any] | str | os.PathLike[str],
-        embodiment_ids: Sequence[int] | None = None,
-        num_states: int | None = None,
-        precision: str = "float32",
-        num_threads: int | None = None,
-    ) -> ActionHead:
-        """Creates a head from tensors in memory.
-
-        The result has the bits of :meth:`from_pretrained` for a file with these tensors. The head
-        keeps no reference to the tensors, so later changes to them have no effect. Tensors are packed one at
-        a time, and of the layers of the embodiments only the requested ones are read. A tensor that is not
-        C-contiguous is copied first. Such a head cannot be pickled, because it has no file to be loaded from.
-
-        Args:
-            tensors: The tensors of the head by their names in a checkpoint, without prefix (the state dict of
-                a released head), as NumPy arrays or torch CPU tensors. float32 and bfloat16 are kept, float16
-                is widened to float32, which is exact. All tensors that the config asks for must be present.
-                Others are refused, except those that only training uses (``task_log_sigma.*``,
-                ``mask_token``) and ``dropout_prob_by_embodiment`` (see the class).
-            config: The config of the head or of a whole checkpoint, as for :meth:`from_pretrained`.
-            embodiment_ids, num_states, precision, num_threads: As for :meth:`from_pretrained`.
-
-        Raises:
-            DtypeError: A tensor has another dtype, or is not on the CPU.
-            ShapeError: Shapes do not fit the config.
-            CheckpointError: Tensors are missing or unknown, or the config is damaged. This message and those
-                of the two errors above list every problem.
-            FileNotFoundError: The config does not exist.
-            InputError: An option is out of range, or a name is not valid Unicode.
-        """
-        check_precision(precision)
-        config_text = to_json(config)
-        ids = optional_integers("embodiment_ids", embodiment_ids)
-        states = optional_integer("num_states", num_states)
-        threads = optional_integer("num_threads", num_threads)
-        held = as_stored(tensors)
-        return cls(_saccade.ActionHead.from_tensors(held, config_text, ids, states, precision, threads))
-
-    @property
-    def config(self) -> HeadConfig:
-        """Sizes and switches of the head."""
-        return self._config
-
-    @property
-    def source(self) -> str | None:
-        """Absolute path of the checkpoint that the head was loaded from; None after :meth:`from_tensors`."""
-        return self._source
-
-    @property
-    def future_tokens(self) -> Float32Array:
-        """A copy of the learned future tokens, ``(num_future_tokens, width)`` float32.
-
-        They are as they enter the first block. To replace them in a call, pass other tokens to
-        :class:`saccade.Intervention` as ``future_tokens``.
-        """
-        return self._head.future_tokens()
-
-    @property
-    def embodiment_ids(self) -> tuple[int, ...]:
-        """The loaded embodiments, in ascending order."""
-        return tuple(self._head.embodiment_ids)
-
-    @property
-    def num_threads(self) -> int:
-        """Number of threads that a call uses."""
-        return self._head.num_threads
-
-    @property
-    def precision(self) -> str:
-        """How the head computes: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
-        return self._head.precision
-
-    @property
-    def isa(self) -> str:
-        """Instruction set of the kernels, one of those that :func:`saccade.show_config` lists."""
-        return self._head.isa
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the weights in memory, in bytes."""
-        return self._head.nbytes
-
-    def warmup(
-        self,
-        num_vl_tokens: int,
-        batch: int = 1,
-        num_samples: int | None = None,
-        future_refresh: int | None = None,
-    ) -> None:
-        """Allocates and touches all memory that calls of this size need, so that the first call is not slow.
-
-        Values that depend on time alone are computed for the Euler steps of the config. Another
-        ``num_steps``, or ``integrator="midpoint"``, evaluates the velocity at other times. Make one call with
-        these options as well.
-
-        Args:
-            num_vl_tokens: T_vl of the calls.
-            batch: Number of observations of the calls.
-            num_samples: ``num_samples`` of the calls.
-            future_refresh: ``future_refresh`` of the calls.
-
-        Raises:
-            InputError: A size is not an integer of at least 1.
-            MemoryError: There is not enough memory.
-        """
-        self._head.warmup(
-            integer("num_vl_tokens", num_vl_tokens),
-            integer("batch", batch),
-            optional_integer("num_samples", num_samples),
-            optional_integer("future_refresh", future_refresh),
-        )
 
     def encode(
         self,
@@ -315,7 +100,7 @@ class ActionHead:
         """
         use_torch = is_torch(backbone_features)
         attention, hidden = check_record(record)
-        held, recorded = self._head.encode(
+        held, recorded = self._engine.encode(
             float32("backbone_features", backbone_features),
             mask_bytes("attention_mask", attention_mask),
             mask_bytes("image_mask", image_mask),
@@ -389,11 +174,11 @@ class ActionHead:
         """
         held = _held(context)
         samples = optional_integer("num_samples", num_samples)
-        config = self._config
+        config = self.config
         leading = (held.batch,) if samples is None else (held.batch, samples)
         output = result((*leading, config.action_horizon, config.action_dim), out)
         start = noise_or_draw(noise, seed, (*leading, config.action_horizon, config.encoder_action_dim))
-        self._head.sample(
+        self._engine.sample(
             held,
             apart(float32("state", state), output),
             int64("embodiment_id", embodiment_id),
@@ -478,8 +263,8 @@ class ActionHead:
             MemoryError: There is not enough memory.
         """
         held = _held(context)
-        output = result((held.batch, self._config.action_horizon, self._config.action_dim), None)
-        self._head.velocity(
+        output = result((held.batch, self.config.action_horizon, self.config.action_dim), None)
+        self._engine.velocity(
             held,
             float32("state", state),
             int64("embodiment_id", embodiment_id),
@@ -531,8 +316,7 @@ class ActionHead:
         Example:
             What the future rows attend to in the first block, averaged over attention heads:
 
-            >>> import importlib.resources
-            >>> import numpy as np, saccade
+                >>> import numpy as np, saccade
             >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
             >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
             >>> state = np.zeros((1, head.config.state_dim), np.float32)
@@ -542,10 +326,10 @@ class ActionHead:
             True
         """
         held = _held(context)
-        config = self._config
+        config = self.config
         start = noise_or_draw(noise, seed, (held.batch, config.action_horizon, config.encoder_action_dim))
         attention, hidden = check_record(record)
-        (probabilities, kept_rows), rows, actions = self._head.trace(
+        (probabilities, kept_rows), rows, actions = self._engine.trace(
             held,
             float32("state", state),
             int64("embodiment_id", embodiment_id),
@@ -564,28 +348,6 @@ class ActionHead:
             rows={group: slice(*span) for group, span in rows.items()},
             actions=like_features(actions, context._torch),
         )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        if self._source is None:
-            raise DtypeError(
-                "a head made by ActionHead.from_tensors cannot be pickled or copied, because it has no file "
-                "to be loaded from: write its tensors to a checkpoint and use ActionHead.from_pretrained"
-            )
-        return _load, (self._source, self._options)
-
-    def __repr__(self) -> str:
-        config = self._config
-        return (
-            f"<saccade.ActionHead {config.version} width={config.width} num_layers={config.num_layers} "
-            f"num_future_tokens={config.num_future_tokens} precision={self.precision} isa={self.isa} "
-            f"num_threads={self.num_threads}>"
-        )
-
-
-def _load(source: str, options: dict[str, Any]) -> ActionHead:
-    """Unpickles a head by loading its checkpoint again."""
-    config, rest = options["config"], {name: value for name, value in options.items() if name != "config"}
-    return ActionHead.from_pretrained(source, config=None if config is None else json.loads(config), **rest)
 
 
 def _held(context: Context) -> _saccade.Context:

@@ -33,7 +33,6 @@ class Trace(Generic[ArrayT]):
         actions: The sampled actions, ``(batch, action_horizon, action_dim)``.
 
     Example:
-        >>> import importlib.resources
         >>> import numpy as np, saccade
         >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
         >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
@@ -95,19 +94,19 @@ class Record:
         return "\n".join(lines) + ">"
 
 
-def check_record(record: Any) -> tuple[bool, bool]:
-    """Whether to record attention, and whether to record hidden rows.
+def check_record(record: Any, known: tuple[str, ...] = RECORDS) -> list[bool]:
+    """Whether to record each of the known names.
 
     Raises:
-        InputError: ``record`` contains anything but the names ``"attention"`` and ``"hidden"``.
+        InputError: ``record`` contains anything else.
     """
     try:
         names = None if isinstance(record, str) else list(record)
     except TypeError:
         names = None
-    if names is None or any(not isinstance(name, str) or name not in RECORDS for name in names):
-        raise InputError(f"record: expected a tuple of names among {', '.join(RECORDS)}, got {record!r}")
-    return "attention" in names, "hidden" in names
+    if names is None or any(not isinstance(name, str) or name not in known for name in names):
+        raise InputError(f"record: expected a tuple of names among {', '.join(known)}, got {record!r}")
+    return [name in names for name in known]
 
 
 def _nbytes(*recorded: Mapping[Any, Any]) -> int:

@@ -1,0 +1,167 @@
+"""Downloads files of published repositories with ``huggingface_hub``, the extra ``hub``."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from saccade._internal.extras import SACCADE
+from saccade._internal.hub_files import missing_files, wanted
+
+#: Seconds until the Hub must answer which files a repository has.
+TIMEOUT = 10.0
+#: Answers that mean that the Hub does not work at present, in place of an answer about the repository.
+OVERLOADED = 429
+SERVER_ERROR = 500
+DENIED = (401, 403)
+
+
+class Offline(Exception):
+    """The Hub cannot be asked.
+
+    Attributes:
+        reason: Why, as a clause.
+        remedy: What to do about it, a sentence or empty.
+        is_unexpected: Whether the connection failed, rather than being switched off or not installed.
+    """
+
+    def __init__(self, reason: str, remedy: str = "", is_unexpected: bool = False) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.remedy = remedy
+        self.is_unexpected = is_unexpected
+
+
+def list_files(name: str, revision: str, argument: str) -> tuple[str, list[str]]:
+    """The commit that a revision is now, and the names of all of its files in ascending order.
+
+    Args:
+        name: An id.
+        revision: A branch, tag or commit.
+        argument: Name of the argument, for messages.
+
+    Raises:
+        Offline: The Hub cannot be asked.
+        FileNotFoundError: There is no such repository or revision.
+        PermissionError: Access is denied.
+    """
+    if importlib.util.find_spec("huggingface_hub") is None:
+        install = SACCADE.install_command(["hub"], ["huggingface_hub"])
+        raise Offline(
+            "huggingface_hub, which downloads published checkpoints, is not installed",
+            f"Install it with: {install}. ",
+        )
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import OfflineModeIsEnabled
+
+    try:
+        api = HfApi(library_name="saccade")
+        found = api.model_info(name, revision=revision, timeout=TIMEOUT)
+        names = [file.rfilename for file in found.siblings or ()]
+        commit = str(found.sha)
+        return commit, sorted(names or api.list_repo_files(name, revision=commit))
+    except OfflineModeIsEnabled:
+        raise Offline("HF_HUB_OFFLINE is set", "Unset it. ") from None
+    except _errors() as error:
+        refused = _refusal(error, name, revision, argument)
+        if refused is not None:
+            raise refused from error
+        raise Offline(f"the Hub cannot be reached ({_line(error)})", is_unexpected=True) from error
+
+
+def download(name: str, commit: str, files: tuple[str, ...], listed: list[str], argument: str) -> Path:
+    """Downloads the files of a commit that match ``files`` and are not in the cache yet.
+
+    Args:
+        name: An id.
+        commit: The commit.
+        files: Patterns of the files that are needed.
+        listed: The names of all files of the commit.
+        argument: Name of the argument, for messages.
+
+    Returns:
+        The directory of the commit in the cache.
+
+    Raises:
+        FileNotFoundError: The download stopped before its end.
+        PermissionError: Access is denied.
+        OSError: A file cannot be written.
+    """
+    from huggingface_hub import snapshot_download
+
+    # Names as patterns: in brackets, the characters of patterns stand for themselves.
+    names = ["".join(f"[{c}]" if c in "*?[" else c for c in one) for one in wanted(files, listed)]
+    stopped = (
+        f"{argument}: {name}: the download stopped ({{}}). Call again to continue it: finished files are kept"
+    )
+    try:
+        folder = snapshot_download(name, revision=commit, allow_patterns=names, library_name="saccade")
+    except _errors() as error:
+        refused = _refusal(error, name, commit, argument)
+        if refused is not None:
+            raise refused from error
+        if isinstance(error, OSError) and error.errno is not None and not isinstance(error, ConnectionError):
+            raise  # a full disk, or a cache that cannot be written
+        raise FileNotFoundError(stopped.format(_line(error))) from error
+    missing = missing_files(Path(folder), files, listed)  # it returns what it has if the connection fails
+    if missing:
+        raise FileNotFoundError(stopped.format(f"it lacks {', '.join(missing)}"))
+    return Path(folder)
+
+
+def _errors() -> tuple[type[BaseException], ...]:
+    """What ``huggingface_hub`` raises: its 1.x uses httpx, whose errors are not OSErrors, before requests."""
+    from huggingface_hub.errors import HfHubHTTPError
+
+    if importlib.util.find_spec("httpx") is None:
+        return OSError, HfHubHTTPError
+    from httpx import TransportError
+
+    return OSError, HfHubHTTPError, TransportError
+
+
+def _refusal(error: BaseException | None, name: str, revision: str, argument: str) -> OSError | None:
+    """The error for an answer about the repository; None if the Hub gave no such answer."""
+    from huggingface_hub.errors import (
+        GatedRepoError,
+        HfHubHTTPError,
+        RepositoryNotFoundError,
+        RevisionNotFoundError,
+    )
+
+    what = f"{argument}: {name}"
+    if error is None:
+        return None
+    if isinstance(error, RevisionNotFoundError):
+        return FileNotFoundError(f"{what}: the repository has no revision {revision}")
+    if isinstance(error, GatedRepoError):
+        return PermissionError(
+            f"{what}: the Hub denies access: accept the conditions on the page of the repository, then log "
+            "in with: hf auth login"
+        )
+    if isinstance(error, RepositoryNotFoundError):
+        return FileNotFoundError(
+            f"{what}: no such path{neighbour(name)}, and no such repository on the Hub, unless it is "
+            "private: then log in with: hf auth login"
+        )
+    response = getattr(error, "response", None)
+    if isinstance(error, HfHubHTTPError) and response is not None:
+        status = response.status_code
+        if status in DENIED:
+            return PermissionError(f"{what}: the Hub denies access ({_line(error)})")
+        if status < SERVER_ERROR and status != OVERLOADED:
+            return FileNotFoundError(f"{what}: the Hub refuses the request ({_line(error)})")
+        return None
+    return _refusal(error.__cause__, name, revision, argument)
+
+
+def neighbour(name: str) -> str:
+    """What to say if a folder has the name of the owner: the id may be a mistyped path."""
+    owner, _, model = name.partition("/")
+    return f" (there is a folder {owner}, without {model} in it)" if Path(owner).is_dir() else ""
+
+
+def _line(error: BaseException) -> str:
+    """The first line of an error's message."""
+    text = str(error.__cause__ or error).strip() or type(error).__name__
+    return text.splitlines()[0]
