@@ -22,7 +22,7 @@ PACKAGES = {
         ("diffusers", "lerobot", "lerobot_policy_saccade", "safetensors", "scipy", "torch", "transformers"),
         "torch",
     ),
-    **dict.fromkeys(("griffe", "msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
+    **dict.fromkeys(("griffe", "huggingface_hub", "msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
     **dict.fromkeys(("saccade.integrations", "saccade.torch", "saccade_lab.reference"), "torch"),
     **dict.fromkeys(("benches", "studies", "why_32", "saccade_lab"), "lab"),
     **dict.fromkeys(("gymnasium", "imageio", "joblib", "jinja2", "matplotlib", "mujoco", "pandas"), "lab"),
@@ -32,6 +32,7 @@ PACKAGES = {
 FOLDERS = {
     **dict.fromkeys(("docs/", "lab/sim/", "lab/parallel/", "package/test_imports.py"), "lab"),
     **dict.fromkeys(("backbone/test_backbone_calls.py", "head/test_memory.py", "lab/"), "torch"),
+    "checkpoints/test_hub_download.py": "torch",
 }
 
 
