@@ -70,11 +70,6 @@ class Loaded(Generic[EngineT, ConfigT]):
         return cls(engine, location, options)
 
     @property
-    def config(self) -> ConfigT:
-        """Sizes and switches."""
-        return self._config
-
-    @property
     def source(self) -> str | None:
         """Absolute path of the checkpoint that it was loaded from; None after :meth:`from_tensors`."""
         return None if self._location is None else str(self._location.path.absolute())

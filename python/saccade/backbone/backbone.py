@@ -129,6 +129,11 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
         held = as_stored(tensors)
         return cls(_saccade.Backbone.from_tensors(held, config_text, precision, threads))
 
+    @property
+    def config(self) -> BackboneConfig:
+        """Sizes and switches of the backbone."""
+        return self._config
+
     def __call__(
         self,
         inputs: BackboneInputs,

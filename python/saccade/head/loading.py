@@ -151,6 +151,11 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
         return cls(engine)
 
     @property
+    def config(self) -> HeadConfig:
+        """Sizes and switches of the head."""
+        return self._config
+
+    @property
     def future_tokens(self) -> Float32Array:
         """A copy of the learned future tokens, ``(num_future_tokens, width)`` float32.
 
