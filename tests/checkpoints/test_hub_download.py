@@ -95,6 +95,13 @@ def test_a_head_is_loaded_by_its_id_and_pickled_with_its_commit(
     assert config == str(saccade.ActionHead.from_pretrained(folder, embodiment_ids=[24]).config)
 
 
+def test_statistics_need_no_weights(hub: Hub, tmp_path: Path) -> None:
+    load = f"import saccade\nprint(saccade.Normalizer.from_pretrained({NAME!r}, 'gr1'))"
+    result = run(load, hub.endpoint, tmp_path)
+    assert "gr1" in result.stdout, result.stderr
+    assert not [name for name in hub.downloaded() if name.startswith("model")]
+
+
 def test_revisions(hub: Hub, files: dict[str, bytes], tmp_path: Path) -> None:
     first = hub.repositories[NAME].branches["main"]
     second = hub.repositories[NAME].commit(files | {"statistics.json": b"{}"}, "pr/2")

@@ -12,6 +12,7 @@ import numpy as np
 
 from saccade._internal.arrays import integer
 from saccade._internal.hub import resolve
+from saccade._internal.hub_files import STATISTICS
 from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.building import Builder, Dims, Options, finished, size_of
@@ -41,7 +42,7 @@ def read(
         FileNotFoundError, CheckpointError, InputError: As there.
     """
     if not isinstance(id_or_path, Mapping):
-        where = str(resolve(id_or_path, revision))
+        where = str(resolve(id_or_path, revision, files=STATISTICS))
     elif revision is None:
         where = "id_or_path"
     else:
