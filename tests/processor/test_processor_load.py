@@ -23,9 +23,12 @@ NOISE = np.random.default_rng(0).integers(0, 256, (90, 120, 3), np.uint8)
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache in place of the user's."""
+    """An empty cache in place of the user's; huggingface_hub reads its place when it is imported."""
     folder = tmp_path / "hub"
     monkeypatch.setenv("HF_HUB_CACHE", str(folder))
+    constants = sys.modules.get("huggingface_hub.constants")
+    if constants is not None:
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(folder))
     return folder
 
 
