@@ -164,7 +164,7 @@ def test_velocity(error: type[Exception], message: str, options: dict[str, Any])
         ("embodiment_ids: .*got -1", {"embodiment_ids": [-1]}),
         ("embodiment_ids: expected at least one", {"embodiment_ids": np.zeros(0, int)}),
         ("embodiment_ids: expected an integer", {"embodiment_ids": ["gr1"]}),
-        ("id_or_path: expected a path, got int", {"id_or_path": 3}),
+        ("id_or_path: expected a path or an id, got int", {"id_or_path": 3}),
         ("id_or_path: .*null characters", {"id_or_path": "a\0b"}),
     ],
 )
