@@ -1,7 +1,8 @@
-"""saccade runs GR00T-style robot policies on CPUs: camera frames and an instruction in, actions out.
+"""saccade runs GR00T robot policies on CPUs: camera images and an instruction in, actions out.
 
-The public names are those of ``__all__`` and the submodules below it. All but :func:`accelerate` and
-:mod:`saccade.torch`, which work on torch's policies, need NumPy only.
+Public are the names of ``__all__``, the submodules in ``_SUBMODULES``, and what each of them lists. All needs
+NumPy only, but :func:`accelerate` and :mod:`saccade.torch`, which work on torch's policies, and
+:mod:`saccade.serve`.
 """
 
 from __future__ import annotations

@@ -24,36 +24,26 @@ class UsageError(Exception):
     """Arguments that a command cannot follow; printed as one line, without a traceback."""
 
 
-class StoreNumber(argparse.Action):
-    """Stores a number and refuses one outside `minimum <= number < below`.
+def number_in(
+    flag: str, kind: type[int] | type[float], minimum: float, below: float = math.inf
+) -> Callable[[str], float]:
+    """A reader of numbers for argparse that refuses those outside ``minimum <= number < below``.
 
-    Raises:
-        UsageError: When the argument is parsed; names the flag, the number given and the range.
+    It raises :class:`UsageError` when the argument is parsed, with the flag, the number and the range.
     """
 
-    def __init__(
-        self, *args: Any, minimum: float = -math.inf, below: float = math.inf, **kwargs: Any
-    ) -> None:
-        super().__init__(*args, **kwargs)
-        self.minimum, self.below = minimum, below
+    def read(word: str) -> float:
+        number = kind(word)
+        if minimum <= number < below:  # never if it is NaN
+            return number
+        if below < math.inf:
+            expected = f"{minimum:g} to below {below:g}"
+        else:
+            expected = "a finite number" if number == math.inf else f"at least {minimum:g}"
+        raise UsageError(f"{flag}: given {number}, expected {expected}")
 
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        """See argparse."""
-        if not self.minimum <= values < self.below:  # not so either if it is NaN
-            if self.below < math.inf:
-                expected = f"{self.minimum:g} to below {self.below:g}"
-            elif values == math.inf:
-                expected = "a finite number"
-            else:
-                expected = f"at least {self.minimum:g}"
-            raise UsageError(f"{option_string}: given {values}, expected {expected}")
-        setattr(namespace, self.dest, values)
+    read.__name__ = kind.__name__  # for argparse's own message on a word that is no number
+    return read
 
 
 class StoreList(argparse.Action):
@@ -119,9 +109,7 @@ def add_integer(
     """Declares a whole number of at least `minimum`; the help text ends with the default, if there is one."""
     parser.add_argument(
         flag,
-        type=int,
-        action=StoreNumber,
-        minimum=minimum,
+        type=number_in(flag, int, minimum),
         default=default,
         required=required,
         metavar="N",
@@ -141,10 +129,7 @@ def add_number(
     """Declares a number with `minimum <= number < below`; the help text ends with the default, if any."""
     parser.add_argument(
         flag,
-        type=float,
-        action=StoreNumber,
-        minimum=minimum,
-        below=below,
+        type=number_in(flag, float, minimum, below),
         default=default,
         metavar="X",
         help=help if default is None else f"{help} (default: {default:g})",

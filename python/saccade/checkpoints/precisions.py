@@ -141,7 +141,7 @@ def check_precisions(
 
     Example:
         >>> from pathlib import Path
-        >>> from saccade.checkpoints.precisions import check_precisions
+        >>> from saccade.checkpoints import check_precisions
         >>> def best(checkpoint: str) -> str:
         ...     return check_precisions(checkpoint, Path("frames"), instruction="open the drawer").recommended
     """

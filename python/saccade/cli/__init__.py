@@ -163,7 +163,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """
     parser = Parser(
         prog="saccade",
-        description="Run GR00T-style robot policies on CPUs.",
+        description="Run GR00T-style robot policies on CPUs: act, serve, inspect and convert checkpoints.",
         epilog=EPILOG,
     )
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")

@@ -173,9 +173,13 @@ def timed(heads: dict[str, ActionHead], call: Call, machine: Machine, rounds: in
     calls: dict[tuple[str, str], Callable[[], Any]] = {}
     counted: dict[tuple[str, str], tuple[int, float]] = {}
     for precision, head in heads.items():
-        for name, work in works_of(head, call).items():
-            calls[precision, name] = work
-            counted[precision, name] = work_and_floor(profiled(work)[1], precision, machine)
+        works = works_of(head, call)
+        calls |= {(precision, name): work for name, work in works.items()}
+        (macs, least), (more_macs, more) = (
+            work_and_floor(profiled(works[name])[1], precision, machine) for name in ("encode", "sample")
+        )
+        counted[precision, "encode"], counted[precision, "sample"] = (macs, least), (more_macs, more)
+        counted[precision, "both"] = macs + more_macs, least + more
     seconds = by_turns(calls, rounds, lambda done: note(f"round {done} of {rounds}"))
     records = []
     for (precision, name), values in seconds.items():
