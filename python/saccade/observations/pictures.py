@@ -28,7 +28,7 @@ STATE = "state.json"
 LARGEST = float(np.finfo(np.float32).max)
 
 
-class Robot(Protocol):
+class ObservingPolicy(Protocol):
     """What is needed of a :class:`saccade.Policy`: its robot's requirements and statistics."""
 
     @property
@@ -67,7 +67,7 @@ class PictureObservation:
 
 
 def read_frames(
-    directory: Path, policy: Robot, *, instruction: str | None = None, state: Path | None = None
+    directory: Path, policy: ObservingPolicy, *, instruction: str | None = None, state: Path | None = None
 ) -> list[PictureObservation]:
     """The observations of a directory, in the order of their names (2 before 10).
 
@@ -135,7 +135,7 @@ def read_frames(
     return found
 
 
-def observation_folders(directory: Path, policy: Robot) -> list[Path]:
+def observation_folders(directory: Path, policy: ObservingPolicy) -> list[Path]:
     """The folders of a directory that are observations, see :func:`read_frames`.
 
     Raises:
@@ -143,14 +143,13 @@ def observation_folders(directory: Path, policy: Robot) -> list[Path]:
     """
 
     def below(folder: Path, levels: int) -> list[Path]:
-        has_pictures = bool(pictures_of(folder))
-        inside = folders_of(folder)
-        if has_pictures and inside:
+        pictures, inside = contents_of(folder)
+        if pictures and inside:
             raise InputError(
                 f"{folder}: expected pictures or folders of pictures, got pictures and the folder "
                 f"{inside[0].name}"
             )
-        if has_pictures:
+        if pictures:
             return [folder]
         if not inside or not levels:
             raise InputError(
@@ -162,13 +161,13 @@ def observation_folders(directory: Path, policy: Robot) -> list[Path]:
     return below(directory, 2)
 
 
-def pictures_in(folder: Path, policy: Robot) -> dict[str, Path]:
+def pictures_in(folder: Path, policy: ObservingPolicy) -> dict[str, Path]:
     """The picture of each camera in a folder, in the order of the prompt.
 
     Raises:
         InputError: A picture is missing, or of no camera, or a camera has two.
     """
-    given = pictures_of(folder)
+    given, _ = contents_of(folder)
     by_name: dict[str, Path] = {}
     for path in given:
         if path.stem in by_name:
@@ -187,29 +186,18 @@ def pictures_in(folder: Path, policy: Robot) -> dict[str, Path]:
     return {name: by_name[name] for name in names}
 
 
-def example_names(policy: Robot) -> str:
+def example_names(policy: ObservingPolicy) -> str:
     """Possible names of the pictures of an observation, for messages."""
     cameras = policy.requirements.cameras
     names = ["front"] if cameras is None else [camera.name for camera in cameras]
     return ", ".join(f"{name}.png" for name in names)
 
 
-def pictures_of(folder: Path) -> list[Path]:
-    """The files of a folder that are taken for pictures, by name."""
-    return [
-        path
-        for path in sorted(folder.iterdir(), key=by_number)
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
-    ]
-
-
-def folders_of(folder: Path) -> list[Path]:
-    """The folders in a folder, by name."""
-    return [
-        path
-        for path in sorted(folder.iterdir(), key=by_number)
-        if not path.name.startswith(".") and path.is_dir()
-    ]
+def contents_of(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The pictures and the folders in a folder, by name. Hidden and other files are left out."""
+    shown = [path for path in sorted(folder.iterdir(), key=by_number) if not path.name.startswith(".")]
+    pictures = [path for path in shown if path.suffix.lower() in SUFFIXES and path.is_file()]
+    return pictures, [path for path in shown if path.is_dir()]
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:
@@ -224,7 +212,7 @@ def by_number(path: Path) -> list[tuple[int, str]]:
 
 
 def observation(
-    policy: Robot, pictures: Mapping[str, Path], instruction: str | None, state: Any
+    policy: ObservingPolicy, pictures: Mapping[str, Path], instruction: str | None, state: Any
 ) -> dict[str, Any]:
     """An observation in Isaac-GR00T's nested format, with a batch of one.
 
