@@ -188,14 +188,7 @@ class Policy:
             action_horizon=action_horizon,
             processor_options=processor_options,
         )
-        return cls(
-            parts.head,
-            parts.normalizer,
-            parts.embodiment,
-            backbone=parts.backbone,
-            processor=parts.processor,
-            requirements=parts.requirements,
-        )
+        return cls(**vars(parts))
 
     def act(
         self,

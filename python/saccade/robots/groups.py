@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -80,6 +80,11 @@ class Group:
         if self.conversion is not None:
             return rotations.SIZES[self.conversion.head]
         return 2 * self.size if self.mode == "sin_cos" else self.size
+
+    def indexed(self, index: Any, **changes: Any) -> Group:
+        """The group with a part of its statistics, if it has any, and with other changes."""
+        names = ("first", "second", "moving") if self.first is not None else ()
+        return replace(self, **{name: getattr(self, name)[index] for name in names}, **changes)
 
     def to_head(self, values: Float32Array) -> Float32Array:
         """Converts ``(..., size)`` in the robot's units to normalised ``(..., width)``.

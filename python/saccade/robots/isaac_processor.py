@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -372,9 +372,7 @@ def single_row(group: Group) -> Group:
     """A group whose statistics of one step are those of every step."""
     if group.first is None or group.first.ndim == 1 or len(group.first) > 1:
         return group
-    assert group.second is not None
-    assert group.moving is not None
-    return replace(group, first=group.first[0], second=group.second[0], moving=group.moving[0])
+    return group.indexed(0)
 
 
 def _bounds(statistics: Any, uses_quantiles: bool) -> Any:

@@ -7,7 +7,6 @@ the same statistics (``isclose``, means, sines) do not apply here.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -260,21 +259,8 @@ def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group
             builder.problems.append(
                 f"action.{group.key}: cut to {size} of {group.size} numbers (env_action_dim)"
             )
-        elif size > 0 and group.mode == "none":
-            found.append(replace(group, size=size))
         elif size > 0:
-            assert group.first is not None
-            assert group.second is not None
-            assert group.moving is not None
-            found.append(
-                replace(
-                    group,
-                    size=size,
-                    first=group.first[..., :size],
-                    second=group.second[..., :size],
-                    moving=group.moving[..., :size],
-                )
-            )
+            found.append(group.indexed((..., slice(size)), size=size))
     return tuple(found)
 
 
