@@ -1,11 +1,10 @@
-"""Camera frames and an instruction to the inputs of a backbone, as the released processors prepare them."""
+"""The processor: camera frames and an instruction in, the inputs of a backbone out."""
 
 from __future__ import annotations
 
 import json
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -13,9 +12,7 @@ import numpy.typing as npt
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import ArrayLike, Float32Array, frame, int64, integer, text
-from saccade._internal.hub import locate_published, resolve
-from saccade._internal.hub_files import PROCESSOR, TOKENIZER
-from saccade._internal.warning import warn
+from saccade._internal.tokenizers import given_tokenizer, processor_source, tokenizer_of
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError, ShapeError
 
@@ -36,14 +33,14 @@ class Processor:
     Args:
         version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
         tokenizer: A ``tokenizer.json``; a directory with one, or with ``vocab.json`` and ``merges.txt``; or
-            the id of a published repository in the local Hugging Face cache.
-        preprocessing: Whose frames and words the checkpoint was trained on. ``"lerobot"``: views sorted by
-            name, no crop. ``"isaac"`` (Isaac-GR00T): views in the order given, a centre crop of 95 %.
+            the id of a published repository with one.
+        preprocessing: The program that the checkpoint was trained with. ``"lerobot"``: views sorted by name,
+            no crop. ``"isaac"`` (Isaac-GR00T): views in the order given, a centre crop of 95 %.
             Default: lerobot's for N1.5, Isaac-GR00T's for N1.6 and N1.7.
         image_size: N1.5: height and width of a view. Default: 224.
         tokens_per_view: N1.5: image tokens of a view. Default: ``(image_size / 14) ** 2``.
-        plain_text: N1.5: the instruction stands in the prompt as it is. Otherwise it stands there as Python
-            prints a list of it, ``['open the drawer']``, as in both released processors.
+        plain_text: N1.5: insert the instruction into the prompt verbatim. Otherwise it is formatted as a
+            Python list, ``['open the drawer']``, as in both released processors.
         options: Keys of the released ``processor_config.json`` and ``preprocessor_config.json``, such as
             ``shortest_image_edge``, ``crop_fraction``, ``min_pixels`` or ``formalize_language``. If
             ``use_albumentations`` is among them, they are read as a released file: a key that is missing has
@@ -54,7 +51,8 @@ class Processor:
             another one that is null or missing.
         CheckpointError: The tokenizer is broken, or of another kind than the version's. The message lists
             every problem.
-        FileNotFoundError: There is no such tokenizer.
+        FileNotFoundError: The tokenizer does not exist, or cannot be downloaded.
+        PermissionError: The Hub denies access to the id.
 
     Example:
         >>> import numpy as np, saccade
@@ -79,7 +77,7 @@ class Processor:
             raise InputError(f"plain_text: expected True or False, got {plain_text!r}")
         self._processor = _saccade.Processor(
             text("version", version),
-            _tokenizer(tokenizer),
+            given_tokenizer(tokenizer),
             None if preprocessing is None else text("preprocessing", preprocessing),
             None if image_size is None else integer("image_size", image_size),
             None if tokens_per_view is None else integer("tokens_per_view", tokens_per_view),
@@ -104,33 +102,35 @@ class Processor:
         ``policy_preprocessor.json``. A checkpoint that holds only a backbone will do.
 
         Args:
-            id_or_path: A path, or the id of a published checkpoint in the local Hugging Face cache.
+            id_or_path: A path or the id of a published checkpoint, as for
+                :meth:`saccade.ActionHead.from_pretrained`.
             revision: A branch, tag or commit of the id. Default: ``main``.
-            preprocessing: Whose frames and words. Default: lerobot's for a checkpoint that lerobot wrote, and
-                else Isaac-GR00T's.
-            tokenizer: A ``tokenizer.json``, a directory, or a published id in the local cache. Default: the
-                checkpoint's own, or that of the released processor in the local cache.
-            options: Options that take the place of the checkpoint's, one by one, such as
-                ``{"letter_box_transform": True}``: some files do not say what was trained.
+            preprocessing: The program that the checkpoint was trained with. Default: lerobot for a
+                checkpoint that lerobot wrote, otherwise Isaac-GR00T.
+            tokenizer: A ``tokenizer.json``, a directory, or the id of a published tokenizer. Default: the
+                checkpoint's own, otherwise the published tokenizer of its release.
+            options: Options that replace those of the checkpoint, such as ``{"letter_box_transform": True}``,
+                because some files do not contain the options of the training.
 
         Raises:
             InputError: An argument has the wrong type or an unknown value. An option is unknown to its
                 release or does not fit the others, or one that is given concerns states or actions.
             CheckpointError: The checkpoint or tokenizer is broken or of another kind, or its files have a
                 step that is not known.
-            FileNotFoundError: There is no such checkpoint, or no tokenizer. The message says which files of
-                which published id are needed.
+            FileNotFoundError: The checkpoint or the tokenizer does not exist, or cannot be downloaded. The
+                message names the files and ids that are needed.
+            PermissionError: The Hub denies access to an id.
 
         Example:
             >>> import saccade
             >>> saccade.Processor.from_pretrained("n1.5-backbone.safetensors", tokenizer="tokenizer.json")
             <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
         """
-        held = _source(id_or_path, revision)
+        held = processor_source(id_or_path, revision)
         chosen = None if preprocessing is None else text("preprocessing", preprocessing)
         processor = cls.__new__(cls)
         replaced = None if options is None else _to_json(options)
-        processor._processor = _saccade.Processor.load(held, _tokenizer_of(held, tokenizer), chosen, replaced)
+        processor._processor = _saccade.Processor.load(held, tokenizer_of(held, tokenizer), chosen, replaced)
         return processor
 
     @property
@@ -140,7 +140,7 @@ class Processor:
 
     @property
     def preprocessing(self) -> str:
-        """Whose frames and words it prepares: ``"lerobot"`` or ``"isaac"``."""
+        """The program whose preprocessing it follows: ``"lerobot"`` or ``"isaac"``."""
         return self._processor.preprocessing
 
     @property
@@ -170,14 +170,14 @@ class Processor:
                 lerobot's preprocessing it may also be ``(3, height, width)``, and floating point from 0 to 1:
                 values beyond that are clamped, as lerobot does. A batch is a list of observations with the
                 same views; its prompts are padded on the left.
-            instruction: What the robot is to do. For a batch: a list with one instruction for each
-                observation. None, and with lerobot's preprocessing an empty text: the released default.
+            instruction: The task. For a batch, a list with one instruction for each observation. None, and
+                with lerobot's preprocessing an empty text, selects the released default.
             view_names: Names of the views of a sequence.
-            plain_text: N1.5: the instruction stands in the prompt as it is, also if this processor renders
-                instructions as lists.
+            plain_text: N1.5: insert the instruction verbatim, even if the processor formats instructions as
+                lists.
 
         Raises:
-            ShapeError, DtypeError: A frame is none. The message names it.
+            ShapeError, DtypeError: A frame has the wrong shape or dtype. The message names it.
             InputError: There are no frames, the observations of a batch differ in their views, or an
                 instruction is too long, contains a token that stands for an image, or a placeholder such as
                 ``<image-2>``, which the released N1.5 would replace by another copy of a frame.
@@ -198,9 +198,9 @@ class Processor:
                 (
                     _views(observation, names),
                     not isinstance(observation, Mapping),
-                    None if told is None else text("instruction", told),
+                    None if task is None else text("instruction", task),
                 )
-                for observation, told in zip(observations, instructions, strict=True)
+                for observation, task in zip(observations, instructions, strict=True)
             ],
             bool(plain_text),
         )
@@ -250,8 +250,8 @@ class Processor:
             ids: ``(tokens,)`` integers.
 
         Raises:
-            ShapeError: They are not a row.
-            InputError: They are not integers, or one is no token's.
+            ShapeError: ``ids`` does not have one axis.
+            InputError: They are not integers, or an id is not that of a token.
 
         Example:
             >>> import saccade
@@ -277,63 +277,6 @@ class Processor:
 
 
 _text = text  # in a method with an argument of that name
-
-
-def tokenizer_path(
-    id_or_path: str | os.PathLike[str], tokenizer: str | os.PathLike[str] | None = None
-) -> Path | None:
-    """Where :meth:`Processor.from_pretrained` finds the tokenizer, if that is outside the checkpoint.
-
-    Args:
-        id_or_path, tokenizer: As in :meth:`Processor.from_pretrained`, which lists the errors.
-
-    Returns:
-        A file or a directory. None if the checkpoint has a tokenizer and no other is requested.
-    """
-    found = _tokenizer_of(_source(id_or_path, None), tokenizer)
-    return None if found is None else Path(found)
-
-
-def _source(id_or_path: str | os.PathLike[str], revision: str | None) -> _saccade.ProcessorSource:
-    return _saccade.ProcessorSource(os.fspath(resolve(id_or_path, revision, files=PROCESSOR)))
-
-
-def _tokenizer_of(source: _saccade.ProcessorSource, given: Any) -> str | None:
-    """The path of the tokenizer to read instead of the checkpoint's own; None for that one."""
-    if given is not None:
-        return _tokenizer(given)
-    return None if source.has_tokenizer else _published_tokenizer(source)
-
-
-def _tokenizer(given: Any) -> str:
-    """The path of a tokenizer that is given as a path or as an id."""
-    return os.fspath(resolve(given, files=TOKENIZER, argument="tokenizer"))
-
-
-def _published_tokenizer(source: _saccade.ProcessorSource) -> str:
-    """The tokenizer for a checkpoint without one: that of its release, or else one with the same ids.
-
-    Raises:
-        FileNotFoundError: None of them can be had.
-        PermissionError: The Hub denies access to one that comes first.
-    """
-    problems: list[str] = []
-    for name in source.published:
-        try:
-            found = locate_published(name, files=TOKENIZER, argument="tokenizer").path
-        except FileNotFoundError as error:
-            problems.append(str(error))
-            continue
-        if problems:
-            warn(f"tokenizer: using {name} in place of {source.published[0]} ({problems[0]})")
-        return os.fspath(found)
-    commands = [f"hf download {name} {' '.join(source.needed_files)}" for name in source.published]
-    listed = "".join(f"\n  {problem}" for problem in problems)
-    raise FileNotFoundError(
-        f"tokenizer: the checkpoint has none, and no published one can be used:{listed}\nDownload that of "
-        f"{source.version.upper()} with: {' or: '.join(commands)}. Or pass tokenizer=, a tokenizer.json or a "
-        "directory with vocab.json and merges.txt"
-    )
 
 
 def _to_json(options: Any) -> str:

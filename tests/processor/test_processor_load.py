@@ -13,8 +13,8 @@ import pytest
 
 import saccade
 from saccade._internal import hub_cache
+from saccade._internal.tokenizers import tokenizer_path
 from saccade.errors import CheckpointError, InputError
-from saccade.processor import tokenizer_path
 from tests.helpers.processor_cases import AS_IT_IS, DATA, TOKENIZER, assert_same
 from tests.helpers.published import published
 

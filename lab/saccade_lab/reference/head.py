@@ -20,6 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade._internal.arrays import integer
+from saccade._internal.hub import resolve
+from saccade._internal.hub_files import HEAD
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig
@@ -115,8 +117,9 @@ class ActionHead(nn.Module):
     @classmethod
     def from_pretrained(
         cls,
-        source: str | PathLike[str],
+        id_or_path: str | PathLike[str],
         *,
+        revision: str | None = None,
         config: Mapping[str, Any] | str | PathLike[str] | None = None,
         num_states: int | None = None,
         dtype: torch.dtype = torch.float32,
@@ -124,22 +127,23 @@ class ActionHead(nn.Module):
         """Loads the head from a checkpoint.
 
         Args:
-            source: a directory or a file in any layout that :meth:`saccade.ActionHead.from_pretrained`
-            reads, or the id
-                of a repository in the local Hugging Face cache.
-            config: the config of the checkpoint or of the head, as a dict or a path. Default: the
+            id_or_path: A directory or a file in any layout that
+                :meth:`saccade.ActionHead.from_pretrained` reads, or the id of a published checkpoint.
+            revision: A branch, tag or commit of the id. Default: ``main``.
+            config: The config of the checkpoint or of the head, as a dict or a path. Default: the
                 `config.json` in the same directory, or else the `config` entry in the metadata of a single
                 file.
-            num_states: number of states in an observation, as for :meth:`saccade.ActionHead.from_pretrained`.
-            dtype: dtype of the parameters. Narrower stored dtypes are widened, which is exact.
+            num_states: Number of states in an observation, as for :meth:`saccade.ActionHead.from_pretrained`.
+            dtype: Dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
         Raises:
-            FileNotFoundError: a path does not exist.
-            CheckpointError: there is no config, or tensors are missing, unknown or of the wrong shape. The
+            FileNotFoundError: A path or id does not exist, or cannot be downloaded.
+            PermissionError: The Hub denies access to the id.
+            CheckpointError: There is no config, or tensors are missing, unknown or of the wrong shape. The
                 message lists all of them.
             InputError: `num_states` is out of range.
         """
-        checkpoint = loading.described(source, config)
+        checkpoint = loading.described(resolve(id_or_path, revision, files=HEAD), config)
         whole, names = checkpoint.head_config, loading.tensor_names(checkpoint)
         has_state_dropout = STATE_DROPOUT in names
         drops = drops_states(whole, has_state_dropout)

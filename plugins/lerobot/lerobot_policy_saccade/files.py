@@ -10,8 +10,8 @@ from huggingface_hub import snapshot_download
 from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError, RevisionNotFoundError
 
 from saccade._internal.hub import PUBLISHED, resolve
+from saccade._internal.tokenizers import tokenizer_path
 from saccade.errors import InputError
-from saccade.processor import tokenizer_path
 
 #: The folder of the checkpoint. It has a `config.json` of its own, as lerobot's policies do.
 CHECKPOINT = "checkpoint"

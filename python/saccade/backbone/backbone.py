@@ -1,4 +1,4 @@
-"""The vision-language backbone of GR00T N1.5, N1.6 and N1.7: camera views and words in, features out."""
+"""The vision-language backbone of GR00T: camera views and an instruction in, features out."""
 
 from __future__ import annotations
 
@@ -50,38 +50,29 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
     ) -> Backbone:
         """Loads the backbone of a checkpoint.
 
-        The tensors of the backbone have the prefix ``backbone.``, ``_groot_model.backbone.`` or none. Their
-        names say the version. Tensors outside the prefix are ignored. Inside it every tensor must be known,
-        present and of the right shape. Known and not read are the pooling head of SigLIP, ``lm_head`` if
-        ``embed_tokens`` is there too, and layers of the language model from ``select_layer`` on.
+        The tensors of the backbone have the prefix ``backbone.``, ``_groot_model.backbone.`` or none. The
+        version is recognised by their names. Tensors outside the prefix are ignored. Inside it every tensor
+        must be known, present and of the right shape. The pooling head of SigLIP, ``lm_head`` beside
+        ``embed_tokens``, and layers of the language model from ``select_layer`` on are not read.
 
         Args:
-            id_or_path: A directory (``config.json`` and one or more ``.safetensors`` files, with or without
-                an index), one ``.safetensors`` file, or the id of a published checkpoint in the local cache
-                of ``huggingface_hub``, such as ``nvidia/GR00T-N1.5-3B``.
+            id_or_path: A path or the id of a published checkpoint, as for
+                :meth:`saccade.ActionHead.from_pretrained`.
             revision: A branch, tag or commit of the id. Default: ``main``.
             config: A dict or the path of a JSON file: the config of a whole checkpoint, whose
-                ``backbone_cfg.eagle_config`` may hold sizes, or that of a backbone alone (``vision_config``,
-                ``text_config``, ``eagle``, ``select_layer``, ``project_to_dim``). Sizes that it does not hold
-                are those of the published model. Default: the ``config.json`` in the directory of the
-                weights, if there is one.
-            precision: How the backbone computes. The residual stream, norms, softmax and all sums of floating
-                point products are float32 at every precision.
-
-                - ``"float32"``: exact up to rounding. Weights stored as bfloat16 stay bfloat16 in memory,
-                  which loses nothing.
-                - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16.
-                - ``"int8"``: the large layers of all blocks multiply 8-bit integers, with a scale for each
-                  output of the weights and one for each row of the inputs. Everything else is as in
-                  ``"bfloat16"``.
-
-                The table of embeddings is held in bfloat16, or in float32 if it is stored so and the
-                precision is float32.
+                ``backbone_cfg.eagle_config`` may contain sizes, or that of a backbone alone
+                (``vision_config``, ``text_config``, ``eagle``, ``select_layer``, ``project_to_dim``). Sizes
+                that it does not contain are those of the published model. Default: the ``config.json`` in the
+                directory of the weights, if there is one.
+            precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as for
+                :meth:`saccade.ActionHead.from_pretrained`. The table of embeddings is kept in bfloat16, or in
+                float32 if it is stored so and the precision is float32.
             num_threads: Number of threads that a call uses. Default: the environment variable
                 ``SACCADE_NUM_THREADS``, else the number of physical cores that the process may use.
 
         Raises:
-            FileNotFoundError: ``id_or_path`` or the config does not exist.
+            FileNotFoundError: ``id_or_path`` or the config does not exist, or cannot be downloaded.
+            PermissionError: The Hub denies access to the id.
             CheckpointError: The config or the weights are damaged or do not fit each other, or there is no
                 backbone. The message lists every problem.
             InputError: An option is out of range.

@@ -11,6 +11,7 @@ from typing import Any
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
 from saccade._internal.hub import resolve
+from saccade._internal.hub_files import WEIGHTS
 from saccade.head.config import HeadConfig, to_json
 
 #: A checkpoint: a directory, one ``.safetensors`` file, or a published id.
@@ -81,7 +82,9 @@ def describe(source: Source, config: Config = None) -> Description:
 
 def open_published(source: Source, config: Config = None) -> _saccade.Published:
     """Opens a checkpoint and recognises its layout, version and config; raises as :func:`describe`."""
-    return _saccade.Published.open(os.fspath(resolve(source)), None if config is None else to_json(config))
+    return _saccade.Published.open(
+        os.fspath(resolve(source, files=WEIGHTS)), None if config is None else to_json(config)
+    )
 
 
 def description_of(published: _saccade.Published, source: Source) -> Description:
@@ -115,4 +118,4 @@ def read_tensors(source: Source, prefix: str = "") -> dict[str, Float32Array]:
         FileNotFoundError: ``source`` does not exist.
         CheckpointError: A file is damaged, or a tensor is not F32, BF16, F16 or I8 with scales.
     """
-    return _saccade.read_tensors(os.fspath(resolve(source)), prefix)
+    return _saccade.read_tensors(os.fspath(resolve(source, files=WEIGHTS)), prefix)

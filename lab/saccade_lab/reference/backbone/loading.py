@@ -13,7 +13,6 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from saccade._internal.hub import resolve
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.errors import CheckpointError
 
@@ -30,11 +29,8 @@ class Checkpoint:
     sizes: BackboneSizes
 
     @classmethod
-    def open(
-        cls, source: str | PathLike[str], config: Mapping[str, Any] | str | PathLike[str] | None
-    ) -> Checkpoint:
+    def open(cls, path: Path, config: Mapping[str, Any] | str | PathLike[str] | None) -> Checkpoint:
         """As :meth:`saccade_lab.reference.Backbone.from_pretrained`."""
-        path = resolve(source)
         files = sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
         if not files or not files[0].is_file():
             raise FileNotFoundError(f"{path}: no such file or directory with .safetensors files")

@@ -17,6 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from saccade._internal.hub import resolve
+from saccade._internal.hub_files import BACKBONE
 from saccade.backbone.inputs import BackboneInputs
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.errors import InputError, ShapeError
@@ -81,28 +83,30 @@ class Backbone(nn.Module):
     @classmethod
     def from_pretrained(
         cls,
-        source: str | PathLike[str],
+        id_or_path: str | PathLike[str],
         *,
+        revision: str | None = None,
         config: Mapping[str, Any] | str | PathLike[str] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> Backbone:
         """Loads the backbone from a checkpoint.
 
         Args:
-            source: a directory or a file in any layout that :meth:`saccade.ActionHead.from_pretrained`
-            reads, or the id
-                of a repository in the local Hugging Face cache.
-            config: as for :meth:`saccade.checkpoints.backbone_sizes.BackboneSizes.from_config`, or the path
+            id_or_path: A directory or a file in any layout that
+                :meth:`saccade.Backbone.from_pretrained` reads, or the id of a published checkpoint.
+            revision: A branch, tag or commit of the id. Default: ``main``.
+            config: As for :meth:`saccade.checkpoints.backbone_sizes.BackboneSizes.from_config`, or the path
                 of such a file. Default: the `config.json` in the same directory, or else the `about` entry
                 in the metadata of a single file.
-            dtype: dtype of the parameters. Narrower stored dtypes are widened, which is exact.
+            dtype: Dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
         Raises:
-            FileNotFoundError: a path does not exist.
-            CheckpointError: there is no config, or tensors are missing, unknown or of the wrong shape. The
+            FileNotFoundError: A path or id does not exist, or cannot be downloaded.
+            PermissionError: The Hub denies access to the id.
+            CheckpointError: There is no config, or tensors are missing, unknown or of the wrong shape. The
                 message lists all of them.
         """
-        checkpoint = loading.Checkpoint.open(source, config)
+        checkpoint = loading.Checkpoint.open(resolve(id_or_path, revision, files=BACKBONE), config)
         with torch.device("meta"):  # no memory and no time for an initialisation that is replaced
             backbone = cls(checkpoint.sizes)
         shapes = {name: tensor.shape for name, tensor in backbone.state_dict().items()}
