@@ -322,15 +322,15 @@ def test_whoever_looks_finds_a_checkpoint(source: Path, tmp_path: Path) -> None:
     """While one takes the place of another, there is always one."""
     out = tmp_path / "out"
     convert(source, out)
-    missed, looks, done = 0, 0, threading.Event()
+    missed, checks, done = 0, 0, threading.Event()
 
-    def look() -> None:
-        nonlocal missed, looks
+    def check() -> None:
+        nonlocal missed, checks
         while not done.is_set():
             missed += not (out / "config.json").exists()
-            looks += 1
+            checks += 1
 
-    watcher = threading.Thread(target=look)
+    watcher = threading.Thread(target=check)
     watcher.start()
     try:
         for _ in range(10):
@@ -338,7 +338,7 @@ def test_whoever_looks_finds_a_checkpoint(source: Path, tmp_path: Path) -> None:
     finally:
         done.set()
         watcher.join()
-    assert looks > 100
+    assert checks > 100
     assert missed == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "source"]
 

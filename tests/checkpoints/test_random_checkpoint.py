@@ -100,10 +100,10 @@ def test_rounding_to_bfloat16_is_torchs() -> None:
     np.testing.assert_array_equal(bfloat16(values), expected)
 
 
-def test_pieces_are_small_and_their_moments_right() -> None:
+def test_blocks_are_small_and_their_mean_and_deviation_right() -> None:
     tensor = random_tensors.Tensor("x.mlp.up_proj.weight", (3000, 2000), "F32")
     found = list(blocks(tensor, seed=0))
-    assert all(len(piece) <= 4 * random_tensors.BLOCK for piece in found)
+    assert all(len(block) <= 4 * random_tensors.BLOCK for block in found)
     values = np.frombuffer(b"".join(found), np.float32)
     assert values.size * 4 == tensor.nbytes
     assert abs(values.std() * 2000**0.5 - 1) < 1e-2

@@ -334,8 +334,8 @@ def features(folder: Path, **more: Any) -> Path:
         "state": rng.standard_normal((3, 12), np.float32),
         "embodiment_id": np.array([2, 0, 2]),
     }
-    np.savez(folder / "looks.npz", **held, **more)
-    return folder / "looks.npz"
+    np.savez(folder / "observations.npz", **held, **more)
+    return folder / "observations.npz"
 
 
 def test_actions_on_recorded_features(source: Path, tmp_path: Path) -> None:

@@ -227,7 +227,7 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
     }
     (tmp_path / "reach").mkdir()
     (tmp_path / "reach" / "recording.json").write_text("{}")
-    arguments |= {"study": ["cuts"], "study report": ["."], "study --features": ["--features", "looks.npz"]}
+    arguments |= {"study": ["cuts"], "study report": ["."], "study --features": ["--features", "o.npz"]}
     words = ["study", "cuts"] if name == "study --features" else name.split()
     done = saccade_command(*words, *arguments.get(name, []), code=BARE)
     assert (done.returncode, done.stdout) == (2, "")

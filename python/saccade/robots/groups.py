@@ -81,10 +81,10 @@ class Group:
             return rotations.SIZES[self.conversion.head]
         return 2 * self.size if self.mode == "sin_cos" else self.size
 
-    def indexed(self, index: Any, **changes: Any) -> Group:
-        """The group with a part of its statistics, if it has any, and with other changes."""
+    def indexed(self, index: Any) -> Group:
+        """The group with a part of its statistics, if it has any."""
         names = ("first", "second", "moving") if self.first is not None else ()
-        return replace(self, **{name: getattr(self, name)[index] for name in names}, **changes)
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def to_head(self, values: Float32Array) -> Float32Array:
         """Converts ``(..., size)`` in the robot's units to normalised ``(..., width)``.

@@ -7,6 +7,7 @@ the same statistics (``isclose``, means, sines) do not apply here.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -260,7 +261,7 @@ def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group
                 f"action.{group.key}: cut to {size} of {group.size} numbers (env_action_dim)"
             )
         elif size > 0:
-            found.append(group.indexed((..., slice(size)), size=size))
+            found.append(replace(group.indexed((..., slice(size))), size=size))
     return tuple(found)
 
 
