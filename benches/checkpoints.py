@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from saccade.checkpoints import random_checkpoint
+from saccade_lab import random_checkpoint
 
 
 def n15(work: Path, *, small: bool, given: Path | None = None) -> Path:
@@ -43,7 +43,7 @@ def written(folder: Path, **options: Any) -> Path:
 
     Args:
         folder: Its directory.
-        **options: As `saccade.checkpoints.random_checkpoint.write` takes them.
+        **options: As `saccade_lab.random_checkpoint.write` takes them.
 
     Raises:
         SystemExit: The directory contains something else.

@@ -42,7 +42,7 @@ import numpy as np
 from real_time import histogram
 
 import saccade
-from saccade.checkpoints import random_checkpoint
+from saccade_lab import random_checkpoint
 
 Actions = dict[str, Any]
 

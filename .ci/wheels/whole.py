@@ -78,7 +78,7 @@ def main() -> int:
         checkpoint = args.checkpoint or folder / "checkpoint"
         if args.checkpoint is None:
             size = ["--small"] if args.small else []
-            run(python, "-I", "-m", "saccade.checkpoints.random_checkpoint", checkpoint, *size)
+            run(python, "-I", "-m", "saccade_lab.random_checkpoint", checkpoint, *size)
         failed = False
         print(f"{'':10}{'load, s':>9}{'first, s':>10}{'second, s':>11}{'memory, GB':>12}  chunk")
         for precision in PRECISIONS:

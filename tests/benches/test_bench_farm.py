@@ -16,7 +16,7 @@ import pytest
 
 from benches import checkpoints, farm, farm_processes, farm_report
 from benches.farm_processes import Robot, Setting
-from saccade.checkpoints import random_checkpoint
+from saccade_lab import random_checkpoint
 from tests.helpers.descendants import all_end, descendants, usual_interrupt
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,7 +12,7 @@ import pytest
 import saccade
 from saccade import _saccade
 from saccade._internal.arrays import PRECISIONS
-from saccade.checkpoints.random_checkpoint.head import config_of_size, write_head
+from saccade.checkpoints.random_head import config_of_size, write_head
 from saccade.cli import main
 from saccade.cli.timing import Call, Machine, by_turns, quartiles, works_of
 

@@ -29,7 +29,7 @@ class Served:
     """A server in a process, and the same policy in this one."""
 
     def __init__(self, version: str, folder: Path) -> None:
-        command = [sys.executable, "-m", "saccade.checkpoints.random_checkpoint", str(folder), "--small"]
+        command = [sys.executable, "-m", "saccade_lab.random_checkpoint", str(folder), "--small"]
         subprocess.run([*command, "--version", version], check=True, stdout=subprocess.DEVNULL)
         self.policy = saccade.Policy.from_pretrained(folder)
         serve = [sys.executable, "-m", "saccade", "serve", str(folder), "--port", "0", "--log", "json"]

@@ -19,7 +19,7 @@ import torch
 
 from lerobot_policy_saccade import SaccadeConfig
 from lerobot_policy_saccade.modeling_saccade import SaccadePolicy
-from saccade.checkpoints import random_checkpoint
+from saccade_lab import random_checkpoint
 from saccade_lab.sim.cameras import DEFAULT_IMAGE_SIZE
 
 VIEWS = ("left", "right", "top")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade.checkpoints import random_checkpoint
+from saccade_lab import random_checkpoint
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 #: Runs the script with the rest of the arguments in an interpreter without torch.

@@ -24,6 +24,7 @@ PACKAGES = {
     ),
     **dict.fromkeys(("griffe", "huggingface_hub", "msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
     **dict.fromkeys(("saccade.integrations", "saccade.torch", "saccade_lab.reference"), "torch"),
+    "saccade_lab.random_checkpoint": "core",
     **dict.fromkeys(("benches", "studies", "why_32", "saccade_lab"), "lab"),
     **dict.fromkeys(("gymnasium", "imageio", "joblib", "jinja2", "matplotlib", "mujoco", "pandas"), "lab"),
     **dict.fromkeys(("metaworld", "ray", "selenium", "sklearn"), "lab"),

@@ -17,8 +17,9 @@ import pytest
 import torch
 
 import saccade
-from saccade.checkpoints import describe, random_checkpoint
+from saccade.checkpoints import describe
 from saccade.checkpoints.whole import robots_of
+from saccade_lab import random_checkpoint
 from saccade_lab.reference import ActionHead as Reference
 from tests.helpers import paths
 from tests.helpers.policy_cases import inputs_of

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade.checkpoints import random_checkpoint
+from saccade_lab import random_checkpoint
 from tests.helpers import paths
 
 DATA = paths.DATA / "robots"

@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from saccade._internal.files import write_json
 from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config
-from saccade.checkpoints.random_checkpoint.robot_metadata import metadata
-from saccade.checkpoints.random_checkpoint.tokenizer import token_id, tokenizer
 from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.processor import Processor
 from saccade.robots import LANGUAGE_KEY, Normalizer
+from saccade_lab.random_checkpoint.robot_metadata import metadata
+from saccade_lab.random_checkpoint.tokenizer import token_id, tokenizer
 from saccade_lab.sim.cameras import CameraPose
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"

@@ -19,8 +19,8 @@ from saccade._internal import flags as arguments
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import UsageError
 from saccade._internal.hub import resolve
+from saccade.checkpoints import random_head
 from saccade.checkpoints.bundled import demo_checkpoint
-from saccade.checkpoints.random_checkpoint import head as random_head
 from saccade.checkpoints.whole import robots_of
 from saccade.cli import EXIT_OK, output
 from saccade.cli.timing import Call, Counter, Machine, arithmetic_of, by_turns, profiled, quartiles, works_of

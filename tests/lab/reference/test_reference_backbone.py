@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from saccade import BackboneInputs, CheckpointError, InputError, ShapeError
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.checkpoints.published import RELEASED
-from saccade.checkpoints.random_checkpoint import backbone_tensors
+from saccade_lab.random_checkpoint import backbone_tensors
 from saccade_lab.reference import Backbone, BackboneFeatures
 from saccade_lab.reference.backbone.loading import is_unread
 from tests.helpers import upstream_backbones

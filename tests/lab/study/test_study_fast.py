@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import saccade
-from saccade.checkpoints.random_checkpoint import head as random_head
+from saccade.checkpoints import random_head
 from saccade.cli import main
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference import random_weights

@@ -291,9 +291,7 @@ def test_the_report_of_every_study_needs_no_simulator(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WITHOUT_A_SIMULATOR, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "report.md").read_text(encoding="utf-8").count(
-        "(not measured)"
-    ) == 2  # tvl, vlsa
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").count("(not measured)") == 2  # tvl, vlsa
 
 
 BARE = """

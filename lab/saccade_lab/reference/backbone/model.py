@@ -61,7 +61,7 @@ class Backbone(nn.Module):
     Example:
         >>> import numpy as np
         >>> from saccade import BackboneInputs
-        >>> from saccade.checkpoints.random_checkpoint import small_backbone
+        >>> from saccade_lab.random_checkpoint import small_backbone
         >>> backbone = Backbone(BackboneSizes.from_config(small_backbone("n1.5")))
         >>> prompt = [[1, 2] + [backbone.sizes.image_token] * 16 + [3]]
         >>> features = backbone(BackboneInputs(np.zeros((1, 3, 56, 56), np.float32), prompt))

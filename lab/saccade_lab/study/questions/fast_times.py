@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from saccade.checkpoints.random_checkpoint import head as random_head
+from saccade.checkpoints import random_head
 from saccade.head.head import ActionHead
 from saccade.head.inputs import HeadInputs
 from saccade_lab.study.cell import Rows

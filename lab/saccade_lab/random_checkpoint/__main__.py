@@ -1,8 +1,8 @@
 """Writes a random whole checkpoint in NVIDIA's layout: backbone, head, statistics, tokenizer. NumPy only.
 
-    python -m saccade.checkpoints.random_checkpoint OUT                    N1.5 at its published size, 4.8 GB
-    python -m saccade.checkpoints.random_checkpoint OUT --small            a few MB
-    python -m saccade.checkpoints.random_checkpoint OUT --version n1.7
+    python -m saccade_lab.random_checkpoint OUT                    N1.5 at its published size, 4.8 GB
+    python -m saccade_lab.random_checkpoint OUT --small            a few MB
+    python -m saccade_lab.random_checkpoint OUT --version n1.7
 
 Everything that loads the published checkpoint loads this one, so installation, memory and speed can be tried
 before it is downloaded. Its actions mean nothing. Weights are scaled so that activations stay of order one;
@@ -17,14 +17,14 @@ import sys
 from pathlib import Path
 
 from saccade.checkpoints.published import RELEASED
-from saccade.checkpoints.random_checkpoint.whole import small_backbone, small_head, write
 from saccade.errors import InputError
+from saccade_lab.random_checkpoint.whole import small_backbone, small_head, write
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m saccade.checkpoints.random_checkpoint",
+        prog="python -m saccade_lab.random_checkpoint",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
