@@ -175,7 +175,7 @@ def add_checkpoint_argument(parser: Arguments) -> None:
         "checkpoint",
         type=Path,
         metavar="CHECKPOINT",
-        help="directory, .safetensors file or published id (read from the local Hugging Face cache)",
+        help="directory, .safetensors file or published id (downloaded with the extra hub)",
     )
 
 

@@ -141,7 +141,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
             previous: Features that this backbone computed before. Views whose pixels are the same, byte for
                 byte, are not encoded again, and of a prompt that begins in the same way (the same ids,
                 padding and views) only the rest is computed. The features have the same bits as without.
-            record: What to keep in ``features.record``, any of ``"hidden"`` (the rows after each layer of the
+            record: The parts of ``features.record``, any of ``"hidden"`` (the rows after each layer of the
                 language model), ``"vision"`` (the patches of each view after the vision tower) and
                 ``"image_tokens"`` (the tokens of each view). With a record nothing is taken from
                 ``previous``.
@@ -159,7 +159,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
     def encode_many(
         self, inputs: Sequence[BackboneInputs], *, previous: Sequence[BackboneFeatures] = ()
     ) -> list[BackboneFeatures]:
-        """Computes the features of several inputs, whose prompts may differ in length, in one pass.
+        """Computes the features of several inputs in one pass. Their prompts may differ in length.
 
         Nothing is padded. All rows share the linear layers, and all views the vision tower. The features of
         each have the bits that it has alone.

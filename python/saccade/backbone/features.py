@@ -1,4 +1,4 @@
-"""What a backbone returns: features, and what a later call may take from them."""
+"""The features that a backbone returns, with what a later call can reuse."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RECORDS = ("hidden", "vision", "image_tokens")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BackboneRecord:
-    """What one call of a backbone recorded. ``repr`` lists what it holds.
+    """The record of a call of a backbone. ``repr`` lists its contents.
 
     Arrays are float32, NumPy or torch like the inputs.
 
@@ -51,8 +51,8 @@ class BackboneRecord:
 class BackboneFeatures(Handle):
     """The features of observations. Returned by :class:`saccade.Backbone`.
 
-    Besides the features it holds what a later call may take from it (``previous``): the pixels and tokens of
-    each view, and the keys and values of every layer. It is immutable: any number of calls and threads may
+    It also contains what a later call can reuse (``previous``): the pixels and tokens of each view, and the
+    keys and values of every layer. It is immutable: any number of calls and threads may
     use it at the same time. ``copy.copy`` and ``copy.deepcopy`` return the object itself. It cannot be
     pickled.
     """
@@ -100,7 +100,7 @@ class BackboneFeatures(Handle):
 
     @property
     def record(self) -> BackboneRecord | None:
-        """What was recorded, or None."""
+        """The record, or None if nothing was to be recorded."""
         return self._record
 
     @property
@@ -115,7 +115,7 @@ class BackboneFeatures(Handle):
 
     @property
     def nbytes(self) -> int:
-        """Size in memory, in bytes. What several features share is counted in each of them."""
+        """Size in memory, in bytes. Memory that several features share is counted in each of them."""
         shown = sum(int(array.nbytes) for array in self._arrays)
         return self._held.nbytes + shown + (0 if self._record is None else self._record.nbytes)
 
@@ -133,7 +133,7 @@ def made(
     inputs: Any,
     image_token_id: int,
 ) -> BackboneFeatures:
-    """The features of ``inputs``, as Python has them."""
+    """The features of ``inputs`` from the result of the engine."""
     use_torch = inputs._is_torch
     arrays = (
         like_features(held.features(), use_torch),

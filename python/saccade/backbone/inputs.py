@@ -1,4 +1,4 @@
-"""What a vision-language backbone takes: pixels and token ids, as the released processors prepare them."""
+"""The inputs of a vision-language backbone: pixels and token ids, as the released processors prepare them."""
 
 from __future__ import annotations
 

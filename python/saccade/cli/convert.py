@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     add_copy_arguments(parser)
     parser.add_argument(
-        "--adapter", metavar="DIR", help="LoRA adapter to merge: a directory, or an id in the local cache"
+        "--adapter", metavar="DIR", help="LoRA adapter to merge: a directory or a published id"
     )
     arguments.add_list(
         parser, "--embodiment-ids", item=int, metavar="ID", help="embodiments to keep (default: all)"

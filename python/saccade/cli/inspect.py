@@ -34,7 +34,7 @@ differ by at most 1 % of their range. docs/precision.md says why.
 
 examples:
   saccade inspect GR00T-N1.5-3B/
-  saccade inspect nvidia/GR00T-N1.5-3B --json          from the local Hugging Face cache
+  saccade inspect nvidia/GR00T-N1.5-3B --json          downloaded, or from the cache
   saccade inspect my-fork/ --reference GR00T-N1.5-3B/  is it still the checkpoint that it started from?
   saccade inspect GR00T-N1.5-3B/ --data-config fourier_gr1_arms_only    what this data config needs
   saccade inspect my-policy/ --precision-check frames/ --instruction "open the drawer"

@@ -37,9 +37,9 @@ class HeadConfig:
         attend_text_every_n_blocks: With ``mask_mode`` ``"alternate"``, every n-th cross-attention block,
             starting with the first, attends to text; the others to images. 0 with ``"none"``.
         use_vlln: Whether the vision-language tokens are normalised first.
-        vl_num_layers: Number of blocks of the VL self-attention; 0 if there is none.
+        vl_num_layers: Number of blocks of the VL self-attention; 0 without one.
         vl_num_heads: Number of its attention heads.
-        vl_head_dim: Width of one of them.
+        vl_head_dim: Width of one of its attention heads.
         num_future_tokens: Number of learned rows between state and actions (``num_target_vision_tokens``).
         future_key_bias: A number for each future token, added to the logits of its key in every
             self-attention block: the logarithm of the number of tokens that it represents. None means zeros.
@@ -55,7 +55,7 @@ class HeadConfig:
         state_history: Number of state vectors in a state row (``state_history_length``).
         num_states: Number of state vectors in an observation. N1.7 makes one row of all of them, so this is
             ``state_history``. The other versions make a row of each: one, or as many as
-            :meth:`saccade.ActionHead.from_pretrained` was told.
+            :meth:`saccade.ActionHead.from_pretrained` was given.
         hidden_dim: Hidden width of encoders and decoders (``hidden_size``).
         num_embodiments: Number of embodiments of the category-specific layers (``max_num_embodiments``).
         num_timestep_buckets: Number of buckets of the time from 0 to 1.

@@ -43,7 +43,7 @@ class Context(Handle):
 
     @property
     def record(self) -> Record | None:
-        """What :meth:`saccade.ActionHead.encode` recorded of the VL self-attention, or None."""
+        """The record of the VL self-attention that :meth:`saccade.ActionHead.encode` made, or None."""
         return self._record
 
     @property

@@ -1,4 +1,4 @@
-"""The action head of every version of GR00T: encode an observation once, sample chunks of actions from it."""
+"""The action head of GR00T: encodes an observation once, and samples chunks of actions from it."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class ActionHead(LoadedHead):
         """Computes everything that depends on the observation alone.
 
         This is the norm of the vision-language tokens (``vlln``), the VL self-attention, and the keys and
-        values of every cross-attention block, as far as the head has them. Keys and values are computed only
-        for positions that a block can attend to.
+        values of each cross-attention block (if present). Keys and values are computed only for positions
+        that a block can attend to.
 
         Args:
             backbone_features: ``(batch, T_vl, context_dim)``.
@@ -133,7 +133,7 @@ class ActionHead(LoadedHead):
         Args:
             context: From :meth:`encode` of this head.
             state: ``(batch, num_states, state_dim)``, the newest last, or ``(batch, state_dim)`` for a head
-                of one state. Normalised and padded (see :meth:`policy` for states in the robot's units).
+                of one state. Normalised and padded: :class:`saccade.Policy` takes the robot's units.
             embodiment_id: One integer, or integers ``(batch,)``.
             noise: ``(batch, action_horizon, encoder_action_dim)``. With ``num_samples``, ``(batch,
                 num_samples, action_horizon, encoder_action_dim)``.

@@ -1,4 +1,4 @@
-"""What a run of the head recorded: attention probabilities, and the rows after each block."""
+"""Records of a run of the head: attention probabilities, and the rows after each block."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ ArrayT = TypeVar("ArrayT")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trace(Generic[ArrayT]):
-    """What one call of :meth:`saccade.ActionHead.trace` recorded. ``repr`` lists keys, shapes and sizes.
+    """The record of a call of :meth:`saccade.ActionHead.trace`. ``repr`` lists keys, shapes and sizes.
 
     Arrays are float32, NumPy or torch like the features. Those of
-    :class:`saccade_lab.reference.ActionHead` are
-    torch tensors in its dtype.
+    :class:`saccade_lab.reference.ActionHead` are torch tensors in its dtype.
 
     Attributes:
         attention: The attention probabilities by ``(step, block)``, ``(batch, heads, queries, keys)``.
@@ -66,7 +65,7 @@ class Trace(Generic[ArrayT]):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Record:
-    """What one call of :meth:`saccade.ActionHead.encode` recorded. ``repr`` lists keys, shapes and sizes.
+    """The record of a call of :meth:`saccade.ActionHead.encode`. ``repr`` lists keys, shapes and sizes.
 
     Arrays are float32, NumPy or torch like the features.
 

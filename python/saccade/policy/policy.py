@@ -146,7 +146,7 @@ class Policy:
                 the way of the program that trained the checkpoint. Default: by version and layout; see
                 ``repr`` of ``policy.processor``.
             tokenizer: A ``tokenizer.json``, or a directory with one or with ``vocab.json`` and
-                ``merges.txt``. Default: in the checkpoint, else in the local cache of ``huggingface_hub``.
+                ``merges.txt``. Default: the checkpoint's own, else the published one of its release.
             precision: How backbone and head compute, as for :meth:`saccade.ActionHead.from_pretrained`: one
                 name for both, or ``{"backbone": name, "head": name}``.
             num_threads: Number of threads, as for :meth:`saccade.ActionHead.from_pretrained`.
